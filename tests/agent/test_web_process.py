@@ -97,5 +97,6 @@ def test_its_command_and_environment_have_what_the_agent_was_told(tmp_path: Path
     for part in ("--agent base", "--port 9000", "--listen 0.0.0.0", "--token-file t", "--config", "--with-agent"):
         assert part in command
     settings = Settings(log_level="debug", log_json=True)
-    environ = web_environment(settings, {"RMPA_RUNTIME_DIR": "x", "RMPA_LOG_LEVEL": "error"})
+    of_systemd = {"NOTIFY_SOCKET": "/run/systemd/notify", "WATCHDOG_USEC": "10000000"}
+    environ = web_environment(settings, {"RMPA_RUNTIME_DIR": "x", "RMPA_LOG_LEVEL": "error", **of_systemd})
     assert environ == {"RMPA_RUNTIME_DIR": "x", "RMPA_LOG_LEVEL": "debug", "RMPA_LOG_JSON": "true"}

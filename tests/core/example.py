@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "rmpa.toml"
+EXAMPLE = Path(__file__).parents[2] / "src" / "rmpa" / "config" / "rmpa.toml"
 
 
 def uncommented(text: str) -> str:

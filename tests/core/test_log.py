@@ -39,6 +39,21 @@ def test_text(stream: io.StringIO) -> None:
     assert re.fullmatch(r"\d\d:\d\d:\d\d\.\d{3} warning mesh      ! it\\nis \\x1b\[31m\n", stream.getvalue())
 
 
+def test_a_journal_gets_priorities_and_no_time(stream: io.StringIO) -> None:
+    configure_logging("debug", stream, as_json=False, in_journal=True)
+    log = logging.getLogger("rmpa.mesh.io.dial")
+    log.debug("> a")
+    log.warning("! b")
+    try:
+        int("x")
+    except ValueError:
+        log.exception("! c")
+    first, second, third, *trace = stream.getvalue().splitlines()
+    assert (first, second) == ("<7>debug   mesh      > a", "<4>warning mesh      ! b")
+    assert third == "<3>error   mesh      ! c"
+    assert {line[:3] for line in trace} == {"<3>"}
+
+
 def test_json_with_a_traceback(stream: io.StringIO) -> None:
     configure_logging("debug", stream, as_json=True)
     try:

@@ -21,7 +21,7 @@ from rmpa.core.identity import is_global_name
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-_EXAMPLE = Path(__file__).parents[2] / "examples" / "rmpa.toml"
+_EXAMPLE = Path(__file__).parents[2] / "src" / "rmpa" / "config" / "rmpa.toml"
 _READERS = (
     *(s.type.read for s in SETTINGS if not s.is_list_of_tables),
     read_duration,

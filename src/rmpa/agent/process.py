@@ -24,7 +24,7 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime import process as realtime
 from rmpa.runtime.accept import is_shortage, raise_file_limit
 from rmpa.runtime.loop import AgentLoop
-from rmpa.runtime.process import notify_service_manager
+from rmpa.runtime.process import SERVICE_VARIABLES, feed_watchdog, notify_service_manager
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
@@ -195,9 +195,9 @@ def web_command(settings: Settings) -> list[str]:
 
 
 def web_environment(settings: Settings, environ: Mapping[str, str]) -> dict[str, str]:
-    """The environment of the child: the agent's, with its log's level and format."""
-    log = {"RMPA_LOG_LEVEL": settings.log_level, "RMPA_LOG_JSON": str(settings.log_json).lower()}
-    return {**environ, **log}
+    """The environment of the child: the agent's, with its log's level and format; systemd hears the agent alone."""
+    own = {name: value for name, value in environ.items() if name not in SERVICE_VARIABLES}
+    return {**own, "RMPA_LOG_LEVEL": settings.log_level, "RMPA_LOG_JSON": str(settings.log_json).lower()}
 
 
 class WebProcess:
@@ -332,6 +332,7 @@ async def serve(
         tasks[1].add_done_callback(lambda _: stop.set())
     try:
         notify_service_manager("READY=1")
+        feed_watchdog(loop)
         await stop.wait()
         notify_service_manager("STOPPING=1")
         _log.info("= ending")

@@ -39,7 +39,7 @@ from rmpa.observe.control import ReloadReply
 from rmpa.observe.control_client import find_agents
 from rmpa.observe.peer_info import FAIL, OK, WARN, CheckLevel, exit_code
 from rmpa.observe.why.diagnosis import Diagnosis
-from rmpa.runtime.process import LogWriter
+from rmpa.runtime.process import LogWriter, in_journal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -268,7 +268,8 @@ def up(**options: object) -> int:
     load = partial(load_settings, options, dict(os.environ), host_name=socket.gethostname())
     loaded = load()
     writer = LogWriter(sys.stderr.fileno())
-    configure_logging(loaded.settings.log_level, writer, as_json=loaded.settings.log_json)
+    journal = in_journal(os.environ, sys.stderr.fileno())
+    configure_logging(loaded.settings.log_level, writer, as_json=loaded.settings.log_json, in_journal=journal)
     for note in loaded.notes:
         _log.warning("%s", note)
     chosen = choose_name(loaded.names)

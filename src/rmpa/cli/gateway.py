@@ -27,7 +27,7 @@ from rmpa.core.counters import configure_logging
 from rmpa.core.errors import ConfigError, StartError, UnreachableError
 from rmpa.core.identity import peer_name_from
 from rmpa.observe.control_client import ControlClient, find_agents
-from rmpa.runtime.process import LogWriter
+from rmpa.runtime.process import LogWriter, in_journal
 from rmpa.trust.permissions import TrustStatus
 
 if TYPE_CHECKING:
@@ -96,7 +96,8 @@ def gateway(context: click.Context, /, **options: object) -> int:
     _check_settings(loaded.settings)
     _check_agents(loaded.settings)
     writer = LogWriter(sys.stderr.fileno())
-    configure_logging(loaded.settings.log_level, writer, as_json=loaded.settings.log_json)
+    journal = in_journal(os.environ, sys.stderr.fileno())
+    configure_logging(loaded.settings.log_level, writer, as_json=loaded.settings.log_json, in_journal=journal)
     for note in loaded.notes:
         _log.warning("%s", note)
     gc.disable()  # as in rmpa up: the start takes a third less time; the agent turns it on again
@@ -270,7 +271,8 @@ def web(config: str | None, with_agent: bool, insecure: bool, options: Options, 
         return module, _setup(module, settings)
 
     module, setup = make()
-    configure_logging(setup.settings.log_level, sys.stderr, as_json=setup.settings.log_json)
+    journal = in_journal(os.environ, sys.stderr.fileno())
+    configure_logging(setup.settings.log_level, sys.stderr, as_json=setup.settings.log_json, in_journal=journal)
     for note in module.loaded.notes:
         _web_log.warning("%s", note)
     from rmpa.web.server.process import serve

@@ -142,22 +142,32 @@ def _one_line(text: str) -> str:
     return "".join(c if c.isprintable() or c == "\t" else _ESCAPE(c)[0].decode("ascii") for c in text)
 
 
+# By the level's number, the greatest that fits: the priority of a line in a journal (sd-daemon(3)).
+_PRIORITIES: Final = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6, logging.NOTSET: 7}
+
+
 class _Formatter(logging.Formatter):
     """One record as text, or as one JSON object a line; ``configure_logging`` says which."""
 
     as_json = False
+    in_journal = False
 
     def format(self, record: logging.LogRecord) -> str:
         """``12:00:01.250 warning mesh       ! text``; local time, a traceback on the following lines.
 
+        In a journal, which has the time itself: ``<4>warning mesh       ! text``, each line with its priority.
         In JSON: time (ISO 8601, UTC), level, room, logger, text, and traceback if there is one.
         """
         level, room = record.levelname.lower(), _room_of(record.name)
         trace = self.formatException(record.exc_info) if record.exc_info else ""
         if not self.as_json:
+            line = f"{level:<7} {room:<9} {_one_line(record.getMessage())}"
+            lines = f"{line}\n{trace}" if trace else line
+            if self.in_journal:
+                priority = next(word for number, word in _PRIORITIES.items() if number <= record.levelno)
+                return "\n".join(f"<{priority}>{each}" for each in lines.split("\n"))
             clock = f"{datetime.fromtimestamp(record.created).astimezone():%H:%M:%S}.{int(record.msecs):03d}"
-            line = f"{clock} {level:<7} {room:<9} {_one_line(record.getMessage())}"
-            return f"{line}\n{trace}" if trace else line
+            return f"{clock} {lines}"
         fields = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": level,
@@ -168,17 +178,18 @@ class _Formatter(logging.Formatter):
         return json.dumps(fields | {"traceback": trace} if trace else fields, ensure_ascii=False)
 
 
-def configure_logging(level: str, stream: SupportsWrite[str], *, as_json: bool) -> None:
+def configure_logging(level: str, stream: SupportsWrite[str], *, as_json: bool, in_journal: bool = False) -> None:
     """Send every record of ``level`` and above to ``stream``, replacing the earlier configuration.
 
     Args:
         level: As in ``Settings.log_level``.
         stream: Usually stderr, for an agent through ``runtime.process``; stdout is for a command's result.
         as_json: JSON lines instead of text.
+        in_journal: Whether ``stream`` leads to systemd's journal: text then has priorities, and no time of its own.
     """
     handler = logging.StreamHandler(stream)
     formatter = _Formatter()
-    formatter.as_json = as_json
+    formatter.as_json, formatter.in_journal = as_json, in_journal
     handler.setFormatter(formatter)
     root = logging.getLogger()
     root.handlers[:] = [handler]

@@ -1,4 +1,4 @@
-"""The process: garbage collection, log, service manager and real time.
+"""The process: garbage collection, log, service manager with its watchdog, and real time.
 
 Sets Python's cyclic garbage collector for an agent: what the start made is frozen, young garbage collected often.
 
@@ -9,6 +9,7 @@ of a collector that waits for pauses; with Python's own settings a full collecti
 
 from __future__ import annotations
 
+import faulthandler
 import gc
 import logging
 import os
@@ -19,9 +20,13 @@ import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from rmpa.runtime import limits
+
+if TYPE_CHECKING:
+    from asyncio import AbstractEventLoop
+    from collections.abc import Mapping
 
 _BEFORE = gc.get_threshold()
 
@@ -110,6 +115,15 @@ class LogWriter:
                 return  # the pipe is closed
 
 
+def in_journal(environ: Mapping[str, str], fd: int) -> bool:
+    """Whether a descriptor leads to systemd's journal, by JOURNAL_STREAM (systemd.exec(5))."""
+    try:
+        status = os.fstat(fd)
+    except OSError:
+        return False
+    return environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
+
+
 # --- ``--realtime`` -------------------------------------------------------------------------------------------------
 #
 # SCHED_FIFO and locked memory. All else is the systemd unit's, or the shell's that starts the agent.
@@ -186,9 +200,16 @@ def _lock_memory() -> str:
 #
 # One datagram to NOTIFY_SOCKET, if it is set.
 
+# What systemd sets for the process that it starts, and that means no child of it.
+SERVICE_VARIABLES: Final = ("NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC")
 
-def notify_service_manager(state: str) -> bool:
+
+def notify_service_manager(state: str, flags: int = 0) -> bool:
     """Send ``READY=1``, ``STOPPING=1`` or ``STATUS=…``; a failure is logged and never fatal.
+
+    Args:
+        state: The text.
+        flags: Of send(2).
 
     Returns:
         Whether it was sent.
@@ -200,8 +221,34 @@ def notify_service_manager(state: str) -> bool:
         address = "\0" + address[1:]
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sock:
-            sock.sendto(state.encode(), address)
+            sock.sendto(state.encode(), flags, address)
     except OSError as error:
         _log.warning("the service manager at NOTIFY_SOCKET=%s cannot be told %s: %s", address, state, error)
         return False
     return True
+
+
+def watchdog_period(environ: Mapping[str, str]) -> float | None:
+    """Half of the time in seconds in which systemd wants ``WATCHDOG=1``; ``None``: never (sd_watchdog_enabled(3))."""
+    usec, pid = environ.get("WATCHDOG_USEC", ""), environ.get("WATCHDOG_PID", "")
+    if not usec.isdecimal() or int(usec) == 0 or pid not in ("", str(os.getpid())):
+        return None
+    return int(usec) / 2e6
+
+
+def feed_watchdog(loop: AbstractEventLoop) -> None:
+    """Send ``WATCHDOG=1`` from the event loop for as long as it runs, if systemd wants it.
+
+    A loop that hangs sends none, and systemd ends the process by SIGABRT; where it hung is then in the log.
+    """
+    period = watchdog_period(os.environ)
+    if period is None:
+        return
+    faulthandler.enable()
+
+    def feed() -> None:
+        # A service manager that does not read must not stop the loop.
+        notify_service_manager("WATCHDOG=1", socket.MSG_DONTWAIT)
+        loop.call_later(period, feed)
+
+    feed()

@@ -18,6 +18,7 @@ from rmpa.config.peer_rules import Effect
 from rmpa.core.contract import Priority
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
 from rmpa.ros.node.node import Node
+from rmpa.runtime.process import feed_watchdog, notify_service_manager
 from rmpa.trust.permissions import Permissions, server_names
 from rmpa.trust.store import CERTIFICATE, KEY
 from rmpa.web import limits
@@ -363,6 +364,8 @@ async def serve(
             if with_agent:
                 _stop_at_end_of_input(loop, stop)
             announce(url_of(web, setup.access, server.port, is_https=certificate.context is not None), setup.access)
+            notify_service_manager("READY=1")
+            feed_watchdog(loop)
             await _first_of(stop.wait(), follower.misfit.wait(), _changed(setup, load, reload))
             _log.info("= ending" if stop.is_set() else "= beginning anew with other settings")
             await gateways.close()

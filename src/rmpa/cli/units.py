@@ -1,0 +1,155 @@
+"""What runs RMPA at boot: the units of systemd, the drop-in of ``--realtime``, and ``/etc/rmpa/rmpa.toml``.
+
+``rmpa service install`` writes these texts, and so does the build of the Debian package:
+
+::
+
+    from rmpa.cli.units import config_text, unit_texts
+
+    for name, text in unit_texts("/usr/bin/rmpa").items(): ...  # rmpa.service, rmpa-web.service, rmpa-gateway.service
+    config_text()                                               # /etc/rmpa/rmpa.toml
+
+Systemd 237 (Ubuntu 18.04) and later take every line; a key that is newer than the system's is told and left out.
+"""
+
+from __future__ import annotations
+
+import re
+from importlib.resources import files
+from typing import Final
+
+# The user and group of the units, and their directories.
+USER: Final = "rmpa"
+GROUP: Final = "rmpa"
+RUNTIME: Final = "/run/rmpa"
+STATE: Final = "/var/lib/rmpa"
+CONFIG: Final = "/etc/rmpa/rmpa.toml"
+# The program of the Debian package, which has man pages.
+PACKAGED: Final = "/usr/bin/rmpa"
+# By the command behind ``rmpa``: its unit.
+UNITS: Final = {"up": "rmpa.service", "web": "rmpa-web.service", "gateway": "rmpa-gateway.service"}
+# The drop-in of ``--realtime``, below the folder of units.
+REALTIME_FILE: Final = "rmpa.service.d/realtime.conf"
+
+_DESCRIPTIONS: Final = {
+    "up": "RMPA agent: this module's ROS core and its place in the mesh",
+    "web": "RMPA web server: metrics, REST and pages of this machine's module",
+    "gateway": "RMPA gateway: joins this network's modules with other sites and with ROS 2",
+}
+_UNIT: Final = """\
+{header}[Unit]
+Description={description}
+{documentation}# Interfaces that come later are followed: there is no need for network-online.target.
+After=network.target{after}
+# It is started again however often it fails, except for settings that it cannot run with.
+StartLimitIntervalSec=0
+
+[Service]
+Type=notify
+ExecStart={program} {command} --config {config}
+ExecReload=/bin/kill -HUP $MAINPID
+Restart=always
+RestartSec=0.5
+RestartPreventExitStatus=2
+# An event loop that hangs for so long is ended, and started again.
+WatchdogSec=10
+TimeoutStopSec=15
+KillMode=mixed
+User={user}
+Group={group}
+# The control sockets. They are found without a setting; members of the group may use them.
+RuntimeDirectory=rmpa
+RuntimeDirectoryMode=0750
+RuntimeDirectoryPreserve=yes
+# What is kept over a restart: registrations, the module's name, keys of a secured mesh.
+StateDirectory=rmpa
+StateDirectoryMode=0700
+Environment=RMPA_RUNTIME_DIR={runtime} RMPA_STATE_DIR={state} RMPA_CONTROL_GROUP={group}
+# Variables of yours, such as ROS_PACKAGE_PATH.
+EnvironmentFile=-/etc/default/rmpa
+SyslogIdentifier={identifier}
+# Sockets, mostly: one for each connection of a node.
+LimitNOFILE=65536
+{capabilities}
+# Nothing of the system but the network.
+UMask=0077
+NoNewPrivileges=yes
+ProtectSystem=strict
+ProtectHome=read-only
+PrivateTmp=yes
+PrivateDevices=yes
+PrivateMounts=yes
+ProtectClock=yes
+ProtectControlGroups=yes
+ProtectHostname=yes
+ProtectKernelLogs=yes
+ProtectKernelModules=yes
+ProtectKernelTunables=yes
+ProtectProc=invisible
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
+RestrictNamespaces=yes
+RestrictRealtime=yes
+RestrictSUIDSGID=yes
+LockPersonality=yes
+MemoryDenyWriteExecute=yes
+RemoveIPC=yes
+SystemCallArchitectures=native
+SystemCallErrorNumber=EPERM
+# A list of what is denied: older versions of systemd do not know the groups that a list of what is allowed needs.
+SystemCallFilter=~@clock @cpu-emulation @debug @module @mount @obsolete @raw-io @reboot @swap
+
+[Install]
+WantedBy=multi-user.target
+"""
+# The agent's alone.
+_NET_ADMIN: Final = """\
+# To end connections whose host has vanished, where topics go from node to node (docs/systemd.md).
+AmbientCapabilities=CAP_NET_ADMIN
+CapabilityBoundingSet=CAP_NET_ADMIN"""
+_REALTIME: Final = """\
+{header}# rmpa up --realtime (docs/realtime.md).
+[Service]
+Environment=RMPA_REALTIME_ENABLED=true
+LimitRTPRIO=50
+LimitMEMLOCK=infinity
+RestrictRealtime=no
+"""
+_SETTING: Final = re.compile(r"^(?=[a-z_]+ = )", re.MULTILINE)
+
+
+def unit_texts(program: str = PACKAGED, user: str = USER, header: str = "") -> dict[str, str]:
+    """The units, by their file's name.
+
+    Args:
+        program: The absolute path of ``rmpa``.
+        user: The user whose rights they have; its group is ``GROUP`` in any case.
+        header: Comment lines above each.
+    """
+    return {
+        unit: _UNIT.format(
+            header=header,
+            description=_DESCRIPTIONS[command],
+            documentation="Documentation=man:rmpa(1)\n" if program == PACKAGED else "",
+            after="" if command == "up" else f" {UNITS['up']}",
+            program=program.replace("%", "%%").replace(" ", "\\x20"),
+            command=command,
+            config=CONFIG,
+            user=user,
+            group=GROUP,
+            runtime=RUNTIME,
+            state=STATE,
+            identifier=unit.removesuffix(".service"),
+            capabilities=_NET_ADMIN if command == "up" else "CapabilityBoundingSet=",
+        )
+        for command, unit in UNITS.items()
+    }
+
+
+def realtime_text(header: str = "") -> str:
+    """The drop-in for ``REALTIME_FILE``."""
+    return _REALTIME.format(header=header)
+
+
+def config_text() -> str:
+    """A first ``rmpa.toml``: every setting with its default, each in a comment, so that later defaults hold."""
+    return _SETTING.sub("# ", (files("rmpa.config") / "rmpa.toml").read_text("utf-8"))

@@ -1,0 +1,49 @@
+"""The texts of what runs RMPA at boot."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tomllib
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.cli.units import config_text, realtime_text, unit_texts
+from tests.core.example import EXAMPLE
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+# Of `systemd-analyze security`, in tenths; 0 is best. docs/systemd.md says what makes it up.
+_EXPOSURE = {"rmpa.service": 20, "rmpa-web.service": 20, "rmpa-gateway.service": 20}
+
+
+def test_the_first_configuration_has_every_line_of_the_example_and_sets_nothing() -> None:
+    assert not any(tomllib.loads(config_text()).get(table) for table in ("core", "mesh", "web", "log"))
+    assert [line.removeprefix("# ") for line in config_text().splitlines()] == [
+        line.removeprefix("# ") for line in EXAMPLE.read_text().splitlines()
+    ]
+
+
+@pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="there is no systemd-analyze")
+def test_systemd_takes_every_line_and_finds_little_exposed(tmp_path: Path) -> None:
+    for name, text in unit_texts(shutil.which("true") or "").items():
+        (tmp_path / name).write_text(text)
+    drop_in = tmp_path / "rmpa.service.d" / "realtime.conf"
+    drop_in.parent.mkdir()
+    drop_in.write_text(realtime_text())
+    units = [tmp_path / name for name in _EXPOSURE]
+    done = subprocess.run(["systemd-analyze", "verify", *units], capture_output=True, text=True, check=False)
+    assert not [line for line in done.stderr.splitlines() if "rmpa" in line], done.stderr
+    for unit in units:
+        limit = f"--threshold={_EXPOSURE[unit.name]}"
+        done = subprocess.run(
+            ["systemd-analyze", "security", "--offline=true", limit, unit],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if "offline" in done.stderr:
+            pytest.skip("systemd-analyze before 250 has no --offline")
+        assert done.returncode == 0, done.stdout

@@ -1,0 +1,72 @@
+"""What systemd hears of a process: its watchdog, by sd_watchdog_enabled(3)."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.runtime.process import watchdog_period
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+# An event loop that hangs at SIGUSR1.
+_PROGRAM = """
+import asyncio, signal, time
+from rmpa.runtime.process import feed_watchdog, notify_service_manager
+
+async def main():
+    loop = asyncio.get_running_loop()
+    loop.add_signal_handler(signal.SIGUSR1, hang)
+    notify_service_manager("READY=1")
+    feed_watchdog(loop)
+    await asyncio.Event().wait()
+
+def hang():
+    time.sleep(60)
+
+asyncio.run(main())
+"""
+
+
+@pytest.mark.parametrize(
+    ("environ", "period"),
+    [
+        ({}, None),
+        ({"WATCHDOG_USEC": "10000000"}, 5),
+        ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": str(os.getpid())}, 5),
+        ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": "1"}, None),
+        ({"WATCHDOG_USEC": "0"}, None),
+        ({"WATCHDOG_USEC": "soon"}, None),
+    ],
+)
+def test_it_is_asked_for_by_variables(environ: dict[str, str], period: float | None) -> None:
+    assert watchdog_period(environ) == period
+
+
+def test_a_loop_that_hangs_sends_nothing_and_the_log_says_where_it_hung(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        environ = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "1000000"}
+        with subprocess.Popen([sys.executable, "-c", _PROGRAM], env=environ, stderr=subprocess.PIPE) as process:
+            try:
+                manager.settimeout(30)
+                assert [manager.recv(64) for _ in range(4)] == [b"READY=1", *[b"WATCHDOG=1"] * 3]
+                process.send_signal(signal.SIGUSR1)
+                manager.settimeout(1)  # as WATCHDOG_USEC has it
+                with contextlib.suppress(TimeoutError):
+                    while manager.recv(64):
+                        pass
+                process.send_signal(signal.SIGABRT)
+                assert process.stderr is not None
+                assert b" in hang\n" in process.stderr.read()
+                assert process.wait() == -signal.SIGABRT
+            finally:
+                process.kill()
