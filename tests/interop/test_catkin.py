@@ -1,0 +1,109 @@
+"""``packaging/ros/rmpa_ros``: the agent started by roslaunch, as from a catkin workspace."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from lab.bed.agents import RMPA
+from lab.bed.processes import eventually, run
+from tests.interop.ros import environment, free_port
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from lab.bed.namespaces import Lab
+    from lab.bed.processes import Process
+    from tests.interop.conftest import ShellFactory
+    from tests.interop.ros import Ros
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(150)]
+
+PACKAGE: Final = Path(__file__).parents[2] / "packaging/ros/rmpa_ros"
+BRINGUP: Final = """
+<launch>
+  <include file="$(find rmpa_ros)/launch/up.launch"/>
+  <node name="talker" pkg="rostopic" type="rostopic" args="pub -r 20 /chatter std_msgs/String hello"/>
+</launch>
+"""
+
+
+@pytest.fixture
+def users(lab: Lab, shell: ShellFactory) -> Iterator[list[Ros]]:
+    """Shells on two hosts of one network that find the package."""
+    with tempfile.TemporaryDirectory(prefix="rmpa-catkin-") as sockets:
+        made = [shell(host) for host in lab.hosts("a", "b")]
+        for ros in made:
+            ros.env |= {"ROS_PACKAGE_PATH": str(PACKAGE), "RMPA_RUNTIME_DIR": f"{sockets}/{ros.host.name}"}
+        yield made
+
+
+def agents(ros: Ros) -> set[str]:
+    """Process ids of the agents on a host."""
+    found = set()
+    for pid in run(["ip", "netns", "pids", ros.host.namespace]).split():
+        with contextlib.suppress(OSError):  # it has ended
+            if b"/rmpa\0up\0" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                found.add(pid)
+    return found
+
+
+def end(roslaunch: Process, ros: Ros) -> None:
+    """Ctrl-C; the agent ends with it, at the first signal."""
+    assert roslaunch.interrupt() == 0, roslaunch.output
+    assert "escalating" not in roslaunch.output
+    assert not agents(ros)
+
+
+@pytest.mark.netns
+def test_agents_of_roslaunch_beside_a_roscore_and_in_its_place_are_a_mesh(users: list[Ros], tmp_path: Path) -> None:
+    a, b = users
+    bringup = tmp_path / "bringup.launch"
+    bringup.write_text(BRINGUP)
+    program = f"rmpa:={RMPA.parents[1]}"
+    beside = a.start("roslaunch", "rmpa_ros", "up.launch", program, "name:=arm", "prefix_peers:=true")
+    found = {"PATH": f"{b.env['PATH']}:{RMPA.parent}", "RMPA_NAME": "base"}
+    in_place = b.start(PACKAGE / "scripts/launch", bringup, env=found)
+    in_place.wait_for("this core has an agent already", 40.0)
+    beside.wait_for("base .*linked", 40.0)
+    eventually(lambda: "/base/chatter" in a.graph_topics(), 40.0, what="the talker of b at a")
+    assert "hello" in a.tool("rostopic", "echo", "-n", "1", "/base/chatter")
+
+    before, mark = agents(a), beside.mark()
+    assert len(before) == len(agents(b)) == 1
+    run(["kill", "-KILL", *before])
+    eventually(lambda: agents(a) - before, what="another agent at a")
+    beside.wait_for("base .*linked", since=mark)
+    end(beside, a)
+    end(in_place, b)
+    assert "- publisher /chatter of /talker" in in_place.output, "nodes that end still have their core"
+
+
+def test_arguments_of_roslaunch_and_empty_ones_of_a_launch_file_are_left_out(tmp_path: Path) -> None:
+    program = tmp_path / "rmpa"
+    program.write_text('#!/bin/sh\nprintf "<%s>" "$PYTHONPATH" "$@"\n')
+    program.chmod(0o755)
+    env = environment(tmp_path, free_port()) | {"PYTHONPATH": "/ros"}
+    words = ["up", "--name=", "--web=false", "--prefix-peers=true", "--seed", "h 1", "__name:=rmpa", "/x:=/y"]
+    script = PACKAGE / "scripts/rmpa"
+    assert run([script, f"--program={tmp_path}", *words], env=env) == "</ros><up><--prefix-peers><--seed><h 1>"
+    missing = subprocess.run([script, "--program=/nowhere", "up"], capture_output=True, text=True, check=False)
+    assert (missing.returncode, missing.stderr.count("\n")) == (127, 1)
+    assert "rmpa_ros: no rmpa at /nowhere" in missing.stderr
+
+
+def test_a_workspace_with_it_builds_and_installs(tmp_path: Path) -> None:
+    if shutil.which("catkin_make", path=environment(tmp_path, 0)["PATH"]) is None:
+        pytest.skip("no catkin here (scripts/install-ros installs Debian's)")
+    env = environment(tmp_path, free_port())
+    (tmp_path / "src").mkdir()
+    shutil.copytree(PACKAGE, tmp_path / "src/rmpa_ros")
+    run(["sh", "-c", 'cd "$HOME" && catkin_make install && rm -r src build'], env=env, timeout=100.0)
+    command = '. "$HOME/install/setup.sh" && roslaunch --args /rmpa rmpa_ros up.launch web:=true'
+    assert f"{tmp_path}/install/lib/rmpa_ros/rmpa" in run(["sh", "-c", command], env=env)
