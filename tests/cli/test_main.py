@@ -114,6 +114,16 @@ def test_version_of_a_build_comes_with_its_commit(monkeypatch: pytest.MonkeyPatc
     assert CliRunner().invoke(cli, ["--version"]).output == "rmpa 0.2.0 (1a2b3c4d5e, 2026-11-26)\n"
 
 
+def test_a_bug_report_has_the_formats_and_the_system(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["version"].startswith(rmpa.__version__.removesuffix("0"))
+    assert (told["protocols"]["beacon"], told["protocols"]["link"]) == (2, 3)
+    assert told["python"] == ".".join(map(str, sys.version_info[:3]))
+    assert main(["--json", "topic", "list"]) == 2
+    assert "--json stands behind the command: rmpa topic list --json" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("words", "remedy"), REMOVED_VERBS.items())
 def test_a_command_that_is_gone_says_what_to_use(words: str, remedy: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*words.split(), "an-argument", "--an-option"]) == 2

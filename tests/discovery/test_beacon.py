@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa import __version__
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import Guid, Identity
@@ -92,7 +93,7 @@ def test_another_domain_is_told_first() -> None:
 
 
 def test_other_version_is_recognised_by_eight_bytes() -> None:
-    text = "speaks version 3 of the protocol, we speak 2: update the older one"
+    text = rf"speaks beacon protocol 3, we speak 2 \(rmpa {__version__}\): install the same release of rmpa on both"
     with pytest.raises(BeaconRefused, match=text) as refused:
         Beacon.parse(GOLDEN[:4] + b"\x03" + GOLDEN[5:8], 5)
     assert refused.value.counter == OTHER_VERSION

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa import __version__
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.core.identity import Guid
@@ -223,7 +224,8 @@ def test_every_shorter_hello_is_malformed(cut: int) -> None:
 def test_other_version_is_distinguished_from_garbage() -> None:
     refuse = problem(b"RMPA\x04\x01\x00\x00")
     assert refuse.code == Refusal.VERSION
-    assert "same release" in refuse.text
+    text = f"link protocol 4 meets 3 of rmpa {__version__}: install the same release of rmpa on both"
+    assert refuse.text == text
 
 
 @pytest.mark.parametrize("name", [b"\xff\xff", b"a/b", b"a b", b"", b"a" * 65])

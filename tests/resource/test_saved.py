@@ -267,6 +267,17 @@ async def test_a_damaged_file_is_set_aside(core: RosCore, tmp_path: Path, caplog
     await member.close()
 
 
+async def test_a_file_of_a_later_release_is_set_aside_whole(
+    core: RosCore, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "sonar.json"
+    later = b'{"format":2,"parameters":{"gain":{"value":2.5}},"more":[1]}'
+    path.write_bytes(later)
+    await (await started(core, path)).close()
+    assert "is of another release of rmpa (format 2, not 1); it is set aside as sonar.json.before" in caplog.text
+    assert path.with_name("sonar.json.before").read_bytes() == later
+
+
 async def test_a_second_process_keeps_nothing(
     core: RosCore, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

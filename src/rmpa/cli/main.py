@@ -14,12 +14,10 @@ import inspect
 import os
 import sys
 from itertools import takewhile
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-import rmpa
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError
 
@@ -198,7 +196,7 @@ class LazyGroup(click.Group):
                 if isinstance(found, LazyGroup) and word in found.commands_at:
                     path.append(word)
                     found = found.get_command(ctx, word) or found
-            if any(error.option_name in each.opts for each in found.params):
+            if found is not self and any(error.option_name in each.opts for each in found.params):
                 ctx.fail(f"{error.option_name} stands behind the command: {' '.join(path)} {error.option_name}")
             raise
 
@@ -357,34 +355,35 @@ def config() -> None:
 
 def _show_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     """Print the version, with the commit that it was built of or that a clone has."""
+    as_json = ctx.meta.get("--json")
+    if as_json and not wanted:
+        raise click.NoSuchOption("--json", ctx=ctx)
     if wanted:
-        click.echo(f"rmpa {_long_version()}")
+        from rmpa.cli import version
+
+        if as_json:
+            from rmpa.cli.output import print_json
+
+            print_json(version.about())
+        else:
+            click.echo(f"rmpa {version.long_version()}")
         ctx.exit()
 
 
-def _long_version() -> str:
-    """The version with the commit: what the build wrote down, else what git says of the clone."""
-    if rmpa.COMMIT:
-        return f"{rmpa.VERSION} ({rmpa.COMMIT}, {rmpa.DATE})"
-    source = Path(rmpa.__file__).parents[1]
-    script = source.with_name("scripts") / "version"
-    if source.name != "src" or not script.exists():
-        return rmpa.__version__
-    import runpy
-
-    names = runpy.run_path(str(script))
-    return str(names["long"](*names["build"]()))
+def _note_json(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
+    """Of the group's own options ``--version`` alone has JSON."""
+    ctx.meta["--json"] = wanted
 
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.option("--json", is_flag=True, is_eager=True, expose_value=False, hidden=True, callback=_note_json)
 @click.option(
     "-V",
     "--version",
     is_flag=True,
-    is_eager=True,
     expose_value=False,
     callback=_show_version,
-    help="Show the version.",
+    help="Show the version; with --json formats and system too.",
 )
 def cli() -> None:
     """ROS 1 modules with a core of their own that share topics, with no master between them.

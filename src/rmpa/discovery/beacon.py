@@ -17,6 +17,7 @@ from enum import IntEnum
 from ipaddress import IPv4Address
 from typing import Final
 
+import rmpa
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import Guid, Identity, dialable
 from rmpa.core.limits import UINT32_MAX
@@ -191,7 +192,10 @@ def sender_of(data: bytes, domain: int) -> tuple[Guid, bytes]:
         remedy = f"we are of domain {domain}: start both with the same --domain (ROS_DOMAIN_ID)"
         raise BeaconRefused(OTHER_DOMAIN, f"is of domain {its_domain}, {remedy}")
     if version != VERSION:
-        text = f"speaks version {version} of the protocol, we speak {VERSION}: update the older one"
+        text = (
+            f"speaks beacon protocol {version}, we speak {VERSION} (rmpa {rmpa.__version__}): "
+            "install the same release of rmpa on both"
+        )
         raise BeaconRefused(OTHER_VERSION, text)
     if len(data) < _FIXED.size:
         raise _malformed(f"only {len(data)} bytes")

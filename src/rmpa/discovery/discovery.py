@@ -19,6 +19,8 @@ from rmpa.discovery.beacon import (
     INSTANCE_AT,
     MALFORMED,
     OTHER_DOMAIN,
+    OTHER_VERSION,
+    VERSION,
     Beacon,
     BeaconKind,
     BeaconRefused,
@@ -185,6 +187,9 @@ class PacketFilter:
             foreign = f"from {host}: {error}; is another program there?"
             text = foreign if counter == MALFORMED else f"the peer at {host} {error}"
             self._refusals.refuse(now, counter, host, text)
+            if counter == OTHER_VERSION:
+                # Its name, if another release has it where this one does: a peer list without it would be a riddle.
+                self._stranger(data[:4] + bytes([VERSION]) + data[5:], str(error), now)
             return None
         self._counters.add("beacon.in")
         return packet
@@ -225,7 +230,7 @@ class PacketFilter:
     def _stranger(self, data: bytes, problem: str, now: float) -> Identity | None:
         """Take in a refused packet; return its sender if that is shown: few are, so a full table takes no more.
 
-        One of the two modules has not joined a mesh.
+        One of the two modules has not joined a mesh, or is of another release.
         """
         beacon = self._parsed(data) if self._stranger_beacons.take(now) else None
         if beacon is None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
+import rmpa
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.core.identity import SERIAL_MASK, Guid, Identity, peer_name_problem
@@ -325,7 +326,10 @@ class Hello:
         if magic != MAGIC:
             return _malformed("it does not begin with RMPA; is this port meant for something else?")
         if version != VERSION:
-            text = f"protocol version {version} meets version {VERSION}: install the same release of rmpa on both"
+            text = (
+                f"link protocol {version} meets {VERSION} of rmpa {rmpa.__version__}: "
+                "install the same release of rmpa on both"
+            )
             return Refuse(Refusal.VERSION, text)
         if len(payload) < _HELLO.size:
             return _malformed(f"{len(payload)} bytes, at least {_HELLO.size} are needed")

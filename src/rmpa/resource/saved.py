@@ -41,6 +41,16 @@ _SECOND: Final = 1_000_000_000
 _ABSENT: Final = 2
 
 
+# The form of the file. A release that changes it reads all earlier ones, from 0.2.0 on (docs/compatibility.md).
+FORMAT: Final = 1
+
+
+class SavedFormat(msgspec.Struct):
+    """The part of the file that all formats have."""
+
+    format: int = 1
+
+
 class SavedRequirement(msgspec.Struct, frozen=True, kw_only=True):
     """The requirement of one client, as it was received.
 
@@ -107,6 +117,7 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
     """The state of a resource, as its file has it.
 
     Attributes:
+        format: ``FORMAT``.
         parameters: The values of parameters that differ from their defaults, by name.
         chosen: The profile chosen by hand, or empty.
         last: The profile that ran last, or empty.
@@ -115,6 +126,7 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
         cool_downs: Cool-downs by profile.
     """
 
+    format: int = FORMAT
     parameters: dict[str, bool | int | float | str] = {}
     chosen: str = ""
     last: str = ""
@@ -384,21 +396,26 @@ class Persistence(RuntimePart):
             self._set_problem("")
 
     def _read(self) -> SavedState:
-        """The content of the file; a damaged one is set aside.
+        """The content of the file; one that is damaged, or of another release, is set aside.
 
         Raises:
             OSError: It cannot be read, or another process uses it.
         """
         self._take_lock()
         try:
-            return msgspec.json.decode(self._path.read_bytes(), type=SavedState)
+            data = self._path.read_bytes()
+            found = msgspec.json.decode(data, type=SavedFormat).format
+            if found == FORMAT:
+                return msgspec.json.decode(data, type=SavedState)
+            what, why = "before", f"is of another release of rmpa (format {found}, not {FORMAT})"
         except FileNotFoundError:
             return SavedState()
         except (msgspec.DecodeError, RecursionError) as error:
-            aside = self._path.with_name(f"{self._path.name}.damaged")
-            self._path.replace(aside)
-            _log.warning("! %s is damaged (%s); it is set aside as %s and begun anew", self._path, error, aside.name)
-            return SavedState()
+            what, why = "damaged", f"is damaged ({error})"
+        aside = self._path.with_name(f"{self._path.name}.{what}")
+        self._path.replace(aside)
+        _log.warning("! %s %s; it is set aside as %s and begun anew", self._path, why, aside.name)
+        return SavedState()
 
     def _replace(self, content: bytes) -> None:
         """Replace the file, so that a crash at any moment leaves the old one or the new one.

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa import __version__
 from rmpa.config.settings import Settings
 from rmpa.config.values import HostPort, Multicast
 from rmpa.core.identity import Guid, Identity
@@ -146,7 +147,9 @@ async def test_garbage_is_counted_said_once_and_survived(
     assert counters["beacon.other_domain"] == 1
     lines = [r.getMessage() for r in caplog.records]
     assert len([line for line in lines if "malformed" in line]) == 1
-    assert any("127.0.0.1 speaks version 3 of the protocol, we speak 2: update" in line for line in lines)
+    told = f"speaks beacon protocol 3, we speak 2 (rmpa {__version__}): install the same release of rmpa on both"
+    assert f"! the peer at 127.0.0.1 {told}" in lines
+    assert [(one.identity.name, one.problem) for one in base.discovery.strangers()] == [("new", told)]
     assert len([line for line in lines if "is of domain 7, we are of domain 0" in line]) == 1
     pc = Agent("pc", settings)
     await start(agents, pc)

@@ -16,7 +16,7 @@ import time
 from collections import defaultdict
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -58,6 +58,16 @@ _SHOWN: Final = 3
 _RECORDS: Final = 8
 
 
+# The form of the file. A release that changes it reads all earlier ones, from 0.2.0 on (docs/compatibility.md).
+FORMAT: Final = "rmpa core 2"
+
+
+class StoredFormat(msgspec.Struct):
+    """The part of the file that all formats have."""
+
+    format: str
+
+
 class StoredState(msgspec.Struct):
     """The content of the file.
 
@@ -68,7 +78,7 @@ class StoredState(msgspec.Struct):
         params: The parameter tree.
     """
 
-    format: Literal["rmpa core 2"]
+    format: str
     boot: str = ""
     nodes: dict[Name, NodeRecord] = {}
     params: dict[str, Any] = {}
@@ -108,6 +118,9 @@ def parse(data: bytes) -> StoredState:
         ValueError: It is damaged, of another format, or holds what no call of a node could have caused.
     """
     try:
+        found = msgspec.msgpack.decode(data, type=StoredFormat).format
+        if found != FORMAT:
+            raise ValueError(f"another release of rmpa wrote it: it is of format {found[:40]!r}, not {FORMAT!r}")
         state = msgspec.msgpack.decode(data, type=StoredState, ext_hook=_unpacked_ext)
         serialize_response([msgspec.to_builtins(state.nodes), state.params])
     except (msgspec.MsgspecError, TypeError, RecursionError, RmpaError) as error:
@@ -355,7 +368,7 @@ class CoreState:
         }
         try:
             # Trees and records are never changed in place, so that a thread may read them.
-            await in_thread(lambda: self._put(StoredState("rmpa core 2", boot, nodes, tree)), "core state")
+            await in_thread(lambda: self._put(StoredState(FORMAT, boot, nodes, tree)), "core state")
         except (OSError, ValueError, TypeError, OverflowError, RecursionError) as error:
             if not self._problem:
                 _log.warning("! nothing of the core is kept over a restart: %s", self._reason(error))
