@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 .DEFAULT_GOAL := venv
 # One apt at a time: a lock on this folder.
 APT := flock scripts
-.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests test-long style format types imports reference fuzz soak soak-services soak-web bench experiment wheel ros chromium clients clean
+.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests test-long style format types imports reference fuzz soak soak-services soak-web bench experiment wheel bundle ros chromium clients clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -96,6 +96,9 @@ experiment: $(STAMP) ros  ## classic ROS beside RMPA, with a report: make experi
 
 wheel: $(STAMP)  ## build the wheel into dist/ and see that it holds the product alone
 	scripts/build-wheel $(BIN)/python
+
+bundle: $(STAMP)  ## build RMPA with a Python of its own into dist/: make bundle [ARCH=aarch64] [PREFIX=an interpreter that is there]
+	$(BIN)/python packaging/bundle/build $(if $(ARCH),--arch $(ARCH)) $(if $(PREFIX),--python $(PREFIX)) dist
 
 clean:  ## remove what the commands above made
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
