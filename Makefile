@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 .DEFAULT_GOAL := venv
 # One apt at a time: a lock on this folder.
 APT := flock scripts
-.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests test-long style format types imports reference fuzz soak soak-services soak-web bench experiment wheel bundle ros chromium clients clean
+.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests test-long style format types imports reference fuzz soak soak-services soak-web bench experiment wheel deb bundle ros chromium clients clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -99,6 +99,11 @@ wheel: $(STAMP)  ## build the wheel into dist/ and see that it holds the product
 
 bundle: $(STAMP)  ## build RMPA with a Python of its own into dist/: make bundle [ARCH=aarch64] [PREFIX=an interpreter that is there]
 	$(BIN)/python packaging/bundle/build $(if $(ARCH),--arch $(ARCH)) $(if $(PREFIX),--python $(PREFIX)) dist
+
+# Debian's names of the machines that the bundle calls by the kernel's.
+deb: $(STAMP)  ## build the Debian package around the bundle into dist/: make deb [ARCH=arm64] [PREFIX=as for bundle]
+	$(BIN)/python packaging/bundle/build --folder-only $(if $(ARCH),--arch $(patsubst amd64,x86_64,$(patsubst arm64,aarch64,$(ARCH)))) $(if $(PREFIX),--python $(PREFIX)) dist
+	$(BIN)/python packaging/debian/build $(if $(ARCH),--arch $(ARCH)) dist
 
 clean:  ## remove what the commands above made
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
