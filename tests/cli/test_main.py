@@ -174,7 +174,7 @@ def test_help_imports_no_command() -> None:
         ("list", "Did you mean `rmpa peer list` or `rmpa topic list`?"),
         ("help", "Did you mean `rmpa --help`?"),
         ("version", "Did you mean `rmpa --version`?"),
-        ("start", "Did you mean `rmpa up`?"),
+        ("start", "Did you mean `rmpa up` or `rmpa service install`?"),
         ("--json peer list", "--json stands behind the command: rmpa peer list --json"),
         ("topic --agent base list", "--agent stands behind the command: rmpa topic list --agent"),
     ],

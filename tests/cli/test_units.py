@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import tomllib
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.cli.units import config_text, realtime_text, unit_texts
+from rmpa.config.settings import SETTINGS
 from tests.core.example import EXAMPLE
 
 if TYPE_CHECKING:
@@ -24,6 +26,11 @@ def test_the_first_configuration_has_every_line_of_the_example_and_sets_nothing(
     assert [line.removeprefix("# ") for line in config_text().splitlines()] == [
         line.removeprefix("# ") for line in EXAMPLE.read_text().splitlines()
     ]
+
+
+def test_each_variable_of_ours_is_one() -> None:
+    texts = [*unit_texts().values(), realtime_text()]
+    assert set(re.findall(r"\b(RMPA_\w+)=", "".join(texts))) <= {setting.env for setting in SETTINGS}
 
 
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="there is no systemd-analyze")

@@ -84,7 +84,7 @@ def gateway(context: click.Context, /, **options: object) -> int:
             option = f"--{given[0].replace('_', '-')}"
             raise ConfigError(option, f"stands before {context.invoked_subcommand}", "write it behind that")
         return 0
-    _check_libraries("rmpa gateway", "rmpa[zenoh]", {"zenoh": "eclipse-zenoh", "xxhash": "xxhash"})
+    _check_gateway_libraries()
     beside = ""
     if not options["name"]:
         beside = find_module(None, {"config": options.get("config")}, _own(os.environ)).name
@@ -189,6 +189,29 @@ def _check_settings(settings: Settings) -> None:
         raise ConfigError("rmpa gateway", "there is no way to the others", f"add --connect, such as {example}")
 
 
+def check_gateway(settings: Settings) -> None:
+    """Check that a gateway with these settings has its libraries, something to join, and a way to it.
+
+    Raises:
+        ConfigError: It has not.
+    """
+    _check_gateway_libraries()
+    _check_settings(settings)
+
+
+def _check_gateway_libraries() -> None:
+    _check_libraries("rmpa gateway", "rmpa[zenoh]", {"zenoh": "eclipse-zenoh", "xxhash": "xxhash"})
+
+
+def check_web() -> None:
+    """Check that ``rmpa web`` has its libraries.
+
+    Raises:
+        ConfigError: It has not.
+    """
+    _check_libraries("rmpa web", "rmpa[web]", {name: name for name in ("aiohttp", "cbor2")})
+
+
 def _check_libraries(program: str, extra: str, libraries: Mapping[str, str]) -> None:
     """Check that the libraries of an extra are there.
 
@@ -256,7 +279,7 @@ def web(config: str | None, with_agent: bool, insecure: bool, options: Options, 
       rmpa up --web                   the agent starts it, and again if it ends
       curl -s localhost:8480/api/v1/peers | jq '.[].name'
     """
-    _check_libraries("rmpa web", "rmpa[web]", {name: name for name in ("aiohttp", "cbor2")})
+    check_web()
 
     def make() -> tuple[Module, WebSetup]:
         module = find_module(options.agent, {"config": config}, os.environ, "--agent")

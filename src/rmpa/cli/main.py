@@ -45,12 +45,15 @@ VERBS: Final = {
     "topic bw": ("topic", "Show how many bytes they need."),
     "topic delay": ("topic", "Show how old they are when they come; over the mesh by the link's clock too."),
     "topic pub": ("messages", "Publish messages."),
-    "service": ("main", "See services, and call them."),
+    "service": ("main", "See services, and call them; start rmpa at boot."),
     "service list": ("service", "List services; those of peers with the peers' names."),
     "service info": ("service", "Show a service's node, address, type and arguments, and what of it crosses."),
     "service type": ("service", "Print a service's type."),
     "service find": ("service", "Print the services of a type."),
     "service call": ("service", "Call a service."),
+    "service install": ("boot", "Start the agent at boot, and now: by a unit of systemd."),
+    "service status": ("boot", "Show whether rmpa's units of systemd run, and the end of their log."),
+    "service uninstall": ("boot", "Stop rmpa, and take it out of the boot."),
     "node": ("main", "See nodes, here and in other modules; ping and end them."),
     "node list": ("node", "List nodes; those of peers as PEER:/node."),
     "node info": ("node", "Show a node's module, address, process, topics and services."),
@@ -117,9 +120,11 @@ REMOVED_VERBS: Final = {
 MEANT: Final = {
     "help": ("--help",),
     "version": ("--version",),
-    "start": ("up",),
+    "start": ("up", "service install"),
+    **{word: (f"service {word}",) for word in ("install", "uninstall")},
+    "enable": ("service install",),
     "roscore": ("core",),
-    "status": ("peer list", "doctor"),
+    "status": ("service status", "peer list", "doctor"),
     "check": ("doctor",),
     "list": ("peer list", "topic list"),
     "info": ("peer info", "topic info"),
@@ -254,10 +259,11 @@ def topic() -> None:
 
 @_group
 def service() -> None:
-    """See services, and call them; no ROS installation is needed.
+    """See services of ROS, and call them; no ROS installation is needed. Start rmpa at boot.
 
     ---
-    A service is written /name; PEER:/name means the service of that peer alone.
+    At boot, as a service of systemd: install, status, uninstall.
+    A service of ROS is written /name; PEER:/name means the service of that peer alone.
     {master}
     """
 

@@ -159,6 +159,7 @@ def find_module(
         ConfigError: The name cannot be one, or a setting cannot be used.
         RmpaError: Several agents run, and none is meant; or the agent does not answer.
     """
+    environ = module_name.of_unit(environ)
     for source, text in ((option, name), ("RMPA_AGENT", environ.get("RMPA_AGENT"))):
         if text and (problem := peer_name_problem(text)):
             raise ConfigError(source, problem)

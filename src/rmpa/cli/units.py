@@ -9,7 +9,7 @@
     for name, text in unit_texts("/usr/bin/rmpa").items(): ...  # rmpa.service, rmpa-web.service, rmpa-gateway.service
     config_text()                                               # /etc/rmpa/rmpa.toml
 
-Systemd 237 (Ubuntu 18.04) and later take every line; a key that is newer than the system's is told and left out.
+A key that is newer than the system's systemd is left out there, and told in the journal; none of the others needs it.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ CapabilityBoundingSet=CAP_NET_ADMIN"""
 _REALTIME: Final = """\
 {header}# rmpa up --realtime (docs/realtime.md).
 [Service]
-Environment=RMPA_REALTIME_ENABLED=true
+Environment=RMPA_REALTIME=true
 LimitRTPRIO=50
 LimitMEMLOCK=infinity
 RestrictRealtime=no

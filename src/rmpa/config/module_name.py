@@ -128,6 +128,14 @@ def state_dir(environ: Mapping[str, str], setting: str | None = None) -> Path | 
     return None
 
 
+def of_unit(environ: Mapping[str, str]) -> Mapping[str, str]:
+    """For commands of root beside an agent: where that starts at boot and nothing is said, its directory is meant."""
+    said = environ.get("RMPA_STATE_DIR") or environ.get("STATE_DIRECTORY")
+    if said or os.geteuid() or not _AT_BOOT.is_symlink():
+        return environ
+    return {**environ, "RMPA_STATE_DIR": str(_SYSTEM)}
+
+
 def module_dir(directory: Path, module: str) -> Path:
     """The folder of one module's files within the state directory."""
     return directory / (re.sub(r"[^\w.-]", "_", module).lstrip(".") or "_")
@@ -157,6 +165,8 @@ PLACES_FILE: Final = "state-directories"
 _READ_MAX: Final = 64 * 1024
 # The state directory of a systemd unit with ``StateDirectory=rmpa``.
 _SYSTEM: Final = Path("/var/lib/rmpa")
+# It is there if that unit starts at boot.
+_AT_BOOT: Final = Path("/etc/systemd/system/multi-user.target.wants/rmpa.service")
 
 
 def kept_name(directory: Path | None) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import grp
 import os
 import socket
 import stat
@@ -77,6 +78,17 @@ def _usable(place: Path) -> bool:
         return False
     trusted = place == _SYSTEM or info.st_uid in {0, os.geteuid()}
     return stat.S_ISDIR(info.st_mode) and trusted and os.access(place, os.R_OK | os.X_OK)
+
+
+def _closed_to_us() -> str:
+    """The group of the directory of a unit's agent, where this user may not read that; else empty."""
+    try:
+        info = _SYSTEM.stat()
+        if os.access(_SYSTEM, os.R_OK | os.X_OK) or not info.st_mode & stat.S_IXGRP:
+            return ""
+        return grp.getgrgid(info.st_gid).gr_name
+    except (OSError, KeyError):
+        return ""
 
 
 def make_runtime_dir(place: Path, group: int | None = None) -> None:
@@ -292,6 +304,9 @@ def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAg
     agents = find_agents(environ)
     wanted = name or environ.get("RMPA_AGENT")
     listed = ", ".join(agent.name for agent in agents)
+    if not agents and (owner := _closed_to_us()):
+        remedy = f"use sudo; or once: sudo usermod -aG {owner} $USER, and log in again"
+        raise UnreachableError("agent", f"{_SYSTEM}, which users of the group {owner} may read", remedy)
     if not wanted and not agents:
         places = ", ".join(map(str, runtime_dirs(environ) or [runtime_dir(environ)]))
         raise UnreachableError("agent", places, _START_ONE)

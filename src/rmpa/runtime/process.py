@@ -134,7 +134,10 @@ def in_journal(environ: Mapping[str, str], fd: int) -> bool:
 # SCHED_RESET_ON_FORK leaves all other threads and every child process at default scheduling.
 
 
-REMEDY: Final = "systemd: LimitRTPRIO=50, LimitMEMLOCK=infinity; else /etc/security/limits.d (docs/realtime.md)"
+REMEDY: Final = (
+    "systemd: sudo rmpa service install --realtime, or LimitRTPRIO=50, LimitMEMLOCK=infinity in a unit of your own; "
+    "else /etc/security/limits.d (docs/realtime.md)"
+)
 _UNLIMITED: Final = (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
 # Of mlockall(2). Mappings that come later are locked page by page as they are used: otherwise the kernel would fill
 # each new thread's stack and heap with zeros, 10 MB for each thread.

@@ -1,0 +1,531 @@
+"""``rmpa service install``, ``status`` and ``uninstall``: the agent at boot, by units of systemd."""
+
+from __future__ import annotations
+
+import os
+import pwd
+import shutil
+import socket
+import subprocess
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from rmpa.cli.machine import UNIT_FOLDER, Machine, check_machine, own_program
+from rmpa.cli.options import Options, flag, json_verb
+from rmpa.cli.trust import confirm
+from rmpa.cli.units import (
+    CONFIG,
+    GROUP,
+    PACKAGED,
+    REALTIME_FILE,
+    RUNTIME,
+    STATE,
+    UNITS,
+    USER,
+    config_text,
+    realtime_text,
+    unit_texts,
+)
+from rmpa.config.module_name import (
+    GATEWAY_SUFFIX,
+    PLACES_FILE,
+    NameSource,
+    choose_name,
+    keep_name,
+    kept_name,
+    state_dir,
+)
+from rmpa.config.read import load_settings
+from rmpa.config.settings import Settings
+from rmpa.core.errors import ConfigError, RmpaError, StartError
+from rmpa.core.identity import peer_name_problem
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from rmpa.cli.output import Text
+
+# The first line of each file that ``install`` makes: ``uninstall`` removes no other.
+_MARK: Final = "# Made by `rmpa service install`; changes belong into a drop-in: systemctl edit {unit}\n"
+# What `systemctl show` is asked for.
+_PROPERTIES: Final = (
+    *("LoadState", "ActiveState", "SubState", "UnitFileState", "Result", "MainPID", "NRestarts"),
+    "StateChangeTimestampMonotonic",
+)
+# Lines of a unit's log that are shown.
+_LOG_LINES: Final = 5
+# A user without any rights of its own: what it cannot run, the unit's user cannot either.
+_NOBODY: Final = 65534
+
+
+# --- install --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Former:
+    """What the agent of a user has had until now.
+
+    Args:
+        user: The user.
+        config: Its ``rmpa.toml`` in its home; ``None``: it has none.
+        state: Its state directory; ``None``: nothing is in it.
+        name: The name of its module; empty: the host's name.
+        settings: Its settings.
+    """
+
+    user: str
+    config: Path | None
+    state: Path | None
+    name: str
+    settings: Settings = field(repr=False)
+
+
+def former(environ: Mapping[str, str], root: str = "") -> Former:
+    """What the user has who called ``sudo``, else root. A system below a folder is another machine: it has nothing.
+
+    Raises:
+        ConfigError: The user's rmpa.toml cannot be used.
+    """
+    if root:
+        return Former("", None, None, "", Settings())
+    caller = environ.get("SUDO_UID", "")
+    user = pwd.getpwuid(int(caller) if caller.isdecimal() else os.geteuid())
+    home = {"HOME": user.pw_dir}
+    loaded = load_settings({}, home, host_name=socket.gethostname(), cwd=Path("/"))
+    chosen = choose_name(loaded.names)
+    config = loaded.settings.config_file
+    state = state_dir(home, loaded.settings.state_dir)
+    return Former(
+        user.pw_name,
+        config if config is not None and str(config) != CONFIG else None,
+        state if state is not None and str(state) != STATE and _entries(state) else None,
+        chosen.name if chosen.source is not NameSource.DEFAULT else "",
+        loaded.settings,
+    )
+
+
+def _entries(state: Path) -> list[Path]:
+    """What a state directory keeps of modules."""
+    return sorted(path for path in state.glob("*") if path.name != PLACES_FILE)
+
+
+def choose_user(program: str) -> str:
+    """The user of the units: one of their own if it can run the program, else the owner of the program.
+
+    Raises:
+        StartError: Only root can run it.
+    """
+    if _runs_as(program, _NOBODY, _NOBODY):
+        return USER
+    owner = Path(program).resolve().stat().st_uid
+    if owner == 0:
+        problem = f"other users than root cannot run {program}"
+        raise StartError(
+            "rmpa service install", problem, "install it elsewhere, such as in /opt/rmpa; or --user root"
+        )
+    return pwd.getpwuid(owner).pw_name
+
+
+def _runs_as(program: str, uid: int, gid: int) -> bool:
+    """Whether a user can run a program, and read all that it imports."""
+    if os.geteuid():
+        return True  # root alone can try
+    command = [program, "--version"]
+    try:
+        done = subprocess.run(  # noqa: S603 - our own program
+            command, user=uid, group=gid, extra_groups=[], cwd="/", capture_output=True, check=False
+        )
+    except OSError:
+        return False
+    return not done.returncode
+
+
+@json_verb(
+    flag("--web", help="The web server too: rmpa web, in a unit of its own."),
+    flag("--gateway", help="The gateway too, with [gateway] of /etc/rmpa/rmpa.toml."),
+    flag("--realtime", help="Let the agent have real-time priority and locked memory."),
+    click.option("--name", metavar="NAME", help="This module. [default: the one that it has had]"),
+    click.option("--user", metavar="NAME", help="Whose rights the units have. [default: rmpa, which is made]"),
+    flag("--dry-run", help="Change nothing; say what would be done, and print the units."),
+    click.option("--root", metavar="DIR", default="", help="The folder of another system, such as an image."),
+)
+def service_install(
+    web: bool,
+    gateway: bool,
+    realtime: bool,
+    name: str | None,
+    user: str | None,
+    dry_run: bool,
+    root: str,
+    options: Options,
+) -> int:
+    """Start the agent at boot, and now: by a unit of systemd, as a user of its own.
+
+    The name that this machine's module has had, its keys and all that it keeps are taken over from the state
+    directory of the user who calls sudo; /etc/rmpa/rmpa.toml is made if it is missing. Nothing is overwritten but
+    the units, and a second call changes nothing.
+
+    ---
+    Where the program is in a home directory that other users cannot read, the units run as its owner.
+    Members of the group rmpa may use rmpa's commands: sudo usermod -aG rmpa USER.
+
+    Exit codes: 0 it runs; 1 it does not, with the reason on stderr; 2 a wrong option or setting.
+
+    Examples:
+      sudo rmpa service install --name base
+      sudo rmpa service install --web --realtime
+      rmpa service install --dry-run               what would be done?
+      sudo rmpa service install --root /mnt/image  for a machine that is not running
+    """
+    root = root.rstrip("/")
+    check_machine(root, "install", dry=dry_run)
+    if name and (problem := peer_name_problem(name)):
+        raise ConfigError("--name", problem)
+    program = own_program()
+    machine = Machine(root, dry=dry_run, tell=(lambda _: None) if options.as_json else click.echo)
+    before = former(os.environ, root)
+    packaged = program == PACKAGED and machine.packaged
+    if packaged and user:
+        raise ConfigError("--user", "the package's units have the user rmpa", "change it by: systemctl edit rmpa")
+    wanted = [UNITS["up"], *([UNITS["web"]] if web else []), *([UNITS["gateway"]] if gateway else [])]
+    _check_parts(machine, before, web=web, gateway=gateway)
+    if user is None:
+        user = USER if root or packaged else choose_user(program)
+        if user != USER:
+            machine.note(f"the units run as {user}: no other user can run {program}")
+    _make_user(machine, user)
+    _make_config(machine, before)
+    _take_over(machine, before, user, name)
+    # Units that were made for another program would hide the package's.
+    changed = _remove_made(machine, UNITS.values()) if packaged else _write_units(machine, wanted, program, user)
+    if realtime and machine.write(f"{UNIT_FOLDER}/{REALTIME_FILE}", realtime_text(_MARK.format(unit=UNITS["up"]))):
+        changed.append(UNITS["up"])
+    _start(machine, wanted, changed)
+    if not (dry_run or root):
+        machine.note("it runs, now and at boot: `rmpa service status`; its log: journalctl -u rmpa")
+    options.show({"units": wanted, "user": user, "changes": machine.changes, "dry_run": dry_run})
+    return 0
+
+
+def _check_parts(machine: Machine, before: Former, *, web: bool, gateway: bool) -> None:
+    """Check that what is to start has a chance to.
+
+    Raises:
+        RmpaError: A library or a setting is missing, or another program has the core's port.
+    """
+    from rmpa.cli.gateway import check_gateway, check_web
+
+    path = machine.path(CONFIG)
+    settings = before.settings
+    if path.is_file():
+        settings = load_settings({"config": str(path)}, {}, host_name=socket.gethostname()).settings
+    if web:
+        check_web()
+        if settings.web.enabled:
+            raise ConfigError("--web", "[web] enabled = true in rmpa.toml has the agent start it", "choose one")
+    if gateway:
+        check_gateway(settings)
+    if machine.root or settings.core_mode != "embedded" or _shown(UNITS["up"]).get("ActiveState") == "active":
+        return
+    from rmpa.runtime.kernel_tcp import program_at
+
+    if holder := program_at(settings.core_port):
+        problem = f"{holder} has port {settings.core_port}, which the agent's core needs"
+        if not machine.dry:
+            raise StartError("rmpa service install", problem, "end it first")
+        machine.note(f"! {problem}: end it first")
+
+
+def _make_user(machine: Machine, user: str) -> None:
+    below = ["--prefix", machine.root] if machine.root else []
+    if not machine.has_group():
+        machine.run(f"make the group {GROUP}", "groupadd", *below, "--system", GROUP)
+    if user != USER:
+        if not machine.root and not _is_user(user):
+            raise ConfigError("--user", f"there is no user {user}", "leave it out, and the user rmpa is made")
+        return
+    if machine.ids(user) is None:
+        home = ["--home-dir", STATE, "--no-create-home", "--shell", "/usr/sbin/nologin"]
+        machine.run(f"make the user {user}", "useradd", *below, "--system", "--gid", GROUP, *home, user)
+
+
+def _is_user(name: str) -> bool:
+    try:
+        return bool(pwd.getpwnam(name))
+    except KeyError:
+        return False
+
+
+def _make_config(machine: Machine, before: Former) -> None:
+    if machine.path(CONFIG).exists():
+        machine.note(f"{CONFIG} stays as it is")
+        if before.config is not None:
+            machine.note(f"! {before.config} is not read by the units")
+        return
+    text, source = config_text(), "every setting in a comment"
+    if before.config is not None:
+        text, source = before.config.read_text("utf-8"), f"as {before.config}"
+    if machine.change(f"write {CONFIG}: {source}"):
+        machine.path(CONFIG).parent.mkdir(mode=0o755, parents=True, exist_ok=True)
+        machine.path(CONFIG).write_text(text, "utf-8")
+        machine.path(CONFIG).chmod(0o644)
+
+
+def _take_over(machine: Machine, before: Former, user: str, name: str | None) -> None:
+    """Give the units what the user's agent has kept, unless they have kept something themselves; and the name."""
+    place = machine.path(STATE)
+    kept = kept_name(place)
+    if _entries(place):
+        machine.note(f"{STATE} stays as it is")
+    elif before.state is not None:
+        kept = kept_name(before.state)
+        if machine.change(f"copy what {before.user}'s agent has kept in {before.state}: {_about(before.state)}"):
+            _copy(before.state, place)
+    wanted = name or kept or before.name
+    if wanted and wanted != kept and machine.change(f"keep the name {wanted}"):
+        keep_name(place, wanted, instead=True)
+    ids = machine.ids(user)
+    if machine.dry or ids is None or os.geteuid():
+        return
+    place.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for path in (place, *place.rglob("*")):
+        os.chown(path, *ids, follow_symlinks=False)
+
+
+def _about(state: Path) -> str:
+    """What a state directory has, in a few words: ``the name base, base/ with keys of a secured mesh``."""
+    kept = kept_name(state)
+    folders = [path for path in _entries(state) if path.is_dir()]
+    keys = [" with keys of a secured mesh" if (folder / "trust").is_dir() else "" for folder in folders]
+    words = [f"{folder.name}/{text}" for folder, text in zip(folders, keys, strict=True)]
+    return ", ".join([*([f"the name {kept}"] if kept else []), *words])
+
+
+def _copy(state: Path, place: Path) -> None:
+    place.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for path in _entries(state):
+        if path.is_dir() and not path.is_symlink():
+            shutil.copytree(path, place / path.name, symlinks=True)
+        elif path.is_file():
+            shutil.copy2(path, place / path.name)
+
+
+def _write_units(machine: Machine, wanted: Sequence[str], program: str, user: str) -> list[str]:
+    """Write the units; return those that are others now."""
+    texts = unit_texts(program, user)
+    return [unit for unit in wanted if machine.write(f"{UNIT_FOLDER}/{unit}", _MARK.format(unit=unit) + texts[unit])]
+
+
+def _start(machine: Machine, wanted: Sequence[str], changed: Sequence[str]) -> None:
+    """Enable the units and, on this machine, start them; those that have changed are started again.
+
+    Raises:
+        RmpaError: One does not start; the text has the last lines of its log.
+    """
+    if machine.root:
+        machine.systemctl("enable", *wanted)
+        return
+    if changed:
+        machine.systemctl("daemon-reload")
+    for unit in wanted:
+        now = _shown(unit)
+        if now.get("ActiveState") == "active" and now.get("UnitFileState") == "enabled" and unit not in changed:
+            machine.note(f"{unit} runs")
+            continue
+        again = now.get("ActiveState") == "active"
+        try:
+            machine.systemctl("enable", *([] if again else ["--now"]), unit)
+            if again:
+                machine.systemctl("restart", unit)
+        except RmpaError as error:
+            raise RmpaError("\n".join([str(error), *(f"  {line}" for line in _log(unit))])) from None
+
+
+# --- status ---------------------------------------------------------------------------------------------------------
+
+
+def _shown(unit: str) -> dict[str, str]:
+    """What ``systemctl show`` says of a unit; empty where it says nothing."""
+    told = _said("systemctl", "show", unit, f"--property={','.join(_PROPERTIES)}")
+    return dict(line.partition("=")[::2] for line in told)
+
+
+def _log(unit: str) -> list[str]:
+    """The last lines of a unit's log; empty for a user who may not read it."""
+    return _said("journalctl", "--quiet", "--no-pager", "--output=cat", f"--lines={_LOG_LINES}", f"--unit={unit}")
+
+
+def _said(*command: str) -> list[str]:
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own words
+    except OSError:
+        return []
+    return done.stdout.splitlines()
+
+
+@json_verb()
+def service_status(options: Options) -> int:
+    """Show the units of rmpa: whether they run and since when, at boot or not, the end of their log; and the peers.
+
+    ---
+    Exit codes: 0 the agent's unit runs; 1 it does not, or it is not installed.
+
+    Examples:
+      rmpa service status
+      rmpa service status --json | jq .units
+    """
+    check_machine("", "status", dry=True)
+    units = [state for name in UNITS.values() if (state := _state(name))["installed"] or name == UNITS["up"]]
+    peers, problem = _peers() if units[0]["active"] == "active" else ([], "")
+
+    def text() -> Iterator[Text]:
+        for unit in units:
+            yield from _unit_lines(unit)
+        if peers:
+            linked = sum(state == "linked" for _, state in peers)
+            yield f"{len(peers)} peer{'' if len(peers) == 1 else 's'}, {linked} linked: `rmpa peer list`"
+        elif units[0]["active"] == "active":
+            yield f"peers: {problem or 'none yet'}"
+
+    found = [{"name": name, "state": state} for name, state in peers]
+    options.show({"units": units, "peers": found, "problem": problem}, text())
+    return 0 if units[0]["active"] == "active" else 1
+
+
+def _state(unit: str) -> dict[str, object]:
+    shown = _shown(unit)
+    since = int(shown.get("StateChangeTimestampMonotonic") or 0) / 1e6
+    installed = shown.get("LoadState") == "loaded"
+    return {
+        "unit": unit,
+        "installed": installed,
+        "active": shown.get("ActiveState", "unknown"),
+        "sub": shown.get("SubState", ""),
+        "since": time.clock_gettime(time.CLOCK_MONOTONIC) - since if since else None,
+        "enabled": shown.get("UnitFileState", "") == "enabled",
+        "result": shown.get("Result", ""),
+        "pid": int(shown.get("MainPID") or 0) or None,
+        "restarts": int(shown.get("NRestarts") or 0),
+        "log": _log(unit) if installed else [],
+    }
+
+
+def _unit_lines(unit: dict[str, object]) -> Iterator[str]:
+    from rmpa.cli.output import duration
+
+    name, active = unit["unit"], unit["active"]
+    if not unit["installed"]:
+        yield f"{name} is not installed: sudo rmpa service install"
+        return
+    since, pid = unit["since"], unit["pid"]
+    words = [str(active) if active == unit["sub"] else f"{active} ({unit['sub']})"]
+    if isinstance(since, float):
+        words.append(f"for {duration(since)}")
+    if pid:
+        words.append(f"pid {pid}")
+    words.append("at boot" if unit["enabled"] else "not at boot")
+    if unit["restarts"]:
+        words.append(f"started again {unit['restarts']} times")
+    if unit["result"] not in ("", "success"):
+        words.append(f"failed by {unit['result']}")
+    yield f"{name}: {', '.join(words)}"
+    if not unit["enabled"]:
+        yield f"    to start it at boot: sudo systemctl enable {name}"
+    log = unit["log"]
+    if isinstance(log, list):
+        yield from (f"    {line}" for line in log)
+        if not log:
+            yield "    no log that this user may read: sudo journalctl -u rmpa"
+
+
+def _peers() -> tuple[list[tuple[str, str]], str]:
+    """The peers of the unit's agent, and why they are not known."""
+    from rmpa.observe.control_client import ControlClient, find_agents
+
+    try:
+        for agent in find_agents({"RMPA_RUNTIME_DIR": RUNTIME}):
+            with ControlClient(agent.path) as client:
+                snapshot = client.snapshot(topics=())
+            if not snapshot.agent.name.endswith(GATEWAY_SUFFIX):
+                return [(peer.name, peer.state) for peer in snapshot.peers], ""
+    except RmpaError as error:
+        return [], str(error)
+    return [], f"this user may not ask: use sudo, or join the group {GROUP}"
+
+
+# --- uninstall ------------------------------------------------------------------------------------------------------
+
+
+@json_verb(
+    flag(
+        "--purge", help="Remove settings and state too, and the user rmpa: the module's name and keys are gone then."
+    ),
+    flag("--yes", help="Do not ask."),
+    flag("--dry-run", help="Change nothing; say what would be done."),
+    click.option("--root", metavar="DIR", default="", help="The folder of another system, such as an image."),
+)
+def service_uninstall(purge: bool, yes: bool, dry_run: bool, root: str, options: Options) -> int:
+    """Stop rmpa, take it out of the boot, and remove what `rmpa service install` has made.
+
+    /etc/rmpa and /var/lib/rmpa stay, unless --purge says otherwise.
+
+    ---
+    Exit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option.
+
+    Examples:
+      sudo rmpa service uninstall
+      sudo rmpa service uninstall --purge --yes   in a script
+      rmpa service uninstall --dry-run
+    """
+    root = root.rstrip("/")
+    check_machine(root, "uninstall", dry=dry_run)
+    machine = Machine(root, dry=dry_run, tell=(lambda _: None) if options.as_json else click.echo)
+    if purge and machine.packaged:
+        raise StartError("rmpa service uninstall", "the package has settings and state", "sudo apt purge rmpa")
+    if purge and not (yes or dry_run) and not confirm(f"Remove {CONFIG} and all of {STATE}, keys too?"):
+        raise ConfigError("rmpa service uninstall", "nothing was removed")
+    parts = machine.parts()
+    if parts:
+        machine.systemctl("disable", *([] if root else ["--now"]), *parts)
+    if _remove_made(machine, (*UNITS.values(), REALTIME_FILE)) and not root:
+        machine.systemctl("daemon-reload")
+    if purge:
+        _purge(machine)
+    if not machine.changes:
+        machine.note("nothing is installed")
+    options.show({"units": parts, "changes": machine.changes, "dry_run": dry_run})
+    return 0
+
+
+def _remove_made(machine: Machine, places: Iterable[str]) -> list[str]:
+    """Remove those of some files in the folder of units that ``install`` has made; return which."""
+    found = []
+    for place in places:
+        path = machine.path(f"{UNIT_FOLDER}/{place}")
+        if path.is_file() and path.read_text("utf-8", "replace").startswith(_MARK.partition("{")[0]):
+            found.append(place)
+            if machine.change(f"remove {UNIT_FOLDER}/{place}"):
+                path.unlink()
+                if path.parent.name.endswith(".d") and not any(path.parent.iterdir()):
+                    path.parent.rmdir()
+    return found
+
+
+def _purge(machine: Machine) -> None:
+    config, state = machine.path(CONFIG), machine.path(STATE)
+    if config.is_file() and machine.change(f"remove {CONFIG}"):
+        config.unlink()
+        if not any(config.parent.iterdir()):
+            config.parent.rmdir()
+    for place in (state, machine.path(RUNTIME)):
+        if place.is_dir() and machine.change(f"remove {str(place).removeprefix(machine.root)}"):
+            shutil.rmtree(place)
+    below = ["--prefix", machine.root] if machine.root else []
+    if machine.ids(USER) is not None:
+        machine.run(f"remove the user {USER}", "userdel", *below, USER)
+    if machine.has_group():
+        machine.run(f"remove the group {GROUP}", "groupdel", *below, GROUP)

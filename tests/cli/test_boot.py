@@ -1,0 +1,300 @@
+"""``rmpa service install``, ``status``, ``uninstall``: a machine below a folder, a systemd of the test."""
+
+from __future__ import annotations
+
+import json
+import os
+import pwd
+import shlex
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from rmpa.cli import boot, machine
+from rmpa.cli.boot import Former
+from rmpa.cli.machine import Machine
+from rmpa.cli.main import main
+from rmpa.config import module_name
+from rmpa.config.settings import Settings
+from rmpa.core.errors import RmpaError, StartError
+from rmpa.observe import control_client
+from tests.cli.test_pictures import compare
+
+_PROGRAMS = {
+    "systemctl": """
+echo "systemctl $*" >> {place}/calls
+case $1 in
+    show) cat {place}/$2.show 2>/dev/null || echo LoadState=not-found ;;
+    enable) for unit; do [ ! -e {place}/$unit.fails ] || {{ echo "Job for $unit failed." >&2; exit 1; }}; done ;;
+esac
+""",
+    "journalctl": "echo 'info    agent     = base is on the air'",
+    "groupadd": 'echo "$4:x:4243:" >> "$2/etc/group"',
+    "useradd": 'for name; do :; done; echo "$name:x:4242:4243::/:/bin/false" >> "$2/etc/passwd"',
+    "userdel": 'sed -i "/^$3:/d" "$2/etc/passwd"',
+    "groupdel": 'sed -i "/^$3:/d" "$2/etc/group"',
+}
+_RUNS = (
+    "LoadState=loaded\nActiveState=active\nSubState=running\nUnitFileState=enabled\nResult=success\nMainPID=4711\n"
+)
+
+
+class Systemd:
+    """The programs of systemd and of the user database, which write down how they are called."""
+
+    def __init__(self, place: Path) -> None:
+        self.place = place
+        for name, text in _PROGRAMS.items():
+            program = place / name
+            program.write_text(f"#!/bin/sh\n{text.format(place=place) if name == 'systemctl' else text}\n")
+            program.chmod(0o755)
+
+    def calls(self) -> list[str]:
+        """The calls that change something, since the last time."""
+        file = self.place / "calls"
+        lines = file.read_text().splitlines() if file.exists() else []
+        file.unlink(missing_ok=True)
+        return [line for line in lines if not line.startswith("systemctl show")]
+
+    def show(self, unit: str, text: str) -> None:
+        since = f"{time.clock_gettime(time.CLOCK_MONOTONIC) - 7500:.0f}000000"
+        (self.place / f"{unit}.show").write_text(f"{text}StateChangeTimestampMonotonic={since}\n")
+
+
+@pytest.fixture
+def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Systemd:
+    place = tmp_path / "programs"
+    place.mkdir()
+    monkeypatch.setenv("PATH", f"{place}:{os.environ['PATH']}")
+    monkeypatch.setattr(machine, "_BOOTED", tmp_path)
+    for module in (boot, machine):
+        monkeypatch.setattr(module, "own_program", lambda: "/opt/rmpa/bin/rmpa")
+    return Systemd(place)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Another system."""
+    etc = tmp_path / "root" / "etc"
+    etc.mkdir(parents=True)
+    (etc / "passwd").touch()
+    (etc / "group").touch()
+    return etc.parent
+
+
+def _files(root: Path) -> dict[str, str]:
+    return {str(path.relative_to(root)): path.read_text() for path in root.rglob("*") if path.is_file()}
+
+
+def test_a_machine_below_a_folder(systemd: Systemd, root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = ""
+    before = _files(root)
+    for line in (
+        "install --name base --web --realtime --dry-run",
+        "install --name base --web --realtime",
+        "install --web --realtime",
+        "install --json",
+        "install --name 1base",
+        "uninstall --dry-run",
+        "uninstall",
+        "uninstall --purge --yes --json",
+        "uninstall",
+    ):
+        code = main(["service", *shlex.split(line), "--root", str(root)])
+        out, err = capsys.readouterr()
+        said += f"$ rmpa service {line}\n{out}{err}exit code {code}\n".replace(str(root), "ROOT")
+        said += "".join(f"called {call}\n".replace(str(root), "ROOT") for call in systemd.calls()) + "\n"
+        if line.endswith("--dry-run") and line.startswith("install"):
+            assert _files(root) == before
+    compare("boot", said)
+    assert _files(root) == before
+
+
+def test_the_package_has_units_of_its_own(
+    systemd: Systemd, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["service", "install", "--root", str(root)]) == 0  # by pip
+    unit = root / "usr/lib/systemd/system/rmpa.service"
+    unit.parent.mkdir(parents=True)
+    unit.write_text("the package's")
+    monkeypatch.setattr(boot, "own_program", lambda: "/usr/bin/rmpa")
+    systemd.calls()
+    assert main(["service", "install", "--root", str(root)]) == 0
+    assert systemd.calls() == [f"systemctl --root {root} enable rmpa.service"]
+    assert not list(root.glob("etc/systemd/system/*.service"))
+    assert main(["service", "install", "--user", "pi", "--root", str(root)]) == 2
+    assert main(["service", "uninstall", "--purge", "--yes", "--root", str(root)]) == 1
+    assert "sudo apt purge rmpa" in capsys.readouterr().err
+    assert main(["service", "uninstall", "--root", str(root)]) == 0
+    assert unit.read_text() == "the package's"
+
+
+def _former(tmp_path: Path) -> Former:
+    state = tmp_path / "home" / ".local" / "state" / "rmpa"
+    (state / "base" / "trust").mkdir(parents=True, mode=0o700)
+    (state / "base" / "trust" / "module.key").write_text("secret")
+    (state / "base" / "trust" / "module.key").chmod(0o600)
+    (state / "module-name").write_text("base\n")
+    (state / "state-directories").write_text("/elsewhere\n")
+    config = tmp_path / "home" / "rmpa.toml"
+    config.write_text("domain = 7\n")
+    return Former("pi", config, state, "base", Settings())
+
+
+def test_what_a_user_s_agent_has_kept_is_taken_over_once(tmp_path: Path, root: Path) -> None:
+    before, changed = _former(tmp_path), Machine(str(root), dry=False)
+    (root / "etc/passwd").write_text("rmpa:x:4242:4243::/:/bin/false\n")
+    (root / "etc/group").write_text("rmpa:x:4243:\n")
+    place = root / "var/lib/rmpa"
+    boot._take_over(changed, before, "rmpa", None)
+    assert changed.changes == [
+        f"copy what pi's agent has kept in {before.state}: the name base, base/ with keys of a secured mesh"
+    ]
+    key = place / "base/trust/module.key"
+    assert _files(place) == {"module-name": "base\n", "base/trust/module.key": "secret"}
+    assert key.stat().st_mode & 0o777 == 0o600
+    if os.geteuid() == 0:
+        assert {(path.stat().st_uid, path.stat().st_gid) for path in (place, *place.rglob("*"))} == {(4242, 4243)}
+    key.write_text("a newer one")
+    boot._take_over(changed, before, "rmpa", None)
+    assert len(changed.changes) == 1
+    assert key.read_text() == "a newer one"
+    boot._take_over(changed, before, "rmpa", "arm")
+    assert changed.changes[1:] == ["keep the name arm"]
+    assert (place / "module-name").read_text() == "arm\n"
+
+
+def test_the_settings_of_a_user_are_taken_over_unless_there_are_some(tmp_path: Path, root: Path) -> None:
+    before, changed = _former(tmp_path), Machine(str(root), dry=False)
+    for _ in range(2):
+        boot._make_config(changed, before)
+        assert (root / "etc/rmpa/rmpa.toml").read_text() == "domain = 7\n"
+        (tmp_path / "home/rmpa.toml").write_text("domain = 8\n")
+    assert changed.changes == [f"write /etc/rmpa/rmpa.toml: as {before.config}"]
+
+
+def test_the_user_is_the_one_who_called_sudo(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    _former(tmp_path)
+    here = pwd.getpwuid(os.geteuid())
+    caller = pwd.struct_passwd((*here[:5], str(tmp_path / "home"), here.pw_shell))
+    monkeypatch.setattr(pwd, "getpwuid", {os.geteuid(): here, 12345: caller}.__getitem__)
+    found = boot.former({"SUDO_UID": "12345", "HOME": "/root"})
+    assert (found.name, found.state) == ("base", tmp_path / "home/.local/state/rmpa")
+    assert boot.former({"SUDO_UID": "12345"}, root="/mnt").state is None  # an image is another machine
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="root alone can be another user")
+def test_the_owner_runs_a_program_that_others_cannot_reach(tmp_path: Path) -> None:
+    home = Path(tempfile.mkdtemp(dir="/tmp"))  # others can reach it, unlike tmp_path
+    try:
+        program = home / "rmpa"
+        program.write_text("#!/bin/sh\n")
+        program.chmod(0o755)
+        home.chmod(0o755)
+        assert boot.choose_user(str(program)) == "rmpa"
+        home.chmod(0o700)
+        with pytest.raises(StartError, match="install it elsewhere"):
+            boot.choose_user(str(program))
+        nobody = pwd.getpwnam("nobody")
+        daemon = pwd.getpwnam("daemon")
+        assert nobody.pw_uid != daemon.pw_uid
+        for path in (home, program):
+            os.chown(path, daemon.pw_uid, daemon.pw_gid)
+        assert boot.choose_user(str(program)) == "daemon"
+    finally:
+        shutil.rmtree(home)
+
+
+def test_units_that_have_changed_are_started_again(systemd: Systemd) -> None:
+    systemd.show("rmpa.service", _RUNS)
+    boot._start(Machine("", dry=False), ["rmpa.service", "rmpa-web.service"], ["rmpa.service"])
+    assert systemd.calls() == [
+        "systemctl daemon-reload",
+        "systemctl enable rmpa.service",
+        "systemctl restart rmpa.service",
+        "systemctl enable --now rmpa-web.service",
+    ]
+    systemd.show("rmpa-web.service", _RUNS)
+    boot._start(Machine("", dry=False), ["rmpa.service", "rmpa-web.service"], [])
+    assert systemd.calls() == []
+
+
+def test_a_unit_that_does_not_start_is_an_error_with_its_log(systemd: Systemd) -> None:
+    (systemd.place / "rmpa.service.fails").touch()
+    with pytest.raises(RmpaError, match=r"Job for rmpa.service failed.\n  info    agent     = base is on the air"):
+        boot._start(Machine("", dry=False), ["rmpa.service"], [])
+
+
+def test_status(systemd: Systemd, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(boot, "RUNTIME", str(systemd.place))
+    said = ""
+    for agent, web in (
+        ("", ""),
+        (_RUNS, _RUNS.replace("enabled", "disabled") + "NRestarts=2\n"),
+        ("LoadState=loaded\nActiveState=failed\nSubState=failed\nUnitFileState=enabled\nResult=watchdog\n", ""),
+    ):
+        for unit, text in (("rmpa", agent), ("rmpa-web", web)):
+            (systemd.place / f"{unit}.service.show").unlink(missing_ok=True)
+            if text:
+                systemd.show(f"{unit}.service", text)
+        code = main(["service", "status"])
+        out, err = capsys.readouterr()
+        said += f"$ rmpa service status\n{out}{err}exit code {code}\n\n"
+    compare("boot_status", said)
+    assert main(["service", "status", "--json"]) == 1
+    unit = json.loads(capsys.readouterr().out)["units"][0]
+    assert unit.pop("since") >= 7500
+    log = ["info    agent     = base is on the air"]
+    assert unit == {
+        "unit": "rmpa.service",
+        "installed": True,
+        "active": "failed",
+        "sub": "failed",
+        "enabled": True,
+        "result": "watchdog",
+        "pid": None,
+        "restarts": 0,
+        "log": log,
+    }
+
+
+@pytest.mark.usefixtures("systemd")
+def test_what_it_needs_is_said_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    assert main(["service", "install", "--web"]) == 1
+    problem = "rmpa: rmpa service install: only root may change the machine; sudo /opt/rmpa/bin/rmpa service install"
+    assert capsys.readouterr().err == f"{problem}\n"
+    monkeypatch.setattr(machine, "_BOOTED", tmp_path / "none")
+    for verb in ("install", "status", "uninstall"):
+        assert main(["service", verb]) == 1
+        assert capsys.readouterr().err.startswith(
+            f"rmpa: rmpa service {verb}: this machine was not started by systemd"
+        )
+
+
+def test_a_command_of_a_user_who_may_not_ask_the_unit_says_how_to(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = tmp_path / "run"
+    place.mkdir(mode=0o750)
+    monkeypatch.setattr(control_client, "_SYSTEM", place)
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    monkeypatch.setenv("RMPA_RUNTIME_DIR", str(tmp_path / "none"))
+    assert main(["peer", "list"]) == 1
+    assert "use sudo; or once: sudo usermod -aG" in capsys.readouterr().err
+
+
+def test_root_s_commands_mean_the_unit_s_state(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    monkeypatch.setattr(module_name, "_AT_BOOT", tmp_path / "rmpa.service")
+    assert module_name.of_unit({}) == {}
+    (tmp_path / "rmpa.service").symlink_to("/etc/systemd/system/rmpa.service")
+    assert module_name.of_unit({}) == {"RMPA_STATE_DIR": "/var/lib/rmpa"}
+    assert module_name.of_unit({"RMPA_STATE_DIR": "/mine"}) == {"RMPA_STATE_DIR": "/mine"}
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    assert module_name.of_unit({}) == {}
