@@ -94,7 +94,7 @@ bench: $(STAMP) ros  ## the measurements, as ratios in one run; results in lab/r
 experiment: $(STAMP) ros  ## classic ROS beside RMPA, with a report: make experiment [ARGS="--short"]; docs/experiments.md
 	$(BIN)/python -m lab experiment run $(ARGS)
 
-wheel: $(STAMP)  ## build the wheel into dist/ and see that it holds the product alone
+wheel: $(STAMP)  ## build sdist and wheel into dist/ and check them
 	scripts/build-wheel $(BIN)/python
 
 bundle: $(STAMP)  ## build RMPA with a Python of its own into dist/: make bundle [ARCH=aarch64] [PREFIX=an interpreter that is there]

@@ -1,14 +1,38 @@
-"""What pyproject.toml cannot say: the version comes from git's tag, and a build writes it down with its commit."""
+"""What pyproject.toml cannot say: version and commit, links for readers elsewhere, a word for older Pythons."""
 
+import re
 import runpy
+import sys
 from pathlib import Path
 
 from setuptools import setup
 from setuptools.command.build_py import build_py
 from setuptools.command.sdist import sdist
 
+if sys.version_info < (3, 11):  # noqa: UP036 - pip runs this file before it looks at requires-python
+    sys.exit(
+        f"rmpa needs Python 3.11 or later, and this is {sys.version.split()[0]}: take another (python3.12 -m pip) "
+        "or RMPA's bundle or Debian package, which bring one: docs/install.md"
+    )
 ROOT = Path(__file__).resolve().parent
 BUILD = runpy.run_path(str(ROOT / "scripts/version"))["build"](ROOT)
+
+
+def url() -> str:
+    """Where the repository is published."""
+    import tomllib  # noqa: PLC0415 - the Pythons that are refused above have none
+
+    return str(tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["rmpa"]["url"])
+
+
+def readme() -> str:
+    """README.md as an index of packages shows it: its links and pictures are those of the repository."""
+
+    def absolute(link: re.Match[str]) -> str:
+        kind = "raw" if link[1].endswith((".png", ".svg")) else "blob"
+        return f"]({url()}/{kind}/HEAD/{'README.md' if link[1].startswith('#') else ''}{link[1]})"
+
+    return re.sub(r"\]\((?!\w+:)([^)\s]+)\)", absolute, (ROOT / "README.md").read_text(encoding="utf-8"))
 
 
 def write_down(package: Path) -> None:
@@ -36,4 +60,15 @@ class BuildSource(sdist):
         write_down(Path(base_dir) / "src/rmpa")
 
 
-setup(version=BUILD[0], cmdclass={"build_py": BuildPackage, "sdist": BuildSource})
+setup(
+    version=BUILD[0],
+    long_description=readme(),
+    long_description_content_type="text/markdown",
+    project_urls={
+        "Source": url(),
+        "Documentation": f"{url()}/blob/HEAD/docs/install.md",
+        "Changelog": f"{url()}/blob/HEAD/CHANGELOG.md",
+        "Issues": f"{url()}/issues",
+    },
+    cmdclass={"build_py": BuildPackage, "sdist": BuildSource},
+)

@@ -73,7 +73,7 @@ def _command(verb: str, module: str, pid: int | None) -> int:
 def _explain_sites(*, as_json: bool) -> None:
     missing = [name for name in ("zenoh", "xxhash") if importlib.util.find_spec(name) is None]
     if missing:
-        raise Refused(f"{' and '.join(missing)} not installed: pip install 'rmpa[zenoh]'; `make` does it")
+        raise Refused(f"{' and '.join(missing)} not installed; `make -B venv` installs it")
     if not as_json:
         places = "; ".join(f"{site}: {', '.join(modules)}" for site, modules in SITES.items())
         print(f"Two sites that do not see each other, joined by a gateway each and a router. {places}", flush=True)

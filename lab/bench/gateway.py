@@ -97,7 +97,7 @@ def why_no_sites() -> str:
     try:
         import zenoh  # noqa: F401 - whether it is there
     except ImportError:
-        return "no eclipse-zenoh here (pip install 'rmpa[zenoh]')"
+        return "no eclipse-zenoh here (pip install -c constraints.txt -e '.[zenoh]')"
     return namespaces.why_no_nat()
 
 

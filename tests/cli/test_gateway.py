@@ -88,7 +88,7 @@ def test_without_the_extra_the_error_says_how_to_install_it(place: Place, tmp_pa
     place.environ["PYTHONPATH"] = os.pathsep.join([str(tmp_path), place.environ.get("PYTHONPATH", "")])
     code, _, err = place.run(*SITE, "--connect", "tcp/localhost:1", "--insecure")
     assert code == 2
-    assert "not installed; run pip install 'rmpa[zenoh]'" in err
+    assert "-m pip install 'rmpa[zenoh]'" in err
 
 
 def test_help_shows_all_options_and_needs_no_library(place: Place, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Final
 
@@ -43,6 +44,22 @@ def test_a_clone_on_the_path_of_an_older_python(tmp_path: Path, version: str) ->
     done = run(old, "-c", caught, cwd=tmp_path, PYTHONPATH=str(_ROOT / "src"))
     assert done.stdout.strip() in said[-1]
     assert done.stdout.startswith("rmpa needs")
+
+
+@pytest.mark.parametrize("version", ["3.8", "3.10"])
+def test_pip_of_an_older_python_in_a_clone(tmp_path: Path, version: str) -> None:
+    options = "--disable-pip-version-check", "--no-build-isolation", "--no-index", "--target", tmp_path
+    done = run(python(version), "-m", "pip", "install", *options, _ROOT, cwd=tmp_path)
+    assert done.returncode == 1
+    assert f"rmpa needs Python 3.11 or later, and this is {version}." in done.stderr
+    assert "docs/install.md" in done.stderr
+
+
+def test_pip_of_an_older_python_does_not_look_for_our_libraries() -> None:
+    project = tomllib.loads((_ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    for requirement in (*project["dependencies"], *extras["web"], *extras["zenoh"], *extras["trust"]):
+        assert requirement.endswith("; python_version>='3.11'")
 
 
 def test_the_package_is_the_program(tmp_path: Path) -> None:

@@ -22,7 +22,15 @@ from rmpa.bridge.policy import Needs
 from rmpa.bridge.sessions import Part
 from rmpa.config.module_name import state_dir
 from rmpa.core.counters import Backoff, RefusalLog, TokenBucket
-from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError, StartError, UnreachableError
+from rmpa.core.errors import (
+    ConfigError,
+    PeerRefused,
+    RemoteProtocolError,
+    RmpaError,
+    StartError,
+    UnreachableError,
+    missing_extra,
+)
 from rmpa.discovery.network import list_interfaces
 from rmpa.trust import limits
 from rmpa.trust.permissions import (
@@ -77,7 +85,7 @@ def open_membership(settings: Settings, clock: SystemClock) -> Membership | None
         from rmpa.trust.membership import Membership  # noqa: PLC0415 - its library takes memory: only when needed
     except ModuleNotFoundError as error:
         missing = f"the library {error.name} is not installed, but this module has joined a secured mesh"
-        raise StartError(str(store.folder), missing, "pip install 'rmpa[trust]'") from None
+        raise StartError(str(store.folder), missing, missing_extra("trust")) from None
     membership = Membership.load(store, clock, time.time)
     if membership.name != settings.name:
         text = f"is of {membership.name}, but this agent is named {settings.name}"

@@ -24,7 +24,7 @@ from rmpa.config.read import load_settings
 from rmpa.config.settings import WebSettings
 from rmpa.config.values import HOST, BadValue
 from rmpa.core.counters import configure_logging
-from rmpa.core.errors import ConfigError, StartError, UnreachableError
+from rmpa.core.errors import ConfigError, StartError, UnreachableError, missing_extra
 from rmpa.core.identity import peer_name_from
 from rmpa.observe.control_client import ControlClient, find_agents
 from rmpa.runtime.process import LogWriter, in_journal
@@ -200,7 +200,7 @@ def check_gateway(settings: Settings) -> None:
 
 
 def _check_gateway_libraries() -> None:
-    _check_libraries("rmpa gateway", "rmpa[zenoh]", {"zenoh": "eclipse-zenoh", "xxhash": "xxhash"})
+    _check_libraries("rmpa gateway", "zenoh", {"zenoh": "eclipse-zenoh", "xxhash": "xxhash"})
 
 
 def check_web() -> None:
@@ -209,7 +209,7 @@ def check_web() -> None:
     Raises:
         ConfigError: It has not.
     """
-    _check_libraries("rmpa web", "rmpa[web]", {name: name for name in ("aiohttp", "cbor2")})
+    _check_libraries("rmpa web", "web", {name: name for name in ("aiohttp", "cbor2")})
 
 
 def _check_libraries(program: str, extra: str, libraries: Mapping[str, str]) -> None:
@@ -217,7 +217,7 @@ def _check_libraries(program: str, extra: str, libraries: Mapping[str, str]) -> 
 
     Args:
         program: The command.
-        extra: What installs them.
+        extra: The extra of rmpa that has them.
         libraries: The name in Python, and that of the package.
 
     Raises:
@@ -225,7 +225,7 @@ def _check_libraries(program: str, extra: str, libraries: Mapping[str, str]) -> 
     """
     missing = [package for name, package in libraries.items() if not _is_there(name)]
     if missing:
-        raise ConfigError(program, f"{' and '.join(missing)} not installed", f"run pip install '{extra}'")
+        raise ConfigError(program, f"{' and '.join(missing)} not installed", f"run {missing_extra(extra)}")
 
 
 def _is_there(name: str) -> bool:

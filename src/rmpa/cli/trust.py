@@ -18,7 +18,7 @@ from rmpa.cli.output import Table, duration, warn
 from rmpa.config import module_name
 from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, Access
 from rmpa.config.read import load_settings
-from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
+from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError, missing_extra
 from rmpa.core.identity import is_global_name, peer_name_problem
 from rmpa.observe.control_client import ControlClient, find_agents, running_agents
 from rmpa.trust.permissions import Permissions, TrustReply, TrustStatus, action_topics
@@ -224,7 +224,7 @@ def check_library() -> None:
         import cryptography  # noqa: F401
     except ModuleNotFoundError:
         problem = "the library cryptography is not installed"
-        raise StartError("rmpa trust", problem, "pip install 'rmpa[trust]'") from None
+        raise StartError("rmpa trust", problem, missing_extra("trust")) from None
 
 
 def confirm(question: str) -> bool:

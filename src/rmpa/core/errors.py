@@ -17,7 +17,9 @@ Errors hold fields and build their text in ``__str__``. A text says what happene
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -123,6 +125,13 @@ class OutOfDescriptors(UnreachableError):  # noqa: N818 - the name says what hap
         return _advised(
             f"no file descriptor is left for a connection to the {self.what} at {self.where}", self.remedy
         )
+
+
+def missing_extra(name: str) -> str:
+    """What adds an extra to this rmpa: pip takes the one that its Python has, and none from an index."""
+    if find_spec("pip") is None:  # pipx, uv
+        return f"the command that installed rmpa, with the extra {name}: docs/install.md#the-extras"
+    return f"{sys.executable} -m pip install 'rmpa[{name}]'"
 
 
 def _advised(text: str, remedy: str) -> str:

@@ -14,7 +14,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.core.errors import StartError
+from rmpa.core.errors import StartError, missing_extra
 from rmpa.gateway import limits
 from rmpa.gateway.zenoh.config import SocketTuning, session_config
 from rmpa.gateway.zenoh.queries import ArrivedQuery, PendingGet, SerialWorker, content
@@ -437,7 +437,7 @@ async def open_session(config: ZenohConfig, changed: Callable[[], bool] = lambda
     try:
         import zenoh  # noqa: PLC0415 - it is an extra
     except ImportError:
-        raise StartError("zenoh", "eclipse-zenoh is not installed", "pip install 'rmpa[zenoh]'") from None
+        raise StartError("zenoh", "eclipse-zenoh is not installed", missing_extra("zenoh")) from None
     settings = zenoh.Config()
     try:
         for key, value in config.entries().items():

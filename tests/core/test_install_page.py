@@ -1,0 +1,25 @@
+"""docs/install.md is the one page that says how RMPA is installed, and from where."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Final
+
+_ROOT: Final = Path(__file__).parents[2]
+_PAGE: Final = _ROOT / "docs/install.md"
+_INSTALLS: Final = re.compile(r"(?:pip3?|pipx|uv tool) install [^`\n]*")
+
+
+def test_no_other_page_installs_rmpa_from_an_index() -> None:
+    for page in (_ROOT / "README.md", *_ROOT.glob("docs/**/*.md"), *_ROOT.glob("packaging/**/*.md")):
+        found = _INSTALLS.findall(page.read_text(encoding="utf-8"))
+        assert [words for words in found if re.search(r"\brmpa\b", words)] == [], page
+
+
+def test_it_says_once_where_the_wheel_is() -> None:
+    text = _PAGE.read_text(encoding="utf-8")
+    assert len(re.findall(r"^\$ RMPA=", text, re.MULTILINE)) == 1
+    commands = [words for words in _INSTALLS.findall(text) if "-c constraints" not in words]
+    assert len(commands) == 3
+    assert all('"$RMPA[web,zenoh,trust]"' in words for words in commands)
