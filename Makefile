@@ -106,5 +106,5 @@ deb: $(STAMP)  ## build the Debian package around the bundle into dist/: make de
 	$(BIN)/python packaging/debian/build $(if $(ARCH),--arch $(ARCH)) dist
 
 clean:  ## remove what the commands above made
-	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) .uv build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
