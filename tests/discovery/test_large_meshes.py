@@ -6,6 +6,8 @@ import random
 from ipaddress import IPv4Address
 from typing import TYPE_CHECKING
 
+import pytest
+
 from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
@@ -151,3 +153,15 @@ def test_forged_peers_never_displace_one_that_was_linked() -> None:
     lost = [event.identity.name for event in agent.membership.events() if event.change == "lost"]
     assert lost
     assert member(0).name not in lost
+
+
+def test_in_a_flood_all_agents_of_a_large_mesh_send_a_hundred_announcements_a_second_together() -> None:
+    agent = Agent()
+    agent.meet(200, linked=True)
+    agent.run(5.0)
+    sent = []
+    for _ in range(400):  # each pause of the reading
+        agent.membership.beacons_lost(agent.now)
+        sent += agent.run(0.05)
+    announced = [beacon for beacon in multicasts(sent) if beacon.kind is BeaconKind.ANNOUNCE]
+    assert len(announced) == pytest.approx(20 * 100 / 200, abs=1)

@@ -685,6 +685,16 @@ def test_change_of_interfaces_sends_a_shorter_burst(one: Harness) -> None:
     assert sent[0].beacon.identity.addresses == (IPv4Address("10.8.0.1"),)
 
 
+def test_while_a_flood_pushes_beacons_out_an_agent_announces_itself_twice_a_second(one: Harness) -> None:
+    sent = []
+    for _ in range(200):  # each pause of the reading
+        one.membership.beacons_lost(one.now)
+        sent += one.run(0.05)
+    announced = [o for o in sent if o.address is None and o.beacon.kind is BeaconKind.ANNOUNCE]
+    assert len(announced) == pytest.approx(2 * 10, abs=2)
+    assert [o.beacon.kind for o in one.run(10)] == [BeaconKind.ANNOUNCE, BeaconKind.HEARTBEAT, BeaconKind.HEARTBEAT]
+
+
 def test_membership_is_bounded_and_links_go_first(one: Harness) -> None:
     for i in range(2 * limits.STRANGERS_MAX):
         guid = Guid.of(IPv4Address(0x0A010000 + i), 4000)

@@ -55,7 +55,7 @@ STRANGER_KEPT: Final = 30.0
 _BEACONS_PER_WAKE: Final = 64
 # Packets a second without a valid proof that an agent of a secured mesh looks at: 37 microseconds each, 15 % of a
 # core. Above it the socket is not read for a while, and the kernel drops what does not fit its buffer: beacons of
-# members too, which are sent again, and which links do not need.
+# members too, which are then sent more often (``MembershipProtocol.beacons_lost``), and which links do not need.
 _BEACONS_UNPROVED_PER_SECOND: Final = 4000.0
 # Refused beacons a second that are parsed for the names of their senders: 0.1 % of a core.
 _STRANGER_BEACONS_PER_SECOND: Final = 50.0
@@ -434,6 +434,7 @@ class Discovery:
         if self._filter.overrun:
             # A flood of forged packets must not take the core: for a while they stay in the kernel's buffer.
             self.counters.add("beacon.paused")
+            self._membership.beacons_lost(time.monotonic())
             self._filter.overrun = False
             loop = asyncio.get_running_loop()
             loop.remove_reader(sock.fileno())
