@@ -76,6 +76,17 @@ def test_program_units_and_configuration_are_where_the_system_looks(tree: Path) 
     assert "# port = 11311" in (tree / "etc/rmpa/rmpa.toml").read_text()
 
 
+def test_the_systems_python_is_told_which_one_has_rmpa(tree: Path) -> None:
+    path = {**os.environ, "PYTHONPATH": str(tree / "usr/lib/python3/dist-packages")}
+    command = [sys.executable, "-c", "import rmpa.resource"]
+    done = subprocess.run(command, env=path, cwd="/", capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith(f"ImportError: RMPA is for a Python of its own, and this is {sys.executable}")
+    assert "`rmpa run FILE`" in last
+    assert "/usr/lib/rmpa/python/bin/python3" in last
+
+
 def test_there_is_a_manual_for_every_command_and_setting(tree: Path) -> None:
     pages = {page.name: gzip.decompress(page.read_bytes()).decode() for page in tree.glob("usr/share/man/man?/*.gz")}
     for words, (module, _) in VERBS.items():
