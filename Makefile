@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 .DEFAULT_GOAL := venv
 # One apt at a time: a lock on this folder.
 APT := flock scripts
-.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests test-long style format types imports reference fuzz soak soak-services soak-web bench experiment wheel deb bundle ros chromium clients clean
+.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests test-long style format types imports reference fuzz soak soak-services soak-web bench experiment wheel deb bundle release ros chromium clients clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -104,6 +104,9 @@ bundle: $(STAMP)  ## build RMPA with a Python of its own into dist/: make bundle
 deb: $(STAMP)  ## build the Debian package around the bundle into dist/: make deb [ARCH=arm64] [PREFIX=as for bundle]
 	$(BIN)/python packaging/bundle/build --folder-only $(if $(ARCH),--arch $(patsubst amd64,x86_64,$(patsubst arm64,aarch64,$(ARCH)))) $(if $(PREFIX),--python $(PREFIX)) dist
 	$(BIN)/python packaging/debian/build $(if $(ARCH),--arch $(ARCH)) dist
+
+release: $(STAMP)  ## all files of a release with checksums, into dist/release-VERSION: make release [ARGS=--check, ARGS=--trial]
+	$(BIN)/python scripts/release $(ARGS)
 
 clean:  ## remove what the commands above made
 	rm -rf $(VENV) .uv build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

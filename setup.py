@@ -15,7 +15,8 @@ if sys.version_info < (3, 11):  # noqa: UP036 - pip runs this file before it loo
         "or RMPA's bundle or Debian package, which bring one: docs/install.md"
     )
 ROOT = Path(__file__).resolve().parent
-BUILD = runpy.run_path(str(ROOT / "scripts/version"))["build"](ROOT)
+VERSION = runpy.run_path(str(ROOT / "scripts/version"))
+BUILD = VERSION["build"](ROOT)
 
 
 def url() -> str:
@@ -37,8 +38,7 @@ def readme() -> str:
 
 def write_down(package: Path) -> None:
     """Write ``_build.py`` into the package that is built; ``rmpa/__init__.py`` reads it."""
-    lines = (f'{name} = "{value}"\n' for name, value in zip(("VERSION", "COMMIT", "DATE"), BUILD, strict=True))
-    (package / "_build.py").write_text("".join(lines), encoding="ascii")
+    (package / "_build.py").write_text(VERSION["module"](*BUILD), encoding="ascii")
 
 
 class BuildPackage(build_py):
