@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 .DEFAULT_GOAL := venv
 # One apt at a time: a lock on this folder.
 APT := flock scripts
-.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests test-long style format types imports reference fuzz soak soak-services soak-web bench experiment wheel deb bundle release ros chromium clients clean
+.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests test-long test-packages test-packages-short short-package short-chroot style format types imports reference fuzz soak soak-services soak-web bench experiment wheel deb bundle release ros chromium clients clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -55,6 +55,26 @@ tests: $(STAMP)  ## all tests, several files at a time; some of them: make tests
 test-long: $(STAMP)  ## more seeds of the simulated networks and fuzz targets than `make tests` has, and tests marked `long`
 	RMPA_SIMULATION_SEEDS=8 FUZZ_MUTATIONS=20000 $(BIN)/python -m pytest -n auto --timeout 3600 tests/simulation tests/fuzz
 	$(BIN)/python -m pytest -m long --timeout 3600
+
+test-packages: $(STAMP) ros  ## install by each way on machines of Debian 11, 12 and 13 (chroots), arm64 too, and let their nodes speak; in half an hour
+	version=$$(scripts/version); for arch in x86_64 aarch64; do \
+		[ -e dist/rmpa-$$version-linux-$$arch.tar.xz ] || $(MAKE) bundle ARCH=$$arch || exit; done
+	version=$$(scripts/version --deb); for arch in amd64 arm64; do \
+		[ -e dist/rmpa_$${version}_$$arch.deb ] || $(BIN)/python packaging/debian/build --arch $$arch dist || exit; done
+	$(MAKE) wheel
+	$(BIN)/python -m pytest -m packages tests/packages
+
+test-packages-short: $(STAMP) ros  ## the same in three minutes: a package with the system's Python, on one machine of this one's release; CI runs it
+	rm -rf dist/short
+	$(MAKE) --jobs=2 --output-sync=target short-package short-chroot
+	$(BIN)/python -m pytest -m packages tests/packages/test_short.py
+
+short-package:
+	bundle=$$($(BIN)/python packaging/bundle/build --folder-only --python /usr dist/short | tail -n 1) && \
+		DPKG_DEB_COMPRESSOR_LEVEL=0 $(BIN)/python packaging/debian/build --bundle $$bundle dist/short
+
+short-chroot:  # where none can be built, the test says why it is skipped
+	-. /etc/os-release && packaging/test/chroot $$VERSION_CODENAME amd64 rospy
 
 style: $(STAMP)  ## ruff, and for the pages prettier and eslint where npm is: lint and format
 	$(BIN)/ruff check .

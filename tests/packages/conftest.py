@@ -68,30 +68,29 @@ class Team:
 def team(request: pytest.FixtureRequest) -> Iterator[Team]:
     """A team; the clock runs from the first command that installs to the first message at the other machine."""
     way: Way = request.param
-    if not way.needs().exists():
-        pytest.skip(f"{way.needs().name} is not in dist: {way.made_by}")
+    if (product := way.product()) is None:
+        pytest.skip(f"nothing in dist to install by this way: {way.made_by}")
     namespaces.remove_stale()
     with ExitStack() as stack:
         lab = stack.enter_context(Lab())
         hosts = lab.hosts(*way.suites)
         made = [stack.enter_context(Machine(host, suite)) for host, suite in zip(hosts, way.suites, strict=True)]
+        files = [machine.put(product, "root" if way.name == "deb" else USER) for machine in made]
         took = {}
         begun = last = time.monotonic()
-        agents = []
         program = ""
-        for machine in made[:2]:
-            program = way.install(machine)
+        for machine, file in zip(made[:2], files, strict=False):
+            program = way.install(machine, file)
             took[machine.suite], last = time.monotonic() - last, time.monotonic()
-        for machine in made[:2]:
-            agents.append(machine.start(program, "up", user=USER, env=way.env))
+        agents = [machine.start(program, "up", user=USER, env=way.env) for machine in made[:2]]
         for agent in agents:
             agent.wait_for("ROS_MASTER_URI=", _UP)
         made[0].start("rostopic", "pub", "-r", "10", "/hello", "std_msgs/String", "hello", user=USER)
         made[1].start("rostopic", "echo", "/hello", user=USER).wait_for("data: .*hello", _UP)
         seconds = time.monotonic() - begun
         request.config.stash[_seconds][way.name] = {**took, "message": time.monotonic() - last, "all": seconds}
-        for machine in made[2:]:
-            way.install(machine)
+        for machine, file in zip(made[2:], files[2:], strict=True):
+            way.install(machine, file)
             agents.append(machine.start(program, "up", user=USER, env=way.env))
             agents[-1].wait_for("ROS_MASTER_URI=", _UP)
         for agent in agents:

@@ -58,7 +58,11 @@ def why_not() -> str:
 def chroot(suite: str, arch: str, kind: str) -> Path:
     """The tree of a release, built if it is not there yet."""
     done = subprocess.run(
-        [CLONE / "packaging/test/chroot", suite, arch, kind], stdout=subprocess.PIPE, text=True, timeout=_BUILT, check=False
+        [CLONE / "packaging/test/chroot", suite, arch, kind],
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=_BUILT,
+        check=False,
     )
     if done.returncode:
         raise BedError(f"no Debian {suite} ({arch}, {kind}) could be built; its own words stand above")
@@ -99,7 +103,7 @@ class Machine:
     def __init__(self, host: Host, suite: str, arch: str = "amd64", kind: str = "robot") -> None:
         self.host, self.suite = host, suite
         self._tree = chroot(suite, arch, kind)
-        boot = [_ENTER, "--fresh", self._tree, "sh", "-c", _BOOT, "boot", host.name]
+        boot: list[str | Path] = [_ENTER, "--fresh", self._tree, "sh", "-c", _BOOT, "boot", host.name]
         self._started = [Process(host.command(boot), name=f"boot of {host.name}")]
         self._started[0].wait_for("^booted")
         mine = self._started[0].pid
@@ -151,7 +155,18 @@ class Machine:
             parts.append("--user")
         become = [] if user == "root" else ["setpriv", f"--reuid={user}", f"--regid={user}", "--init-groups"]
         variables = [f"{name}={value}" for name, value in basic.items()]
-        return ["nsenter", "--target", str(self._first), *parts, "env", "-i", f"--chdir={home}", *variables, *become, *argv]
+        return [
+            "nsenter",
+            "--target",
+            str(self._first),
+            *parts,
+            "env",
+            "-i",
+            f"--chdir={home}",
+            *variables,
+            *become,
+            *argv,
+        ]
 
     def run(
         self,

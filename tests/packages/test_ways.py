@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.bed.processes import eventually
 from tests.interop.modules import whole
 from tests.packages.conftest import LINKED, around
-from tests.packages.ways import USER
+from tests.packages.ways import USER, purge
 
 if TYPE_CHECKING:
     from tests.packages.conftest import Team
@@ -67,9 +66,5 @@ def test_the_end_of_a_machine_is_noticed_and_it_comes_back(team: Team) -> None:
 def test_purge_leaves_nothing(team: Team) -> None:
     if team.way.name != "deb":
         pytest.skip("only a package is purged")
-    machine = team.machines[0]
     team.agents[0].interrupt()
-    machine.run("apt-get", "purge", "-y", "-q", "rmpa", timeout=120.0)
-    left = machine.run("find", "/", "-xdev", "-path", "/home", "-prune", "-o", "-name", "*rmpa*", "-print").split()
-    assert [path for path in left if not path.startswith("/root/")] == []
-    eventually(lambda: "rmpa" not in machine.run("getent", "passwd") + machine.run("getent", "group"))
+    assert purge(team.machines[0]) == []

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +17,7 @@ if TYPE_CHECKING:
     from tests.packages.machines import Machine
 
 USER: Final = "robot"
+DIST: Final = CLONE / "dist"
 _PATIENCE: Final = 180.0
 """Seconds for one command that installs: more than a user is to wait, so that a figure is there in any case."""
 _CERTIFICATES: Final = "/etc/ssl/certs/ca-certificates.crt"
@@ -36,58 +35,65 @@ NOETIC: Final = {
 """What /opt/ros/noetic/setup.bash sets, with the places that Debian's ROS has."""
 
 
-@functools.cache
-def _version(*option: str) -> str:
-    return subprocess.run(
-        [sys.executable, CLONE / "scripts/version", *option], capture_output=True, text=True, check=True
-    ).stdout.strip()
+def _newest(pattern: str) -> Path | None:
+    return max(DIST.glob(pattern), key=lambda path: path.stat().st_mtime, default=None)
 
 
-def package(arch: str = "amd64") -> Path:
-    """The Debian package of this tree."""
-    return CLONE / f"dist/rmpa_{_version('--deb')}_{arch}.deb"
+def package(arch: str = "amd64") -> Path | None:
+    """The newest Debian package in dist/."""
+    return _newest(f"rmpa_*_{arch}.deb")
 
 
-def bundle(arch: str = "x86_64") -> Path:
-    """The bundle of this tree."""
-    return CLONE / f"dist/rmpa-{_version()}-linux-{arch}.tar.xz"
+def bundle(arch: str = "x86_64") -> Path | None:
+    """The newest bundle in dist/."""
+    return _newest(f"rmpa-*-linux-{arch}.tar.xz")
 
 
-def wheel() -> Path:
-    """The wheel of this tree."""
-    return CLONE / f"dist/rmpa-{_version()}-py3-none-any.whl"
+def wheel() -> Path | None:
+    """The newest wheel in dist/."""
+    return _newest("rmpa-*.whl")
 
 
-def install_package(machine: Machine) -> str:
+def install_package(machine: Machine, file: str) -> str:
     """``sudo apt install ./rmpa_*.deb``."""
-    file = machine.put(package())
     machine.run("apt-get", "update", "-q", online=True, timeout=_PATIENCE)
     machine.run("apt-get", "install", "-y", "-q", file, online=True, timeout=_PATIENCE)
     return "rmpa"
 
 
-def unpack_bundle(machine: Machine) -> str:
+def purge(machine: Machine) -> list[str]:
+    """``sudo apt purge rmpa``; return what it leaves: files outside of /tmp and homes, users and groups."""
+    machine.run("apt-get", "purge", "-y", "-q", "rmpa", timeout=_PATIENCE)
+    words = ["/", "-xdev"]
+    for folder in ("/home", "/root", "/tmp"):
+        words += ["-path", folder, "-prune", "-o"]
+    files = machine.run("find", *words, "-name", "*rmpa*", "-print").split()
+    accounts = (machine.run("getent", "passwd") + machine.run("getent", "group")).splitlines()
+    return files + [line for line in accounts if "rmpa" in line]
+
+
+def unpack_bundle(machine: Machine, file: str) -> str:
     """``tar xf``, without root."""
-    machine.run("tar", "xf", machine.put(bundle(), USER), user=USER, timeout=_PATIENCE)
-    return f"./{bundle().name.removesuffix('.tar.xz')}/rmpa"
+    machine.run("tar", "xf", file, user=USER, timeout=_PATIENCE)
+    return f"{file.removesuffix('.tar.xz')}/rmpa"
 
 
-def install_by_pip(machine: Machine) -> str:
+def install_by_pip(machine: Machine, file: str) -> str:
     """Into a virtual environment of the system's own Python."""
     machine.run("python3", "-m", "venv", ".rmpa", user=USER, timeout=_PATIENCE)
-    pip = [".rmpa/bin/pip", "install", "-q", f"{machine.put(wheel(), USER)}[web,zenoh,trust]"]
+    pip = [".rmpa/bin/pip", "install", "-q", f"{file}[web,zenoh,trust]"]
     machine.run(*pip, user=USER, online=True, timeout=_PATIENCE)
     return ".rmpa/bin/rmpa"
 
 
-def install_by_uv(machine: Machine) -> str:
+def install_by_uv(machine: Machine, file: str) -> str:
     """``uv tool install``, with uv from PyPI and a Python from 3.12 on that is there; it cannot fetch one here."""
     machine.run("python3", "-m", "venv", ".uv", user=USER, timeout=_PATIENCE)
     machine.run(".uv/bin/pip", "install", "-q", "uv", user=USER, online=True, timeout=_PATIENCE)
     python = "3.13"
     if machine.suite == "bookworm":  # has 3.11; as if somebody had put a newer one there
         python = f"{machine.bind(_python_312())}/bin/python3.12"
-    tool = [".uv/bin/uv", "tool", "install", "-q", "--python", python, f"{machine.put(wheel(), USER)}[web,zenoh,trust]"]
+    tool = [".uv/bin/uv", "tool", "install", "-q", "--python", python, f"{file}[web,zenoh,trust]"]
     machine.run(*tool, user=USER, online=True, timeout=_PATIENCE, env={"SSL_CERT_FILE": _CERTIFICATES})
     return "rmpa"
 
@@ -106,17 +112,17 @@ class Way:
 
     Args:
         name: As the table of seconds calls it.
-        install: Does it, and returns the program.
+        install: Does it with a file, and returns the program.
         suites: The releases of the machines.
-        needs: The file that is installed.
+        product: The file that is installed, if it was made.
         made_by: The command that makes this file.
         env: What the shell of the user has set.
     """
 
     name: str
-    install: Callable[[Machine], str]
+    install: Callable[[Machine, str], str]
     suites: tuple[str, ...]
-    needs: Callable[[], Path]
+    product: Callable[[], Path | None]
     made_by: str
     env: Mapping[str, str]
 

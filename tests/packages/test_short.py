@@ -1,0 +1,50 @@
+"""The short form, which CI runs: a package made in seconds, on a new machine of this one's release, and a clone.
+
+Its interpreter is the system's own, and it is hardly compressed; ``make test-packages`` has the ones that users get.
+"""
+
+from __future__ import annotations
+
+import platform
+from typing import TYPE_CHECKING
+
+import pytest
+
+from lab.bed.agents import Agent
+from lab.bed.namespaces import Lab
+from tests.interop.modules import whole
+from tests.interop.ros import Ros
+from tests.packages.machines import Machine
+from tests.packages.ways import DIST, USER, install_package, purge
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = [pytest.mark.packages, pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(600)]
+
+
+def test_a_new_machine_gets_the_package_and_hears_a_clone(tmp_path: Path) -> None:
+    release = platform.freedesktop_os_release()
+    if release["ID"] != "debian":
+        pytest.skip("the short form needs Debian: its interpreter is the system's")
+    package = next((DIST / "short").glob("*.deb"))
+    with Lab() as lab, Machine(lab.host("robot", 0), release["VERSION_CODENAME"], kind="rospy") as robot:
+        desk = lab.host("desk", 0)
+        with Agent(desk, tmp_path, name="desk") as agent, Ros(desk, tmp_path) as ros:
+            agent.start()
+            program = install_package(robot, robot.put(package))
+            up = robot.start(program, "up", user=USER)
+            agent.wait_ready()
+            agent.wait_peer("robot", 60.0)
+            heard = [
+                robot.node("rospy", "listener", topic="/to_robot", count=50),
+                ros.roscpp("listener", topic="/to_desk", count=50),
+            ]
+            ros.roscpp("talker", topic="/to_robot", rate=50, count=50, wait=1)
+            robot.node("rospy", "talker", topic="/to_desk", rate=50, count=50, wait=1)
+            for listener in heard:
+                whole(listener.wait_event("done", 60.0), 50)
+            assert "/to_robot" in robot.run("rostopic", "list").split()
+            assert "desk" in robot.run("rmpa", "peer", "list", user=USER)
+            up.interrupt()
+        assert purge(robot) == []
