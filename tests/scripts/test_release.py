@@ -112,6 +112,10 @@ REFUSED: Final = {
     "CHANGELOG.md says that 0.2.0 is unreleased": (
         "sed -i s/2026-11-26/unreleased/ CHANGELOG.md; git commit -qam two; git tag -f v0.2.0"
     ),
+    "tests/golden/0.1.0.json is not what v0.1.0 had": (
+        "echo 1 > tests/golden/0.1.0.json; git add .; git commit -qm two; git tag v0.1.0;"
+        "echo 2 > tests/golden/0.1.0.json; git commit -qam three; git tag -f v0.2.0"
+    ),
     "tests/golden/0.2.0.json is missing": "git rm -q tests/golden/0.2.0.json; git commit -qm two; git tag -f v0.2.0",
 }
 
