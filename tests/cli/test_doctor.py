@@ -43,7 +43,7 @@ def test_every_check_answers(loopback: Place) -> None:
     assert checks == {
         *("settings", "agent", "interface", "multicast", "firewall", "rp_filter", "route", "port", "ROS", "clock"),
         "radio",
-        *("realtime", "files", "exposed nodes"),
+        *("realtime", "files", "boot", "exposed nodes"),
     }
     assert set(CHECKS) <= checks
     assert answers["multicast", "lo"]["level"] == "ok"

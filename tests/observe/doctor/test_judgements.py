@@ -10,7 +10,14 @@ import msgspec
 import pytest
 
 from rmpa.observe.doctor.checks import is_beyond_loopback, judge_agents, judge_exposed_nodes, judge_membership
-from rmpa.observe.doctor.machine import NetworkInterface, judge_clock, judge_peer_clock, judge_rights, judge_sim_time
+from rmpa.observe.doctor.machine import (
+    NetworkInterface,
+    judge_clock,
+    judge_peer_clock,
+    judge_rights,
+    judge_sim_time,
+    judge_unit,
+)
 from rmpa.observe.doctor.network import (
     MulticastEcho,
     judge_interfaces,
@@ -65,6 +72,7 @@ def files(problem: str = "", *, near: bool = False) -> Callable[[], Iterable[Che
     return agent(agent=changed, notes=(problem,) if problem else ())
 
 
+UNIT: Final = {"LoadState": "loaded", "ActiveState": "active", "UnitFileState": "enabled", "Result": "success"}
 CASES: dict[str, tuple[Callable[[], Iterable[Check]], str]] = {
     # The facts, the levels of the results.
     "two ordinary interfaces": (interfaces(WLAN, ETH), "ok ok"),
@@ -149,6 +157,10 @@ CASES: dict[str, tuple[Callable[[], Iterable[Check]], str]] = {
         ),
         "warn",
     ),
+    "a unit": (one(judge_unit, UNIT), "ok"),
+    "no unit": (one(judge_unit, {"LoadState": "not-found"}), "skipped"),
+    "a unit that is not enabled": (one(judge_unit, UNIT | {"UnitFileState": "disabled"}), "warn"),
+    "a unit that has failed": (one(judge_unit, UNIT | {"ActiveState": "failed", "Result": "watchdog"}), "fail"),
     "nodes of an open mesh": (one(judge_exposed_nodes, "base", None, trusted=False), "skipped"),
     "unknown nodes": (one(judge_exposed_nodes, "base", None, trusted=True), "skipped"),
     "nodes on loopback": (one(judge_exposed_nodes, "base", {}, trusted=True), "ok"),

@@ -276,6 +276,7 @@ CHECKS: Final[dict[str, Callable[[DoctorInput], Iterable[Check]]]] = {
     "ROS": machine.shell,
     "clock": machine.clocks,
     "realtime": machine.rights,
+    "boot": machine.at_boot,
     "exposed nodes": _exposed_nodes,
 }
 

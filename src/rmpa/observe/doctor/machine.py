@@ -277,6 +277,29 @@ def judge_peer_clock(agent: str, peer: str, offset: float, error: float | None) 
     return Check("clock", WARN, text, remedy, where=f"{agent}-{peer}")
 
 
+# --- the start with the machine -------------------------------------------------------------------------------------
+
+
+def at_boot(_: DoctorInput) -> Iterable[Check]:
+    """The check of the unit of ``rmpa service install``."""
+    properties = "--property=LoadState,ActiveState,UnitFileState,Result"
+    told = ask_program("systemctl", "show", "rmpa.service", properties) or ""
+    return [judge_unit(dict(line.partition("=")[::2] for line in told.splitlines()))]
+
+
+def judge_unit(unit: Mapping[str, str]) -> Check:
+    """Whether the agent's unit starts it with the machine, by what ``systemctl show`` says of it."""
+    if unit.get("LoadState") != "loaded":
+        remedy = "sudo rmpa service install starts an agent with the machine"
+        return Check("boot", SKIPPED, "rmpa.service is not installed", remedy)
+    if unit["ActiveState"] == "failed":
+        return Check("boot", FAIL, f"rmpa.service has failed ({unit['Result']})", "journalctl -u rmpa says why")
+    if unit["UnitFileState"] != "enabled":
+        text = f"rmpa.service is {unit['ActiveState']}, and does not start with the machine"
+        return Check("boot", WARN, text, "sudo systemctl enable rmpa")
+    return Check("boot", OK, f"rmpa.service is {unit['ActiveState']}, and starts with the machine")
+
+
 # --- rights for real time, and the limit of open files --------------------------------------------------------------
 
 
