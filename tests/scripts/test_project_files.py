@@ -20,6 +20,8 @@ PAGES: Final = (
     "CONTRIBUTING.md",
     "README.md",
     "docs/compatibility.md",
+    "docs/install.md",
+    "docs/troubleshooting.md",
 )
 TEMPLATES: Final = sorted((ROOT / ".github/ISSUE_TEMPLATE").glob("[!c]*.yml"))
 
