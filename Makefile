@@ -56,7 +56,7 @@ test-long: $(STAMP)  ## more seeds of the simulated networks and fuzz targets th
 	RMPA_SIMULATION_SEEDS=8 FUZZ_MUTATIONS=20000 $(BIN)/python -m pytest -n auto --timeout 3600 tests/simulation tests/fuzz
 	$(BIN)/python -m pytest -m long --timeout 3600
 
-test-packages: $(STAMP) ros  ## install by each way on machines of Debian 11, 12 and 13 (chroots), arm64 too, and let their nodes speak; in half an hour
+test-packages: $(STAMP) ros  ## install by each way on machines of Debian 11, 12 and 13 (chroots), arm64 too, and let their nodes speak, and boot it with systemd; in half an hour
 	version=$$(scripts/version); for arch in x86_64 aarch64; do \
 		[ -e dist/rmpa-$$version-linux-$$arch.tar.xz ] || $(MAKE) bundle ARCH=$$arch || exit; done
 	version=$$(scripts/version --deb); for arch in amd64 arm64; do \

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
 from lab.bed import namespaces
-from lab.bed.processes import DEADLINE, BedError, Process, run
+from lab.bed.processes import DEADLINE, BedError, Process, eventually, run
 from lab.bed.ros import words
 
 if TYPE_CHECKING:
@@ -42,8 +42,14 @@ mount -t sysfs sysfs /sys 2>/dev/null || true
 hostname "$1" 2>/dev/null && echo "127.0.1.1 $1" >>/etc/hosts
 useradd --create-home --shell /bin/bash robot
 echo booted
-while :; do sleep 1000; done
+[ "$2" = systemd ] || while :; do sleep 1000; done
+mount -t cgroup2 cgroup2 /sys/fs/cgroup
+mkdir /dev/pts
+mount -t devpts -o newinstance,ptmxmode=0666,mode=620 devpts /dev/pts
+ln -s pts/ptmx /dev/ptmx
+exec env -i container=lxc PATH="$PATH" /lib/systemd/systemd --unit=multi-user.target >/dev/null 2>&1
 """
+_IN_A_CGROUP: Final = 'mkdir "$0" && echo $$ >"$0/cgroup.procs" && exec unshare --cgroup "$@"'
 
 
 @functools.cache
@@ -52,6 +58,18 @@ def why_not() -> str:
     if reason := namespaces.why_not():
         return reason
     return "" if shutil.which("apt-get") else "chroots of Debian need apt and debootstrap"
+
+
+@functools.cache
+def why_no_systemd() -> str:
+    """Why no machine can be booted by systemd here, or an empty string."""
+    return why_not() or ("" if os.access(_cgroups() or "/-", os.W_OK) else "no control groups (cgroup2) can be made")
+
+
+def _cgroups() -> str:
+    """Where the hierarchy of control groups is mounted; empty where there is none."""
+    mounts = [line.split() for line in Path("/proc/mounts").read_text().splitlines()]
+    return next((mount[1] for mount in mounts if mount[2] == "cgroup2"), "")
 
 
 @functools.cache
@@ -98,16 +116,24 @@ class Machine:
         suite: Its release.
         arch: Its architecture.
         kind: What it has; see packaging/test/chroot.
+        systemd: Whether it is booted by systemd (kind robot), which then has a control group of its own.
     """
 
-    def __init__(self, host: Host, suite: str, arch: str = "amd64", kind: str = "robot") -> None:
+    def __init__(
+        self, host: Host, suite: str, arch: str = "amd64", kind: str = "robot", *, systemd: bool = False
+    ) -> None:
         self.host, self.suite = host, suite
+        self._cgroup = Path(_cgroups(), f"rmpa-test-{os.getpid()}-{host.name}") if systemd else None
         self._tree = chroot(suite, arch, kind)
         boot: list[str | Path] = [_ENTER, "--fresh", self._tree, "sh", "-c", _BOOT, "boot", host.name]
-        self._started = [Process(host.command(boot), name=f"boot of {host.name}")]
+        boot.append("systemd" if systemd else "")
+        grouped: list[str | Path] = ["sh", "-c", _IN_A_CGROUP, self._cgroup] if self._cgroup else []
+        self._started = [Process([*grouped, *host.command(boot)], name=f"boot of {host.name}")]
         self._started[0].wait_for("^booted")
         mine = self._started[0].pid
         self._first = int(Path(f"/proc/{mine}/task/{mine}/children").read_text().split()[-1])
+        if systemd:
+            self.run("sh", "-c", "until systemctl is-system-running | grep -E 'running|degraded'; do sleep 0.1; done")
 
     def __enter__(self) -> Self:
         return self
@@ -115,6 +141,13 @@ class Machine:
     def __exit__(self, *_: object) -> None:
         while self._started:
             self._started.pop().end()
+        if (group := self._cgroup) is not None:
+            eventually(
+                lambda: "populated 0" in (group / "cgroup.events").read_text(), what="the end of its processes"
+            )
+            for path in sorted((path for path in group.rglob("*") if path.is_dir()), reverse=True):
+                path.rmdir()
+            group.rmdir()
 
     @property
     def root(self) -> Path:
