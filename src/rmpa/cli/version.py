@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import platform
 from pathlib import Path
 
 import rmpa
@@ -24,6 +23,8 @@ def long_version() -> str:
 
 def about() -> dict[str, object]:
     """What a bug report should tell: ``rmpa --version --json``."""
+    import platform
+
     libc, libc_version = platform.libc_ver()
     return {
         "version": long_version(),
