@@ -62,6 +62,7 @@ test-packages: $(STAMP) ros  ## install by each way on machines of Debian 11, 12
 	version=$$(scripts/version --deb); for arch in amd64 arm64; do \
 		[ -e dist/rmpa_$${version}_$$arch.deb ] || $(BIN)/python packaging/debian/build --arch $$arch dist || exit; done
 	$(MAKE) wheel
+	$(APT) scripts/install-podman
 	$(BIN)/python -m pytest -m packages tests/packages
 
 test-packages-short: $(STAMP) ros  ## the same in three minutes: a package with the system's Python, on one machine of this one's release; CI runs it

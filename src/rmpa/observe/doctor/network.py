@@ -95,7 +95,7 @@ def judge_interfaces(
         yield check(WARN, text, "keep one of them, or --interface NAME", where="+".join(sharing))
     if container and outer:
         text = "this is a container with a network of its own: no multicast of the outside comes in"
-        remedy = "start it with --network host, or reach the others by --seed HOST:PORT"
+        remedy = "start it with --network host; or publish its --port for TCP and UDP, and give it a --seed"
         yield check(WARN, text, remedy, where=outer[0].name)
 
 
