@@ -23,6 +23,7 @@ from rmpa.observe.control import ReloadReply
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime import process as realtime
 from rmpa.runtime.accept import is_shortage, raise_file_limit
+from rmpa.runtime.interpreter import own_command
 from rmpa.runtime.loop import AgentLoop
 from rmpa.runtime.process import SERVICE_VARIABLES, feed_watchdog, notify_service_manager
 
@@ -185,7 +186,7 @@ _USAGE: Final = 2
 def web_command(settings: Settings) -> list[str]:
     """The command line of the child: all that the agent's own options may have changed is given."""
     web = settings.web
-    command = [sys.executable, "-m", "rmpa.cli.main", "web", "--with-agent", "--agent", settings.name]
+    command = own_command("web", "--with-agent", "--agent", settings.name)
     command += ["--port", str(web.port), "--listen", web.listen]
     if web.token_file:
         command += ["--token-file", web.token_file]

@@ -25,6 +25,7 @@ from rmpa.cli.options import argument, flag, verb
 from rmpa.cli.output import print_error, printable
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.runtime import limits
+from rmpa.runtime.interpreter import own_command
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -275,7 +276,7 @@ class ModuleAgent:
                 raise ConfigError("--", text, "leave them out, or choose another --name")
             _log.info("= using the agent %s, %s", self.name, self._uri)
             return self
-        command = [sys.executable, "-m", "rmpa.cli.main", "up", *self._options]
+        command = own_command("up", *self._options)
         environ = {**os.environ, "RMPA_NAME": self.name}  # not --name: a file's resources do not name the machine
         libc, us = ctypes.CDLL(None), os.getpid()
 
