@@ -63,6 +63,7 @@ test-packages: $(STAMP) ros  ## install by each way on machines of Debian 11, 12
 		[ -e dist/rmpa_$${version}_$$arch.deb ] || $(BIN)/python packaging/debian/build --arch $$arch dist || exit; done
 	$(MAKE) wheel
 	$(APT) scripts/install-podman
+	command -v lintian >/dev/null || DEBIAN_FRONTEND=noninteractive $(APT) apt-get install -y -q --no-install-recommends lintian
 	$(BIN)/python -m pytest -m packages tests/packages
 
 test-packages-short: $(STAMP) ros  ## the same in three minutes: a package with the system's Python, on one machine of this one's release; CI runs it
