@@ -39,8 +39,10 @@ _BUILT: Final = 900.0
 """Seconds until a chroot is built: minutes on a fast line, and arm64's is emulated."""
 _BOOT: Final = """
 mount -t sysfs sysfs /sys 2>/dev/null || true
+echo "$1" >/etc/hostname
 hostname "$1" 2>/dev/null && echo "127.0.1.1 $1" >>/etc/hosts
 useradd --create-home --shell /bin/bash robot
+[ ! -d /etc/sudoers.d ] || echo "robot ALL=(ALL) NOPASSWD: ALL" >/etc/sudoers.d/robot
 echo booted
 [ "$2" = systemd ] || while :; do sleep 1000; done
 mount -t cgroup2 cgroup2 /sys/fs/cgroup
@@ -75,13 +77,8 @@ def _cgroups() -> str:
 @functools.cache
 def chroot(suite: str, arch: str, kind: str) -> Path:
     """The tree of a release, built if it is not there yet."""
-    done = subprocess.run(
-        [CLONE / "packaging/test/chroot", suite, arch, kind],
-        stdout=subprocess.PIPE,
-        text=True,
-        timeout=_BUILT,
-        check=False,
-    )
+    build: list[str | Path] = [CLONE / "packaging/test/chroot", suite, arch, kind]
+    done = subprocess.run(build, stdout=subprocess.PIPE, text=True, timeout=_BUILT, check=False)
     if done.returncode:
         raise BedError(f"no Debian {suite} ({arch}, {kind}) could be built; its own words stand above")
     root = Path(done.stdout.strip())
@@ -187,19 +184,8 @@ class Machine:
         if (Path(f"/proc/{self._first}/ns/user").readlink()) != Path("/proc/self/ns/user").readlink():
             parts.append("--user")
         become = [] if user == "root" else ["setpriv", f"--reuid={user}", f"--regid={user}", "--init-groups"]
-        variables = [f"{name}={value}" for name, value in basic.items()]
-        return [
-            "nsenter",
-            "--target",
-            str(self._first),
-            *parts,
-            "env",
-            "-i",
-            f"--chdir={home}",
-            *variables,
-            *become,
-            *argv,
-        ]
+        clean = ["env", "-i", f"--chdir={home}", *(f"{name}={value}" for name, value in basic.items())]
+        return ["nsenter", "--target", str(self._first), *parts, *clean, *become, *argv]
 
     def run(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -117,6 +117,7 @@ class Way:
         product: The file that is installed, if it was made.
         made_by: The command that makes this file.
         env: What the shell of the user has set.
+        boot: Whether ``sudo rmpa service install`` starts the agent, and not ``rmpa up`` in a terminal.
     """
 
     name: str
@@ -124,12 +125,16 @@ class Way:
     suites: tuple[str, ...]
     product: Callable[[], Path | None]
     made_by: str
-    env: Mapping[str, str]
+    env: Mapping[str, str] = field(default_factory=dict)
+    boot: bool = False
 
 
 WAYS: Final = (
-    Way("deb", install_package, ("bullseye", "trixie", "bookworm"), package, "make deb", {}),
+    Way("deb", install_package, ("bullseye", "trixie", "bookworm"), package, "make deb"),
     Way("bundle", unpack_bundle, ("bullseye", "bookworm", "trixie"), bundle, "make bundle", NOETIC),
-    Way("pip", install_by_pip, ("bookworm", "trixie"), wheel, "make wheel", {}),
-    Way("uv", install_by_uv, ("trixie", "bookworm"), wheel, "make wheel", {}),
+    Way("pip", install_by_pip, ("bookworm", "trixie"), wheel, "make wheel"),
+    Way("uv", install_by_uv, ("trixie", "bookworm"), wheel, "make wheel"),
+    Way("deb at boot", install_package, ("bookworm", "bullseye", "trixie"), package, "make deb", boot=True),
+    Way("bundle at boot", unpack_bundle, ("trixie", "bullseye"), bundle, "make bundle", NOETIC, boot=True),
+    Way("pip at boot", install_by_pip, ("trixie", "bookworm"), wheel, "make wheel", boot=True),
 )
