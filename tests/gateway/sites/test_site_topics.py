@@ -6,6 +6,7 @@ import asyncio
 
 import pytest
 
+import rmpa
 from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.gateway.sites.keys import token_keys
 from rmpa.gateway.zenoh.threads import QueuedPublisher
@@ -84,6 +85,16 @@ async def test_the_last_message_of_a_latched_topic_is_sent_when_its_limit_lets_i
             yard.graph.send(source, str(number).encode())
         await until(lambda: topic.messages and topic.messages[-1] == b"19")
         assert len(topic.messages) < 10
+
+
+async def test_a_gateway_of_another_release_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    async with site_bed() as bed:
+        await bed.site("yard")
+        other = await bed.zenoh.session()
+        other.token(f"rmpa/2/hall/-gateway/005/{'0' * 32}")
+        told = f"the gateway of site hall speaks rmpa/2, we speak rmpa/1 (rmpa {rmpa.__version__}): install the same"
+        await until(lambda: told in caplog.text)
+    assert caplog.text.count("we speak") == 1
 
 
 async def test_a_topic_that_a_rule_keeps_from_one_site_is_neither_sent_nor_announced_there() -> None:

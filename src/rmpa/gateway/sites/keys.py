@@ -401,6 +401,10 @@ def token_keys(own: str) -> tuple[str, ...]:
     return f"{ROOT}/*/{GATEWAY}/**", f"{ROOT}/*/*/{_UP}/**", f"{ROOT}/*/*/{TO}/*/{own}/**"
 
 
+# The key expression of the tokens of all gateways, those of other formats too: they are told that they do not meet.
+ANY_GATEWAY: Final = f"{ROOT.partition('/')[0]}/*/*/{GATEWAY}/**"
+
+
 def parse_token(key: str) -> SiteModule | SiteSource | SiteGateway | None:
     """Read a liveliness token; ``None`` for one of a later version, which has other chunks behind the known ones.
 

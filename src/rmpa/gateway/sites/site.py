@@ -6,11 +6,12 @@ import logging
 import time
 from typing import TYPE_CHECKING
 
-from rmpa.core.counters import earliest, logged_failure
+import rmpa
+from rmpa.core.counters import RefusalLog, earliest, logged_failure
 from rmpa.gateway import limits
 from rmpa.gateway.rules import SourceKind
 from rmpa.gateway.sites.catalogue import CatalogueChange, Leader, SiteCatalogue, SiteHistory
-from rmpa.gateway.sites.keys import SiteGateway, SiteModule, token_keys
+from rmpa.gateway.sites.keys import ANY_GATEWAY, ROOT, SiteGateway, SiteModule, token_keys
 from rmpa.gateway.sites.plans import SiteExports, SiteImports
 from rmpa.gateway.sites.services import SiteActions, SiteServices
 from rmpa.gateway.sites.topics import SiteTopics
@@ -66,6 +67,7 @@ class SiteNeighbour:
         self._sites: tuple[str, ...] = ()
         self._tokens: dict[str, Declaration] = {}
         self._declared: list[Declaration] = []
+        self._refusals = RefusalLog(_log, context.counters)
         self._timer = MachineTimer(self._next_timer, self._handle_timer)
         self._closed = False
 
@@ -73,6 +75,7 @@ class SiteNeighbour:
         """Announce this gateway, and begin to follow the graph and the other sites."""
         session = self.context.session
         self._declared = [session.watch_tokens(key, self._on_token) for key in token_keys(self.own.site)]
+        self._declared.append(session.watch_tokens(ANY_GATEWAY, self._on_gateway))
         self._declared.append(session.token(self.own.token()))
         self.context.graph.watch(self._on_source)
         self._timer.arm()
@@ -103,6 +106,15 @@ class SiteNeighbour:
         if isinstance(item, SiteGateway):
             (self._leader.seen if alive else self._leader.gone)(item, now)
         self._follow()
+
+    def _on_gateway(self, key: str, alive: bool) -> None:
+        """Tell of a gateway whose keys this one does not read, as it will never be a site here."""
+        parts = key.split("/")
+        theirs, site = "/".join(parts[:2]), parts[2][: limits.SITE_NAME_MAX]
+        if alive and theirs != ROOT and not self._closed:
+            text = f"the gateway of site {site} speaks {theirs[:20]}, we speak {ROOT} (rmpa {rmpa.__version__})"
+            remedy = "install the same release of rmpa on both"
+            self._refusals.refuse(time.monotonic(), "site.other_release", site, f"{text}: {remedy}")
 
     def _on_source(self, source: MeshSource, there: bool) -> None:
         if not self._closed:
