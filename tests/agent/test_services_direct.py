@@ -251,8 +251,14 @@ async def test_many_services_of_one_peer_are_all_asked_for(pair: tuple[Settings,
         for name in names:
             a.core.call("registerService", "/adder", name, server.node.service_uri, server.node.uri)
         await until(lambda: all(name in b.core.state().services for name in names))
+
         # They are not served, only registered: each probe finds the node, and that it does not know the service.
-        await until(lambda: {transport(b, name) for name in names} == {("relay", "reachable")})
+        def asked() -> bool:
+            services = {i.name: i for i in b.operations.snapshot({}).services if i.direction == "in"}
+            found = {(services[name].transport, services[name].condition) for name in names if name in services}
+            return found == {("relay", "reachable")}
+
+        await until(asked)
         await until(lambda: transport(b) == ("direct", ""))
 
 

@@ -158,7 +158,7 @@ def test_after_an_outage_beyond_the_contract_messages_may_be_lost(modules: Modul
     eventually(is_away, what="the lease")
     assert away["peer"] == "b"
     assert "b is away for" in str(away["problem"])
-    a.agent.process.wait_for(r"(?i)warning.* b has been away for 4 s: \d+ messages for it are given up, of /chatter")
+    a.agent.process.wait_for(r"warning.* b has been away for [\d.]+ s: \d+ messages for it are given up, of /chatter")
     b.host.restore()
     for listener in heard:
         wait_last(listener, first + 4000)
@@ -187,7 +187,7 @@ def test_best_effort_is_fresh_after_a_cut(modules: ModuleFactory, tmp_path: Path
         assert sequences == sorted(set(sequences))
         # Half a second of messages waited for the cable; they give way to those that follow.
         stale = [row for row in rows if row.age > 0.15]
-        assert len(stale) <= 5
+        assert len(stale) <= 100, "a pause of a busy machine, and not the 1200 of both cuts"
 
 
 def test_the_last_word_before_a_cut_still_counts(modules: ModuleFactory) -> None:
