@@ -119,7 +119,7 @@ experiment: $(STAMP) ros  ## classic ROS beside RMPA, with a report: make experi
 wheel: $(STAMP)  ## build sdist and wheel into dist/ and check them
 	scripts/build-wheel $(BIN)/python
 
-bundle: $(STAMP)  ## build RMPA with a Python of its own into dist/: make bundle [ARCH=aarch64] [PREFIX=an interpreter that is there]
+bundle: $(STAMP)  ## build RMPA with a Python of its own into dist/: make bundle [ARCH=aarch64] [PREFIX=an interpreter that is there] [FRESH=1]
 	$(BIN)/python packaging/bundle/build $(if $(ARCH),--arch $(ARCH)) $(if $(PREFIX),--python $(PREFIX)) dist
 
 # Debian's names of the machines that the bundle calls by the kernel's.
