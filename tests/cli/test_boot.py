@@ -60,7 +60,7 @@ class Systemd:
         return [line for line in lines if not line.startswith("systemctl show")]
 
     def show(self, unit: str, text: str) -> None:
-        since = f"{time.clock_gettime(time.CLOCK_MONOTONIC) - 7500:.0f}000000"
+        since = f"{time.clock_gettime(time.CLOCK_MONOTONIC) - 7530:.0f}000000"
         (self.place / f"{unit}.show").write_text(f"{text}StateChangeTimestampMonotonic={since}\n")
 
 
@@ -236,7 +236,8 @@ def test_status(systemd: Systemd, monkeypatch: pytest.MonkeyPatch, capsys: pytes
         (_RUNS, _RUNS.replace("enabled", "disabled") + "NRestarts=2\n"),
         ("LoadState=loaded\nActiveState=failed\nSubState=failed\nUnitFileState=enabled\nResult=watchdog\n", ""),
     ):
-        for unit, text in (("rmpa", agent), ("rmpa-web", web)):
+        gateway = agent and _RUNS.replace("enabled", "disabled").replace("=active", "=inactive")  # a package has it
+        for unit, text in (("rmpa", agent), ("rmpa-web", web), ("rmpa-gateway", gateway)):
             (systemd.place / f"{unit}.service.show").unlink(missing_ok=True)
             if text:
                 systemd.show(f"{unit}.service", text)

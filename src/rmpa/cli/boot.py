@@ -56,6 +56,8 @@ _PROPERTIES: Final = (
     *("LoadState", "ActiveState", "SubState", "UnitFileState", "Result", "MainPID", "NRestarts"),
     "StateChangeTimestampMonotonic",
 )
+# The states of a unit that does nothing, or is not there.
+_AWAY: Final = ("inactive", "unknown")
 # Lines of a unit's log that are shown.
 _LOG_LINES: Final = 5
 # A user without any rights of its own: what it cannot run, the unit's user cannot either.
@@ -379,7 +381,9 @@ def service_status(options: Options) -> int:
       rmpa service status --json | jq .units
     """
     check_machine("", "status", dry=True)
-    units = [state for name in UNITS.values() if (state := _state(name))["installed"] or name == UNITS["up"]]
+    states = [_state(name) for name in UNITS.values()]
+    # A package has all units, of which web server and gateway may be of no use here.
+    units = [states[0], *(state for state in states[1:] if state["enabled"] or state["active"] not in _AWAY)]
     peers, problem = _peers() if units[0]["active"] == "active" else ([], "")
 
     def text() -> Iterator[Text]:
