@@ -90,20 +90,24 @@ def test_arguments_of_roslaunch_and_empty_ones_of_a_launch_file_are_left_out(tmp
     program.write_text('#!/bin/sh\nprintf "<%s>" "$PYTHONPATH" "$@"\n')
     program.chmod(0o755)
     env = environment(tmp_path, free_port()) | {"PYTHONPATH": "/ros"}
-    words = ["up", "--name=", "--web=false", "--prefix-peers=true", "--seed", "h 1", "__name:=rmpa", "/x:=/y"]
+    words = ["up", "--name=", "--web=false", "--prefix-peers=true", "--seed", "a: b:=1", "__name:=rmpa", "/x:=/y"]
     script = PACKAGE / "scripts/rmpa"
-    assert run([script, f"--program={tmp_path}", *words], env=env) == "</ros><up><--prefix-peers><--seed><h 1>"
+    assert run([script, f"--program={tmp_path}", *words], env=env) == "</ros><up><--prefix-peers><--seed><a: b:=1>"
     missing = subprocess.run([script, "--program=/nowhere", "up"], capture_output=True, text=True, check=False)
     assert (missing.returncode, missing.stderr.count("\n")) == (127, 1)
     assert "rmpa_ros: no rmpa at /nowhere" in missing.stderr
 
 
 def test_a_workspace_with_it_builds_and_installs(tmp_path: Path) -> None:
-    if shutil.which("catkin_make", path=environment(tmp_path, 0)["PATH"]) is None:
+    if shutil.which("catkin_make_isolated", path=environment(tmp_path, 0)["PATH"]) is None:
         pytest.skip("no catkin here (scripts/install-ros installs Debian's)")
     env = environment(tmp_path, free_port())
     (tmp_path / "src").mkdir()
     shutil.copytree(PACKAGE, tmp_path / "src/rmpa_ros")
-    run(["sh", "-c", 'cd "$HOME" && catkin_make install && rm -r src build'], env=env, timeout=100.0)
-    command = '. "$HOME/install/setup.sh" && roslaunch --args /rmpa rmpa_ros up.launch web:=true'
-    assert f"{tmp_path}/install/lib/rmpa_ros/rmpa" in run(["sh", "-c", command], env=env)
+    run(
+        ["sh", "-c", 'cd "$HOME" && catkin_make_isolated --install && rm -r src build_isolated'],
+        env=env,
+        timeout=100.0,
+    )
+    command = '. "$HOME/install_isolated/setup.sh" && roslaunch --args /rmpa rmpa_ros up.launch web:=true'
+    assert f"{tmp_path}/install_isolated/lib/rmpa_ros/rmpa" in run(["sh", "-c", command], env=env)
