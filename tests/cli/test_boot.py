@@ -132,6 +132,17 @@ def test_the_package_has_units_of_its_own(
     assert unit.read_text() == "the package's"
 
 
+def test_a_unit_that_was_written_by_hand_is_kept(systemd: Systemd, root: Path) -> None:
+    unit = root / "etc/systemd/system/rmpa.service"
+    unit.parent.mkdir(parents=True)
+    unit.write_text("mine")
+    for _ in range(2):
+        assert main(["service", "install", "--root", str(root)]) == 0
+        assert unit.with_name("rmpa.service.by-hand").read_text() == "mine"
+    assert main(["service", "uninstall", "--root", str(root)]) == 0
+    assert [path.name for path in unit.parent.iterdir()] == ["rmpa.service.by-hand"]
+
+
 def _former(tmp_path: Path) -> Former:
     state = tmp_path / "home" / ".local" / "state" / "rmpa"
     (state / "base" / "trust").mkdir(parents=True, mode=0o700)

@@ -317,8 +317,13 @@ def _copy(state: Path, place: Path) -> None:
 
 
 def _write_units(machine: Machine, wanted: Sequence[str], program: str, user: str) -> list[str]:
-    """Write the units; return those that are others now."""
+    """Write the units; return those that are others now. One that somebody has written by hand is kept beside it."""
     texts = unit_texts(program, user)
+    for unit in wanted:
+        path = machine.path(f"{UNIT_FOLDER}/{unit}")
+        old = f"{unit}.by-hand"
+        if path.is_file() and not _is_made(path) and machine.change(f"rename {UNIT_FOLDER}/{unit} to {old}"):
+            path.rename(path.with_name(old))
     return [unit for unit in wanted if machine.write(f"{UNIT_FOLDER}/{unit}", _MARK.format(unit=unit) + texts[unit])]
 
 
@@ -505,12 +510,17 @@ def service_uninstall(purge: bool, yes: bool, dry_run: bool, root: str, options:
     return 0
 
 
+def _is_made(path: Path) -> bool:
+    """Whether ``install`` has made a file."""
+    return path.read_text("utf-8", "replace").startswith(_MARK.partition("{")[0])
+
+
 def _remove_made(machine: Machine, places: Iterable[str]) -> list[str]:
     """Remove those of some files in the folder of units that ``install`` has made; return which."""
     found = []
     for place in places:
         path = machine.path(f"{UNIT_FOLDER}/{place}")
-        if path.is_file() and path.read_text("utf-8", "replace").startswith(_MARK.partition("{")[0]):
+        if path.is_file() and _is_made(path):
             found.append(place)
             if machine.change(f"remove {UNIT_FOLDER}/{place}"):
                 path.unlink()
