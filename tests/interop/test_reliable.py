@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import itertools
-import json
 import time
 from typing import TYPE_CHECKING
 
+import msgspec
 import pytest
 
 from lab.bed.processes import eventually
@@ -53,11 +53,10 @@ def connected(teller: Process, heard: list[Process]) -> int:
 
 
 def route(module: Module) -> dict[str, object]:
-    """What ``rmpa topic info --json`` says of the route."""
-    code, output = module.agent.rmpa("topic", "info", "/chatter", "--json")
-    assert code == 0, output
-    (found,) = json.loads(output)["mesh"]["routes"]
-    return dict(found)
+    """What ``rmpa topic info --json`` says of the route, asked without a process: some states last for seconds."""
+    (topic,) = (topic for topic in module.agent.snapshot().topics if topic.name == "/chatter")
+    (found,) = topic.routes
+    return dict(msgspec.to_builtins(found))
 
 
 @pytest.mark.parametrize(("outage", "cuts", "pause"), [(0.3, 5, 1.4), (2.5, 2, 2.0)], ids=["short", "long"])
