@@ -66,10 +66,9 @@ def test_agents_of_roslaunch_beside_a_roscore_and_in_its_place_are_a_mesh(users:
     a, b = users
     bringup = tmp_path / "bringup.launch"
     bringup.write_text(BRINGUP)
-    program = f"rmpa:={RMPA.parents[1]}"
-    beside = a.start("roslaunch", "rmpa_ros", "up.launch", program, "name:=arm", "prefix_peers:=true")
+    beside = a.start("roslaunch", "rmpa_ros", "up.launch", f"rmpa:={RMPA}", "name:=arm", "prefix_peers:=true")
     found = {"PATH": f"{b.env['PATH']}:{RMPA.parent}", "RMPA_NAME": "base"}
-    in_place = b.start(PACKAGE / "scripts/launch", bringup, env=found)
+    in_place = b.start(PACKAGE / "scripts/launch", f"--program={RMPA.parents[1]}", bringup, env=found)
     in_place.wait_for("this core has an agent already", 40.0)
     beside.wait_for("base .*linked", 40.0)
     eventually(lambda: "/base/chatter" in a.graph_topics(), 40.0, what="the talker of b at a")
