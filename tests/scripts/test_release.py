@@ -33,9 +33,7 @@ WHEELS: Final = {
     "click-8.1": "Name: click\nVersion: 8.1\nLicense-Expression: BSD-3-Clause",
     "Old_One-1": "Name: Old_One\nVersion: 1\nClassifier: License :: OSI Approved :: MIT License",
 }
-PROGRAM: Final = (
-    b"\x7fELF\0v3.12.7\0OpenSSL 3.5.4 30 Sep 2025\0SQLite format 3\0 3.11.9\0x3.46.1\0deflate 1.3.1 Copyright"
-)
+TEXTS: Final = "ELF;v3.12.7;OpenSSL 3.5.4 30 Sep 2025;SQLite format 3;3.14.9;3.46.1;no liblzma;5.8.1;expat_2.7.1"
 
 
 class Clone:
@@ -61,7 +59,7 @@ class Clone:
             self.write(name, text)
         program = self.root / "bundle/python/bin/python3.12"
         program.parent.mkdir()
-        program.write_bytes(PROGRAM)
+        program.write_bytes(b"\x7f" + TEXTS.encode().replace(b";", b"\0") + b"\0deflate 1.3.1 Copyright")
         me = {f"GIT_{who}_{what}": "a@b" for who in ("AUTHOR", "COMMITTER") for what in ("NAME", "EMAIL")}
         self.environment = {**os.environ, **me, "RMPA_BUILD_CACHE": str(folder / "cache")}
         names = runpy.run_path(str(ROOT / "scripts/release"))
@@ -162,7 +160,8 @@ def test_the_bill_of_materials_has_wheels_interpreter_and_c_libraries(clone: Clo
     parts = {part["name"]: part for part in bill["components"]}
     versions = {name: part["version"] for name, part in parts.items()}
     assert versions == {
-        "cpython": "3.12.7", "openssl": "3.5.4", "sqlite": "3.46.1", "zlib": "1.3.1", "click": "8.1", "old-one": "1"
+        "cpython": "3.12.7", "openssl": "3.5.4", "sqlite": "3.46.1", "xz": "5.8.1", "expat": "2.7.1", "zlib": "1.3.1",
+        "click": "8.1", "old-one": "1",
     }  # fmt: skip
     assert parts["click"]["licenses"] == [{"expression": "BSD-3-Clause"}]
     assert parts["old-one"]["licenses"] == [{"license": {"name": "MIT License"}}]
