@@ -25,7 +25,7 @@ from rmpa.core.errors import RmpaError
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-DEADLINE: Final = 20.0
+DEADLINE: Final = 40.0
 """Seconds that a caller waits for a line at the most: generous, because machines are shared."""
 _END_AFTER: Final = 4.0
 """Seconds from SIGTERM to SIGKILL when a process is only to be gone."""

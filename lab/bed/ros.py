@@ -147,7 +147,7 @@ class Ros:
     def roscore(self) -> Process:
         """Start the real roscore (master, rosout, /run_id); return when it answers."""
         process = self.start("roscore", "-p", str(self.port))
-        process.wait_for("started core service", 30.0)  # it sets /run_id before that
+        process.wait_for("started core service", 60.0)  # it sets /run_id before that
         self._wait_master()
         return process
 
