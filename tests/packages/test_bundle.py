@@ -40,6 +40,8 @@ def shoot() -> None: frames.publish(data=b"1")
 print("the file has", os.environ["PYTHONPATH"], flush=True)
 """
 
+pytestmark = pytest.mark.timeout(900)  # the first one builds the bundle
+
 
 @pytest.fixture(scope="module")
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -207,6 +209,15 @@ def test_no_file_asks_for_a_newer_glibc_than_2_27(bundle: Path) -> None:
         assert (done.returncode, done.stdout.splitlines()[1:]) == (0, [])
     assert "GLIBC_" not in done.stdout
     assert re.match(r"glibc 2\.(2[0-7]|1\d)\b", done.stdout)
+
+
+@pytest.mark.long
+def test_the_same_commit_gives_the_same_bytes_in_any_folder(tmp_path: Path) -> None:
+    for folder in ("one", "another place/deeper"):
+        words = ["--python", sys.base_prefix, str(tmp_path / folder)]
+        run([sys.executable, ROOT / "packaging/bundle/build", *words], timeout=600)
+    one, other = (path.read_bytes() for path in tmp_path.rglob("rmpa-*.tar.xz"))
+    assert one == other
 
 
 def test_the_licences_of_all_parts_are_in_it(bundle: Path) -> None:
