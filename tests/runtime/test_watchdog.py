@@ -51,6 +51,29 @@ def test_it_is_asked_for_by_variables(environ: dict[str, str], period: float | N
     assert watchdog_period(environ) == period
 
 
+@pytest.mark.parametrize(
+    "command",
+    ["up --interface lo --multicast off --core-port {port} --keep never", "web --port {port}"],
+    ids=["up", "web"],
+)
+def test_a_program_of_a_unit_is_ready_and_then_gives_signs_of_life(command: str, tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager, socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        words = command.format(port=free.getsockname()[1]).split()
+        free.close()
+        manager.bind(str(tmp_path / "notify"))
+        manager.settimeout(30)
+        environ = {name: value for name, value in os.environ.items() if not name.startswith(("RMPA_", "ROS_"))}
+        environ |= {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "200000"}
+        environ |= {"RMPA_RUNTIME_DIR": str(tmp_path / "run"), "RMPA_STATE_DIR": str(tmp_path / "state")}
+        program = [sys.executable, "-m", "rmpa.cli.main", *words]
+        with subprocess.Popen(program, env=environ, cwd=tmp_path, stdout=-1, stderr=-1) as process:
+            try:
+                assert [manager.recv(64) for _ in range(4)] == [b"READY=1", *[b"WATCHDOG=1"] * 3]
+            finally:
+                process.kill()
+
+
 def test_a_loop_that_hangs_sends_nothing_and_the_log_says_where_it_hung(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
