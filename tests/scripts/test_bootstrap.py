@@ -14,6 +14,7 @@ import pytest
 _SCRIPT: Final = Path(__file__).parents[2] / "scripts/bootstrap"
 # An interpreter as far as the script asks it: version, modules, a virtual environment, and pip, which brings uv.
 _PYTHON: Final = """#!/bin/sh
+[ -z "${{PYTHONPATH:-}}" ] || exit 3
 case "$*" in
     *version_info\\ *) exit {old} ;;
     *ensurepip*) exit {bare} ;;
@@ -57,7 +58,7 @@ def interpreter(path: Path, version: str, *, bare: bool = False, no_pip: bool = 
 
 
 def bootstrap(clone: Path, python: str = "python3") -> subprocess.CompletedProcess[str]:
-    env = {"PATH": str(clone / "bin"), "HOME": str(clone / "home")}
+    env = {"PATH": str(clone / "bin"), "HOME": str(clone / "home"), "PYTHONPATH": "/opt/ros/noetic"}
     command = ["/bin/sh", "scripts/bootstrap", python, ".venv"]
     return subprocess.run(command, cwd=clone, env=env, capture_output=True, text=True, check=False, timeout=30)
 
