@@ -63,7 +63,9 @@ class Podman:
     def __init__(self, home: Path) -> None:
         # crun wants cgroups of one version.
         cgroups = "umount -R /sys/fs/cgroup && mount -t cgroup2 none /sys/fs/cgroup"
-        boot = f"mount -t tmpfs tmpfs {home}; ip link set lo up; {cgroups}; echo up; exec sleep infinity"
+        # What podman and its networks keep beside the images is in /run and /var/lib.
+        memory = f"for place in /run /var/lib {home}; do mount -t tmpfs tmpfs $place; done"
+        boot = f"{memory}; ip link set lo up; {cgroups}; echo up; exec sleep infinity"
         words = ["unshare", "--net", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc", "sh", "-c", boot]
         self._machine = Process(words)
         self._machine.wait_for("up")
