@@ -57,9 +57,9 @@ test-long: $(STAMP)  ## more seeds of the simulated networks and fuzz targets th
 	$(BIN)/python -m pytest -m long --timeout 3600
 
 test-packages: $(STAMP) ros  ## install by each way on machines of Debian 11, 12 and 13 (chroots), arm64 too, and let their nodes speak, and boot it with systemd; in half an hour
-	version=$$(scripts/version); for arch in x86_64 aarch64; do \
+	version=$$($(BIN)/python scripts/version); for arch in x86_64 aarch64; do \
 		[ -e dist/rmpa-$$version-linux-$$arch.tar.xz ] || $(MAKE) bundle ARCH=$$arch || exit; done
-	version=$$(scripts/version --deb); for arch in amd64 arm64; do \
+	version=$$($(BIN)/python scripts/version --deb); for arch in amd64 arm64; do \
 		[ -e dist/rmpa_$${version}_$$arch.deb ] || $(BIN)/python packaging/debian/build --arch $$arch dist || exit; done
 	$(MAKE) wheel
 	$(APT) scripts/install-podman

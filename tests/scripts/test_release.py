@@ -20,14 +20,14 @@ pytestmark = pytest.mark.git
 CHANGELOG: Final = "# Changelog\n\nAll.\n\n## [0.2.0] - 2026-11-26\n\nFirst words.\n\n### Added\n\n* a\n"
 MAKEFILE: Final = """\
 .PHONY: wheel bundle deb
-V := $(shell scripts/version)
+V := $(shell PYTHON scripts/version)
 wheel:
 \tmkdir -p dist; echo $(SALT)wheel > dist/rmpa-$V-py3-none-any.whl; echo sdist > dist/rmpa-$V.tar.gz
 bundle:
 \tmkdir -p dist; cp -r bundle dist/rmpa-$V-linux-$(ARCH); echo $(ARCH) > dist/rmpa-$V-linux-$(ARCH).tar.xz
 deb:
 \techo $(ARCH) > dist/rmpa_$V_$(ARCH).deb
-"""
+""".replace("PYTHON", sys.executable)
 WHEELS: Final = {
     "rmpa-0.2.0": "Name: rmpa\nVersion: 0.2.0",
     "click-8.1": "Name: click\nVersion: 8.1\nLicense-Expression: BSD-3-Clause",
