@@ -51,6 +51,7 @@ class Clone:
             "CHANGELOG.md": CHANGELOG,
             ".gitignore": "dist\n",
             "tests/golden/0.2.0.json": "{}",
+            "pyproject.toml": '[tool.rmpa]\nurl = "https://example.org"\n',
         }
         files |= {
             f"{site}/{name}.dist-info/METADATA": f"Metadata-Version: 2.4\n{text}\n" for name, text in WHEELS.items()
@@ -61,7 +62,7 @@ class Clone:
         program.parent.mkdir()
         program.write_bytes(b"\x7f" + TEXTS.encode().replace(b";", b"\0") + b"\0deflate 1.3.1 Copyright")
         me = {f"GIT_{who}_{what}": "a@b" for who in ("AUTHOR", "COMMITTER") for what in ("NAME", "EMAIL")}
-        self.environment = {**os.environ, **me, "RMPA_BUILD_CACHE": str(folder / "cache")}
+        self.environment = {**os.environ, **me, "DEBEMAIL": "a@b", "RMPA_BUILD_CACHE": str(folder / "cache")}
         names = runpy.run_path(str(ROOT / "scripts/release"))
         mark = hashlib.sha256(names["VALIDATOR"].encode()).hexdigest()[:8]
         tool = folder / f"cache/validator-{mark}-{sys.version_info.minor}"
@@ -113,6 +114,9 @@ REFUSED: Final = {
     "tests/golden/0.1.0.json is not what v0.1.0 had": (
         "echo 1 > tests/golden/0.1.0.json; git add .; git commit -qm two; git tag v0.1.0;"
         "echo 2 > tests/golden/0.1.0.json; git commit -qam three; git tag -f v0.2.0"
+    ),
+    "pyproject.toml does not say where RMPA is published": (
+        "sed -i s/example.org/rmpa.invalid/ pyproject.toml; git commit -qam two; git tag -f v0.2.0"
     ),
     "tests/golden/0.2.0.json is missing": "git rm -q tests/golden/0.2.0.json; git commit -qm two; git tag -f v0.2.0",
 }
