@@ -150,8 +150,8 @@ def _runs_as(program: str, uid: int, gid: int) -> bool:
     flag("--web", help="The web server too: rmpa web, in a unit of its own."),
     flag("--gateway", help="The gateway too, with [gateway] of /etc/rmpa/rmpa.toml."),
     flag("--realtime", help="Let the agent have real-time priority and locked memory."),
-    click.option("--name", metavar="NAME", help="This module. [default: the one that it has had]"),
-    click.option("--user", metavar="NAME", help="Whose rights the units have. [default: rmpa, which is made]"),
+    click.option("--name", metavar="NAME", help="The module's name. [default: the one that it has had]"),
+    click.option("--user", metavar="NAME", help="The user that the units run as. [default: rmpa, which is made]"),
     flag("--dry-run", help="Change nothing; say what would be done, and print the units."),
     click.option("--root", metavar="DIR", default="", help="The folder of another system, such as an image."),
 )
@@ -168,8 +168,9 @@ def service_install(
     """Start the agent at boot, and now: by a unit of systemd, as a user of its own.
 
     The name that this machine's module has had, its keys and all that it keeps are taken over from the state
-    directory of the user who calls sudo; /etc/rmpa/rmpa.toml is made if it is missing. Nothing is overwritten but
-    the units, and a second call changes nothing.
+    directory of the user who calls sudo; /etc/rmpa/rmpa.toml is made if it is missing. Other options of rmpa up
+    are not taken over: write them into that file first. Nothing is overwritten but the units, and a second call
+    changes nothing.
 
     ---
     Where the program is in a home directory that other users cannot read, the units run as its owner.

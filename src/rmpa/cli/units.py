@@ -115,6 +115,11 @@ LimitMEMLOCK=infinity
 RestrictRealtime=no
 """
 _SETTING: Final = re.compile(r"^(?=[a-z_]+ = )", re.MULTILINE)
+_HEADING: Final = """\
+# rmpa.toml: the settings of this machine's module. To change one, remove the "# " in front of it. Where two lines
+# have one key, the first is the default and the second an example. After a change: sudo systemctl reload rmpa
+# docs/ is /usr/share/doc/rmpa/docs with the Debian package, else a folder of the repository.
+"""
 
 
 def unit_texts(program: str = PACKAGED, user: str = USER, header: str = "") -> dict[str, str]:
@@ -152,4 +157,5 @@ def realtime_text(header: str = "") -> str:
 
 def config_text() -> str:
     """A first ``rmpa.toml``: every setting with its default, each in a comment, so that later defaults hold."""
-    return _SETTING.sub("# ", (files("rmpa.config") / "rmpa.toml").read_text("utf-8"))
+    _, _, rest = (files("rmpa.config") / "rmpa.toml").read_text("utf-8").partition("\n")
+    return _HEADING + _SETTING.sub("# ", rest)
