@@ -140,7 +140,77 @@ def test_a_unit_that_was_written_by_hand_is_kept(systemd: Systemd, root: Path) -
         assert main(["service", "install", "--root", str(root)]) == 0
         assert unit.with_name("rmpa.service.by-hand").read_text() == "mine"
     assert main(["service", "uninstall", "--root", str(root)]) == 0
-    assert [path.name for path in unit.parent.iterdir()] == ["rmpa.service.by-hand"]
+    assert [path.name for path in unit.parent.iterdir()] == ["rmpa.service"]
+    assert unit.read_text() == "mine"
+    systemd.calls()
+    assert main(["service", "uninstall", "--root", str(root)]) == 0
+    assert systemd.calls() == []  # it is not ours to stop
+
+
+def test_a_masked_unit_stays_masked(
+    systemd: Systemd, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    unit, null = root / "etc/systemd/system/rmpa.service", root / "null"  # not this machine's, should the test fail
+    null.touch()
+    monkeypatch.setattr(os, "devnull", str(null))
+    unit.parent.mkdir(parents=True)
+    unit.symlink_to(null)
+    assert main(["service", "install", "--root", str(root)]) == 1
+    said = f"rmpa: /etc/systemd/system/rmpa.service: the unit is masked; systemctl --root {root} unmask rmpa\n"
+    assert (capsys.readouterr().err, systemd.calls()) == (said, [])
+
+
+def test_what_a_link_leads_to_stays_as_it_is(root: Path) -> None:
+    other, unit = root / "other", root / "etc/unit"
+    other.write_text("other")
+    other.chmod(0o600)
+    unit.symlink_to(other)
+    assert Machine(str(root), dry=False).write("/etc/unit", "text")
+    assert (other.read_text(), other.stat().st_mode & 0o777) == ("other", 0o600)
+    assert (unit.read_text(), unit.is_symlink(), unit.stat().st_mode & 0o777) == ("text", False, 0o644)
+
+
+def test_a_name_that_the_settings_outweigh_is_refused(
+    systemd: Systemd, root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = root / "etc/rmpa/rmpa.toml"
+    config.parent.mkdir()
+    config.write_text('domain = 7\nname = "base"\n')
+    assert main(["service", "install", "--name", "arm", "--root", str(root)]) == 2
+    said = f"rmpa: {config}:2: name: base outweighs --name arm; write it there, or remove the line\n"
+    assert (capsys.readouterr().err, systemd.calls()) == (said, [])
+    assert main(["service", "install", "--name", "base", "--root", str(root)]) == 0
+
+
+@pytest.mark.usefixtures("systemd")
+def test_another_name_starts_the_units_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[object] = []
+    monkeypatch.setattr(boot, "_start", lambda _, wanted, changed: started.append((wanted, changed)))
+    for name in ("base", "arm", "arm"):
+        assert main(["service", "install", "--name", name, "--root", str(root)]) == 0
+    assert started[1:] == [(["rmpa.service"], ["rmpa.service"]), (["rmpa.service"], [])]
+
+
+@pytest.mark.parametrize("sign", ["'", '"', "\\", "\t"])
+def test_a_program_that_systemd_cannot_start_is_refused(
+    systemd: Systemd, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], sign: str
+) -> None:
+    monkeypatch.setattr(boot, "own_program", lambda: f"/opt/a{sign}b/rmpa")
+    assert main(["service", "install", "--root", str(root)]) == 1
+    err = capsys.readouterr().err
+    assert err.startswith("rmpa: rmpa service install: systemd cannot start ")
+    assert (err.count("\n"), systemd.calls()) == (1, [])
+
+
+def test_purge_removes_a_state_directory_elsewhere(tmp_path: Path) -> None:
+    state, place, image = tmp_path / "data/rmpa", tmp_path / "rmpa", tmp_path / "image"
+    (state / "base").mkdir(parents=True)
+    for link in (image, place):
+        link.symlink_to(state)
+    machine.remove_folder(image, "/image")  # there it leads to another folder
+    assert (image.is_symlink(), state.is_dir()) == (False, True)
+    machine.remove_folder(place, "")
+    assert (place.is_symlink(), state.exists()) == (False, False)
 
 
 def _former(tmp_path: Path) -> Former:
@@ -176,6 +246,45 @@ def test_what_a_user_s_agent_has_kept_is_taken_over_once(tmp_path: Path, root: P
     boot._take_over(changed, before, "rmpa", "arm")
     assert changed.changes[1:] == ["keep the name arm"]
     assert (place / "module-name").read_text() == "arm\n"
+
+
+def test_links_and_pipes_are_not_taken_over(tmp_path: Path, root: Path) -> None:
+    before, secret = _former(tmp_path), tmp_path / "secret"
+    assert before.state is not None
+    secret.write_text("root's")
+    (before.state / "file").symlink_to(secret)
+    (before.state / "folder").symlink_to(tmp_path)
+    os.mkfifo(before.state / "pipe")
+    boot._take_over(Machine(str(root), dry=False), before, "rmpa", None)
+    copied = {str(path.relative_to(root / "var/lib/rmpa")) for path in (root / "var/lib/rmpa").rglob("*")}
+    assert copied == {"base", "base/trust", "base/trust/module.key", "module-name"}
+
+
+def test_a_copy_that_stops_midway_leaves_nothing(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    before = _former(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "copyfileobj", full)
+        with pytest.raises(StartError, match=r"No space left on device; nothing was copied"):
+            boot._take_over(Machine(str(root), dry=False), before, "rmpa", None)
+    assert not list((root / "var/lib").iterdir())
+    boot._take_over(Machine(str(root), dry=False), before, "rmpa", None)
+    assert (root / "var/lib/rmpa/base/trust/module.key").exists()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="root alone can give files away")
+def test_what_the_state_directory_has_already_is_not_given_away(tmp_path: Path, root: Path) -> None:
+    (root / "etc/passwd").write_text("rmpa:x:4242:4243::/:/bin/false\n")
+    (root / "etc/group").write_text("rmpa:x:4243:\n")
+    place = root / "var/lib/rmpa"
+    place.mkdir(parents=True)
+    os.chown(place, 4242, 4243)
+    (place / "base").mkdir()  # where a link of that user led a moment ago
+    boot._take_over(Machine(str(root), dry=False), _former(tmp_path), "rmpa", "arm")
+    assert (place / "base").stat().st_uid == 0
+    assert ((place / "module-name").stat().st_uid, (place / "module-name").read_text()) == (4242, "arm\n")
 
 
 def test_the_settings_of_a_user_are_taken_over_unless_there_are_some(tmp_path: Path, root: Path) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,6 +12,7 @@ from rmpa.config.module_name import (
     NAME_FILE,
     ModuleName,
     NameSource,
+    as_owner,
     choose_name,
     keep_name,
     kept_name,
@@ -20,9 +22,6 @@ from rmpa.config.module_name import (
 )
 from rmpa.config.read import load_settings
 from rmpa.core.errors import ConfigError, RmpaError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.mark.parametrize(
@@ -86,17 +85,22 @@ def test_a_pipe_in_place_of_the_name_is_not_waited_for(tmp_path: Path) -> None:
     assert not kept_name(tmp_path)
 
 
-def test_a_name_that_root_keeps_belongs_to_the_user_of_the_agent(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root writes for another user")
+def test_a_name_that_root_keeps_belongs_to_the_user_of_the_agent_wherever_links_of_that_user_lead(
+    tmp_path: Path,
 ) -> None:
-    owned: list[tuple[int, int]] = []
-    owner = tmp_path.stat().st_uid or 1000
-    os.chown(tmp_path, owner, -1)
-    group = tmp_path.stat().st_gid
-    monkeypatch.setattr(os, "geteuid", lambda: 0)
-    monkeypatch.setattr(os, "chown", lambda _, user, group: owned.append((user, group)))
-    assert keep_name(tmp_path, "arm")
-    assert owned == [(owner, group)]
+    state, other = tmp_path / "state", tmp_path / "other"
+    state.mkdir()
+    other.write_text("root's")
+    os.chown(state, 65534, 65534)
+    (state / f".{NAME_FILE}.{os.getpid()}").symlink_to(other)
+    rights = (os.geteuid(), os.getegid(), os.getgroups(), Path.cwd())
+    with as_owner(state) as here, pytest.raises(PermissionError):
+        (here / f".{NAME_FILE}.{os.getpid()}").write_bytes(b"arm")
+    assert keep_name(state, "arm")
+    assert (other.read_text(), other.stat().st_uid) == ("root's", 0)
+    assert ((state / NAME_FILE).stat().st_uid, kept_name(state)) == (65534, "arm")
+    assert (os.geteuid(), os.getegid(), os.getgroups(), Path.cwd()) == rights
 
 
 def test_a_state_directory_of_its_own_is_noted_in_the_usual_one(tmp_path: Path) -> None:

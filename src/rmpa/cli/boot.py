@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import pwd
-import shutil
+import re
 import socket
 import subprocess
 import time
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.machine import UNIT_FOLDER, Machine, check_machine, own_program
+from rmpa.cli.machine import UNIT_FOLDER, Machine, check_machine, copy_state, own_program, remove_folder
 from rmpa.cli.options import Options, flag, json_verb
 from rmpa.cli.trust import confirm
 from rmpa.cli.units import (
@@ -39,7 +39,7 @@ from rmpa.config.module_name import (
     kept_name,
     state_dir,
 )
-from rmpa.config.read import load_settings
+from rmpa.config.read import line_of, load_settings, parse_config
 from rmpa.config.settings import Settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.core.identity import peer_name_problem
@@ -51,6 +51,8 @@ if TYPE_CHECKING:
 
 # The first line of each file that ``install`` makes: ``uninstall`` removes no other.
 _MARK: Final = "# Made by `rmpa service install`; changes belong into a drop-in: systemctl edit {unit}\n"
+# Behind the name of a unit that was written by hand, and is kept beside ours.
+_BY_HAND: Final = ".by-hand"
 # What `systemctl show` is asked for.
 _PROPERTIES: Final = (
     *("LoadState", "ActiveState", "SubState", "UnitFileState", "Result", "MainPID", "NRestarts"),
@@ -195,6 +197,12 @@ def service_install(
     if packaged and user:
         raise ConfigError("--user", "the package's units have the user rmpa", "change it by: systemctl edit rmpa")
     wanted = [UNITS["up"], *([UNITS["web"]] if web else []), *([UNITS["gateway"]] if gateway else [])]
+    if re.search(r"[\x00-\x1f\x7f'\"\\]", program):
+        raise StartError("rmpa service install", f"systemd cannot start {program!r}", "install it elsewhere")
+    for unit in wanted:
+        machine.check_unmasked(unit)
+    if name:
+        _check_name(machine, before, name)
     _check_parts(machine, before, web=web, gateway=gateway)
     if user is None:
         user = USER if root or packaged else choose_user(program)
@@ -202,16 +210,37 @@ def service_install(
             machine.note(f"the units run as {user}: no other user can run {program}")
     _make_user(machine, user)
     _make_config(machine, before)
-    _take_over(machine, before, user, name)
+    renamed = _take_over(machine, before, user, name)
     # Units that were made for another program would hide the package's.
     changed = _remove_made(machine, UNITS.values()) if packaged else _write_units(machine, wanted, program, user)
     if realtime and machine.write(f"{UNIT_FOLDER}/{REALTIME_FILE}", realtime_text(_MARK.format(unit=UNITS["up"]))):
         changed.append(UNITS["up"])
+    if renamed:
+        changed.extend(wanted)
     _start(machine, wanted, changed)
     if not (dry_run or root):
         machine.note("it runs, now and at boot: `rmpa service status`; its log: journalctl -u rmpa")
     options.show({"units": wanted, "user": user, "changes": machine.changes, "dry_run": dry_run})
     return 0
+
+
+def _check_name(machine: Machine, before: Former, name: str) -> None:
+    """Check that ``--name`` says no other name than the settings, which outweigh the name that is kept.
+
+    Raises:
+        ConfigError: It does; with the line of the settings.
+    """
+    path = machine.path(CONFIG)
+    config = path if path.is_file() else before.config
+    if config is None:
+        return
+    data = config.read_bytes()
+    said = parse_config(data, config).get(("name",))
+    if said not in (None, name):
+        line = line_of(data.decode("utf-8-sig"), ("name",))
+        raise ConfigError(
+            "name", f"{said} outweighs --name {name}", "write it there, or remove the line", config, line
+        )
 
 
 def _check_parts(machine: Machine, before: Former, *, web: bool, gateway: bool) -> None:
@@ -278,25 +307,31 @@ def _make_config(machine: Machine, before: Former) -> None:
         machine.path(CONFIG).chmod(0o644)
 
 
-def _take_over(machine: Machine, before: Former, user: str, name: str | None) -> None:
-    """Give the units what the user's agent has kept, unless they have kept something themselves; and the name."""
+def _take_over(machine: Machine, before: Former, user: str, name: str | None) -> bool:
+    """Give the units what the user's agent has kept, unless they have kept something themselves; and the name.
+
+    Returns:
+        Whether the module has another name now.
+    """
     place = machine.path(STATE)
     kept = kept_name(place)
+    ids = None if machine.dry or os.geteuid() else machine.ids(user)
     if _entries(place):
         machine.note(f"{STATE} stays as it is")
     elif before.state is not None:
         kept = kept_name(before.state)
         if machine.change(f"copy what {before.user}'s agent has kept in {before.state}: {_about(before.state)}"):
-            _copy(before.state, place)
+            copy_state(before.state, place, ids)
     wanted = name or kept or before.name
-    if wanted and wanted != kept and machine.change(f"keep the name {wanted}"):
+    if not wanted or wanted == kept:
+        return False
+    if machine.change(f"keep the name {wanted}"):
+        if not place.is_dir():
+            place.mkdir(mode=0o700, parents=True)
+            if ids is not None:
+                os.chown(place, *ids)
         keep_name(place, wanted, instead=True)
-    ids = machine.ids(user)
-    if machine.dry or ids is None or os.geteuid():
-        return
-    place.mkdir(mode=0o700, parents=True, exist_ok=True)
-    for path in (place, *place.rglob("*")):
-        os.chown(path, *ids, follow_symlinks=False)
+    return True
 
 
 def _about(state: Path) -> str:
@@ -308,21 +343,12 @@ def _about(state: Path) -> str:
     return ", ".join([*([f"the name {kept}"] if kept else []), *words])
 
 
-def _copy(state: Path, place: Path) -> None:
-    place.mkdir(mode=0o700, parents=True, exist_ok=True)
-    for path in _entries(state):
-        if path.is_dir() and not path.is_symlink():
-            shutil.copytree(path, place / path.name, symlinks=True)
-        elif path.is_file():
-            shutil.copy2(path, place / path.name)
-
-
 def _write_units(machine: Machine, wanted: Sequence[str], program: str, user: str) -> list[str]:
     """Write the units; return those that are others now. One that somebody has written by hand is kept beside it."""
     texts = unit_texts(program, user)
     for unit in wanted:
         path = machine.path(f"{UNIT_FOLDER}/{unit}")
-        old = f"{unit}.by-hand"
+        old = f"{unit}{_BY_HAND}"
         if path.is_file() and not _is_made(path) and machine.change(f"rename {UNIT_FOLDER}/{unit} to {old}"):
             path.rename(path.with_name(old))
     return [unit for unit in wanted if machine.write(f"{UNIT_FOLDER}/{unit}", _MARK.format(unit=unit) + texts[unit])]
@@ -498,10 +524,15 @@ def service_uninstall(purge: bool, yes: bool, dry_run: bool, root: str, options:
         raise StartError("rmpa service uninstall", "the package has settings and state", "sudo apt purge rmpa")
     if purge and not (yes or dry_run) and not confirm(f"Remove {CONFIG} and all of {STATE}, keys too?"):
         raise ConfigError("rmpa service uninstall", "nothing was removed")
-    parts = machine.parts()
+    parts = [unit for unit in UNITS.values() if _is_installed(machine, unit)]
     if parts:
         machine.systemctl("disable", *([] if root else ["--now"]), *parts)
-    if _remove_made(machine, (*UNITS.values(), REALTIME_FILE)) and not root:
+    removed = _remove_made(machine, (*UNITS.values(), REALTIME_FILE))
+    for unit in removed:
+        old = machine.path(f"{UNIT_FOLDER}/{unit}{_BY_HAND}")
+        if old.is_file() and machine.change(f"rename {UNIT_FOLDER}/{old.name} to {unit}"):
+            old.rename(old.with_name(unit))
+    if removed and not root:
         machine.systemctl("daemon-reload")
     if purge:
         _purge(machine)
@@ -509,6 +540,12 @@ def service_uninstall(purge: bool, yes: bool, dry_run: bool, root: str, options:
         machine.note("nothing is installed")
     options.show({"units": parts, "changes": machine.changes, "dry_run": dry_run})
     return 0
+
+
+def _is_installed(machine: Machine, unit: str) -> bool:
+    """Whether a unit is one that ``install`` or a package has made, and not one that was written by hand."""
+    path = machine.path(f"{UNIT_FOLDER}/{unit}")
+    return _is_made(path) if path.is_file() else machine.has_packaged(unit)
 
 
 def _is_made(path: Path) -> bool:
@@ -538,7 +575,7 @@ def _purge(machine: Machine) -> None:
             config.parent.rmdir()
     for place in (state, machine.path(RUNTIME)):
         if place.is_dir() and machine.change(f"remove {str(place).removeprefix(machine.root)}"):
-            shutil.rmtree(place)
+            remove_folder(place, machine.root)
     below = ["--prefix", machine.root] if machine.root else []
     if machine.ids(USER) is not None:
         machine.run(f"remove the user {USER}", "userdel", *below, USER)

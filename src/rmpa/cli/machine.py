@@ -6,12 +6,15 @@ import grp
 import os
 import pwd
 import shutil
+import stat
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from rmpa.cli.units import GROUP, PACKAGED, UNITS
+from rmpa.config.module_name import PLACES_FILE
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 
 if TYPE_CHECKING:
@@ -83,8 +86,10 @@ class Machine:
             return False
         if self.change(f"write {place}"):
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text, "utf-8")
-            path.chmod(0o644)
+            temporary = path.with_name(f".{path.name}.new")  # what a link leads to stays as it is
+            temporary.write_text(text, "utf-8")
+            temporary.chmod(0o644)
+            temporary.replace(path)
         if self.dry:
             self.note("".join(f"    {line}\n" for line in text.splitlines()).rstrip("\n"))
         return True
@@ -113,12 +118,19 @@ class Machine:
     @property
     def packaged(self) -> bool:
         """Whether there are units that belong to a package."""
-        return any(self.path(f"{folder}/{UNITS['up']}").is_file() for folder in _PACKAGED_UNITS)
+        return self.has_packaged(UNITS["up"])
 
-    def parts(self) -> list[str]:
-        """The units that are installed."""
-        folders = (UNIT_FOLDER, *_PACKAGED_UNITS)
-        return [name for name in UNITS.values() if any(self.path(f"{at}/{name}").is_file() for at in folders)]
+    def has_packaged(self, unit: str) -> bool:
+        """Whether a package has brought a unit."""
+        return any(self.path(f"{folder}/{unit}").is_file() for folder in _PACKAGED_UNITS)
+
+    def check_unmasked(self, unit: str) -> None:
+        """Raise ``StartError`` if a unit is masked, so that it cannot be started."""
+        path = self.path(f"{UNIT_FOLDER}/{unit}")
+        if path.is_symlink() and str(path.readlink()) == os.devnull:
+            below = f"--root {self.root} " if self.root else ""
+            remedy = f"systemctl {below}unmask {unit.removesuffix('.service')}"
+            raise StartError(f"{UNIT_FOLDER}/{unit}", "the unit is masked", remedy)
 
 
 def check_machine(root: str, verb: str, *, dry: bool) -> None:
@@ -150,3 +162,63 @@ def own_program() -> str:
             packaged = Path(PACKAGED)
             return PACKAGED if packaged.exists() and packaged.samefile(path) else str(path.absolute())
     raise StartError("rmpa", f"there is no program rmpa in {prefix}/bin", "install it there, or use the bundle")
+
+
+def copy_state(state: Path, place: Path, ids: tuple[int, int] | None) -> None:
+    """Copy files and folders into a new folder, which no other user can reach before it takes its place.
+
+    Args:
+        state: The user's state directory. Links in it are not followed.
+        place: That of the units: missing or empty.
+        ids: User and group that it is to belong to; ``None``: it stays this user's.
+
+    Raises:
+        StartError: It cannot be copied; then nothing was.
+    """
+    place = place.resolve()  # of a link
+    new = None
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        new = Path(tempfile.mkdtemp(prefix=f".{place.name}-", dir=place.parent))
+        _copy_files(state.resolve(), new)
+        if ids is not None:
+            for path in (*new.rglob("*"), new):
+                os.chown(path, *ids)
+        new.replace(place)
+    except OSError as error:
+        if new is not None:
+            shutil.rmtree(new, ignore_errors=True)
+        raise StartError(str(place), f"{state} cannot be copied there: {error}", "nothing was copied") from None
+
+
+def _copy_files(state: Path, new: Path) -> None:
+    def fail(error: OSError) -> None:
+        raise error
+
+    for folder, folders, names, place in os.fwalk(state, onerror=fail):
+        to = new / Path(folder).relative_to(state)
+        for name in folders:
+            if stat.S_ISDIR(os.stat(name, dir_fd=place, follow_symlinks=False).st_mode):
+                (to / name).mkdir(mode=0o700)
+        for name in names:
+            if name == PLACES_FILE or not stat.S_ISREG(os.stat(name, dir_fd=place, follow_symlinks=False).st_mode):
+                continue
+            flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+            with os.fdopen(os.open(name, flags, dir_fd=place), "rb") as source, (to / name).open("xb") as copy:
+                os.fchmod(copy.fileno(), os.fstat(source.fileno()).st_mode & 0o777)
+                shutil.copyfileobj(source, copy)
+
+
+def remove_folder(place: Path, root: str) -> None:
+    """Remove a folder, and the link that leads to it: below another system's folder the link alone.
+
+    Raises:
+        StartError: It cannot be removed.
+    """
+    try:
+        if not (root and place.is_symlink()):
+            shutil.rmtree(place.resolve())
+        if place.is_symlink():
+            place.unlink()
+    except OSError as error:
+        raise StartError(str(place), f"cannot be removed: {error}") from None

@@ -24,7 +24,7 @@ from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.core.identity import peer_name_problem
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
 # What a gateway's name has behind that of its module.
 GATEWAY_SUFFIX = "_gateway"
@@ -167,6 +167,37 @@ _READ_MAX: Final = 64 * 1024
 _SYSTEM: Final = Path("/var/lib/rmpa")
 # It is there if that unit starts at boot.
 _AT_BOOT: Final = Path("/etc/systemd/system/multi-user.target.wants/rmpa.service")
+_NOGROUP: Final = 65534
+
+
+@contextlib.contextmanager
+def as_owner(directory: Path) -> Iterator[Path]:
+    """Change a state directory of another user as root with the rights of that user, wherever links lead.
+
+    The whole process has them, and works in that directory, until the block ends: for programs of one
+    thread. Nothing is to be imported in the block: the owner may not read the folder of the program.
+
+    Yields:
+        The directory's path in the block.
+    """
+    with contextlib.ExitStack() as back:
+        place = os.open(directory, os.O_PATH | os.O_DIRECTORY)
+        back.callback(os.close, place)
+        owner = os.fstat(place)
+        if os.geteuid() != 0 or owner.st_uid == 0:
+            yield directory
+            return
+        before = os.open(".", os.O_PATH | os.O_DIRECTORY)
+        back.callback(os.close, before)
+        back.callback(os.fchdir, before)
+        os.fchdir(place)  # there may be folders above that the owner cannot search, as those of an image
+        back.callback(os.setgroups, os.getgroups())
+        os.setgroups([])
+        back.callback(os.setegid, os.getegid())
+        os.setegid(owner.st_gid or _NOGROUP)
+        back.callback(os.seteuid, 0)
+        os.seteuid(owner.st_uid)
+        yield Path()
 
 
 def kept_name(directory: Path | None) -> str:
@@ -195,22 +226,21 @@ def keep_name(directory: Path, name: str, *, instead: bool = False) -> bool:
         StartError: It cannot be written.
     """
     path = directory / NAME_FILE
-    temporary = path.with_name(f".{NAME_FILE}.{os.getpid()}")
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        temporary.write_text(f"{name}\n", encoding="ascii")
-        owner = directory.stat()
-        if os.geteuid() == 0 and owner.st_uid != 0:  # the agent runs as that user, and is to read it
-            os.chown(temporary, owner.st_uid, owner.st_gid)
-        try:
-            if instead:
-                temporary.replace(path)
-            else:
-                os.link(temporary, path)  # fails where there is one already: of two first starts one is the first
-        except FileExistsError:
-            return kept_name(directory) == name
-        finally:
+        with as_owner(directory) as here:  # the agent runs as that user, and is to read it
+            temporary = here / f".{NAME_FILE}.{os.getpid()}"
             temporary.unlink(missing_ok=True)
+            temporary.write_bytes(f"{name}\n".encode())
+            try:
+                if instead:
+                    temporary.replace(here / NAME_FILE)
+                else:
+                    os.link(temporary, here / NAME_FILE)  # fails where there is one: of two first starts one is first
+            except FileExistsError:
+                return kept_name(here) == name
+            finally:
+                temporary.unlink(missing_ok=True)
     except OSError as error:
         raise StartError(str(path), f"cannot be written: {error.strerror}", "say --name at each start") from None
     return True

@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from rmpa.config.module_name import GATEWAY_SUFFIX, module_dir, other_state_dirs
+from rmpa.config.module_name import GATEWAY_SUFFIX, as_owner, module_dir, other_state_dirs
 from rmpa.core.errors import StartError
 from rmpa.trust import limits
 from rmpa.trust.tokens import Invitation, TokenBook
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
     from rmpa.config.settings import TrustSettings
@@ -210,8 +210,8 @@ class TrustStore:
 
     def forget(self, name: str) -> None:
         """Remove a file that is not needed any more, if it is there."""
-        with contextlib.suppress(OSError):
-            self.path(name).unlink()
+        with contextlib.suppress(OSError), self._as_owner() as folder:
+            (folder / name).unlink()
 
     def write(self, name: str, data: bytes) -> None:
         """Write one file atomically, for this user alone.
@@ -219,25 +219,13 @@ class TrustStore:
         Raises:
             StartError: It cannot be written.
         """
-        path = self.path(name)
-        temporary = path.with_name(f".{name}.{os.getpid()}")
         try:
-            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            self.folder.chmod(0o700)
-            self._give_to_owner(self.folder.parent, self.folder)
-            with contextlib.suppress(FileNotFoundError):
-                temporary.unlink()  # of a run that was killed, with this process id
-            with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _OPEN, 0o600), "wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            self._give_to_owner(temporary)
-            temporary.replace(path)
-            _sync_folder(self.folder)
+            self.folder.parents[1].mkdir(parents=True, exist_ok=True)
+            with self._as_owner() as folder:
+                _write(folder, name, data)
         except OSError as error:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
-            raise StartError(str(path), f"cannot be written: {error.strerror}", "is the disk full?") from None
+            remedy = _USER if isinstance(error, PermissionError) else "is the disk full?"
+            raise StartError(str(self.path(name)), f"cannot be written: {error.strerror}", remedy) from None
 
     def remove(self) -> list[str]:
         """Leave the mesh: remove all files; return the names of those that were there.
@@ -246,21 +234,24 @@ class TrustStore:
             StartError: One cannot be removed.
         """
         removed = [name for name in _ALL if _is_there(self.path(name))]
-        for name in removed:
-            try:
-                self.path(name).unlink()
-            except OSError as error:
-                raise StartError(str(self.path(name)), f"cannot be removed: {error.strerror}") from None
-        with contextlib.suppress(OSError):
-            self.folder.rmdir()
+        if not is_folder(self.folder):
+            return removed
+        with self._as_owner() as folder:
+            for name in removed:
+                try:
+                    (folder / name).unlink()
+                except OSError as error:
+                    raise StartError(str(self.path(name)), f"cannot be removed: {error.strerror}") from None
+            with contextlib.suppress(OSError):
+                folder.rmdir()
         return removed
 
-    def _give_to_owner(self, *paths: Path) -> None:
-        """As root, let what was written belong to the owner of the state directory: the agent runs as that user."""
-        owner = self.folder.parents[1].stat()
-        if os.geteuid() == 0 and owner.st_uid != 0:
-            for path in paths:
-                os.chown(path, owner.st_uid, owner.st_gid)
+    @contextlib.contextmanager
+    def _as_owner(self) -> Iterator[Path]:
+        """Change files with the rights of the owner of the state directory: the agent runs as that user."""
+        state = self.folder.parents[1]
+        with as_owner(state) as here:
+            yield here / self.folder.relative_to(state)
 
     def _read(self, name: str, remedy: str = _JOIN) -> bytes:
         path = self.path(name)
@@ -359,6 +350,25 @@ def _exposed(info: os.stat_result, owners: set[int]) -> str:
     if info.st_mode & 0o077:
         return f"can be read by others (mode {stat.S_IMODE(info.st_mode):o})"
     return ""
+
+
+def _write(folder: Path, name: str, data: bytes) -> None:
+    temporary = folder / f".{name}.{os.getpid()}"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.chmod(0o700)
+        with contextlib.suppress(FileNotFoundError):
+            temporary.unlink()  # of a run that was killed, with this process id
+        with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _OPEN, 0o600), "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(folder / name)
+        _sync_folder(folder)
+    except OSError:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
 
 
 def _sync_folder(folder: Path) -> None:

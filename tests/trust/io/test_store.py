@@ -199,3 +199,21 @@ def test_what_root_writes_belongs_to_the_owner_of_the_state_directory(tmp_path: 
     os.chown(trust.path(store.KEY), 1234, 1234)
     with pytest.raises(StartError, match="belongs to user 1234"):
         trust.load()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root writes for another user")
+def test_a_link_of_the_owner_leads_root_to_nothing_of_others(tmp_path: Path) -> None:
+    state, other = tmp_path / "state", tmp_path / "other"
+    state.mkdir()
+    (other / store.FOLDER).mkdir(parents=True)
+    (other / store.FOLDER / store.CA).write_text("root's")
+    before = [(path, path.stat()) for path in (other, other / store.FOLDER, other / store.FOLDER / store.CA)]
+    os.chown(state, 4321, 4321)
+    (state / "arm").symlink_to(other)
+    trust = TrustStore(state, "arm")
+    with pytest.raises(StartError, match=r"cannot be written: .*; run it as the user of the agent"):
+        trust.save(FILES)
+    with pytest.raises(StartError, match="cannot be removed"):
+        trust.remove()
+    trust.forget(store.CA)
+    assert [(path, path.stat()) for path, _ in before] == before
