@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import signal
 import subprocess
 import tempfile
 from pathlib import Path
@@ -82,6 +83,31 @@ def test_agents_of_roslaunch_beside_a_roscore_and_in_its_place_are_a_mesh(users:
     end(beside, a)
     end(in_place, b)
     assert "- publisher /chatter of /talker" in in_place.output, "nodes that end still have their core"
+
+
+def test_in_roscores_place_no_agent_starts_where_a_core_answers(shell: ShellFactory) -> None:
+    ros = shell()
+    ros.master()
+    launch = ros.start(PACKAGE / "scripts/launch", "--program=/nowhere", "bringup.launch")
+    assert launch.wait() == 1
+    assert len(launch.lines) == 1
+    assert f"a core answers at {ros.uri} already: use it by plain roslaunch" in launch.output
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_launch_that_is_ended_before_its_core_answers_ends_its_agent(
+    shell: ShellFactory, tmp_path: Path, number: signal.Signals
+) -> None:
+    program = tmp_path / "rmpa"
+    program.write_text(
+        "#!/bin/sh\ntrap 'echo ended; exit' TERM\necho started\nwhile kill -0 $PPID 2>/dev/null; do sleep 0.1; done\n"
+    )
+    program.chmod(0o755)
+    launch = shell().start(PACKAGE / "scripts/launch", f"--program={tmp_path}", "bringup.launch")
+    launch.wait_for("started")
+    launch.send(number)
+    assert launch.wait() == 128 + number
+    assert launch.lines == ["started", "ended"]
 
 
 def test_arguments_of_roslaunch_and_empty_ones_of_a_launch_file_are_left_out(tmp_path: Path) -> None:

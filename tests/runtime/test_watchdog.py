@@ -35,6 +35,20 @@ def hang():
 asyncio.run(main())
 """
 
+# It has no descriptor left after the first sign of life.
+_OUT_OF_DESCRIPTORS = """
+import asyncio, resource
+from rmpa.runtime.process import feed_watchdog
+
+async def main():
+    feed_watchdog(asyncio.get_running_loop())
+    resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
+    print("fed", flush=True)
+    await asyncio.Event().wait()
+
+asyncio.run(main())
+"""
+
 
 @pytest.mark.parametrize(
     ("environ", "period"),
@@ -93,3 +107,27 @@ def test_a_loop_that_hangs_sends_nothing_and_the_log_says_where_it_hung(tmp_path
                 assert process.wait() == -signal.SIGABRT
             finally:
                 process.kill()
+
+
+def test_a_sign_of_life_that_failed_is_sent_soon_also_without_a_free_descriptor(tmp_path: Path) -> None:
+    with (
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as others,
+    ):
+        manager.bind(str(tmp_path / "notify"))
+        with contextlib.suppress(BlockingIOError):  # until its queue is full
+            while others.sendto(b"READY=1", socket.MSG_DONTWAIT, str(tmp_path / "notify")):
+                pass
+        environ = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "120000000"}
+        program = [sys.executable, "-c", _OUT_OF_DESCRIPTORS]
+        with subprocess.Popen(program, env=environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+            try:
+                assert process.stdout is not None
+                assert process.stdout.readline() == b"fed\n"
+                manager.settimeout(30)  # half of what the next regular one takes
+                while manager.recv(64) == b"READY=1":
+                    pass
+            finally:
+                process.kill()
+            assert process.stderr is not None
+            assert process.stderr.read().count(b"cannot be told WATCHDOG=1") == 1

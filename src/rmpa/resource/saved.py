@@ -24,6 +24,7 @@ from rmpa.resource.adaptation import CoolDown
 from rmpa.resource.quality import parse_requirement
 from rmpa.resource.runtime import RuntimePart
 from rmpa.runtime.accept import in_thread
+from rmpa.runtime.files import set_aside
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -412,8 +413,7 @@ class Persistence(RuntimePart):
             return SavedState()
         except (msgspec.DecodeError, RecursionError) as error:
             what, why = "damaged", f"is damaged ({error})"
-        aside = self._path.with_name(f"{self._path.name}.{what}")
-        self._path.replace(aside)
+        aside = set_aside(self._path, what)
         _log.warning("! %s %s; it is set aside as %s and begun anew", self._path, why, aside.name)
         return SavedState()
 

@@ -205,30 +205,36 @@ def _lock_memory() -> str:
 
 # What systemd sets for the process that it starts, and that means no child of it.
 SERVICE_VARIABLES: Final = ("NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC")
+# Seconds after which a sign of life that could not be sent is tried again.
+_WATCHDOG_RETRY: Final = 1.0
+_CANNOT_TELL: Final = "the service manager at NOTIFY_SOCKET=%s cannot be told %s: %s"
 
 
-def notify_service_manager(state: str, flags: int = 0) -> bool:
+def notify_service_manager(state: str) -> bool:
     """Send ``READY=1``, ``STOPPING=1`` or ``STATUS=…``; a failure is logged and never fatal.
-
-    Args:
-        state: The text.
-        flags: Of send(2).
 
     Returns:
         Whether it was sent.
     """
-    address = os.environ.get("NOTIFY_SOCKET", "")
+    address = _notify_address()
     if not address:
         return False
-    if address.startswith("@"):
-        address = "\0" + address[1:]
     try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sock:
-            sock.sendto(state.encode(), flags, address)
+        with _notify_socket() as sock:
+            sock.sendto(state.encode(), address)
     except OSError as error:
-        _log.warning("the service manager at NOTIFY_SOCKET=%s cannot be told %s: %s", address, state, error)
+        _log.warning(_CANNOT_TELL, address, state, error)
         return False
     return True
+
+
+def _notify_address() -> str:
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    return "\0" + address[1:] if address.startswith("@") else address
+
+
+def _notify_socket() -> socket.socket:
+    return socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
 
 
 def watchdog_period(environ: Mapping[str, str]) -> float | None:
@@ -244,14 +250,26 @@ def feed_watchdog(loop: AbstractEventLoop) -> None:
 
     A loop that hangs sends none, and systemd ends the process by SIGABRT; where it hung is then in the log.
     """
-    period = watchdog_period(os.environ)
-    if period is None:
+    period, address = watchdog_period(os.environ), _notify_address()
+    if period is None or not address:
         return
     faulthandler.enable()
+    sock: socket.socket | None = None
+    failed = False
 
     def feed() -> None:
-        # A service manager that does not read must not stop the loop.
-        notify_service_manager("WATCHDOG=1", socket.MSG_DONTWAIT)
-        loop.call_later(period, feed)
+        nonlocal sock, failed
+        try:
+            # One socket for all: later there may be no descriptor left.
+            sock = sock or _notify_socket()
+            # A service manager that does not read must not stop the loop.
+            sock.sendto(b"WATCHDOG=1", socket.MSG_DONTWAIT, address)
+        except OSError as error:
+            if not failed:
+                _log.warning(_CANNOT_TELL, address, "WATCHDOG=1", error)
+            failed = True
+        else:
+            failed = False
+        loop.call_later(min(period, _WATCHDOG_RETRY) if failed else period, feed)
 
     feed()

@@ -493,6 +493,12 @@ async def test_a_file_that_cannot_be_read_is_set_aside(
     assert path.with_name("core.state.before").read_bytes() == data
     async with running(path) as core:
         assert core.call("hasParam", "/x", "/c").value is True
+    path.write_bytes(b"another")
+    async with running(path) as core:
+        core.call("setParam", "/x", "/c", 1)
+    assert "is set aside as core.state.before-2" in caplog.text
+    assert path.with_name("core.state.before").read_bytes() == data
+    assert path.with_name("core.state.before-2").read_bytes() == b"another"
 
 
 async def test_a_larger_file_than_a_core_writes_is_not_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

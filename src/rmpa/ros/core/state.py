@@ -28,6 +28,7 @@ from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import Name, NodeRecord  # noqa: TC001 - msgspec reads the annotations
 from rmpa.ros.wire.xmlrpc import RosFault, serialize_response
 from rmpa.runtime.accept import in_thread
+from rmpa.runtime.files import set_aside
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
@@ -171,7 +172,7 @@ class CoreState:
         self._up = self._gone = self._params = 0
         self._dropped = ""
         self._asking: set[asyncio.Task[None]] = set()
-        # Whether there is a file that could not be read: it is renamed before another one is written.
+        # Whether there is a file that could not be read: it is set aside before another one is written.
         self._unread = False
         self._problem = ""
         self._written: tuple[int, object] = (-1, None)
@@ -191,9 +192,9 @@ class CoreState:
             return
         except (OSError, ValueError) as error:
             self._unread = True
-            why, aside = self._reason(error), self._aside.name
+            why = self._reason(error)
             self._problem = why if isinstance(error, OSError) else ""
-            _log.warning("! the core begins empty: %s; before it is written anew, it is renamed to %s", why, aside)
+            _log.warning("! the core begins empty: %s; before it is written anew, it is set aside", why)
             return
         if self._keep == "never":
             self._drop(state, "core.keep is never")
@@ -391,7 +392,7 @@ class CoreState:
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if self._unread:
             with contextlib.suppress(FileNotFoundError):
-                self.path.replace(self._aside)
+                _log.warning("! %s is set aside as %s", self.path, set_aside(self.path, "before").name)
             self._unread = False
         new = self.path.with_name(f"{self.path.name}.new")
         with open(new, "wb", opener=lambda path, flags: os.open(path, flags, 0o600)) as file:
@@ -400,10 +401,6 @@ class CoreState:
             os.fsync(file.fileno())
         new.replace(self.path)
         self._digest = hash(data)
-
-    @property
-    def _aside(self) -> Path:
-        return self.path.with_name(f"{self.path.name}.before")
 
     def _reason(self, error: Exception) -> str:
         match error:
