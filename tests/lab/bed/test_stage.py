@@ -65,7 +65,7 @@ def _children() -> set[int]:
 
 @of_both_kinds
 def test_messages_flow_and_nothing_is_left_behind(kind: Kind) -> None:
-    before = _children()
+    before, namespaces = _children(), _namespaces()  # beds of other tests may stand yet
     with _system(kind) as (stage, robot):
         assert robot.kind == kind
         assert robot.hosts == tuple(HOSTS)
@@ -79,7 +79,7 @@ def test_messages_flow_and_nothing_is_left_behind(kind: Kind) -> None:
         scratch = stage.scratch
     assert not scratch.exists()
     assert not _children() - before
-    assert f"-{os.getpid()}-" not in _namespaces()
+    assert not _namespaces() - namespaces
 
 
 def test_direct_is_from_node_to_node_and_relayed_is_not() -> None:
@@ -214,7 +214,9 @@ def _connections(robot: System, address: str) -> set[str]:
     return {" ".join(line.split()[2:4]) for line in shown.splitlines()}
 
 
-def _namespaces() -> str:
+def _namespaces() -> set[str]:
+    """Those that this process has made."""
     if namespaces.why_not():
-        return ""
-    return subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=True).stdout
+        return set()
+    listed = subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=True).stdout
+    return {line for line in listed.splitlines() if f"-{os.getpid()}-" in line}
