@@ -201,9 +201,9 @@ def service_install(
         raise StartError("rmpa service install", f"systemd cannot start {program!r}", "install it elsewhere")
     for unit in wanted:
         machine.check_unmasked(unit)
+    _check_parts(machine, before, web=web, gateway=gateway)  # reads the settings: below they are sound
     if name:
         _check_name(machine, before, name)
-    _check_parts(machine, before, web=web, gateway=gateway)
     if user is None:
         user = USER if root or packaged else choose_user(program)
         if user != USER:
