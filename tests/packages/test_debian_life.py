@@ -135,3 +135,19 @@ def test_it_lives_from_installation_to_purge(machines: tuple[Machine, Machine], 
     assert files(robot) - before == set()
     assert "rmpa" not in robot.run("getent", "passwd") + robot.run("getent", "group")
     assert robot.run("find", "/run", "/var/lib", "/etc", "-xdev", "-name", "*rmpa*") == ""
+
+
+def test_the_service_of_a_bundle_outlives_the_package(machines: tuple[Machine, Machine]) -> None:
+    robot, _ = machines
+    given = package()
+    assert given is not None
+    dpkg(robot, "-i", robot.put(given))
+    unit = robot.root / "etc/systemd/system/rmpa.service"
+    unit.write_text("[Service]\nExecStart=/bin/sleep infinity\nUser=rmpa\nStateDirectory=rmpa\n")
+    robot.run("systemctl", "daemon-reload")
+    robot.run("systemctl", "start", "rmpa")
+    robot.run("sh", "-c", "echo '# mine' >>/etc/rmpa/rmpa.toml")
+    assert "is not the package's" in dpkg(robot, "-P", "rmpa")
+    assert state(robot, "ActiveState") == "active"
+    assert robot.run("tail", "-n", "1", "/etc/rmpa/rmpa.toml").strip() == "# mine"
+    assert robot.run("stat", "-c", "%U", "/var/lib/rmpa").strip() == "rmpa"

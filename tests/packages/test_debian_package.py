@@ -18,6 +18,7 @@ from rmpa.cli.units import UNITS
 from rmpa.config.settings import SETTINGS
 from tests.packages import ways
 
+SCRIPTS: Final = ("preinst", "postinst", "prerm", "postrm")
 BUILD: Final = Path(__file__).parents[2] / "packaging/debian/build"
 pytestmark = pytest.mark.skipif(not shutil.which("dpkg-deb"), reason="there is no dpkg-deb")
 
@@ -117,7 +118,136 @@ def test_shells_find_the_completion(tree: Path) -> None:
 
 @pytest.mark.skipif(not shutil.which("shellcheck"), reason="there is no shellcheck")
 def test_shellcheck_finds_nothing_in_the_maintainer_scripts(tree: Path) -> None:
-    run("shellcheck", *(tree / "DEBIAN" / name for name in ("postinst", "prerm", "postrm")))
+    run("shellcheck", *(tree / "DEBIAN" / name for name in SCRIPTS))
+
+
+class System:
+    """A system in a folder, for maintainer scripts, with stubs of the programs that they call.
+
+    Args:
+        root: The folder.
+        tree: The files of the package.
+    """
+
+    def __init__(self, root: Path, tree: Path) -> None:
+        self.root, self.tree = root, tree
+        self.put("run/systemd/system/is", "")
+        for name in ("addgroup", "adduser", "deb-systemd-invoke", "groupdel", "install", "systemctl", "userdel"):
+            self.stub(f"stubs/{name}")
+        self.stub("stubs/getent", f"cat {root}/etc/$1")
+        self.accounts()
+
+    def put(self, name: str, text: str) -> Path:
+        path = self.root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        return path
+
+    def stub(self, name: str, does: str = "") -> None:
+        """A program that writes down how it was called."""
+        log = f'echo "${{0##*/}} $*" >>{self.root}/log\n' if not does else ""
+        self.put(name, f"#!/bin/sh\n{log}{does}\n").chmod(0o755)
+
+    def accounts(self, uid: int = 105, home: str = "/var/lib/rmpa") -> None:
+        """Give it the user and the group rmpa."""
+        self.put("etc/passwd", f"rmpa:x:{uid}:{uid}::{self.root}{home}:/bin/sh\n")
+        self.put("etc/group", f"rmpa:x:{uid}:\n")
+
+    def run(self, script: str, *words: str, status: int = 0) -> tuple[list[str], str]:
+        """Run a maintainer script; return the programs that it has called, and its errors."""
+        text = re.sub(
+            r"(?<![\w.])/(?=(etc|run|usr|var)/)", f"{self.root}/", (self.tree / "DEBIAN" / script).read_text()
+        )
+        (self.root / "log").write_text("")
+        path = {"PATH": f"{self.root}/stubs:{os.environ['PATH']}"}
+        done = subprocess.run(
+            ["sh", "-c", text, script, *words], env=path, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == status, done.stderr
+        return (self.root / "log").read_text().replace(str(self.root), "").splitlines(), done.stderr
+
+
+@pytest.fixture
+def system(tmp_path: Path, tree: Path) -> System:
+    return System(tmp_path, tree)
+
+
+BUNDLES: Final = "[Service]\nExecStart=/opt/rmpa/rmpa up --config /etc/rmpa/rmpa.toml\n"
+
+
+def test_the_service_of_a_bundle_outlives_removal_and_purge(system: System) -> None:
+    system.put("etc/systemd/system/rmpa.service", BUNDLES)
+    settings, state = system.put("etc/rmpa/rmpa.toml", "mine"), system.put("var/lib/rmpa/module-name", "robot")
+    drop_in = system.put("etc/systemd/system/rmpa.service.d/mine.conf", "")
+    called, _ = system.run("prerm", "remove")
+    assert "deb-systemd-invoke stop rmpa-web.service" in called
+    assert not [call for call in called if "rmpa.service" in call]
+    system.run("postrm", "remove")
+    settings.unlink()  # as dpkg does before it calls purge
+    called, said = system.run("postrm", "purge")
+    assert said.count("\n") == 1
+    assert "/etc/systemd/system/rmpa.service is not the package's" in said
+    assert (settings.read_text(), state.read_text(), drop_in.exists()) == ("mine", "robot", True)
+    assert list(settings.parent.iterdir()) == [settings]
+    assert called == ["systemctl --system daemon-reload"]
+
+
+def test_the_packages_own_service_goes_though_its_unit_was_edited(system: System) -> None:
+    unit = system.put("etc/systemd/system/rmpa.service", "ExecStart=/usr/bin/rmpa up\n")
+    unit.write_text(f"ExecStart={system.root}/usr/bin/rmpa up\n")
+    system.put("etc/rmpa/rmpa.toml", "mine")
+    called, _ = system.run("prerm", "remove")
+    assert {"deb-systemd-invoke stop rmpa.service", "systemctl --quiet disable rmpa.service"} <= set(called)
+    system.run("postrm", "remove")
+    called, said = system.run("postrm", "purge")
+    assert not (system.root / "etc/rmpa").exists()
+    assert (called[:2], said) == (["userdel rmpa", "groupdel rmpa"], "")
+
+
+def test_purge_removes_state_behind_a_link(system: System) -> None:
+    kept = system.put("data/rmpa/module-name", "robot").parent
+    link = system.root / "var/lib/rmpa"
+    link.parent.mkdir(parents=True)
+    link.symlink_to(kept)
+    system.run("postrm", "purge")
+    assert not link.is_symlink()
+    assert not kept.exists()
+
+
+@pytest.mark.parametrize(("uid", "home"), [(1000, "/var/lib/rmpa"), (105, "/home/rmpa")])
+def test_purge_leaves_an_account_that_is_not_the_packages(system: System, uid: int, home: str) -> None:
+    system.accounts(uid, home)
+    called, _ = system.run("postrm", "purge")
+    assert not {"userdel rmpa", "groupdel rmpa"} & set(called)
+
+
+def test_a_user_that_cannot_be_removed_does_not_fail_the_purge(system: System) -> None:
+    for name in ("userdel", "groupdel"):
+        system.stub(f"stubs/{name}", "exit 8")
+    assert "sudo userdel rmpa" in system.run("postrm", "purge")[1]
+
+
+def test_a_login_account_of_its_name_is_told_before_anything_is_unpacked(system: System) -> None:
+    system.run("preinst", "install")
+    system.accounts(1000, "/home/rmpa")
+    said = system.run("preinst", "install", status=1)[1]
+    assert "usermod --login NEW rmpa" in said
+    assert said.count("\n") == 1
+    system.put("etc/passwd", "")
+    assert "groupmod" in system.run("preinst", "install", status=1)[1]
+    system.put("etc/group", "")
+    system.run("preinst", "install")
+
+
+def test_an_upgrade_asks_its_own_program_and_leaves_the_state_to_its_owner(system: System) -> None:
+    system.stub("stubs/rmpa", "exit 1")  # a pip's, in /usr/local/bin
+    system.stub("usr/bin/rmpa")
+    made = "install -d -o rmpa -g rmpa -m 0700 /var/lib/rmpa"
+    called, _ = system.run("postinst", "configure", "1.0")
+    assert {made, "rmpa config show --config /etc/rmpa/rmpa.toml"} <= set(called)
+    assert "deb-systemd-invoke try-restart rmpa.service" in called
+    system.put("var/lib/rmpa/module-name", "robot")
+    assert made not in system.run("postinst", "configure", "1.0")[0]
 
 
 @pytest.mark.packages

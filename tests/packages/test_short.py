@@ -6,15 +6,18 @@ Its interpreter is the system's own, and it is hardly compressed; ``make test-pa
 from __future__ import annotations
 
 import platform
+import shutil
+import subprocess
 from typing import TYPE_CHECKING
 
 import pytest
 
 from lab.bed.agents import Agent
 from lab.bed.namespaces import Lab
+from lab.bed.processes import BedError
 from tests.interop.modules import whole
 from tests.interop.ros import Ros
-from tests.packages.machines import Machine
+from tests.packages.machines import Machine, chroot
 from tests.packages.ways import DIST, USER, install_package, purge
 
 if TYPE_CHECKING:
@@ -23,12 +26,30 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.packages, pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(600)]
 
 
+def why_not() -> str:
+    """Why the short form cannot be built here, or an empty string."""
+    if platform.freedesktop_os_release()["ID"] != "debian":
+        return "the short form needs Debian: its interpreter is the system's"
+    if not shutil.which("dpkg-deb"):
+        return "there is no dpkg-deb"
+    new = ["/usr/bin/python3", "-c", "import sys; sys.exit(sys.version_info < (3, 11))"]
+    if not shutil.which(new[0]) or subprocess.run(new, check=False).returncode:
+        return "the short form needs a /usr/bin/python3 of 3.11 or later: its interpreter is the system's"
+    return ""
+
+
 def test_a_new_machine_gets_the_package_and_hears_a_clone(tmp_path: Path) -> None:
-    release = platform.freedesktop_os_release()
-    if release["ID"] != "debian":
-        pytest.skip("the short form needs Debian: its interpreter is the system's")
-    package = next((DIST / "short").glob("*.deb"))
-    with Lab() as lab, Machine(lab.host("robot", 0), release["VERSION_CODENAME"], kind="rospy") as robot:
+    if reason := why_not():
+        pytest.skip(reason)
+    suite = platform.freedesktop_os_release()["VERSION_CODENAME"]
+    arch = subprocess.check_output(["dpkg", "--print-architecture"], text=True).strip()
+    try:
+        chroot(suite, arch, "rospy")
+    except BedError as error:
+        pytest.skip(str(error))
+    package = next((DIST / "short").glob(f"*_{arch}.deb"), None)
+    assert package is not None, "make short-package has made none"
+    with Lab() as lab, Machine(lab.host("robot", 0), suite, arch, "rospy") as robot:
         desk = lab.host("desk", 0)
         with Agent(desk, tmp_path, name="desk") as agent, Ros(desk, tmp_path) as ros:
             agent.start()

@@ -86,6 +86,24 @@ def test_the_tag_of_a_clean_tree_is_the_version(tree: Path, git: Callable[..., s
 
 
 @pytest.mark.git
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+def test_a_clone_of_another_user_is_asked_by_an_old_git_too(
+    tree: Path, git: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = tmp_path / "bin/git"
+    old.parent.mkdir()
+    old.write_text(
+        f'#!/bin/sh\nshift; at=$1; shift; [ "$1" != -c ] || shift 2; exec {shutil.which("git")} -C "$at" "$@"'
+    )
+    old.chmod(0o755)
+    monkeypatch.setitem(ENVIRONMENT, "PATH", f"{old.parent}:{os.environ['PATH']}")
+    for path in (tree, *tree.rglob("*")):
+        os.chown(path, 65534, 65534)
+    assert version(tree) == "0.2.0.dev1"
+    assert int(version(tree, "--epoch")) > 10**9
+
+
+@pytest.mark.git
 def test_a_shallow_clone_has_no_count(tree: Path, git: Callable[..., str]) -> None:
     git("commit", "-qm", "two", "--allow-empty")
     run("git", "clone", "-q", "--depth=1", tree.as_uri(), "shallow", folder=tree.parent)
