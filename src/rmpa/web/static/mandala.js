@@ -191,6 +191,7 @@ function useQuery(text) {
   useEffect(() => {
     const change = () => set(query.matches);
     query.addEventListener("change", change);
+    change(); // it may have changed between the drawing and this effect
     return () => query.removeEventListener("change", change);
   }, []);
   return matches;
