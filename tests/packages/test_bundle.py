@@ -87,6 +87,8 @@ def pip_environ(environ: dict[str, str], tmp_path: Path) -> dict[str, str]:
     """The same without what Python itself heeds before any module of ours."""
     for name in (*AT_START, "rmpa"):
         (tmp_path / f"poison/{name}.py").unlink()
+    for library in (tmp_path / "libraries").iterdir():  # heeded by the loader of the system's Python
+        library.unlink()
     return environ | {"PYTHONHOME": "", "PYTHONNOUSERSITE": "1"}
 
 
