@@ -344,7 +344,7 @@ def _about(state: Path) -> str:
 
 
 def _write_units(machine: Machine, wanted: Sequence[str], program: str, user: str) -> list[str]:
-    """Write the units; return those that are others now. One that somebody has written by hand is kept beside it."""
+    """Write the units; return those whose text has changed. One that was written by hand is renamed, not replaced."""
     texts = unit_texts(program, user)
     for unit in wanted:
         path = machine.path(f"{UNIT_FOLDER}/{unit}")
