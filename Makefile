@@ -94,7 +94,7 @@ types: $(STAMP)  ## mypy, strict
 imports: $(STAMP)  ## the rooms import one way only; pure rooms stay pure
 	$(BIN)/lint-imports
 
-reference: $(STAMP)  ## write docs/settings.md, docs/rmpa.schema.json and the figures of docs/limits.md from the code
+reference: $(STAMP)  ## write docs/reference/settings.md, docs/rmpa.schema.json and the figures of docs/reference/limits.md from the code
 	$(BIN)/python scripts/write-reference
 
 fuzz: $(STAMP)  ## every fuzz target for longer: make fuzz [SECONDS=60]
@@ -113,7 +113,7 @@ bench: $(STAMP) ros  ## the measurements, as ratios in one run; results in lab/r
 	-$(BIN)/pip install -q -c constraints.txt -e '.[web-peers,zenoh-peers]'  # a peer that cannot be installed is left out
 	$(BIN)/python -m lab bench $(ARGS)
 
-experiment: $(STAMP) ros  ## classic ROS beside RMPA, with a report: make experiment [ARGS="--short"]; docs/experiments.md
+experiment: $(STAMP) ros  ## classic ROS beside RMPA, with a report: make experiment [ARGS="--short"]; docs/compare/experiments.md
 	$(BIN)/python -m lab experiment run $(ARGS)
 
 wheel: $(STAMP)  ## build sdist and wheel into dist/ and check them

@@ -12,7 +12,7 @@ from setuptools.command.sdist import sdist
 if sys.version_info < (3, 11):  # noqa: UP036 - pip runs this file before it looks at requires-python
     sys.exit(
         f"rmpa needs Python 3.11 or later, and this is {sys.version.split()[0]}: take another (python3.12 -m pip) "
-        "or RMPA's bundle or Debian package, which bring one: docs/install.md"
+        "or RMPA's bundle or Debian package, which bring one: docs/start/install.md"
     )
 ROOT = Path(__file__).resolve().parent
 VERSION = runpy.run_path(str(ROOT / "scripts/version"))

@@ -134,7 +134,7 @@ def run(
     """Measure classic ROS and RMPA side by side, and write the report.
 
     Both systems take turns, cell by cell, with the same nodes on the same hosts. Raw samples, a manifest and the
-    report are in one directory (docs/experiments.md).
+    report are in one directory (docs/compare/experiments.md).
     """
     from lab.bed import namespaces
     from lab.bed.stage import make_stage, why_not

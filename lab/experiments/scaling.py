@@ -89,7 +89,7 @@ agents and RMPA direct, from node to node, in turns:
 
 Larger meshes are simulated with the agents' real protocol machines, up to 256 modules. With 256 and seed 1, 1 % of
 the packets lost and all started within a second, all know all topics after 1.8 s; one that is killed is known to all
-after 17 s, a third killed at once too (times of the simulated clock). `docs/networks.md`, *How many
+after 17 s, a third killed at once too (times of the simulated clock). `docs/guides/networks.md`, *How many
 modules*, has the other sizes and what was not measured.
 """
 

@@ -1,7 +1,7 @@
 """Manual pages from the declarations of the commands and settings: ``pages()`` gives their text by file name.
 
 ``rmpa(1)`` is the overview; a family of commands (``rmpa topic ...``) has one page, a command outside of families its
-own; ``rmpa.toml(5)`` has every setting. The words are those of ``--help`` and docs/settings.md.
+own; ``rmpa.toml(5)`` has every setting. The words are those of ``--help`` and docs/reference/settings.md.
 """
 
 import datetime as dt

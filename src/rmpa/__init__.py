@@ -3,7 +3,7 @@
 import sys
 
 if sys.version_info < (3, 11):  # noqa: UP036 - a clone on the PYTHONPATH of an older one; 2.7 can read this file too
-    _text = "rmpa needs Python 3.11 or later, and {} is {}; its bundle and Debian package bring one: docs/install.md"
+    _text = "rmpa needs Python 3.11 or later, and {} is {}; bundle and Debian package have one: docs/start/install.md"
     # A program says one line; an import fails as any other.
     _error = SystemExit if sys.argv[:1] == ["-m"] else ImportError
     raise _error(_text.format(sys.executable, sys.version.split()[0]))

@@ -185,10 +185,10 @@ def test_a_contract_that_no_rule_can_make_is_refused(contract: object) -> None:
         read_ask(WANT._asdict() | {"contract": contract})
 
 
-# docs/contracts.md lists every condition of direct transport, by the word that the commands show.
+# docs/guides/contracts.md lists every condition of direct transport, by the word that the commands show.
 
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "contracts.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "guides" / "contracts.md"
 
 
 def _first_column(section: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""Every handler of messages from outside declares which permissions it asks; docs/security.md lists all of them."""
+"""Each handler of messages from outside declares its permissions; docs/reference/security.md lists them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.policy import Needs
 
 SOURCE: Final = Path(rmpa.__file__).parent
-PAGE: Final = Path(__file__).parents[2] / "docs" / "security.md"
+PAGE: Final = Path(__file__).parents[2] / "docs" / "reference" / "security.md"
 BEGIN: Final = "<!-- The table is compared with the code by tests/bridge/test_permission_table.py. -->\n"
 KINDS: Final = {"on_request": "request", "on_notification": "notification", "queryable": "query"}
 """The methods at which handlers are registered: of ``PeerRpc``, and of Zenoh's session."""
@@ -88,8 +88,8 @@ def table() -> str:
 
 def test_the_documentation_lists_every_handler_with_the_permission_that_it_asks() -> None:
     _, begin, rest = PAGE.read_text().partition(BEGIN)
-    assert begin, f"docs/security.md has lost its line {BEGIN}"
-    assert rest.partition("\n\n")[0] + "\n" == table(), f"write into docs/security.md:\n{table()}"
+    assert begin, f"docs/reference/security.md has lost its line {BEGIN}"
+    assert rest.partition("\n\n")[0] + "\n" == table(), f"write into docs/reference/security.md:\n{table()}"
 
 
 def test_every_kind_of_handler_is_found() -> None:

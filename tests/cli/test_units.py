@@ -17,7 +17,7 @@ from tests.core.example import EXAMPLE
 if TYPE_CHECKING:
     from pathlib import Path
 
-# Of `systemd-analyze security`, in tenths; 0 is best. docs/systemd.md says what makes it up.
+# Of `systemd-analyze security`, in tenths; 0 is best. docs/guides/running.md#at-boot says what makes it up.
 _EXPOSURE = {"rmpa.service": 20, "rmpa-web.service": 20, "rmpa-gateway.service": 20}
 
 

@@ -32,7 +32,7 @@ from rmpa.core.contract import (
 from rmpa.core.errors import ConfigError
 from tests.core.example import EXAMPLE, uncommented
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "contracts.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "guides" / "contracts.md"
 Load = Callable[[str], Loaded]
 
 

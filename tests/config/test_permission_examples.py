@@ -1,4 +1,4 @@
-"""docs/permissions.md: its examples are read, and what it says of them is what `rmpa trust check` says."""
+"""The examples of permissions in docs/guides/trust.md are read, and `rmpa trust check` says what the page says."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rmpa.cli.trust import trust_check
 from rmpa.config.peer_rules import NAME_KEYS, Access
 from rmpa.config.read import load_settings
 
-DOCUMENT = (Path(__file__).parents[2] / "docs" / "permissions.md").read_text("utf-8")
+DOCUMENT = (Path(__file__).parents[2] / "docs/guides/trust.md").read_text("utf-8").partition("\n## Permissions\n")[2]
 EXAMPLES = re.findall(r"```toml\n(.*?)```", DOCUMENT, re.DOTALL)
 CHECKS = re.findall(r"(?m)^\$ rmpa trust check (.*)\n(.*)$", DOCUMENT)
 

@@ -40,7 +40,7 @@ def test_documentation_is_up_to_date() -> None:
 
 
 def test_documentation_has_every_setting_and_every_list_of_tables() -> None:
-    page = (DOCS / "settings.md").read_text()
+    page = (DOCS / "reference" / "settings.md").read_text()
     for setting in SETTINGS:
         assert (
             setting.title if setting.is_list_of_tables else f"| `{(setting.key or (setting.env,))[-1]}` |"
@@ -79,7 +79,7 @@ def test_schema_accepts_the_example_file(validate: Any) -> None:
 
 def test_schema_accepts_the_files_of_the_documentation(validate: Any) -> None:
     blocks = [
-        block.partition("```")[0] for page in DOCS.glob("*.md") for block in page.read_text().split("```toml\n")[1:]
+        block.partition("```")[0] for page in DOCS.rglob("*.md") for block in page.read_text().split("```toml\n")[1:]
     ]
     assert len(blocks) > 20
     for block in blocks:

@@ -1,4 +1,4 @@
-"""docs/install.md is the one page that says how RMPA is installed, and from where."""
+"""docs/start/install.md is the one page that says how RMPA is installed, and from where."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 _ROOT: Final = Path(__file__).parents[2]
-_PAGE: Final = _ROOT / "docs/install.md"
+_PAGE: Final = _ROOT / "docs/start/install.md"
 _INSTALLS: Final = re.compile(r"(?:pip3?|pipx|uv tool) install [^`\n]*")
 
 

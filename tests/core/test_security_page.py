@@ -1,4 +1,4 @@
-"""docs/security.md: each attack in its table has a test, and the test is there."""
+"""docs/reference/security.md: each attack in its table has a test, and the test is there."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "security.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "reference" / "security.md").read_text(encoding="utf-8")
 ATTACKS = ROOT / "tests" / "interop" / "test_trust_attacks.py"
 HEADER = "| attack | what happens | test |"
 
@@ -35,7 +35,7 @@ def test_each_attack_names_a_test_that_is_there() -> None:
 
 def test_links_of_the_page_lead_somewhere() -> None:
     for target, anchor in re.findall(r"\]\(([\w/.-]*)(?:#([\w-]+))?\)", PAGE):
-        text = (ROOT / "docs" / target).read_text(encoding="utf-8") if target else PAGE
+        text = (ROOT / "docs/reference" / target).read_text(encoding="utf-8") if target else PAGE
         headings = {
             re.sub(r"[^\w -]", "", line.lstrip("# ")).strip().lower().replace(" ", "-")
             for line in text.split("\n")

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 ROOT: Final = Path(__file__).parents[2]
 FILES: Final = ROOT / "examples" / "resources"
-TUTORIAL: Final = (ROOT / "docs" / "tutorials" / "resources.md").read_text(encoding="utf-8")
+PAGE: Final = (ROOT / "docs/guides/smart-resources.md").read_text(encoding="utf-8")
+TUTORIAL: Final = PAGE.partition("\n## Configuration\n")[0]
 README: Final = (ROOT / "README.md").read_text(encoding="utf-8")
 STEP: Final = re.compile(r"^```console\n(.*?)^```$|^<!-- ctrl-c: (\S+) -->$", re.MULTILINE | re.DOTALL)
 COMMAND: Final = re.compile(r"^\$ (.*)\n((?:[^$].*\n)*)", re.MULTILINE)

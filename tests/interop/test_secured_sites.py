@@ -1,7 +1,7 @@
 """Two sites behind NAT, each a secured mesh, by a router with mTLS: what crosses, what is kept back, and intruders.
 
-The router's machine is the authority; modules and gateways of both sites join by ``rmpa trust``, as in docs/sites.md.
-All tests share one set of processes; each leaves it as it was.
+The router's machine is the authority; modules and gateways of both sites join by ``rmpa trust``, as in
+docs/guides/sites.md. All tests share one set of processes; each leaves it as it was.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Attacks on a secured mesh, by a program in a network namespace of its own; docs/security.md lists them."""
+"""Attacks on a secured mesh, from a network namespace of its own; docs/reference/security.md lists them."""
 
 from __future__ import annotations
 

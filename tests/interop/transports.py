@@ -89,7 +89,7 @@ def shown(module: Module, topic: str, node: str) -> SubscriberTransport | None:
 
 
 def wait_condition(module: Module, topic: str, condition: str) -> None:
-    """Wait until a module says that a topic is relayed because of one condition of docs/contracts.md."""
+    """Wait until a module says that a topic is relayed because of one condition of docs/guides/contracts.md."""
     eventually(lambda: conditions(module).get(topic) == condition, what=f"{topic} relayed by {condition}")
 
 

@@ -285,7 +285,7 @@ def test_a_full_mesh_refuses_strangers_alone() -> None:
     verdict = judge(hello_of(LOW), HIGH, full=True)
     assert verdict is not None
     assert verdict.code == Refusal.FULL
-    assert "docs/sites.md" in verdict.text
+    assert "docs/guides/sites.md" in verdict.text
     assert judge(hello_of(LOW), HIGH, LOW, full=True) is None
 
 

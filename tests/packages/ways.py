@@ -1,4 +1,4 @@
-"""The ways to install of docs/install.md, as a user types them; what is to be installed is in dist/."""
+"""The ways to install of docs/start/install.md, as a user types them; what is to be installed is in dist/."""
 
 from __future__ import annotations
 

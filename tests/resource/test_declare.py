@@ -209,7 +209,7 @@ def test_observe_refuses_invalid_values(value: Any) -> None:
 
 
 def test_the_docs_list_the_roles() -> None:
-    page = Path(__file__).parents[2] / "docs" / "smart-resources.md"
+    page = Path(__file__).parents[2] / "docs" / "guides" / "smart-resources.md"
     section = page.read_text(encoding="utf-8").partition("## Roles\n")[2].partition("\n## ")[0]
     assert re.findall(r'^\| `"(\w+)"` \|', section, re.MULTILINE) == list(Role)
     assert [Resource("sonar", role=role).role for role in Role] == list(Role)

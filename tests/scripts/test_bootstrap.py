@@ -148,7 +148,7 @@ def test_where_all_fail_one_line_says_what_to_do(clone: Path, *, no_pip: bool) -
     last = done.stderr.splitlines()[-1]
     assert "needs Python 3.11 or later; 'python3' is Python 3.9.2." in last
     assert "make PYTHON=python3.12" in last
-    assert "docs/install.md" in last
+    assert "docs/start/install.md" in last
     assert len(done.stderr.splitlines()) == (1 if no_pip else 2)  # the other one says that uv tries
 
 

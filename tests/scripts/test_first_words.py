@@ -39,7 +39,7 @@ def test_a_clone_on_the_path_of_an_older_python(tmp_path: Path, version: str) ->
     said = done.stderr.splitlines()
     assert done.returncode == 1
     assert re.search(rf"rmpa needs Python 3.11 or later, and /\S+ is {version}\.", said[-1])
-    assert "docs/install.md" in said[-1]
+    assert "docs/start/install.md" in said[-1]
     assert len(said) == 1 or version == "2.7"  # its runpy adds a traceback
     caught = "try: import rmpa.resource\nexcept ImportError as error: print(error)"
     done = run(old, "-c", caught, cwd=tmp_path, PYTHONPATH=str(_ROOT / "src"))
@@ -53,7 +53,7 @@ def test_pip_of_an_older_python_in_a_clone(tmp_path: Path, version: str) -> None
     done = run(python(version), "-m", "pip", "install", *options, _ROOT, cwd=tmp_path)
     assert done.returncode == 1
     assert f"rmpa needs Python 3.11 or later, and this is {version}." in done.stderr
-    assert "docs/install.md" in done.stderr
+    assert "docs/start/install.md" in done.stderr
 
 
 def test_pip_of_an_older_python_does_not_look_for_our_libraries() -> None:

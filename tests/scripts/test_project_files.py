@@ -19,9 +19,9 @@ PAGES: Final = (
     "CODE_OF_CONDUCT.md",
     "CONTRIBUTING.md",
     "README.md",
-    "docs/compatibility.md",
-    "docs/install.md",
-    "docs/troubleshooting.md",
+    "docs/reference/compatibility.md",
+    "docs/start/install.md",
+    "docs/guides/troubleshooting.md",
 )
 TEMPLATES: Final = sorted((ROOT / ".github/ISSUE_TEMPLATE").glob("[!c]*.yml"))
 

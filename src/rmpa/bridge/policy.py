@@ -150,7 +150,7 @@ _WITHOUT_TRUST: Final = PermissionDecision(True, "trust is off")
 class Needs:
     """What a handler of messages from outside asks the permissions; declared where it is registered.
 
-    ``docs/security.md`` lists all of them; a test compares it with the registrations.
+    ``docs/reference/security.md`` lists all of them; a test compares it with the registrations.
 
     Args:
         access: The kinds of access that are judged; none: nothing is.

@@ -67,7 +67,7 @@ def gateway(context: click.Context, /, **options: object) -> int:
     ---
     The gateway is a peer of the mesh with a core of its own, beside this machine's agent. It reads the same rmpa.toml
     and RMPA_* variables, but its name, its core's address and the mesh's port only from its own options.
-    What may cross: [[gateway.rule]] (docs/sites.md), mapping files of ROS 2 (docs/ros2.md).
+    What may cross: [[gateway.rule]] (docs/guides/sites.md), mapping files of ROS 2 (docs/guides/ros2.md).
 
     Exit codes: 0 it was ended; 1 it cannot start; 2 a wrong option or setting, or a library that is not installed.
 

@@ -110,11 +110,11 @@ VERBS: Final = {
 }
 # What to use in place of a command that is gone, by its words behind ``rmpa``.
 REMOVED_VERBS: Final = {
-    "experiment": "in a clone of the repository: make experiment, or python -m lab experiment (docs/experiments.md)",
+    "experiment": "in a clone: make experiment, or python -m lab experiment (docs/compare/experiments.md)",
     "multicast": "`rmpa doctor --listen 30` on one machine and `rmpa doctor` on the other try multicast between them",
     "resource history": "record it: rosbag record /SONAR/decision /SONAR/quality /SONAR/alarms",
     "site last": "record the topic with rosbag where it is needed, or keep its key by a storage of Zenoh",
-    "trust import": "write [[permission]] tables into rmpa.toml: docs/permissions.md",
+    "trust import": "write [[permission]] tables into rmpa.toml: docs/guides/trust.md#permissions",
 }
 # Words that are no commands of ``rmpa``, and what a user who writes them wants.
 MEANT: Final = {
@@ -342,7 +342,7 @@ def trust() -> None:
     """Secure the mesh: who may join, and what other modules may do here.
 
     ---
-    A walk-through, a fleet's provisioning, and what to do when keys are lost: docs/trust.md
+    A walk-through, a fleet's provisioning, and what to do when keys are lost: docs/guides/trust.md#a-secured-mesh
     """
 
 
@@ -355,7 +355,7 @@ def config() -> None:
     Examples:
       rmpa config show                        what `rmpa up` would take, and from where
       rmpa config show --config new.toml      is this file right?
-      rmpa config schema > rmpa.schema.json   for editors: see docs/settings.md
+      rmpa config schema > rmpa.schema.json   for editors: see docs/reference/settings.md
     """
 
 

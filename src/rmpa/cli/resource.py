@@ -250,7 +250,7 @@ def resource_list(options: Options) -> None:
     async def body(graph: ResourceGraph) -> None:
         for path, count in Counter(one.path for one in graph.seen).items():
             if count > 1:
-                text = "what is asked of that name is heard by all of them; docs/names.md tells them apart"
+                text = "what is asked of that name is heard by all of them; docs/guides/names.md tells them apart"
                 warn(f"{count} modules have a resource {path}: {text}")
         states, profiles, contexts = await graph.texts(graph.seen, "state", "profile", "context")
         found: list[dict[str, Any]] = []

@@ -92,7 +92,7 @@ def run(
     """Run the Smart Resources of FILE as nodes of this module's own core.
 
     ---
-    The file declares one or more rmpa.resource.Resource; see docs/tutorials/resources.md.
+    The file declares one or more rmpa.resource.Resource; see docs/guides/smart-resources.md#tutorial.
     Without --name and --master the module is named as for rmpa up, or else as its first resource. An agent of that
     name that runs already is used, and stays; else one is started with the options behind --, and ends with the
     resources.

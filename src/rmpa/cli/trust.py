@@ -321,7 +321,7 @@ def trust_init(module: Module, options: Options, label: str) -> None:
             warn(_RESTART.format(module.name))
         again = " again" if module.socket is not None else ""
         yield f"Next: {start} here{again}, and rmpa trust invite for each module."
-        yield "Modules may do here only what [[permission]] in rmpa.toml allows: docs/permissions.md"
+        yield "Modules may do here only what [[permission]] in rmpa.toml allows: docs/guides/trust.md#permissions"
 
     options.show(status, text())
 

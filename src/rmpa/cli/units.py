@@ -103,11 +103,11 @@ WantedBy=multi-user.target
 """
 # The agent's alone.
 _NET_ADMIN: Final = """\
-# To end connections whose host has vanished, where topics go from node to node (docs/systemd.md).
+# To end connections whose host has vanished, where topics go from node to node (docs/guides/running.md#at-boot).
 AmbientCapabilities=CAP_NET_ADMIN
 CapabilityBoundingSet=CAP_NET_ADMIN"""
 _REALTIME: Final = """\
-{header}# rmpa up --realtime (docs/realtime.md).
+{header}# rmpa up --realtime (docs/guides/running.md#real-time).
 [Service]
 Environment=RMPA_REALTIME=true
 LimitRTPRIO=50

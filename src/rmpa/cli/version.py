@@ -38,7 +38,7 @@ def about() -> dict[str, object]:
 def protocols() -> dict[str, tuple[int | str, str]]:
     """The number of each format that other programs or later runs read, and what has it.
 
-    docs/compatibility.md shows them of each release; tests/golden has bytes of each.
+    docs/reference/compatibility.md shows them of each release; tests/golden has bytes of each.
     """
     from rmpa.discovery import beacon
     from rmpa.gateway.sites import keys

@@ -1,9 +1,9 @@
 """Rules about peers: ``[[peer]]``, ``[[permission]]`` and ``[[service]]``, and the policy of names.
 
-``[[peer]]`` has names and policy for single peers (docs/names.md). Names that no topic can have, or that never cross,
-are refused. What two names do that become one shows at run time: the first stays, and the other one says why it is
-hidden. ``[[permission]]`` and ``[trust.groups]`` say what other modules may do here; the grammar, with examples:
-docs/design/trust.md, "Permissions".
+``[[peer]]`` has names and policy for single peers (docs/guides/names.md). Names that no topic can have, or that
+never cross, are refused. What two names do that become one shows at run time: the first stays, and the other one
+says why it is hidden. ``[[permission]]`` and ``[trust.groups]`` say what other modules may do here; the grammar, with
+examples: docs/design/trust.md, "Permissions".
 """
 
 from __future__ import annotations

@@ -424,7 +424,7 @@ def _named_file(named: str, source: str) -> Path:
         problem = error.strerror or str(error)
     except RuntimeError:
         problem = "there is no such home"
-    raise ConfigError(source, f"{named}: {problem}", "name a file in TOML (docs/settings.md)")
+    raise ConfigError(source, f"{named}: {problem}", "name a file in TOML (docs/reference/settings.md)")
 
 
 def _file_layer(path: Path) -> _Layer:

@@ -1,6 +1,6 @@
 """Rules about topics, parameters and sites in ``rmpa.toml``: ``[[contract]]``, ``[[param]]`` and ``[gateway]``.
 
-A ``[[contract]]`` says what topics need, in ROS 2's words (docs/contracts.md).
+A ``[[contract]]`` says what topics need, in ROS 2's words (docs/guides/contracts.md).
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@
     port: int = setting(0, PORT_OR_ANY, "The mesh's port.", key="mesh.port", option="--port")
 
 From this line follow the typed field with its default, the key of ``rmpa.toml`` and the check of its type, the
-environment variable (RMPA_PORT), the option of ``rmpa up`` or ``rmpa gateway``, the row of docs/settings.md and the
-entry of the JSON Schema.
+environment variable (RMPA_PORT), the option of ``rmpa up`` or ``rmpa gateway``, the row of
+docs/reference/settings.md and the entry of the JSON Schema.
 """
 
 from __future__ import annotations
@@ -241,7 +241,7 @@ _REMEDIES: Final = {
     "--ros1-bridge --no-ros1-bridge": "let a gateway with a site name join those robots, "
     "or run zenoh-bridge-ros1 beside rmpa",
     "mesh.links mesh.full_mesh_up_to RMPA_LINKS RMPA_FULL_MESH_UP_TO": "leave it out: "
-    "up to 256 modules keep a link to each other; make more of them sites (docs/sites.md)",
+    "up to 256 modules keep a link to each other; make more of them sites (docs/guides/sites.md)",
     "gateway.store RMPA_GATEWAY_STORE gateway.rule.keep": "no gateway keeps values: "
     "record the topic with rosbag, or keep its key by a storage of Zenoh",
     "--yes": "leave it out: nothing is asked",

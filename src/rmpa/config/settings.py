@@ -1,7 +1,7 @@
 """The agent's settings: each is declared once here; ``config.schema`` says what follows from a declaration.
 
 ``config.read`` reads them from the file, the environment and the command line. The reference for users,
-docs/settings.md, is made from this module by ``scripts/write-reference``. The JSON Schema is made here.
+docs/reference/settings.md, is made from this module by ``scripts/write-reference``. The JSON Schema is made here.
 """
 
 from __future__ import annotations
@@ -414,10 +414,10 @@ TABLES: Final = {
     "limits": "How much is accepted from one peer.",
     "lanes": "How the packets of each lane are marked.",
     "realtime": "What the agent asks the kernel for.",
-    "web": "Where the module's state is served over HTTP (docs/web.md).",
+    "web": "Where the module's state is served over HTTP (docs/guides/web.md#rmpa-web).",
     "trust": "What the modules of a secured mesh may do here (docs/design/trust.md).",
-    "gateway": "The other sites that rmpa gateway joins (docs/sites.md); the options are those of rmpa gateway.",
-    "gateway.ros2": "The ROS 2 graph that rmpa gateway joins (docs/ros2.md).",
+    "gateway": "The sites that rmpa gateway joins (docs/guides/sites.md); the options are those of rmpa gateway.",
+    "gateway.ros2": "The ROS 2 graph that rmpa gateway joins (docs/guides/ros2.md).",
     "relay": "Whether this module joins networks that are not routed to each other.",
     "control": "Who on this machine may use the agent's control socket, which the commands ask.",
     "log": "What the log says, and how.",

@@ -1,6 +1,6 @@
 """Contracts: the QoS of a topic in ROS 2's terms, and the rules of ``rmpa.toml`` that set it.
 
-Both ends of a route have rules; ``combine`` of both contracts holds for the route: see docs/contracts.md.
+Both ends of a route have rules; ``combine`` of both contracts holds for the route: see docs/guides/contracts.md.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Priority(StrEnum):
 
 
 class Transport(StrEnum):
-    """The path of the messages: through both agents, or from node to node where that can be (docs/contracts.md).
+    """The path of the messages: through both agents, or from node to node where possible (docs/guides/contracts.md).
 
     Attributes:
         DIRECT: From node to node; a warning where a condition fails and the agents relay instead.

@@ -130,7 +130,7 @@ class OutOfDescriptors(UnreachableError):  # noqa: N818 - the name says what hap
 def missing_extra(name: str) -> str:
     """What adds an extra to this rmpa: pip takes the one that its Python has, and none from an index."""
     if find_spec("pip") is None:  # pipx, uv
-        return f"the command that installed rmpa, with the extra {name}: docs/install.md#the-extras"
+        return f"the command that installed rmpa, with the extra {name}: docs/start/install.md#the-extras"
     return f"{sys.executable} -m pip install 'rmpa[{name}]'"
 
 

@@ -372,7 +372,7 @@ class Hello:
 FULL: Final = Refuse(
     Refusal.FULL,
     f"this mesh has {limits.MODULES_MAX} modules and no place for one more: make further ones a site of their own "
-    "(`rmpa gateway`, docs/sites.md)",
+    "(`rmpa gateway`, docs/guides/sites.md)",
 )
 
 

@@ -11,7 +11,7 @@ from rmpa.core.limits import KIB, MIB, PEER_LEASE
 
 # --- mesh -------------------------------------------------------------------------------------------------------
 # Modules of one mesh, each with a link to each other one: 255 links and up to 510 sockets. One more is refused; more
-# modules are sites, joined by gateways (docs/sites.md).
+# modules are sites, joined by gateways (docs/guides/sites.md).
 MODULES_MAX: Final = 256
 # A link on which no byte arrived for this long is dead (TCP alone would take two hours to notice).
 EXPRESS_LEASE: Final = 1.0

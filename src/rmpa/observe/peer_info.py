@@ -290,7 +290,7 @@ class ContractTerm(msgspec.Struct, kw_only=True, frozen=True):
     """One term of a topic's contract by this module's settings; values of the operation ``contract``, by key.
 
     Attributes:
-        value: Its value; seconds, messages a second, or a word of docs/contracts.md.
+        value: Its value; seconds, messages a second, or a word of docs/guides/contracts.md.
         rule: What sets it: ``rule 2: topics /cmd/**`` (the second ``[[contract]]``), ``[bridge] transport``, or
             ``default``.
     """

@@ -156,7 +156,7 @@ class SubscriberTransport(msgspec.Struct, kw_only=True, frozen=True):
         since_ago: Seconds since a direct connection was answered, else since the state began; ``None``: not known.
         wanted: The transport that the contract of the subscriber's module asks for; empty for ``out``.
         endpoint: ``address:port`` of the publisher's node while the transport is direct; ``out``: the port alone.
-        condition: The condition of direct transport that does not hold (docs/contracts.md), if it is relayed.
+        condition: The condition of direct transport that does not hold (docs/guides/contracts.md), if it is relayed.
         text: That as text, ready to read.
         interruptions: How often it was without a path: moved between transports, its connection broken, or its link
             lost. What was published meanwhile is lost, and not counted.
@@ -220,7 +220,7 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
         transport: How its messages go: ``direct``, ``relay``, ``both`` (its subscribers differ), or empty while none
             is in use.
         condition: Why a subscriber is relayed: the condition of direct transport that does not hold
-            (docs/contracts.md); empty where none is relayed.
+            (docs/guides/contracts.md); empty where none is relayed.
         condition_text: That as text, ready to read.
         subscribers: The subscribers that have, or may get, a direct connection, by name. ``in``: of this module, if
             its contract's transport is ``direct`` or ``auto``; ``out``: of the peer, if one was granted.

@@ -4,7 +4,7 @@ This package is the public interface; the modules below it may be moved::
 
     from rmpa.resource import Resource, at_least
 
-``docs/tutorials/resources.md`` shows how to write a resource, ``docs/smart-resources.md`` what it offers to others.
+``docs/guides/smart-resources.md`` shows how to write a resource, and lists what it offers to others.
 """
 
 from __future__ import annotations

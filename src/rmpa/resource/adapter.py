@@ -1,6 +1,6 @@
 """Drives the control loop of a resource: takes measurements and requests, applies profiles, publishes reports.
 
-Requests and reports are plain topics below the resource's node (``docs/smart-resources.md`` lists them), so any node
+Requests and reports are topics below the node (``docs/guides/smart-resources.md`` lists them), so any node
 in any module can use them. ``resource.adaptation`` makes the decisions.
 """
 
@@ -143,7 +143,7 @@ class Preconditions:
 
 # --- Texts and values of a resource's reports -----------------------------------------------------------------------
 #
-# Alarms, health, responses (``docs/smart-resources.md``).
+# Alarms, health, responses (``docs/guides/smart-resources.md#reference``).
 
 
 def alarm_values(

@@ -386,7 +386,7 @@ def check_arity(function: Callable[..., object], count: int, where: str) -> None
 
 
 def read_contract(where: str, terms: Mapping[str, object]) -> Contract:
-    """Make the contract of an output or input from the keys of a ``[[contract]]`` (docs/contracts.md).
+    """Make the contract of an output or input from the keys of a ``[[contract]]`` (docs/guides/contracts.md).
 
     Raises:
         ConfigError: A key is unknown or a value is invalid; ``where`` begins the error's text.

@@ -42,7 +42,7 @@ _SECOND: Final = 1_000_000_000
 _ABSENT: Final = 2
 
 
-# The form of the file. A release that changes it reads all earlier ones, from 0.2.0 on (docs/compatibility.md).
+# The file's form. A release that changes it reads the earlier ones, from 0.2.0 on (docs/reference/compatibility.md).
 FORMAT: Final = 1
 
 

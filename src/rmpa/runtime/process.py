@@ -136,7 +136,7 @@ def in_journal(environ: Mapping[str, str], fd: int) -> bool:
 
 REMEDY: Final = (
     "systemd: sudo rmpa service install --realtime, or LimitRTPRIO=50, LimitMEMLOCK=infinity in a unit of your own; "
-    "else /etc/security/limits.d (docs/realtime.md)"
+    "else /etc/security/limits.d (docs/guides/running.md#real-time)"
 )
 _UNLIMITED: Final = (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
 # Of mlockall(2). Mappings that come later are locked page by page as they are used: otherwise the kernel would fill

@@ -1,4 +1,4 @@
-"""docs/rosbridge.md: its figures are the code's."""
+"""docs/guides/web.md#rosbridge: its figures are the code's."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from rmpa.core.limits import MIB
 from rmpa.web import limits
 
-PAGE = Path(__file__).parents[3] / "docs" / "rosbridge.md"
+PAGE = Path(__file__).parents[3] / "docs" / "guides" / "web.md"
 
 
 def test_the_page_says_the_bounds_of_the_code() -> None:

@@ -1,7 +1,7 @@
 """What two agents say of one direct connection: the question, the grant, and each condition that fails as a reason.
 
-docs/contracts.md lists the conditions for users, docs/design/protocol.md has examples of the messages. Topics and
-services have the same three: ``direct.topic`` or ``direct.service`` asks, ``…_again`` makes the asking side ask
+docs/guides/contracts.md lists the conditions for users, docs/design/protocol.md has examples of the messages. Topics
+and services have the same three: ``direct.topic`` or ``direct.service`` asks, ``…_again`` makes the asking side ask
 again, ``…_release`` gives a grant back.
 """
 

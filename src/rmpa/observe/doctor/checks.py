@@ -167,7 +167,7 @@ def _peer(agent: str, peer: PeerInfo) -> Iterator[Check]:
             yield machine.judge_peer_clock(agent, peer.name, link.clock_offset, link.clock_error)
 
 
-# --- which nodes of a secured module listen beyond this machine: what ROS 1 leaves open (docs/security.md) ----------
+# --- which nodes of a secured module listen beyond this machine: what ROS 1 leaves open (docs/reference/security.md)
 
 _LISTED: Final = 5
 _AGENTS_OWN: Final = ("/rmpa", "/rosout")
@@ -204,7 +204,7 @@ def judge_exposed_nodes(
     more = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
     remedy = (
         "start them with ROS_IP=127.0.0.1 (roscpp's XML-RPC port stays open), and let a firewall drop what comes "
-        "from outside to them (docs/security.md)"
+        "from outside to them (docs/reference/security.md)"
     )
     remedy += "; direct transport needs them open, and crosses the network unprotected" if direct else ""
     return check(WARN, f"other machines reach {', '.join(listed[:_LISTED])}{more} without any check", remedy)

@@ -203,7 +203,7 @@ _REMEDIES: Final = {
     "caller_id": "give one of both nodes another name",
     "reachable": "see that TCP gets through from this machine to the ports of nodes over there (a firewall?)",
     "latched": "start the subscriber again",
-    "trust": "trust.direct = true in both modules allows it, where the network is trusted (docs/permissions.md)",
+    "trust": "trust.direct = true in both modules allows it, on a trusted network (docs/guides/trust.md#permissions)",
 }
 # In place of figures.
 UNMEASURED: Final = "not measured: the nodes are connected directly"
@@ -250,8 +250,10 @@ def route_texts(route: RouteInfo) -> list[str]:
 def remedy_for(one: SubscriberTransport) -> str:
     """What to do about a subscriber that is relayed, or has to be."""
     if one.transport == "direct":
-        return "if it stays so, give the agent CAP_NET_ADMIN (docs/systemd.md), or start that subscriber again"
-    return _REMEDIES.get(one.condition, "docs/contracts.md explains the conditions")
+        return (
+            "if it lasts, give the agent CAP_NET_ADMIN (docs/guides/running.md#at-boot), or restart that subscriber"
+        )
+    return _REMEDIES.get(one.condition, "docs/guides/contracts.md explains the conditions")
 
 
 def misplaced(route: RouteInfo) -> list[SubscriberTransport]:

@@ -145,7 +145,7 @@ def _at_client(peer: str, service: str, wire: str, info: ServiceInfo | None, her
     if here.mismatched:
         yield Check("calls", WARN, info.problem, "build both sides with one version of the service")
     elif info.problem:
-        yield Check("calls", WARN, f"{text}; the last time: {info.problem}", "docs/services.md")
+        yield Check("calls", WARN, f"{text}; the last time: {info.problem}", "docs/guides/services.md#services")
     else:
         yield Check("calls", OK, text)
 
@@ -159,7 +159,7 @@ def _transport(peer: str, info: ServiceInfo) -> Check:
         return Check("transport", OK, f"relayed by both agents; {peer} is being asked for direct calls")
     if info.wanted == "direct" and info.condition != "transport":
         text = f'relayed although transport is "direct" ({info.condition}): {info.relayed_because}'
-        return Check("transport", WARN, text, "docs/services.md says what each condition needs")
+        return Check("transport", WARN, text, "docs/guides/services.md#services says what each condition needs")
     return Check("transport", OK, f"relayed by both agents ({info.condition}): {info.relayed_because}")
 
 

@@ -468,7 +468,7 @@ def _arrived(way: Way) -> Check:
         text = f"{way.peer} has {f'sent {sent}' if sent else 'sent some'} meanwhile, and none arrived at "
         text += way.ends.snapshot.agent.name
         text += f" ({told.dropped} were given up over there)" if told is not None and told.dropped else ""
-        remedy = "is the link too slow? `rmpa peer info`; a max_rate or priority helps (docs/contracts.md)"
+        remedy = "is the link too slow? `rmpa peer info`; a max_rate or priority helps (docs/guides/contracts.md)"
         return Check("arrived", FAIL, text, remedy)
     age, usual = now.age or 0.0, now.period.p99 if now.period is not None else None
     text = f"{now.messages} messages, the last {age:.2f} s ago"
@@ -491,7 +491,7 @@ def _contract(way: Way) -> Check:
         return Check("contract", OK, f"kept ({said})" if said else "nothing lost, late or expired")
     parts = [f"{count} {key}" for key, count in missing.items()]
     parts += [f"{kind.replace('_', ' ')} {count} times" for kind, count in events.items()]
-    remedy = "`rmpa topic info` tells when; docs/contracts.md what to do"
+    remedy = "`rmpa topic info` tells when; docs/guides/contracts.md what to do"
     if ("lost" in missing or "loss_unknown" in events) and route.contract.get("reliability") == "reliable":
         remedy = "a longer outage, or more depth, in [[contract]] keeps more; `rmpa topic info` tells when"
     return Check("contract", WARN, ", ".join(parts), remedy)

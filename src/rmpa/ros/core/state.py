@@ -59,7 +59,7 @@ _SHOWN: Final = 3
 _RECORDS: Final = 8
 
 
-# The form of the file. A release that changes it reads all earlier ones, from 0.2.0 on (docs/compatibility.md).
+# The file's form. A release that changes it reads the earlier ones, from 0.2.0 on (docs/reference/compatibility.md).
 FORMAT: Final = "rmpa core 2"
 
 

@@ -371,7 +371,7 @@ class WebServer:
         self._responses.add(str(status))
         if _JUDGED not in request:
             address = request.remote or "?"
-            text = f"{address}: a request that is no HTTP/1.1, or with a header beyond the limits (docs/limits.md)"
+            text = f"{address}: not HTTP/1.1, or a header beyond a limit (docs/reference/limits.md)"
             self._refusals.refuse(time.monotonic(), "malformed", address, text)
 
 
