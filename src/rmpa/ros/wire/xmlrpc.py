@@ -286,8 +286,11 @@ class DocumentReader:
         # bytes are fed again when there are as many as the unfinished token had.
         if len(self._waiting) < self._token:
             return
-        with self._errors():
+        try:
             self._give()
+        except BaseException as error:
+            self._malformed(error)
+            raise
         self._token = self._size - self._expat.CurrentByteIndex
 
     def abandon(self) -> None:
@@ -327,10 +330,13 @@ class DocumentReader:
         return params[0]
 
     def _end(self) -> tuple[str | None, tuple[XmlRpcValue, ...]]:
-        with self._errors():
+        try:
             self._give()
             self._parser.close()
             params = cast("tuple[XmlRpcValue, ...]", self._unmarshaller.close())
+        except BaseException as error:
+            self._malformed(error)
+            raise
         return self._unmarshaller.getmethodname(), params
 
     def _give(self) -> None:
@@ -338,16 +344,12 @@ class DocumentReader:
         self._waiting.clear()
         self._parser.feed(waiting)
 
-    @contextlib.contextmanager
-    def _errors(self) -> Iterator[None]:
-        try:
-            yield
-        except BaseException as error:
-            self.abandon()
-            for kinds, text in _MALFORMED:
-                if isinstance(error, kinds):
-                    raise RemoteProtocolError(text.format(error).rstrip()) from error
-            raise
+    def _malformed(self, error: BaseException) -> None:
+        # A function, and no context manager: from Python 3.13 on its frame would hold the error in a reference cycle.
+        self.abandon()
+        for kinds, text in _MALFORMED:
+            if isinstance(error, kinds):
+                raise RemoteProtocolError(text.format(error).rstrip()) from error
 
 
 # What the parsers raise for malformed documents, with the text of our error.
