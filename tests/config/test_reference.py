@@ -64,7 +64,7 @@ def test_every_default_can_be_read_again() -> None:
 def test_up_has_an_option_for_each_setting_that_declares_one() -> None:
     of_up = {part for s in SETTINGS if s.option and s.command == "up" for part in s.option.split("/")}
     of_gateway = {part for s in SETTINGS if s.option and s.command == "gateway" for part in s.option.split("/")}
-    assert _options(up) == {"--config"} | of_up
+    assert _options(up) == {"--config", "-q", "--quiet"} | of_up
     assert _options(gateway) == {"--config"} | of_gateway | of_up - NOT_OF_A_GATEWAY
 
 

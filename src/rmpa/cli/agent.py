@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
+from rmpa.cli.advice import advise, advises
 from rmpa.cli.graph import read_name
 from rmpa.cli.options import (
     FiniteRange,
@@ -244,8 +245,12 @@ def _paint(text: str, level: CheckLevel) -> Painted:
     return paint(text, _COLOURS.get(level, "yellow"))
 
 
-@verb(setting_options("up"), config_option)
-def up(**options: object) -> int:
+@verb(
+    setting_options("up"),
+    config_option,
+    flag("-q", "--quiet", help="Only warnings (--log-level warning), and no advice about what to do next."),
+)
+def up(quiet: bool, **options: object) -> int:
     """Run this machine's agent: ROS core, discovery, mesh and bridge.
 
     ---
@@ -265,6 +270,8 @@ def up(**options: object) -> int:
       rmpa up --core external                 join the graph of a roscore that runs already
       rmpa up --realtime                      punctual on a busy machine; the log says what was not granted
     """
+    if quiet and options["log_level"] is None:
+        options["log_level"] = "warning"
     load = partial(load_settings, options, dict(os.environ), host_name=socket.gethostname())
     loaded = load()
     writer = LogWriter(sys.stderr.fileno())
@@ -279,8 +286,15 @@ def up(**options: object) -> int:
     gc.disable()
     from rmpa.agent.agent import run
 
+    advised = sys.stderr.isatty() and advises(loaded.settings, os.environ, quiet=quiet or journal)
+
+    def started() -> None:
+        _keep_first_name(loaded.settings, loaded.names)
+        if advised:
+            threading.Thread(target=advise, args=(loaded.settings,), name="advice", daemon=True).start()
+
     try:
-        return run(loaded.settings, load, partial(_keep_first_name, loaded.settings, loaded.names))
+        return run(loaded.settings, load, started)
     finally:
         writer.close()
 
