@@ -13,7 +13,8 @@ from rmpa.cli.trust import trust_check
 from rmpa.config.peer_rules import NAME_KEYS, Access
 from rmpa.config.read import load_settings
 
-DOCUMENT = (Path(__file__).parents[2] / "docs/guides/trust.md").read_text("utf-8").partition("\n## Permissions\n")[2]
+PAGE = (Path(__file__).parents[2] / "docs/guides/trust.md").read_text("utf-8")
+DOCUMENT = PAGE.partition("\n## Permissions\n")[2].partition("\n## ")[0]
 EXAMPLES = re.findall(r"```toml\n(.*?)```", DOCUMENT, re.DOTALL)
 CHECKS = re.findall(r"(?m)^\$ rmpa trust check (.*)\n(.*)$", DOCUMENT)
 
