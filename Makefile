@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 .DEFAULT_GOAL := venv
 # One apt at a time: a lock on this folder.
 APT := flock scripts
-.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests test-long test-packages test-packages-short short-package short-chroot style format types imports reference fuzz soak soak-services soak-web bench experiment wheel deb bundle release ros chromium clients clean
+.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests test-long test-packages test-packages-short short-package short-chroot style format types imports reference docs fuzz soak soak-services soak-web bench experiment wheel deb bundle release ros chromium clients clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -97,6 +97,10 @@ imports: $(STAMP)  ## the rooms import one way only; pure rooms stay pure
 reference: $(STAMP)  ## write docs/reference/settings.md, docs/rmpa.schema.json and the figures of docs/reference/limits.md from the code
 	$(BIN)/python scripts/write-reference
 
+docs: $(STAMP)  ## build the site of docs/ into site/, which is read from disk or from any web server
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "site/index.html, for a browser"
+
 fuzz: $(STAMP)  ## every fuzz target for longer: make fuzz [SECONDS=60]
 	$(BIN)/python -m tests.fuzz --seconds $(or $(SECONDS),60)
 
@@ -131,5 +135,5 @@ release: $(STAMP)  ## all files of a release with checksums, into dist/release-V
 	$(BIN)/python scripts/release $(ARGS)
 
 clean:  ## remove what the commands above made
-	rm -rf $(VENV) .uv build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) .uv build dist site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -66,7 +66,7 @@ setup(
     long_description_content_type="text/markdown",
     project_urls={
         "Source": url(),
-        "Documentation": f"{url()}/blob/HEAD/docs/install.md",
+        "Documentation": f"{url()}/blob/HEAD/docs/start/install.md",
         "Changelog": f"{url()}/blob/HEAD/CHANGELOG.md",
         "Issues": f"{url()}/issues",
     },

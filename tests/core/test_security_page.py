@@ -31,14 +31,3 @@ def test_each_attack_names_a_test_that_is_there() -> None:
         assert all((ROOT / file).exists() for file in files), attack
         named |= set(found)
     assert {name for name in known if name.startswith("test_")} <= named, "an attack that the page does not tell"
-
-
-def test_links_of_the_page_lead_somewhere() -> None:
-    for target, anchor in re.findall(r"\]\(([\w/.-]*)(?:#([\w-]+))?\)", PAGE):
-        text = (ROOT / "docs/reference" / target).read_text(encoding="utf-8") if target else PAGE
-        headings = {
-            re.sub(r"[^\w -]", "", line.lstrip("# ")).strip().lower().replace(" ", "-")
-            for line in text.split("\n")
-            if line.startswith("#")
-        }
-        assert not anchor or anchor in headings, f"{target}#{anchor}"

@@ -1,4 +1,4 @@
-"""The files about the project itself: they fit their forms, and name commands and pages that are there."""
+"""The files about the project itself: they fit their forms; tests/docs has the rules for pages."""
 
 from __future__ import annotations
 
@@ -10,38 +10,8 @@ from typing import Final
 import pytest
 import yaml
 
-from rmpa.cli.main import VERBS
-
 ROOT: Final = Path(__file__).parents[2]
-PAGES: Final = (
-    "CHANGELOG.md",
-    "SECURITY.md",
-    "CODE_OF_CONDUCT.md",
-    "CONTRIBUTING.md",
-    "README.md",
-    "docs/reference/compatibility.md",
-    "docs/start/install.md",
-    "docs/guides/troubleshooting.md",
-)
 TEMPLATES: Final = sorted((ROOT / ".github/ISSUE_TEMPLATE").glob("[!c]*.yml"))
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_links_lead_to_files_and_headings(page: str) -> None:
-    text = (ROOT / page).read_text()
-    for name, heading in re.findall(r"\]\((?!https?:)([^)#]*)(?:#([^)]*))?\)", text):
-        there = (ROOT / page).parent / name if name else ROOT / page
-        assert there.exists(), name
-        if heading:
-            titles = re.findall(r"^#+ (.*)$", there.read_text(), re.MULTILINE)
-            anchors = {re.sub(r"[^\w\- ]", "", title).strip().lower().replace(" ", "-") for title in titles}
-            assert heading in anchors, f"{name}#{heading}"
-
-
-@pytest.mark.parametrize("page", [*PAGES, *(str(path.relative_to(ROOT)) for path in TEMPLATES)])
-def test_commands_that_are_named_are_there(page: str) -> None:
-    named = re.findall(r"(?:`|: )rmpa ((?:[a-z]+ ?)+)", (ROOT / page).read_text())
-    assert [words for words in named if words.split()[0] not in {verb.split()[0] for verb in VERBS}] == []
 
 
 def test_the_changelog_has_the_form_that_a_release_is_cut_from() -> None:

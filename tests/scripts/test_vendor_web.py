@@ -17,12 +17,13 @@ def test_the_committed_libraries_are_those_that_the_script_names() -> None:
 
 
 def test_each_library_has_its_licence() -> None:
-    for folder in ("src/rmpa/web/static/vendor", "tests/web/browser/vendor"):
+    for folder in ("src/rmpa/web/static/vendor", "tests/web/browser/vendor", "packaging/site/theme/assets"):
         names = {path.name for path in (ROOT / folder).iterdir()}
         for library, licences in {
             "htm-preact.js": {"htm.LICENSE", "preact.LICENSE"},
             "uPlot.js": {"uPlot.LICENSE"},
             "axe.min.js": {"axe.LICENSE"},
+            "iframe-worker.js": {"iframe-worker.LICENSE"},
         }.items():
             if library in names:
                 assert licences <= names

@@ -1,7 +1,7 @@
 """Messages of the Foxglove WebSocket protocol (``foxglove.websocket.v1`` and ``foxglove.sdk.v1``), without I/O.
 
 JSON messages are text frames with the field ``op``. Binary messages begin with an opcode of one byte; their integers
-are little-endian. Source: the protocol's specification in github.com/foxglove/ws-protocol (``docs/spec.md``), and the
+are little-endian. Source: the protocol's specification in github.com/foxglove/ws-protocol (``spec.md``), and the
 output of foxglove-sdk, whose order of fields is kept.
 """
 

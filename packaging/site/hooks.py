@@ -1,0 +1,43 @@
+"""What mkdocs.yml cannot say: anchors as GitHub's, and links that leave docs/ lead to the published repository."""
+
+import posixpath
+import re
+import tomllib
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import Files
+from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).parents[2]
+LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)\s#]+)")
+
+
+def slug(heading: str, _separator: str = "-") -> str:
+    """The anchor of a heading, as GitHub makes it."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
+
+
+def on_config(config: MkDocsConfig) -> None:
+    """Set what is made by code."""
+    config.mdx_configs["toc"]["slugify"] = slug
+    for section in config.nav or []:  # pages that are still being written
+        for name, pages in section.items():
+            if isinstance(pages, list):
+                section[name] = [page for page in pages if Path(config.docs_dir, page).exists()]
+    config.nav = [section for section in config.nav or [] if all(section.values())]
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """The page with the links that GitHub follows into the repository made absolute."""
+    del files
+    url = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["rmpa"]["url"]
+    docs = Path(config.docs_dir).name
+
+    def published(link: re.Match[str]) -> str:
+        place = posixpath.normpath(posixpath.join(docs, posixpath.dirname(page.file.src_uri), link[1]))
+        if place.startswith(f"{docs}/"):
+            return link[0]
+        return f"{url}/{'tree' if (ROOT / place).is_dir() else 'blob'}/HEAD/{place}"
+
+    return LINK.sub(published, markdown)
