@@ -62,7 +62,9 @@ def test_an_option_that_is_gone_says_what_to_use(command: str, capfd: pytest.Cap
 WORDS = {"values": "{}", "value": "1"}
 QUIET = {
     "rmpa config show",
+    "rmpa bug-report",
     "rmpa doctor",
+    "rmpa init",
     "rmpa trust init",
     "rmpa trust status",
     "rmpa web",

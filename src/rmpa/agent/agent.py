@@ -328,7 +328,7 @@ async def start_core(core: Core, settings: Settings) -> None:
                 f"nodes with ROS_MASTER_URI=http://localhost:{port} are in its module, and so are resources by "
                 f"`rmpa run FILE --name {agent.name}`; a second module here needs another --name and --core-port"
             )
-        elif await _is_other_master(port):
+        elif await is_other_master(port):
             error.remedy = "join its graph with `rmpa up --core external`, or end it, or choose another --core-port"
         raise
 
@@ -343,7 +343,7 @@ def _agent_at(port: int, runtime_dir: str) -> AgentInfo | None:
     return None
 
 
-async def _is_other_master(port: int) -> bool:
+async def is_other_master(port: int) -> bool:
     """Whether a ROS master without an agent answers at a port of this machine."""
     uri = f"http://127.0.0.1:{port}/"
     try:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 # ``rmpa topic list`` is the function ``topic_list`` of its module.
 VERBS: Final = {
     "up": ("agent", "Run this machine's agent: ROS core, discovery, mesh and bridge."),
+    "init": ("init", "Write a first rmpa.toml, from what is found on this machine."),
     "core": ("gateway", "Run the ROS core alone: a drop-in for roscore."),
     "run": ("run", "Run the Smart Resources of a Python file, with the agent of their module."),
     "peer": ("main", "See the peers that the agent knows."),

@@ -323,7 +323,7 @@ def load_settings(
     from_variables, from_options = _variable_layer(environ, notes), _option_layer(options)
     said = from_file | from_variables | from_options
     external = "core_mode" in said and said["core_mode"].read() == "external"
-    strongest = _ros_layer(environ, host_name, notes, external=external) | said
+    strongest = ros_layer(environ, host_name, notes, external=external) | said
     values = {name: given.read() for name, given in strongest.items()}
     directory = state_dir(environ, str(values.get("state_dir") or ""))
     names = {
@@ -479,7 +479,18 @@ def _check_core(strongest: _Layer, notes: list[str], *, external: bool) -> None:
     notes += [str(given.error("is of no use with an external core", "", ())) for given in useless]
 
 
-def _ros_layer(environ: Mapping[str, str], host_name: str, notes: list[str], *, external: bool) -> _Layer:
+def ros_layer(environ: Mapping[str, str], host_name: str, notes: list[str], *, external: bool) -> dict[str, Given]:
+    """What the ROS environment gives, by the setting's name.
+
+    Args:
+        environ: The environment's variables.
+        host_name: This machine's name.
+        notes: Gets a line for each variable that is ignored.
+        external: Whether the core is an external one.
+
+    Raises:
+        ConfigError: A variable cannot be used.
+    """
     found: dict[str, tuple[object, str]] = {}
     if environ.get("ROS_DOMAIN_ID"):
         found["domain"] = (environ["ROS_DOMAIN_ID"], "ROS_DOMAIN_ID")

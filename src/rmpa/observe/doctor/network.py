@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 # --- interfaces -----------------------------------------------------------------------------------------------------
 
-_CONTAINERS: Final = re.compile(r"(docker|br-|veth|virbr|lxc|lxd|cni|flannel|podman|cali)")
+CONTAINERS: Final = re.compile(r"(docker|br-|veth|virbr|lxc|lxd|cni|flannel|podman|cali)")
 _TUNNELS: Final = re.compile(r"(tun|tap|wg|zt|tailscale|ppp|utun|nordlynx|proton)")
 _CONTAINER_MARKS: Final = (Path("/.dockerenv"), Path("/run/.containerenv"))
 
@@ -104,7 +104,7 @@ def _judge_interface(one: NetworkInterface) -> Check:
     if _TUNNELS.match(one.name) or not one.multicast:
         text = f"{addresses}: a tunnel; most of them carry no multicast"
         return check(WARN, text, "name one agent behind it by --seed HOST:PORT")
-    if _CONTAINERS.match(one.name):
+    if CONTAINERS.match(one.name):
         text = f"{addresses}: belongs to containers or virtual machines; agents send beacons there too"
         return check(OK, text, "to keep to one network: --interface NAME")
     if all(network.is_link_local for network in one.networks):

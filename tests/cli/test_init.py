@@ -1,0 +1,181 @@
+"""``rmpa init``: what is found on a machine, and a file that ``rmpa up`` takes as it is."""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+from ipaddress import IPv4Interface
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+import pytest
+
+from rmpa.cli.init import Finding, file_text
+from rmpa.cli.init import _interfaces as of_interfaces
+from rmpa.cli.units import config_text
+from rmpa.config.read import load_settings
+from rmpa.core.identity import peer_name_from
+from rmpa.observe.doctor.machine import NetworkInterface
+from tests.cli.conftest import end, free_port, until, with_core
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from rmpa.config.settings import Settings
+    from rmpa.ros.core.embedded import RosCore
+    from tests.cli.conftest import Place
+
+LO = NetworkInterface("lo", (IPv4Interface("127.0.0.1/8"),), loopback=True)
+WLAN = NetworkInterface("wlan0", (IPv4Interface("192.168.1.5/24"),))
+ETH = NetworkInterface("eth0", (IPv4Interface("10.0.0.5/24"),))
+CABLE = NetworkInterface("eth1", up=False, used=False)
+DOCKER = NetworkInterface("docker0", (IPv4Interface("172.17.0.1/16"),))
+
+
+def settings_of(path: Path) -> Settings:
+    """What the file alone says; nothing of it is doubtful."""
+    loaded = load_settings({"config": str(path)}, {}, host_name="other")
+    assert loaded.notes == ()
+    return loaded.settings
+
+
+def found(place: Place, **environ: str) -> dict[str, dict[str, object]]:
+    place.environ |= environ
+    (told,) = place.json("init", "--json", "--force")
+    assert isinstance(told["found"], list)
+    return {each["setting"]: each for each in told["found"]}
+
+
+def test_what_is_written_is_what_was_found_and_all_else_is_a_default(place: Place) -> None:
+    code, out, err = place.run("init")
+    assert (code, err) == (0, "")
+    assert out.splitlines()[-1] == "rmpa.toml is written. Next: rmpa up"
+    text = (place.path / "rmpa.toml").read_text()
+    added = [line for line in text.splitlines() if line not in config_text().splitlines()]
+    assert all(line.startswith(("# ", "name = ", "interfaces = ")) for line in added)
+    settings = settings_of(place.path / "rmpa.toml")
+    assert settings.name == peer_name_from(socket.gethostname())
+    assert (settings.domain, settings.core_mode, settings.relay) == (0, "embedded", False)
+
+
+def test_the_variables_of_ros_stand_in_the_file(place: Place) -> None:
+    port = free_port()
+    given = found(
+        place,
+        ROS_MASTER_URI=f"http://localhost:{port}",
+        ROS_DOMAIN_ID="7",
+        ROS_STATIC_PEERS="10.0.0.2;arm:40001",
+        ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST",
+        ROS_PACKAGE_PATH="/opt/ros/noetic/share:/home/arm/catkin_ws/src",
+    )
+    assert given["domain"] == {"setting": "domain", "value": 7, "found": "ROS_DOMAIN_ID is set"}
+    assert "/home/arm/catkin_ws/src" in str(given["web.enabled"]["found"])
+    assert "/opt/ros" not in str(given["web.enabled"]["found"])
+    settings = settings_of(place.path / "rmpa.toml")
+    assert (settings.domain, settings.core_port, settings.interfaces) == (7, port, ("lo",))
+    assert [str(seed) for seed in settings.seeds] == ["10.0.0.2", "arm:40001"]
+    for name in [name for name in place.environ if name.startswith("ROS_")]:
+        del place.environ[name]
+    (shown,) = place.json("config", "show", "--json")
+    assert isinstance(shown["settings"], list)
+    origins = {each["name"]: each["from"] for each in shown["settings"]}
+    assert all(str(origins[key]).startswith("rmpa.toml:") for key in ("domain", "core.port", "discovery.seeds"))
+
+
+def test_rmpa_up_does_what_the_file_says(place: Place) -> None:
+    port = free_port()
+    found(place, ROS_MASTER_URI=f"http://localhost:{port}", ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
+    del place.environ["ROS_MASTER_URI"]
+    place.environ["RMPA_MULTICAST"] = f"239.255.82.77:{20000 + os.getpid() % 20000}"
+    name = peer_name_from(socket.gethostname())
+    process = place.start("up")
+    try:
+        until(lambda: process.poll() is not None or (place.path / f"{name}.sock").exists())
+        (shown,) = place.json("config", "show", "--json")
+        code, out, _ = place.run("doctor", "--json")
+        assert code in (0, 1)
+        assert re.search(rf"domain 0, core http://[\w.]+:{port}/", out)
+        assert f"{name} runs here" in str(found(place, ROS_MASTER_URI=f"http://localhost:{port}")["name"]["found"])
+        assert shown["file"] == "rmpa.toml"
+    finally:
+        end(process)
+
+
+def test_a_roscore_that_runs_is_joined(place: Place, core: RosCore) -> None:
+    given = found(place, ROS_MASTER_URI=core.uri.replace("127.0.0.1", "localhost"))
+    port = urlsplit(core.uri).port
+    assert given["core.mode"]["value"] == "external"
+    assert f"is the ROS master at port {port}" in str(given["core.mode"]["found"])
+    settings = settings_of(place.path / "rmpa.toml")
+    assert (settings.core_mode, settings.core_master) == ("external", f"http://localhost:{port}/")
+
+
+def test_beside_another_agent_the_core_gets_another_port(
+    place: Place, core: RosCore, agent: Callable[..., None]
+) -> None:
+    agent(snapshot=with_core(core.uri))
+    port = urlsplit(core.uri).port or 0
+    given = found(place, ROS_MASTER_URI=f"http://localhost:{port}")
+    assert "core.mode" not in given
+    assert given["core.port"]["value"] == port + 1
+    assert "the agent base has port" in str(given["core.port"]["found"])
+
+
+@pytest.mark.parametrize(
+    ("there", "value", "words"),
+    [
+        ((LO, WLAN), None, "wlan0 (192.168.1.5/24) can be used"),
+        ((LO, WLAN, CABLE, DOCKER), ("lo", "wlan0", "eth1"), "docker0 of containers"),
+        ((LO,), None, "no network but loopback"),
+        ((LO, DOCKER), None, "docker0 of containers"),
+    ],
+)
+def test_interfaces(there: tuple[NetworkInterface, ...], value: object, words: str) -> None:
+    (one,) = of_interfaces(there)
+    assert one.value == value
+    assert words in one.text
+
+
+def test_a_machine_in_two_networks_is_told_of_relay() -> None:
+    _, relay = of_interfaces((LO, ETH, WLAN, DOCKER))
+    assert relay.key == ("relay", "enabled")
+    assert relay.value is None, "whether networks are to be joined is for the user to say"
+    assert "10.0.0.0/24 and 192.168.1.0/24" in relay.text
+
+
+def test_each_comment_stands_above_its_line_and_ends_no_line() -> None:
+    text = file_text([Finding(("core", "port"), "a\nb " + "x " * 100, 7), Finding(("relay", "enabled"), "two")])
+    lines = text.splitlines()
+    at = lines.index("port = 7")
+    assert lines[at - 2].startswith("# Found: a\\nb x x")
+    assert lines[lines.index("# Found: two") + 1] == "# enabled = false"
+    assert max(len(line) for line in lines[at - 2 : at]) <= 118
+    assert text.startswith("# Written by `rmpa init`")
+
+
+def test_what_is_there_is_not_replaced_and_a_print_writes_nothing(place: Place) -> None:
+    code, out, _ = place.run("init", "-")
+    assert code == 0
+    assert "\n[core]\n" in out
+    assert not (place.path / "rmpa.toml").exists()
+    assert place.run("init", "--dry-run")[1] == out
+    (place.path / "rmpa.toml").write_text("domain = 3\n")
+    code, _, err = place.run("init")
+    assert (code, err.startswith("rmpa: rmpa.toml: is there already; --force")) == (1, True)
+    assert place.run("init", "--force")[0] == 0
+    assert settings_of(place.path / "rmpa.toml").domain == 0
+
+
+def test_no_password_of_a_variable_is_told(place: Place) -> None:
+    place.environ["ROS_MASTER_URI"] = "http://me:hunter2@10.1.1.1:11311"
+    code, out, err = place.run("init")
+    assert code == 0
+    assert "hunter2" not in out + err + (place.path / "rmpa.toml").read_text()
+    assert "names another machine and is ignored" in err
+
+
+def test_the_file_of_the_system_is_roots(place: Place) -> None:
+    code, _, err = place.run("init", "--system", "file.toml")
+    assert (code, "leave out FILE or --system" in err) == (2, True)
