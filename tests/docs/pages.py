@@ -30,7 +30,6 @@ UNMARKED: Final = {
     "README.md",
     "docs/compare/experiments.md",
     *(f"docs/guides/{path.name}" for path in (ROOT / "docs/guides").glob("*.md")),
-    "docs/reference/cli.md",
     "docs/reference/compatibility.md",
     "docs/reference/security.md",
     "docs/reference/settings.md",

@@ -211,9 +211,12 @@ def _ping(master: Master, wanted: GraphName, number: int, options: Options) -> b
 def node_kill(nodes: tuple[str, ...], everything: bool, options: Options) -> int:
     """Ask nodes to end, and wait until they have.
 
-    The peer's agent ends a node of a peer, if `[nodes] kill` of its rmpa.toml allows it. Exits 1 if a node lives on.
+    The peer's agent ends a node of a peer, if `[nodes] kill` of its rmpa.toml allows it. Exits 1 if a node lives on
+    after 3 s, with the reason.
 
     ---
+    `rosnode kill` of a proxy, /rmpa/PEER/node, ends the peer's node too, and prints "killed" even where that was
+    refused. `rosnode kill -a` ends nodes of this module only.
 
     Examples:
       rmpa node kill /talker

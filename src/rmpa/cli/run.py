@@ -75,7 +75,12 @@ _ROS_MODULES: Final = {
         help="Where resources keep their state. [env: RMPA_STATE_DIR; default: ~/.local/state/rmpa]",
     ),
     flag("--no-state", help="The resources store nothing; for an empty core add -- --keep never."),
-    click.option("--log-level", default="info", type=click.Choice(["debug", "info", "warning", "error"])),
+    click.option(
+        "--log-level",
+        default="info",
+        type=click.Choice(["debug", "info", "warning", "error"]),
+        help="Of the resources; the agent's is behind --. [default: info]",
+    ),
     argument("options", nargs=-1, type=click.UNPROCESSED, metavar="[-- OPTIONS OF rmpa up]"),
     context_settings={"ignore_unknown_options": False},
 )
@@ -95,7 +100,11 @@ def run(
     The file declares one or more rmpa.resource.Resource; see docs/guides/smart-resources.md#tutorial.
     Without --name and --master the module is named as for rmpa up, or else as its first resource. An agent of that
     name that runs already is used, and stays; else one is started with the options behind --, and ends with the
-    resources.
+    resources. An exception in a task, a profile or a hook is logged, and ends neither of them. A second Ctrl-C ends
+    at once.
+
+    Exit codes: 0 ended in order; 1 the agent or a resource could not start, the agent ended, or a function of the
+    file did not return at the end; 2 a mistake in the file or in an option; 130 interrupted before it ran, or twice.
 
     Examples:
       rmpa run sonar.py                            with an agent of its own, named sonar

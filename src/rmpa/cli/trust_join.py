@@ -67,6 +67,9 @@ def trust_invite(
     lets its holder join: pass it on as a secret.
 
     ---
+    With --json one object a line is printed: the token, then each step, whose state is refused or joined. A token
+    that was refused is still valid.
+
     Exit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.
 
     Examples:
