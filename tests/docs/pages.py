@@ -29,7 +29,7 @@ USER_PAGES: Final = [
 UNMARKED: Final = {
     "README.md",
     "docs/compare/experiments.md",
-    *(f"docs/guides/{path.name}" for path in (ROOT / "docs/guides").glob("*.md")),
+    *(f"docs/guides/{name}.md" for name in ("monitor", "ros2", "sites", "smart-resources", "trust", "web")),
     "docs/reference/compatibility.md",
     "docs/reference/security.md",
     "docs/reference/settings.md",
