@@ -28,12 +28,10 @@ USER_PAGES: Final = [
 """The pages that users read."""
 UNMARKED: Final = {
     "README.md",
-    "docs/compare/experiments.md",
     *(f"docs/guides/{name}.md" for name in ("monitor", "ros2", "sites", "smart-resources", "trust", "web")),
     "docs/reference/compatibility.md",
     "docs/reference/security.md",
     "docs/reference/settings.md",
-    "docs/report/README.md",
     "docs/start/demo.md",
     "docs/start/install.md",
 }

@@ -10,6 +10,7 @@ import runpy
 import shutil
 import subprocess
 import sys
+import tarfile
 from pathlib import Path
 from typing import Any, Final
 
@@ -73,6 +74,10 @@ class Clone:
         self.git("add", ".")
         self.git("commit", "-qm", "one")
         self.git("tag", "v0.2.0")
+        head = subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], cwd=self.root, text=True).strip()
+        told = {"code": {"commit": head, "changed": False}, "plan": {"size": "full"}}
+        self.write("dist/experiment/manifest.json", json.dumps(told))
+        self.write("dist/experiment/report/figures/a.svg", "<svg/>")
 
     def write(self, name: str, text: str) -> None:
         path = self.root / name
@@ -118,6 +123,10 @@ REFUSED: Final = {
     "pyproject.toml does not say where RMPA is published": (
         "sed -i s/example.org/rmpa.invalid/ pyproject.toml; git commit -qam two; git tag -f v0.2.0"
     ),
+    "dist/experiment has no report: sudo make experiment": "rm -r dist/experiment",
+    "dist/experiment is no whole run of this code": (
+        "mkdir src/x; echo > src/x/y; git add .; git commit -qm two; git tag -f v0.2.0"
+    ),
     "tests/golden/0.2.0.json is missing": "git rm -q tests/golden/0.2.0.json; git commit -qm two; git tag -f v0.2.0",
 }
 
@@ -128,7 +137,7 @@ def test_a_tree_that_is_no_release_is_refused_in_one_line(clone: Clone, why: str
     error = clone.run(fails=True)
     assert error.startswith(f"make release: {why}"), error
     assert error.count("\n") == 1
-    assert not (clone.root / "dist").exists()
+    assert not clone.release.exists()
 
 
 def test_the_files_of_a_release_with_their_sums(clone: Clone) -> None:
@@ -139,9 +148,13 @@ def test_the_files_of_a_release_with_their_sums(clone: Clone) -> None:
         "rmpa-0.2.0.tar.gz",
         *(f"rmpa-0.2.0-linux-{machine}.{end}" for machine in ("x86_64", "aarch64") for end in ("tar.xz", "cdx.json")),
         *(f"rmpa_0.2.0_{machine}.deb" for machine in ("amd64", "arm64")),
+        "rmpa-0.2.0-report.tar.xz",
         "NOTES.md",
         "SHA256SUMS",
     }
+    with tarfile.open(clone.release / "rmpa-0.2.0-report.tar.xz") as packed:
+        packed_names = [name.removeprefix("rmpa-0.2.0-report/") for name in packed.getnames()]
+    assert packed_names == ["manifest.json", "report/figures", "report/figures/a.svg"]
     assert (clone.release / "NOTES.md").read_text() == "First words.\n\n### Added\n\n* a\n"
     checked = subprocess.run(
         ["sha256sum", "-c", "SHA256SUMS"], cwd=clone.release, capture_output=True, text=True, check=True
@@ -155,7 +168,7 @@ def test_a_second_run_says_what_differs(clone: Clone) -> None:
     shutil.rmtree(clone.root / "dist/rmpa-0.2.0-linux-aarch64")
     out = clone.run(SALT="other")
     assert re.findall(r"(\S+)  DIFFERS from the run before", out) == ["rmpa-0.2.0-py3-none-any.whl"]
-    assert out.count("  as before") == 8
+    assert out.count("  as before") == 9
 
 
 def test_the_bill_of_materials_has_wheels_interpreter_and_c_libraries(clone: Clone) -> None:
