@@ -28,9 +28,8 @@ USER_PAGES: Final = [
 """The pages that users read."""
 UNMARKED: Final = {
     "README.md",
-    *(f"docs/guides/{name}.md" for name in ("monitor", "ros2", "sites", "smart-resources", "trust", "web")),
+    *(f"docs/guides/{name}.md" for name in ("monitor", "ros2", "sites", "smart-resources")),
     "docs/reference/compatibility.md",
-    "docs/reference/security.md",
     "docs/reference/settings.md",
     "docs/start/demo.md",
     "docs/start/install.md",

@@ -73,7 +73,7 @@ class Machine:
 def test_the_commands_of_the_page(lab: Lab, tmp_path: Path) -> None:
     known = {"rmpa1-ae4vq2k…": "", "4f2a91c0…": ""}
     with ExitStack() as stack:
-        machines = {host.name: Machine(host, tmp_path, stack) for host in lab.hosts("base", "arm", "arm2")}
+        machines = {host.name: Machine(host, tmp_path, stack) for host in lab.hosts("base", "arm", "hand")}
         for name, typed, lines in steps():
             command, _, comment = typed.partition(" # ")
             for shown, real in known.items():
