@@ -38,11 +38,12 @@ def steps(page: str) -> Iterator[tuple[str, str, list[str]]]:
 
 def pattern(line: str) -> str:
     """A line of a page as a regular expression: what has a digit, and words that are cut by "…", may be another."""
-    words = (
-        r"\S+" if re.search(r"…|^/home/", word) else re.sub(r"[\w\\.:]*\d[\w\\.:]*", r"[\\w.:]+", re.escape(word))
+    return " ".join(
+        r"\S+"
+        if re.search(r"…|^/home/", word)
+        else r"[\w.:]+".join(map(re.escape, re.split(r"[\w.:]*\d[\w.:]*", word)))
         for word in line.split()
     )
-    return " ".join(words)
 
 
 def says(line: str, output: str) -> bool:
