@@ -118,16 +118,14 @@ def test_the_web_server_answers_as_its_page_says(lab: Lab, tmp_path: Path) -> No
         joystick.start_agent()
         joystick.start("rmpa topic pub -r 10 /joy std_msgs/String 'data: x'")
         eventually(lambda: "/joy" in base.say("rmpa topic list"), what="the topic of the joystick")
-        served = None
+        served = base.start("rmpa web")
         done = []
-        for name, command, lines in steps("web.md"):
-            assert name == "base"
-            plain = "curl" in command and (served is None or served.name != "rmpa web")
-            if command.startswith("rmpa web") or plain:
-                if served:
-                    served.interrupt()
-                served = base.start("rmpa web" if plain else command)
-                served.wait_for("https?://")
+        for _, command, lines in steps("web.md"):
+            wanted = command if command.startswith("rmpa web") else "rmpa web" if "curl" in command else served.name
+            if served.name != wanted:
+                served.interrupt()
+                served = base.start(wanted)
+            served.wait_for("https?://")
             if command.startswith("rmpa web"):
                 for line in lines:
                     served.wait_for(pattern(line))
