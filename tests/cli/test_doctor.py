@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
+import pty
 import socket
+import subprocess
+import sys
 from typing import TYPE_CHECKING
 
 import pytest
@@ -29,8 +33,6 @@ def loopback(place: Place) -> Place:
 
 
 def found(place: Place, *words: str) -> dict[tuple[object, object], dict[str, object]]:
-    import json
-
     _, out, err = place.run("doctor", "--json", *words)
     assert "Traceback" not in err
     return {(f["check"], f["subject"]): f for f in json.loads(out)}
@@ -42,7 +44,7 @@ def test_every_check_answers(loopback: Place) -> None:
     checks = {check for check, _ in answers}
     assert checks == {
         *("settings", "agent", "interface", "multicast", "firewall", "rp_filter", "route", "port", "ROS", "clock"),
-        "radio",
+        *("radio", "directory"),
         *("realtime", "files", "boot", "exposed nodes"),
     }
     assert set(CHECKS) <= checks
@@ -102,3 +104,67 @@ def test_a_core_port_that_somebody_else_has(loopback: Place) -> None:
         taken = found(loopback)["port", str(port)]
     assert taken["level"] == "fail"
     assert "Address already in use" in str(taken["text"])
+
+
+@pytest.fixture
+def killed(loopback: Place) -> Place:
+    """A machine on which an agent was killed."""
+    with socket.socket(socket.AF_UNIX) as sock:
+        sock.bind(str(loopback.path / "dead.sock"))
+    (loopback.path / "dead.lock").touch()
+    return loopback
+
+
+def test_without_a_terminal_fix_shows_what_it_would_do(killed: Place) -> None:
+    code, out, err = killed.run("doctor", "--fix")
+    assert code == 1
+    lock, sock = killed.path / "dead.lock", killed.path / "dead.sock"
+    assert f"    do:   flock --nonblock {lock} rm -f {sock} {lock}\n    undo: nothing: the next agent" in out
+    assert "nothing was changed: there is no terminal to ask on; --yes does it" in err
+    assert sock.exists()
+    code, out, _ = killed.run("doctor", "--fix", "--json")
+    told = json.loads(out)
+    assert (code, told["done"], [each["check"] for each in told["plan"]]) == (1, [], ["directory"])
+    assert sock.exists()
+
+
+def test_fix_does_it_and_checks_again(killed: Place) -> None:
+    assert found(killed)["directory", str(killed.path)]["level"] == "warn"
+    code, out, _ = killed.run("doctor", "--fix", "--yes", "--json")
+    told = json.loads(out)
+    assert told["done"] == [each["command"] for each in told["plan"]]
+    levels = {each["check"]: each["level"] for each in told["checks"]}
+    assert (levels["directory"], told["failed"]) == ("ok", [])
+    assert code == int("fail" in levels.values())
+    assert not (killed.path / "dead.sock").exists()
+    assert "Nothing here can be put right" in killed.run("doctor", "--fix")[1]
+
+
+def test_what_is_the_users_is_printed_and_not_done(killed: Place) -> None:
+    killed.environ["ROS_MASTER_URI"] = "http://203.0.113.7:11311"
+    out = killed.run("doctor", "--fix")[1]
+    mine, _, by_hand = out.partition("By hand, for it is yours to decide:\n")
+    assert "unset ROS_MASTER_URI" in by_hand
+    assert "ROS_MASTER_URI" not in mine
+
+
+@pytest.mark.pty
+@pytest.mark.parametrize(("answer", "stays"), [("n", True), ("y", False)])
+def test_on_a_terminal_fix_asks(killed: Place, answer: str, stays: bool) -> None:
+    ours, its = pty.openpty()
+    command = [sys.executable, "-m", "rmpa.cli.main", "doctor", "--fix"]
+    with subprocess.Popen(command, stdin=its, stdout=its, stderr=its, env=killed.environ, cwd=killed.path) as process:
+        os.close(its)
+        seen = b""
+        while b"Run this command? [y/N] " not in seen:
+            seen += os.read(ours, 65536)
+        os.write(ours, f"{answer}\n".encode())
+        try:
+            while read := os.read(ours, 65536):
+                seen += read
+        except OSError:  # the other end was closed: it has ended
+            pass
+        os.close(ours)
+    assert (killed.path / "dead.sock").exists() is stays
+    assert (b"Checked again:" in seen) is not stays
+    assert process.returncode == int(stays)

@@ -12,7 +12,8 @@ import click
 import msgspec
 import pytest
 
-from rmpa.cli.agent import check_json, check_lines, checks_summary, stage_lines
+from rmpa.cli.agent import stage_lines
+from rmpa.cli.doctor import check_json, check_lines, checks_summary
 from rmpa.observe.doctor.machine import judge_shell
 from rmpa.observe.doctor.network import judge_rules
 from rmpa.observe.health import Health, diagnostic_status

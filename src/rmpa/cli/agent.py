@@ -1,4 +1,4 @@
-"""Verbs about this machine's agent: ``rmpa up``, ``reload``, ``config``, ``doctor``, ``why`` and ``completion``."""
+"""Verbs about this machine's agent: ``rmpa up``, ``reload``, ``config``, ``why`` and ``completion``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import os
 import socket
 import sys
 import threading
-from collections import Counter
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -18,7 +17,6 @@ import click
 from rmpa.cli.advice import advise, advises
 from rmpa.cli.graph import read_name
 from rmpa.cli.options import (
-    FiniteRange,
     Options,
     agent_verb,
     argument,
@@ -28,7 +26,7 @@ from rmpa.cli.options import (
     setting_options,
     verb,
 )
-from rmpa.cli.output import Painted, Table, paint, print_error, print_text, printable, warn
+from rmpa.cli.output import Painted, Table, paint, print_error, printable, warn
 from rmpa.config.module_name import GATEWAY_SUFFIX, NameSource, choose_name, keep_name, state_dir
 from rmpa.config.read import load_settings
 from rmpa.config.settings import SETTINGS, json_value, schema_text, toml_value
@@ -38,17 +36,16 @@ from rmpa.core.identity import proxied_node, proxied_peer
 from rmpa.observe import limits
 from rmpa.observe.control import ReloadReply
 from rmpa.observe.control_client import find_agents
-from rmpa.observe.peer_info import FAIL, OK, WARN, CheckLevel, exit_code
+from rmpa.observe.peer_info import FAIL, OK, WARN, CheckLevel
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.runtime.process import LogWriter, in_journal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rmpa.cli.graph import Graph
     from rmpa.config.schema import Setting
     from rmpa.config.settings import Settings
-    from rmpa.observe.peer_info import Check
 
 _log = logging.getLogger("rmpa.up")
 # Of the results of ``rmpa doctor`` and ``rmpa why``, on a terminal; of all others yellow.
@@ -126,62 +123,6 @@ def config_schema() -> None:
     click.echo(schema_text(), nl=False)
 
 
-@json_verb(
-    config_option,
-    flag("-q", "--quiet", help="Only what fails, or may."),
-    click.option("--listen", metavar="SECONDS", type=FiniteRange(1.0), help="Wait for multicasts of other machines."),
-)
-def doctor(config: str | None, quiet: bool, listen: float | None, options: Options) -> int:
-    """Check this machine: settings, agents, network, ROS environment, clock and rights.
-
-    It changes nothing. It sends one packet on each interface to the agents' multicast group, which agents ignore, and
-    checks that it comes back. To see whether a switch or a firewall in between drops it, run it with --listen on one
-    machine and meanwhile without on the other, then the other way round.
-
-    ---
-    Exit codes: 0 nothing fails (there may be warnings); 1 something does.
-
-    Examples:
-      rmpa doctor
-      sudo rmpa doctor                reads the firewall's rules too
-      rmpa doctor --listen 30         and `rmpa doctor` on another machine: do multicasts get through?
-      rmpa doctor --json | jq '.[] | select(.level == "fail")'
-    """
-    from rmpa.observe.doctor.checks import examine
-    from rmpa.observe.doctor.machine import look_at
-
-    found, shown = [], []
-    for check in examine(look_at(os.environ, config, listen or 0.0)):
-        found.append(check)
-        if not quiet or check.level in (WARN, FAIL):
-            shown.append(check)
-            if not options.as_json:
-                print_text(check_lines(check))
-    options.show([*map(check_json, shown)], checks_summary(found))
-    return exit_code(found)
-
-
-def check_json(check: Check) -> dict[str, str]:
-    """A result of ``rmpa doctor`` for programs."""
-    keys = {"check": check.name, "subject": check.where, "level": check.level, "text": check.text}
-    return keys | ({"remedy": check.remedy} if check.remedy else {})
-
-
-def check_lines(check: Check) -> Iterator[str]:
-    """A result of ``rmpa doctor`` for people."""
-    what = printable(f"{check.name} {check.where}".strip())
-    yield Painted(f"{_paint(f'{check.level.value:<7}', check.level)}  {what}: {printable(check.text)}")
-    if check.remedy:
-        yield f"{'':<9}{check.remedy}"
-
-
-def checks_summary(found: Sequence[Check]) -> str:
-    """How many results there are of each level."""
-    counts = Counter(check.level for check in found)
-    words = [f"{counts[level]} {level.value}" for level in CheckLevel if counts[level]]
-    return f"{len(found)} answers: {', '.join(words)}"
-
-
 @agent_verb(
     argument("name", "topic", metavar="[PEER:]NAME"),
     flag("-s", "--service", help="A service is meant, though a topic has that name."),
@@ -227,21 +168,22 @@ def stage_lines(diagnosis: Diagnosis) -> Iterator[str]:
     yield f"{diagnosis.name}{of}{way}{to}:"
     width = max((len(stage.name) for stage in diagnosis.stages), default=0)
     for stage in diagnosis.stages:
-        mark = _paint(f"{stage.level.value:<7}", stage.level)
+        mark = paint_level(f"{stage.level.value:<7}", stage.level)
         advice = f" ({stage.remedy})" if stage.remedy and stage.level is WARN else ""
         yield Painted(f"  {mark}  {printable(stage.name):<{width}}  {printable(stage.text + advice)}")
     failed = diagnosis.failed
     if diagnosis.unasked:
-        yield _paint("nothing is in its way: it flows as soon as a node subscribes", WARN)
+        yield paint_level("nothing is in its way: it flows as soon as a node subscribes", WARN)
     elif failed is None:
-        yield _paint(_WELL.get(diagnosis.kind, "it flows"), OK)
+        yield paint_level(_WELL.get(diagnosis.kind, "it flows"), OK)
     else:
-        yield _paint(f"it stops at: {failed.name}", FAIL)
+        yield paint_level(f"it stops at: {failed.name}", FAIL)
         if failed.remedy:
             yield f"what to do: {failed.remedy}"
 
 
-def _paint(text: str, level: CheckLevel) -> Painted:
+def paint_level(text: str, level: CheckLevel) -> Painted:
+    """A text in the colour of a result."""
     return paint(text, _COLOURS.get(level, "yellow"))
 
 

@@ -99,7 +99,7 @@ VERBS: Final = {
     "trust join": ("trust_join", "Join a secured mesh with a token, or by files."),
     "trust check": ("trust", "Say whether a peer may do something here, and by which rule."),
     "why": ("agent", "Say why a topic of a peer does not arrive, and what to do."),
-    "doctor": ("agent", "Check this machine: network, clock, rights, ROS environment."),
+    "doctor": ("doctor", "Check this machine: network, clock, rights, ROS environment."),
     "web": ("gateway", "Serve this module's state over HTTP: metrics, REST."),
     "gateway": ("gateway", "Join this network's modules with other sites and with ROS 2, over Zenoh."),
     "gateway zenoh-config": ("gateway", "Print a configuration for zenohd, Zenoh's own router."),

@@ -80,7 +80,7 @@ def _usable(place: Path) -> bool:
     return stat.S_ISDIR(info.st_mode) and trusted and os.access(place, os.R_OK | os.X_OK)
 
 
-def _closed_to_us() -> str:
+def closed_to_us() -> str:
     """The group of the directory of a unit's agent, where this user may not read that; else empty."""
     try:
         info = _SYSTEM.stat()
@@ -304,7 +304,7 @@ def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAg
     agents = find_agents(environ)
     wanted = name or environ.get("RMPA_AGENT")
     listed = ", ".join(agent.name for agent in agents)
-    if not agents and (owner := _closed_to_us()):
+    if not agents and (owner := closed_to_us()):
         remedy = f"use sudo; or once: sudo usermod -aG {owner} $USER, and log in again"
         raise UnreachableError("agent", f"{_SYSTEM}, which users of the group {owner} may read", remedy)
     if not wanted and not agents:

@@ -20,7 +20,7 @@ from rmpa.core.counters import remedy as file_limit_advice
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
 from rmpa.observe import limits
-from rmpa.observe.doctor import machine, network
+from rmpa.observe.doctor import machine, network, repairs
 from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.why.diagnosis import misplaced, remedy_for, subscriber_text
 from rmpa.ros.http.rpc import call_api
@@ -277,6 +277,7 @@ CHECKS: Final[dict[str, Callable[[DoctorInput], Iterable[Check]]]] = {
     "clock": machine.clocks,
     "realtime": machine.rights,
     "boot": machine.at_boot,
+    "directory": repairs.directories,
     "exposed nodes": _exposed_nodes,
 }
 

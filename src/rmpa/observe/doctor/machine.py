@@ -280,11 +280,20 @@ def judge_peer_clock(agent: str, peer: str, offset: float, error: float | None) 
 # --- the start with the machine -------------------------------------------------------------------------------------
 
 
+# The agent's unit, as ``rmpa service install`` and the Debian package name it.
+UNIT: Final = "rmpa.service"
+
+
 def at_boot(_: DoctorInput) -> Iterable[Check]:
     """The check of the unit of ``rmpa service install``."""
+    return [judge_unit(read_unit())]
+
+
+def read_unit() -> dict[str, str]:
+    """What ``systemctl show`` says of the agent's unit; empty where there is no systemd."""
     properties = "--property=LoadState,ActiveState,UnitFileState,Result"
-    told = ask_program("systemctl", "show", "rmpa.service", properties) or ""
-    return [judge_unit(dict(line.partition("=")[::2] for line in told.splitlines()))]
+    told = ask_program("systemctl", "show", UNIT, properties) or ""
+    return dict(line.partition("=")[::2] for line in told.splitlines())
 
 
 def judge_unit(unit: Mapping[str, str]) -> Check:
@@ -296,7 +305,11 @@ def judge_unit(unit: Mapping[str, str]) -> Check:
         return Check("boot", FAIL, f"rmpa.service has failed ({unit['Result']})", "journalctl -u rmpa says why")
     if unit["UnitFileState"] != "enabled":
         text = f"rmpa.service is {unit['ActiveState']}, and does not start with the machine"
-        return Check("boot", WARN, text, "sudo systemctl enable rmpa")
+        return Check("boot", WARN, text, "sudo systemctl enable --now rmpa")
+    if unit["ActiveState"] == "inactive":
+        return Check(
+            "boot", WARN, "rmpa.service starts with the machine, and was stopped", "sudo systemctl start rmpa"
+        )
     return Check("boot", OK, f"rmpa.service is {unit['ActiveState']}, and starts with the machine")
 
 
