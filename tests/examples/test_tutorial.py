@@ -10,14 +10,12 @@ import sys
 import tempfile
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import pytest
 
 from lab.bed.processes import Process, eventually
-from rmpa.cli.messages import read_values
 from rmpa.cli.run import load
-from rmpa.resource.quality import parse_requirement
 from tests.interop.ros import free_port
 
 if TYPE_CHECKING:
@@ -27,7 +25,6 @@ ROOT: Final = Path(__file__).parents[2]
 FILES: Final = ROOT / "examples" / "resources"
 PAGE: Final = (ROOT / "docs/guides/smart-resources.md").read_text(encoding="utf-8")
 TUTORIAL: Final = PAGE.partition("\n## Configuration\n")[0]
-README: Final = (ROOT / "README.md").read_text(encoding="utf-8")
 STEP: Final = re.compile(r"^```console\n(.*?)^```$|^<!-- ctrl-c: (\S+) -->$", re.MULTILINE | re.DOTALL)
 COMMAND: Final = re.compile(r"^\$ (.*)\n((?:[^$].*\n)*)", re.MULTILINE)
 NUMBER: Final = re.compile(r"\d+(?:\.\d+)?(?:e-?\d+)?")
@@ -38,25 +35,6 @@ def test_its_files_are_the_examples() -> None:
     assert [name for name, _ in shown] == ["sonar.py", "keeper.py", "ask.py"]
     for name, text in shown:
         assert (FILES / name).read_text(encoding="utf-8") == text, name
-
-
-def test_the_readme_has_a_resource_that_can_be_run(tmp_path: Path) -> None:
-    (text,) = re.findall(r"`camera\.py`:\n\n```python\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
-    path = tmp_path / "camera.py"
-    path.write_text(text, encoding="utf-8")
-    (camera,) = load(path)
-    assert camera.profiles.keys() == {"small", "full"}
-    sent: list[int] = []
-    camera.outputs["frames"].on_publish = lambda values, _message: sent.append(len(values["data"]))
-    for name in camera.profiles:
-        camera.profiles[name].apply()
-        camera.tasks["shoot"].function()
-    assert sent == [320 * 30, 640 * 30]
-    (asked,) = re.findall(r"/camera/requirements \S+ \\\n +'(.*)'$", README, re.MULTILINE)
-    array: Any = read_values((asked,))
-    values = [(pair["key"], pair["value"]) for pair in array["status"][0]["values"]]
-    bounds = parse_requirement("/someone", values, camera.attributes, "camera", 0.0).bounds
-    assert {name: bound.hard for name, bound in bounds.items()} == {"sharpness": False, "rate": True}
 
 
 def test_the_keeper_says_how_close_it_keeps() -> None:

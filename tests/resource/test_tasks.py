@@ -8,45 +8,13 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from rmpa.resource.resource import Resource
-from rmpa.resource.tasks import Schedule, TaskReport, Tasks, restart_delay, stuck_after
+from rmpa.resource.tasks import TaskReport, Tasks, restart_delay, stuck_after
 from tests.resource.rig import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
-
-
-def test_times_are_absolute_whatever_the_work_takes() -> None:
-    schedule = Schedule(0.1, 5.0)
-    dues = [schedule.next_due(now) for now in (5.0, 5.03, 5.19, 5.2)]
-    assert [due for due, _ in dues] == pytest.approx([5.0, 5.1, 5.2, 5.3])
-    assert not any(missed for _, missed in dues)
-
-
-def test_a_time_that_is_a_whole_period_past_is_left_out() -> None:
-    schedule = Schedule(0.1, 0.0)
-    schedule.next_due(0.0)
-    due, missed = schedule.next_due(0.35)
-    assert due == pytest.approx(0.3)
-    assert missed == 2
-
-
-@given(st.floats(1e-4, 10), st.lists(st.floats(0, 100), max_size=30))
-def test_each_due_time_is_met_or_missed(period: float, works: list[float]) -> None:
-    schedule = Schedule(period, 0.0)
-    now, dues, missed = 0.0, [], 0
-    for work in works:
-        due, late = schedule.next_due(now)
-        dues.append(due)
-        missed += late
-        assert due > now - period * 1.000001
-        now = max(now, due) + work
-    ticks = [round(due / period) for due in dues]
-    assert ticks == sorted(set(ticks))
-    assert not ticks or missed == ticks[-1] + 1 - len(ticks)
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from rmpa.core.schedule import Schedule
 from rmpa.resource import limits
 from rmpa.resource.declare import OnFailure
 from rmpa.resource.runtime import RuntimePart
@@ -45,7 +46,6 @@ ENTER_SLICE: Final = 0.1
 _POLL: Final = 0.002
 # Seconds between checks for stuck runs.
 _STUCK_CHECK: Final = 0.25
-_EARLY: Final = 1e-9
 
 
 class RunGate:
@@ -106,29 +106,6 @@ class RunGate:
         with self._change:
             self._closers.discard(closer)
             self._change.notify_all()
-
-
-class Schedule:
-    """The due times of a periodic task: start, start + period, start + 2 periods and so on.
-
-    The times are absolute, so that lateness does not add up. A due time that is a whole period past is skipped.
-
-    Args:
-        period: The period in seconds, above 0.
-        start: The first due time, in monotonic seconds.
-    """
-
-    def __init__(self, period: float, start: float) -> None:
-        self.period = period
-        self._start = start
-        self._tick = -1
-
-    def next_due(self, now: float) -> tuple[float, int]:
-        """Advance to the next due time; returns it in monotonic seconds like ``now``, and how many were skipped."""
-        self._tick += 1
-        late = max(0, math.floor((now - self._start) / self.period + _EARLY) - self._tick)
-        self._tick += late
-        return self._start + self._tick * self.period, late
 
 
 @dataclass(slots=True)
