@@ -1,4 +1,9 @@
-"""RMPA: ROS 1 modules with a core of their own that share topics, with no master between them."""
+"""RMPA: ROS 1 modules with a core of their own that share topics, with no master between them.
+
+What ``__all__`` of ``rmpa``, ``rmpa.client`` and ``rmpa.resource`` has is the Python API, which
+``docs/reference/compatibility.md`` promises; every other name is private. The names are imported at their first use,
+and ``__init__.pyi`` has their types.
+"""
 
 import sys
 
@@ -14,4 +19,44 @@ except ImportError:  # a clone, on its way to the release that CHANGELOG.md begi
     VERSION, COMMIT, DATE = "0.2.0.dev0", "", ""
 
 __version__ = str(VERSION)
-__all__ = ["COMMIT", "DATE", "VERSION", "__version__"]
+
+_MODULES = {
+    "rmpa.core.errors": ["ConfigError", "PeerRefused", "RmpaError", "UnreachableError"],
+    "rmpa.ros.node.node": ["Node", "Publisher", "Received", "Service", "ServiceClient", "Subscriber"],
+    "rmpa.ros.node.service_client": ["ServiceFailed"],
+    "rmpa.ros.types.definitions": ["DefinitionError"],
+    "rmpa.ros.types.messages": ["MessageError"],
+    "rmpa.sync": ["SyncNode", "SyncPublisher", "connect"],
+}
+_LAZY = {name: module for module, names in _MODULES.items() for name in names}
+__all__ = [
+    "COMMIT",
+    "DATE",
+    "VERSION",
+    "ConfigError",
+    "DefinitionError",
+    "MessageError",
+    "Node",
+    "PeerRefused",
+    "Publisher",
+    "Received",
+    "RmpaError",
+    "Service",
+    "ServiceClient",
+    "ServiceFailed",
+    "Subscriber",
+    "SyncNode",
+    "SyncPublisher",
+    "UnreachableError",
+    "__version__",
+    "connect",
+]
+
+
+def __getattr__(name):
+    """Import a name of the API at its first use."""
+    if name not in _LAZY:
+        raise AttributeError(f"module 'rmpa' has no attribute {name!r}")
+    import importlib  # noqa: PLC0415 - most programs that import rmpa need no more of it
+
+    return getattr(importlib.import_module(_LAZY[name]), name)

@@ -44,6 +44,7 @@ NODE_UNREGISTER_AT_ONCE: Final = 16
 _REMEDY: Final = "start one (rmpa up, or roscore), or set ROS_MASTER_URI to one that runs"
 
 Handler = Callable[[Any], "Awaitable[Any] | Any"]
+ParamCallback = Callable[[str, "XmlRpcValue"], None]
 
 
 class MasterClient:
@@ -60,8 +61,8 @@ class MasterClient:
         self.master_uri = master_uri
         # By ``Publisher``, ``Subscriber`` or ``Service``, and name.
         self._entries: dict[tuple[str, str], Publisher | Subscriber | Service] = {}
-        # The parameters that are subscribed to.
-        self._followed: set[str] = set()
+        # The parameters that are subscribed to, with what is told of their changes.
+        self._followed: dict[str, ParamCallback | None] = {}
 
     @property
     def uri(self) -> str:

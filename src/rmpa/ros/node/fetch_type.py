@@ -83,6 +83,20 @@ async def fetch_type(
     return None
 
 
+async def find_here(name: str) -> MessageType | None:
+    """Find a message type on this machine; ``None`` if only a publisher can supply it.
+
+    Raises:
+        DefinitionError: The definition is malformed, or rmpa brings the types of its package, but none of this name.
+    """
+    try:
+        return await asyncio.to_thread(find_message_type, name)
+    except UnknownTypeError as error:
+        if not error.fetchable:
+            raise
+        return None
+
+
 async def find_or_fetch(master_uri: str, caller_id: str, name: str, topic: str = "") -> MessageType:
     """Find a message type on this machine (``ros.types.find``), else fetch it from a publisher.
 

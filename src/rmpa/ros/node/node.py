@@ -1,10 +1,11 @@
-"""``Node``: a ROS node in Python without ROS, for programs, tools and tests; ``from rmpa.ros import Node``.
+"""``Node``: a ROS node in Python without ROS, for programs, tools and tests; ``rmpa.Node``.
 
 ::
 
     async with Node("talker") as node:
         publisher = await node.advertise("/chatter", "std_msgs/String")
-        publisher.publish(data="hello")
+        async for count in node.rate(10):
+            publisher.publish(data=f"hello {count}")
 
     async with Node("echo", anonymous=True) as node:
         async for received in await node.subscribe("/chatter"):
@@ -14,18 +15,24 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 import logging
 import os
+import signal
 import time
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from rmpa.config import limits as config_limits
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.core.schedule import Schedule
 from rmpa.ros import limits
 from rmpa.ros.environment import RosEnvironment, host_of, is_loopback
+from rmpa.ros.node import rosout
 from rmpa.ros.node.endpoints import (
     Handler,
     MasterClient,
+    ParamCallback,
     Publisher,
     Received,
     Service,
@@ -33,17 +40,17 @@ from rmpa.ros.node.endpoints import (
     Subscriber,
     probe,
 )
-from rmpa.ros.node.fetch_type import find_or_fetch
+from rmpa.ros.node.fetch_type import find_here, find_or_fetch
 from rmpa.ros.node.listeners import local_addresses
+from rmpa.ros.node.rosout import RosoutHandler
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.types.definitions import UnknownTypeError
-from rmpa.ros.types.find import find_message_type, find_service_type
+from rmpa.ros.types.find import find_service_type
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import ANY, TopicDescription
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
     from types import TracebackType
 
     from rmpa.ros.types.installed import ServiceType
@@ -59,6 +66,8 @@ __all__ = ["Node", "Publisher", "Received", "Service", "ServiceClient", "Subscri
 
 _log = logging.getLogger(__name__)
 _NO_DEFAULT: Final = object()
+# Time between two look-ups of a service that is waited for.
+_SERVICE_CHECK: Final = 0.2
 
 
 class Node(MasterClient):
@@ -75,6 +84,8 @@ class Node(MasterClient):
         environment: Replaces that of this process's variables; pass one to use command-line arguments.
         on_shutdown: ``(reason)``: called when the master shuts the node down, before the node closes.
         on_param_update: ``(key, value)``: a parameter subscribed to by ``follow_param`` has changed.
+        handle_signals: Whether SIGINT (Ctrl-C) and SIGTERM close the node, so that its loops end and the program goes
+            on behind the ``async with``. For the main thread.
 
     Raises:
         ConfigError: A ROS variable cannot be used.
@@ -92,7 +103,8 @@ class Node(MasterClient):
         anonymous: bool = False,
         environment: RosEnvironment | None = None,
         on_shutdown: Callable[[str], None] | None = None,
-        on_param_update: Callable[[str, XmlRpcValue], None] | None = None,
+        on_param_update: ParamCallback | None = None,
+        handle_signals: bool = False,
     ) -> None:
         if environment is None:
             environment = RosEnvironment.read(os.environ, (), local_addresses())
@@ -102,7 +114,9 @@ class Node(MasterClient):
         self.stopped = asyncio.Event()
         self._on_shutdown = on_shutdown
         self._on_param_update = on_param_update
-        self._watch: asyncio.Task[None] | None = None
+        self._signals = (signal.SIGINT, signal.SIGTERM) if handle_signals else ()
+        self._rosout: RosoutHandler | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
         self._closing: asyncio.Task[None] | None = None
         master_uri = master_uri or environment.master_uri
         host = environment.host
@@ -131,7 +145,10 @@ class Node(MasterClient):
         except BaseException:
             await self.slave.close()
             raise
-        self._watch = asyncio.get_running_loop().create_task(self._watch_master(), name=f"watch master {self.name}")
+        loop = asyncio.get_running_loop()
+        for number in self._signals:
+            loop.add_signal_handler(number, self._begin_close)
+        self._start(self._watch_master(), f"watch master {self.name}")
         return self
 
     async def __aexit__(
@@ -209,7 +226,7 @@ class Node(MasterClient):
         resolved = self._resolve(topic)
         type_name = kind if isinstance(kind, str) else ANY
         if isinstance(kind, str):
-            kind = await self._find_type(kind) if kind != ANY else None
+            kind = await find_here(kind) if kind != ANY else None
         if ("Subscriber", resolved) in self._entries:
             raise ValueError(f"{self.name} subscribes to {resolved} already")
         subscriber = Subscriber(
@@ -225,6 +242,35 @@ class Node(MasterClient):
         )
         await self._add(subscriber)
         return subscriber
+
+    async def wait_for_message(
+        self,
+        topic: str,
+        kind: str | MessageType | None = None,
+        timeout: float | None = None,  # noqa: ASYNC109 - the message names it
+    ) -> Received:
+        """The next message of a topic; arguments and errors are those of ``subscribe``.
+
+        Args:
+            topic: Resolved in the namespace.
+            kind: The type; ``None`` accepts any.
+            timeout: Seconds; ``None`` waits for ever.
+
+        Raises:
+            UnreachableError: There was none in time, or the node was closed.
+        """
+        subscriber = await self.subscribe(topic, kind, queue_messages=1)
+        where = f"{self.name}, which is closed"
+        try:
+            async with asyncio.timeout(timeout):
+                async for received in subscriber:
+                    return received
+        except TimeoutError:
+            where = f"{self.name} in {timeout:g} s"
+        finally:
+            await subscriber.close()
+        remedy = f"`rmpa why {subscriber.topic}` says what is missing"
+        raise UnreachableError(f"publisher of {subscriber.topic}", where, remedy)
 
     # --- services ---------------------------------------------------------------------------------------------
 
@@ -271,6 +317,29 @@ class Node(MasterClient):
             where = f"the ROS master {self.master_uri}"
             raise UnreachableError(f"server of service {resolved}", where, "does its node run?")
         return str(reply.value)
+
+    async def wait_for_service(self, name: str, timeout: float | None = None) -> None:  # noqa: ASYNC109
+        """Wait until a service answers.
+
+        Args:
+            name: Resolved in the namespace.
+            timeout: Seconds; ``None`` waits for ever.
+
+        Raises:
+            UnreachableError: It does not in time; the text says why.
+        """
+        loop = asyncio.get_running_loop()
+        until = None if timeout is None else loop.time() + timeout
+        while True:
+            try:
+                uri = await self.lookup_service(name)
+                await probe(uri, self._resolve(name), self.name, limits.SERVICE_OPEN_TIMEOUT)
+            except RmpaError:
+                if self.stopped.is_set() or (until is not None and loop.time() >= until):
+                    raise
+            else:
+                return
+            await self._stopped_before(loop.time() + _SERVICE_CHECK)
 
     async def connect_service(self, name: str, kind: str | ServiceType, *, persistent: bool = True) -> ServiceClient:
         """Connect to a service, for many calls or for one; close the result.
@@ -358,27 +427,84 @@ class Node(MasterClient):
         reply = await self._call("searchParam", key)
         return str(reply.value) if reply.code == 1 else None
 
-    async def follow_param(self, key: str) -> XmlRpcValue:
-        """Subscribe to a parameter: ``on_param_update`` gets its changes; return its value, ``{}`` for none."""
+    async def follow_param(self, key: str, callback: ParamCallback | None = None) -> XmlRpcValue:
+        """Subscribe to a parameter or a namespace; return its value, ``{}`` for none.
+
+        Args:
+            key: Resolved in the namespace; ``~name`` is the node's own.
+            callback: ``(key, value)``: called in the event loop with each change; a deleted parameter's value is
+                ``{}``. ``on_param_update`` is called too.
+        """
         resolved = self._resolve(key)
-        self._followed.add(resolved)
+        self._followed[resolved] = callback
         return await self.call_master("subscribeParam", self.uri, resolved)
 
-    # --- inside -----------------------------------------------------------------------------------------------
+    # --- time and log -----------------------------------------------------------------------------------------
 
-    async def _find_type(self, name: str) -> MessageType | None:
-        """Find a message type on this machine; ``None`` if only a publisher can supply it.
+    async def rate(self, hz: float) -> AsyncIterator[int]:
+        """The numbers 0, 1, 2 … at a rate, the first one at once, until the node closes.
 
-        Raises:
-            DefinitionError: The definition is malformed, or rmpa brings the types of its package, but none of this
-                name.
+        Due times are absolute, so that lateness does not add up. A time that is a whole period past is left out, and
+        so is its number.
+
+        Args:
+            hz: How many a second.
         """
-        try:
-            return await asyncio.to_thread(find_message_type, name)
-        except UnknownTypeError as error:
-            if not error.fetchable:
-                raise
-            return None
+        loop = asyncio.get_running_loop()
+        schedule, count = Schedule(1 / hz, loop.time()), 0
+        while True:
+            due, missed = schedule.next_due(loop.time())
+            if await self._stopped_before(due):
+                return
+            count += missed
+            yield count
+            count += 1
+
+    def timer(self, period: float, callback: Callable[[], Awaitable[None] | None]) -> asyncio.Task[None]:
+        """Call a function again and again, the first time after one period, until the node closes.
+
+        Args:
+            period: Seconds from one call to the next, by absolute times as in ``rate``.
+            callback: A function or a coroutine function; its exceptions are logged.
+
+        Returns:
+            Its task: ``cancel()`` ends it.
+        """
+
+        async def run() -> None:
+            async for count in self.rate(1 / period):
+                if not count:
+                    continue
+                try:
+                    result = callback()
+                    if inspect.isawaitable(result):
+                        await result
+                except Exception:  # noqa: BLE001 - the top of the user's code
+                    _log.exception("! %s: a timer of %g s failed", self.name, period)
+
+        return self._start(run(), f"timer of {self.name}")
+
+    @cached_property
+    def logger(self) -> logging.Logger:
+        """The node's log: its records go to ``/rosout``, and to the handlers that the program has configured.
+
+        Without a handler they go to standard error. First read it inside of the ``async with``; it may be used in any
+        thread then. Its level is INFO unless the program sets another.
+        """
+
+        def topics() -> list[str]:
+            return sorted(key for kind, key in self._entries if kind == Publisher.kind_name)
+
+        logger = logging.getLogger("rosout" + self.name.replace("/", "."))
+        if logger.level == logging.NOTSET:
+            logger.setLevel(logging.INFO)
+        self._rosout = RosoutHandler(
+            self.name, partial(self.advertise, rosout.TOPIC, rosout.TYPE, latch=True), topics
+        )
+        logger.addHandler(self._rosout)
+        return logger
+
+    # --- inside -----------------------------------------------------------------------------------------------
 
     async def _version_of(self, uri: str, service: str, found: ServiceType) -> ServiceType | None:
         """Find the server's version of a service type; ``None`` if it is the same or is not on this machine."""
@@ -408,13 +534,31 @@ class Node(MasterClient):
 
     def _param_update(self, key: str, value: XmlRpcValue) -> bool:
         # An update of a namespace concerns subscriptions below it, and the other way round.
-        if not any(
-            key == f or key.startswith(f.rstrip("/") + "/") or f.startswith(key.rstrip("/") + "/")
-            for f in self._followed
-        ):
+        told = [
+            callback
+            for f, callback in self._followed.items()
+            if key == f or key.startswith(f.rstrip("/") + "/") or f.startswith(key.rstrip("/") + "/")
+        ]
+        for callback in (*told, self._on_param_update) if told else ():
+            try:
+                if callback is not None:
+                    callback(key, value)
+            except Exception:  # noqa: BLE001 - the top of the user's code
+                _log.exception("! %s: the callback for parameter %s failed", self.name, key)
+        return bool(told)
+
+    def _start(self, run: Coroutine[Any, Any, None], name: str) -> asyncio.Task[None]:
+        task = asyncio.get_running_loop().create_task(run, name=name)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    async def _stopped_before(self, due: float) -> bool:
+        try:
+            async with asyncio.timeout_at(due):
+                await self.stopped.wait()
+        except TimeoutError:
             return False
-        if self._on_param_update is not None:
-            self._on_param_update(key, value)
         return True
 
     def _shutdown_requested(self, reason: str) -> None:
@@ -429,10 +573,14 @@ class Node(MasterClient):
         return self._closing
 
     async def _close(self) -> None:
-        if self._watch is not None:
-            self._watch.cancel()
-            await asyncio.wait([self._watch])
         self.stopped.set()
+        if self._rosout is not None:
+            await self._rosout.drained()
+            self.logger.removeHandler(self._rosout)
+        if self._tasks:
+            for task in self._tasks:
+                task.cancel()
+            await asyncio.wait(self._tasks)
         await self._unregister_all()
         for entry in self._entries.values():
             if isinstance(entry, Publisher):
@@ -440,3 +588,5 @@ class Node(MasterClient):
             elif isinstance(entry, Subscriber):
                 entry.ended()
         await self.slave.close()
+        for number in self._signals:
+            asyncio.get_running_loop().remove_signal_handler(number)

@@ -1,0 +1,104 @@
+"""The log of a node: a ``logging.Logger`` whose records go to ``/rosout``, as rospy's and roscpp's do."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import sys
+from collections import deque
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core.errors import RmpaError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from rmpa.ros.node.endpoints import Publisher
+
+TOPIC: Final = "/rosout"
+TYPE: Final = "rosgraph_msgs/Log"
+# Records that wait for the connection of the core's /rosout; above it the oldest is dropped.
+_WAITING: Final = 1000
+# Time in which the core's /rosout connects: what is published before that would be lost.
+_SUBSCRIBED_WITHIN: Final = 1.0
+# Time between two attempts to register at a master that does not answer.
+_RETRY: Final = 1.0
+# Of rosgraph_msgs/Log, by the least level of Python's.
+_LEVELS: Final = {logging.CRITICAL: 16, logging.ERROR: 8, logging.WARNING: 4, logging.INFO: 2}
+_DEBUG: Final = 1
+
+_log = logging.getLogger(__name__)
+
+
+class RosoutHandler(logging.Handler):
+    """Publishes records on ``/rosout``; records may come from any thread.
+
+    A program that does not configure ``logging`` sees them on standard error too.
+
+    Args:
+        name: The node's name.
+        advertise: Advertises a topic: ``Node.advertise`` for ``/rosout``.
+        topics: The topics that the node publishes.
+    """
+
+    def __init__(
+        self, name: str, advertise: Callable[[], Awaitable[Publisher]], topics: Callable[[], list[str]]
+    ) -> None:
+        super().__init__()
+        self._node = name
+        self._advertise = advertise
+        self._topics = topics
+        self._loop = asyncio.get_running_loop()
+        self._waiting: deque[dict[str, object]] = deque(maxlen=_WAITING)
+        self._publisher: Publisher | None = None
+        self._task: asyncio.Task[None] | None = None
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Publish a record."""
+        text = self.format(record)
+        if not logging.getLogger().handlers:
+            print(f"[{record.levelname}] [{record.created:.6f}]: {text}", file=sys.stderr)
+        fields: dict[str, object] = {
+            "header": {"stamp": record.created},
+            "level": next((ros for python, ros in _LEVELS.items() if record.levelno >= python), _DEBUG),
+            "name": self._node,
+            "msg": text,
+            "file": record.pathname,
+            "function": record.funcName or "",
+            "line": record.lineno,
+        }
+        with contextlib.suppress(RuntimeError):  # the loop is closed: the program ends
+            self._loop.call_soon_threadsafe(self._take, fields)
+
+    async def drained(self) -> None:
+        """Wait until what has been logged is published, for a moment at the most."""
+        await asyncio.sleep(0)  # what other calls have put into the loop comes first
+        if self._task is not None:
+            await asyncio.wait([self._task], timeout=_SUBSCRIBED_WITHIN)
+            self._task.cancel()
+
+    def _take(self, fields: dict[str, object]) -> None:
+        self._waiting.append(fields)
+        if self._publisher is not None:
+            self._publish(self._publisher)
+        elif self._task is None:
+            self._task = self._loop.create_task(self._start(), name=f"rosout of {self._node}")
+
+    async def _start(self) -> None:
+        publisher: Publisher | None = None
+        while publisher is None:
+            try:
+                publisher = await self._advertise()
+            except RmpaError as error:
+                _log.debug("! %s: %s", self._node, error)
+                await asyncio.sleep(_RETRY)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_SUBSCRIBED_WITHIN):
+                await publisher.wait_for_subscriber()
+        self._publisher = publisher
+        self._publish(publisher)
+
+    def _publish(self, publisher: Publisher) -> None:
+        while self._waiting:
+            publisher.publish(topics=self._topics(), **self._waiting.popleft())

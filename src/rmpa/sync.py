@@ -1,0 +1,418 @@
+"""``connect``: a node for scripts, without asyncio; as near to rospy as that is possible.
+
+::
+
+    with rmpa.connect("talker") as node:
+        chatter = node.advertise("/chatter", "std_msgs/String")
+        for count in node.rate(10):
+            chatter.publish(data=f"hello {count}")
+
+Its methods are those of ``rmpa.Node``, with the same names, and wait for the result. Callbacks get the message itself
+and run in threads, so that they may wait too: each subscription has a thread, each timer, and each call of a service.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+import threading
+from concurrent.futures import CancelledError, Future
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self, TypeVar
+
+from rmpa.config.limits import SERVICE_TIMEOUT
+from rmpa.core.errors import RmpaError
+from rmpa.ros import limits
+from rmpa.ros.node.node import Node
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+    from types import FrameType, TracebackType
+
+    from rmpa.ros.node.endpoints import ParamCallback, Publisher, Service, Subscriber
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+
+_T = TypeVar("_T")
+_log = logging.getLogger(__name__)
+
+# Messages that wait for a callback; above it the oldest is dropped.
+_QUEUE: Final = 100
+_NO_DEFAULT: Final = object()
+
+
+class _WaitFor(Protocol):
+    def __call__(self, coroutine: Coroutine[Any, Any, _T], /) -> _T: ...
+
+
+def connect(name: str, *, master_uri: str = "", anonymous: bool = False) -> SyncNode:
+    """Make a node for a script; use the result in a ``with``, which Ctrl-C and SIGTERM end.
+
+    Args:
+        name: The node's name, resolved in the namespace.
+        master_uri: Replaces ROS_MASTER_URI.
+        anonymous: Whether the name is made unique.
+    """
+    return SyncNode(name, master_uri=master_uri, anonymous=anonymous)
+
+
+class SyncPublisher:
+    """Publishes one topic of a ``SyncNode``; made by ``SyncNode.advertise``."""
+
+    def __init__(self, publisher: Publisher, wait_for: _WaitFor) -> None:
+        self._publisher = publisher
+        self._wait_for = wait_for
+
+    @property
+    def topic(self) -> str:
+        """The global name."""
+        return self._publisher.topic
+
+    @property
+    def subscribers(self) -> int:
+        """Number of connected subscribers."""
+        return self._publisher.subscribers
+
+    def publish(self, message: object = None, /, **fields: object) -> int:
+        """Publish a message, as ``rmpa.Publisher.publish``: a message, plain values, or fields by name.
+
+        Returns:
+            The number of older messages dropped for slow subscribers.
+
+        Raises:
+            MessageError: The message does not fit the type.
+            RmpaError: The node is closed.
+        """
+
+        async def publish() -> int:
+            return self._publisher.publish(message, **fields)
+
+        return self._wait_for(publish())
+
+    def wait_for_subscriber(self, timeout: float | None = None) -> bool:
+        """Wait until there is a subscriber; false if there is none in time."""
+
+        async def wait() -> bool:
+            try:
+                async with asyncio.timeout(timeout):
+                    await self._publisher.wait_for_subscriber()
+            except TimeoutError:
+                return False
+            return True
+
+        return self._wait_for(wait())
+
+
+class SyncNode:
+    """A node for scripts; made by ``connect``.
+
+    A ``with`` registers it, and unregisters it at its end. In the main thread Ctrl-C and SIGTERM end the ``with``:
+    KeyboardInterrupt interrupts what runs in it, and the program goes on behind it. When the master shuts the node
+    down (``rosnode kill``), ``rate`` and ``spin`` end.
+
+    Args:
+        name: The node's name, resolved in the namespace.
+        master_uri: Replaces ROS_MASTER_URI.
+        anonymous: Whether the name is made unique.
+    """
+
+    def __init__(self, name: str, *, master_uri: str = "", anonymous: bool = False) -> None:
+        self._arguments: dict[str, Any] = {"name": name, "master_uri": master_uri, "anonymous": anonymous}
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._thread = threading.Thread(target=self._run, name=f"rmpa {name}", daemon=True)
+        self._node: Node | None = None
+        self._stopped = threading.Event()
+        self._closing = False
+        self._restore: list[tuple[signal.Signals, Any]] = []
+
+    def __enter__(self) -> Self:
+        """Register at the master.
+
+        Raises:
+            UnreachableError: The master does not answer.
+            ConfigError: A ROS variable cannot be used.
+        """
+        self._loop = asyncio.new_event_loop()
+        self._thread.start()
+        try:
+            self._node = self._wait_for(self._open())
+        except BaseException:
+            self._end()
+            raise
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._restore.append((number, signal.signal(number, self._interrupt)))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool:
+        """Unregister and close; KeyboardInterrupt ends here."""
+        self.close()
+        return isinstance(error, KeyboardInterrupt)
+
+    def close(self) -> None:
+        """Unregister everything and close; may be called twice."""
+        self._closing = True  # which takes seconds at the most, so further signals are ignored
+        if self._loop is not None and self._node is not None:
+            self._wait_for(self._node.close())
+            self._end()
+        for number, handler in self._restore:
+            signal.signal(number, handler)
+        self._restore.clear()
+
+    @property
+    def name(self) -> str:
+        """The global name."""
+        return self._open_node.name
+
+    @property
+    def logger(self) -> logging.Logger:
+        """The node's log, which goes to ``/rosout``; see ``rmpa.Node.logger``."""
+
+        async def logger() -> logging.Logger:
+            return self._open_node.logger
+
+        return self._wait_for(logger())
+
+    # --- topics -----------------------------------------------------------------------------------------------
+
+    def advertise(
+        self,
+        topic: str,
+        kind: str,
+        *,
+        latch: bool = False,
+        queue_messages: int = limits.SUBSCRIBER_QUEUE_MESSAGES,
+    ) -> SyncPublisher:
+        """Publish a topic; see ``rmpa.Node.advertise``.
+
+        Args:
+            topic: Resolved in the namespace; ``~name`` is the node's own.
+            kind: The type, ``package/Name``.
+            latch: Whether each new subscriber gets the last message.
+            queue_messages: Messages queued for one slow subscriber; above it the oldest is dropped.
+        """
+        node = self._open_node
+        made = self._wait_for(node.advertise(topic, kind, latch=latch, queue_messages=queue_messages))
+        if made.kind is not None:
+            made.kind.serialize(made.make())  # makes its code, so that the first message does not wait for that
+        return SyncPublisher(made, self._wait_for)
+
+    def subscribe(
+        self, topic: str, kind: str | None, callback: Callable[[Any], object], *, queue_messages: int = _QUEUE
+    ) -> Subscriber:
+        """Subscribe to a topic; see ``rmpa.Node.subscribe``.
+
+        Args:
+            topic: Resolved in the namespace.
+            kind: The type, ``package/Name``; ``None`` accepts any.
+            callback: Called with each message, in a thread, one after the other; its exceptions are logged.
+            queue_messages: Messages that wait for the callback; above it the oldest is dropped.
+        """
+        made = self._wait_for(self._open_node.subscribe(topic, kind, queue_messages=queue_messages))
+        self._for_each(aiter(made), lambda received: callback(received.message), f"callback for {topic}")
+        return made
+
+    def wait_for_message(self, topic: str, kind: str | None = None, timeout: float | None = None) -> Any:
+        """The next message of a topic; see ``rmpa.Node.wait_for_message``.
+
+        Raises:
+            UnreachableError: There was none in time.
+        """
+        return self._wait_for(self._open_node.wait_for_message(topic, kind, timeout)).message
+
+    # --- services ---------------------------------------------------------------------------------------------
+
+    def advertise_service(
+        self, name: str, kind: str, handler: Callable[[Any], Any], *, timeout: float = SERVICE_TIMEOUT
+    ) -> Service:
+        """Serve a service; see ``rmpa.Node.advertise_service``.
+
+        Args:
+            name: Resolved in the namespace.
+            kind: The type, ``package/Name``.
+            handler: Called with each request, in a thread; returns the response as an object or plain values. An
+                exception becomes the client's error.
+            timeout: Seconds for a call before the client gets an error.
+        """
+
+        async def handle(request: Any) -> Any:
+            future: Future[Any] = Future()
+
+            def run() -> None:
+                future.set_running_or_notify_cancel()
+                try:
+                    future.set_result(handler(request))
+                except Exception as error:  # noqa: BLE001 - it is the client's answer
+                    future.set_exception(error)
+
+            threading.Thread(target=run, name=f"call of {name}", daemon=True).start()
+            return await asyncio.wrap_future(future)
+
+        return self._wait_for(self._open_node.advertise_service(name, kind, handle, timeout=timeout))
+
+    def wait_for_service(self, name: str, timeout: float | None = None) -> None:
+        """Wait until a service answers; raises UnreachableError where it does not in time."""
+        self._wait_for(self._open_node.wait_for_service(name, timeout))
+
+    def call_service(
+        self, name: str, kind: str, request: object = None, timeout: float | None = SERVICE_TIMEOUT
+    ) -> Any:
+        """Call a service, and return its response; see ``rmpa.Node.call_service``."""
+        return self._wait_for(self._open_node.call_service(name, kind, request, timeout))
+
+    # --- parameters -------------------------------------------------------------------------------------------
+
+    def get_param(self, key: str, default: Any = _NO_DEFAULT) -> Any:
+        """A parameter's value, or ``default`` where one is given and the parameter does not exist."""
+        given = {} if default is _NO_DEFAULT else {"default": default}
+        return self._wait_for(self._open_node.get_param(key, **given))
+
+    def set_param(self, key: str, value: XmlRpcValue) -> None:
+        """Set a parameter."""
+        self._wait_for(self._open_node.set_param(key, value))
+
+    def has_param(self, key: str) -> bool:
+        """Whether a parameter exists."""
+        return self._wait_for(self._open_node.has_param(key))
+
+    def delete_param(self, key: str) -> None:
+        """Delete a parameter."""
+        self._wait_for(self._open_node.delete_param(key))
+
+    def follow_param(self, key: str, callback: ParamCallback) -> XmlRpcValue:
+        """Call ``callback(key, value)`` in a thread with each change; return the present value, ``{}`` for none."""
+        changes: asyncio.Queue[tuple[str, XmlRpcValue]] = asyncio.Queue()
+
+        async def each() -> AsyncIterator[tuple[str, XmlRpcValue]]:
+            while True:
+                yield await changes.get()
+
+        node = self._open_node
+        value = self._wait_for(node.follow_param(key, lambda key, value: changes.put_nowait((key, value))))
+        self._for_each(each(), lambda change: callback(*change), f"callback for parameter {key}")
+        return value
+
+    # --- time -------------------------------------------------------------------------------------------------
+
+    def rate(self, hz: float) -> Iterator[int]:
+        """The numbers 0, 1, 2 … at a rate, until the node is closed; see ``rmpa.Node.rate``."""
+        ticks = self._open_node.rate(hz)
+        while (count := self._wait_for(_next(ticks))) is not None:
+            yield count
+
+    def timer(self, period: float, callback: Callable[[], object]) -> Callable[[], None]:
+        """Call a function every ``period`` seconds, in a thread, one call at a time; see ``rmpa.Node.timer``.
+
+        Returns:
+            A function that ends it.
+        """
+        ended = threading.Event()
+
+        def tick(count: int) -> None:
+            if count and not ended.is_set():
+                callback()
+
+        self._for_each(self._open_node.rate(1 / period), tick, f"timer of {period:g} s", ended)
+        return ended.set
+
+    def sleep(self, seconds: float) -> bool:
+        """Sleep; false if the node is closed meanwhile."""
+        return not self._stopped.wait(seconds)
+
+    def spin(self) -> None:
+        """Wait until the node is closed: by Ctrl-C, SIGTERM or the master."""
+        self._stopped.wait()
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the node is closed."""
+        return self._stopped.is_set()
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    @property
+    def _open_node(self) -> Node:
+        if self._node is None:
+            raise RmpaError(f"{self._arguments['name']} is not open: write `with rmpa.connect(...) as node:`")
+        return self._node
+
+    async def _open(self) -> Node:
+        node = Node(**self._arguments, on_shutdown=lambda _reason: self._stopped.set())
+        await node.__aenter__()
+        return node
+
+    def _run(self) -> None:
+        """Run the event loop, in a thread of its own."""
+        if self._loop is not None:
+            self._loop.run_forever()
+
+    def _wait_for(self, coroutine: Coroutine[Any, Any, _T], /) -> _T:
+        """Run a coroutine in the event loop, and wait for its result.
+
+        Raises:
+            RmpaError: The node is closed.
+        """
+        loop = self._loop
+        if loop is None:
+            coroutine.close()
+            raise RmpaError(f"{self._arguments['name']} is closed")
+        future: Future[_T] = asyncio.run_coroutine_threadsafe(coroutine, loop)
+        try:
+            return future.result()
+        except CancelledError:
+            raise RmpaError(f"{self._arguments['name']} is closed") from None
+        except RmpaError as error:  # what happened in the loop is no help to a script's author
+            raise error.with_traceback(None) from None
+        except BaseException:
+            future.cancel()
+            raise
+
+    def _for_each(
+        self,
+        items: AsyncIterator[_T],
+        callback: Callable[[_T], object],
+        what: str,
+        ended: threading.Event | None = None,
+    ) -> None:
+        """Call a function of the script with each item, in a thread, until the items or the node end."""
+
+        def run() -> None:
+            with suppress(RmpaError, RuntimeError):  # the node, or its loop, is closed
+                while not (ended and ended.is_set()) and (item := self._wait_for(_next(items))) is not None:
+                    try:
+                        callback(item)
+                    except Exception:  # noqa: BLE001 - the top of the user's code
+                        _log.exception("! the %s failed", what)
+
+        threading.Thread(target=run, name=what, daemon=True).start()
+
+    def _end(self) -> None:
+        """End the loop and its thread; calls that still wait get an error."""
+        self._stopped.set()
+        loop, self._loop = self._loop, None
+        if loop is None:
+            return
+
+        async def cancel() -> None:
+            others = asyncio.all_tasks() - {asyncio.current_task()}
+            for task in others:
+                task.cancel()
+            await asyncio.gather(*others, return_exceptions=True)
+            await loop.shutdown_asyncgens()
+            await loop.shutdown_default_executor()
+
+        asyncio.run_coroutine_threadsafe(cancel(), loop).result()
+        loop.call_soon_threadsafe(loop.stop)
+        self._thread.join()
+        loop.close()
+
+    def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
+        if not self._closing:
+            self._stopped.set()
+            raise KeyboardInterrupt
+
+
+async def _next(items: AsyncIterator[_T]) -> _T | None:
+    return await anext(items, None)

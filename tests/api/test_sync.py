@@ -1,0 +1,196 @@
+"""``rmpa.connect``, as scripts use it, at a core in another thread."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import threading
+from concurrent.futures import Future
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import rmpa
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.http.rpc import call_api
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+DEADLINE = 30.0
+
+
+@pytest.fixture
+def core(monkeypatch: pytest.MonkeyPatch) -> Iterator[RosCore]:
+    ready: Future[RosCore] = Future()
+    loop = asyncio.new_event_loop()
+    ended = asyncio.Event()
+
+    async def serve() -> None:
+        made = RosCore("127.0.0.1", 0)
+        await made.start()
+        ready.set_result(made)
+        await ended.wait()
+        await made.close()
+
+    thread = threading.Thread(target=lambda: loop.run_until_complete(serve()))
+    thread.start()
+    made = ready.result(DEADLINE)
+    monkeypatch.setenv("ROS_MASTER_URI", made.uri)
+    yield made
+    loop.call_soon_threadsafe(ended.set)
+    thread.join()
+    loop.close()
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_left() -> Iterator[None]:
+    before = set(threading.enumerate())
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    yield
+    for thread in set(threading.enumerate()) - before:
+        thread.join(DEADLINE)
+        assert not thread.is_alive(), thread.name
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+
+
+def test_a_script_publishes_and_another_hears_it(core: RosCore) -> None:
+    heard: list[str] = []
+    three = threading.Event()
+
+    def hear(message: Any) -> None:
+        heard.append(message.data)
+        if len(heard) == 1:
+            raise ValueError("the first")  # which is told, and no more
+        if len(heard) == 3:
+            three.set()
+
+    with rmpa.connect("listener") as listener, rmpa.connect("talker") as talker:
+        listener.subscribe("/chatter", "std_msgs/String", hear)
+        chatter = talker.advertise("/chatter", "std_msgs/String")
+        assert chatter.wait_for_subscriber(DEADLINE)
+        for count in talker.rate(100):
+            chatter.publish(data=f"hello {count}")
+            if count >= 2:
+                break
+        while not three.wait(0.05):
+            chatter.publish("again")
+        with pytest.raises(rmpa.MessageError, match="has no field 'dat'"):
+            chatter.publish(dat="hello")
+        assert (talker.name, chatter.topic, chatter.subscribers) == ("/talker", "/chatter", 1)
+    assert heard[0] == "hello 0"
+    assert "/chatter" not in core.state().publishers
+
+
+def test_a_callback_may_wait_for_a_service_and_a_handler_too(core: RosCore) -> None:
+    answers: Future[int] = Future()
+    with rmpa.connect("server") as server, rmpa.connect("client") as client:
+
+        def double(request: Any) -> dict[str, int]:
+            return {"sum": 2 * request.a}
+
+        def add(request: Any) -> dict[str, int]:
+            if request.b < 0:
+                raise ValueError("less than nothing")
+            twice = server.call_service("/double", "rospy_tutorials/AddTwoInts", [request.a, 0]).sum
+            return {"sum": twice + request.b}
+
+        server.advertise_service("/double", "rospy_tutorials/AddTwoInts", double)
+        server.advertise_service("/add", "rospy_tutorials/AddTwoInts", add)
+        client.wait_for_service("/add", DEADLINE)
+        client.subscribe(
+            "/go",
+            "std_msgs/Int64",
+            lambda m: answers.set_result(client.call_service("/add", "rospy_tutorials/AddTwoInts", [m.data, 1]).sum),
+        )
+        server.advertise("/go", "std_msgs/Int64", latch=True).publish(20)
+        assert answers.result(DEADLINE) == 41
+        with pytest.raises(rmpa.PeerRefused, match="ValueError: less than nothing"):
+            client.call_service("/add", "rospy_tutorials/AddTwoInts", {"b": -1})
+        with pytest.raises(rmpa.UnreachableError, match="no server of service /never"):
+            client.wait_for_service("/never", 0.05)
+
+
+def test_parameters_messages_timers_and_the_log(core: RosCore) -> None:
+    changes: list[tuple[str, object]] = []
+    changed = threading.Event()
+    ticks: list[int] = []
+
+    def change(key: str, value: object) -> None:
+        changes.append((key, value))
+        changed.set()
+
+    with rmpa.connect("n") as node, rmpa.connect("other") as other:
+        other.set_param("/gain", 1.5)
+        assert node.follow_param("/gain", change) == 1.5
+        assert (node.has_param("/gain"), node.get_param("/gain"), node.get_param("/none", 7)) == (True, 1.5, 7)
+        with pytest.raises(rmpa.PeerRefused):
+            node.get_param("/none")
+        other.set_param("/gain", 2.5)
+        assert changed.wait(DEADLINE)
+        assert changes == [("/gain", 2.5)]
+        other.delete_param("/gain")
+        with pytest.raises(rmpa.UnreachableError, match="no publisher of /t"):
+            node.wait_for_message("/t", "std_msgs/String", timeout=0.05)
+        other.advertise("/t", "std_msgs/String", latch=True).publish("hello")
+        assert node.wait_for_message("/t", timeout=DEADLINE).data == "hello"
+        end = node.timer(0.01, lambda: ticks.append(1))
+        while len(ticks) < 3:
+            assert node.sleep(0.01)
+        end()
+        other.logger.warning("low")
+        assert node.wait_for_message("/rosout", timeout=DEADLINE).msg == "low"
+
+
+def test_ctrl_c_ends_the_with_and_nothing_else(core: RosCore) -> None:
+    for number, wait in (
+        (signal.SIGINT, lambda n: n.spin()),
+        (signal.SIGTERM, lambda n: n.wait_for_message("/never")),
+        (signal.SIGINT, lambda n: list(n.rate(0.001))),
+        (signal.SIGINT, lambda n: n.sleep(DEADLINE)),
+    ):
+        with rmpa.connect("n") as node:
+            threading.Timer(0.1, os.kill, (os.getpid(), number)).start()
+            wait(node)
+            pytest.fail("it was not interrupted")
+        assert node.stopped
+
+
+def test_a_node_that_the_master_ends_is_stopped(core: RosCore) -> None:
+    with rmpa.connect("n") as node:
+        node.advertise("/t", "std_msgs/String")
+        uri = str(asyncio.run(call_api(core.uri, "lookupNode", "/me", "/n")).value)
+        threading.Timer(0.1, lambda: asyncio.run(call_api(uri, "shutdown", "/me", "enough"))).start()
+        for count in node.rate(0.001):
+            assert count == 0
+        node.spin()
+        assert node.stopped
+
+
+def test_calls_that_wait_end_with_the_node(core: RosCore) -> None:
+    told: Future[BaseException] = Future()
+    with rmpa.connect("n") as node:
+
+        def wait() -> None:
+            try:
+                node.wait_for_message("/never")
+            except rmpa.RmpaError as error:
+                told.set_result(error)
+
+        threading.Thread(target=wait).start()
+        while "/never" not in core.state().subscribers:
+            node.sleep(0.01)
+    assert "is closed" in str(told.result(DEADLINE))
+    with pytest.raises(rmpa.RmpaError, match="n is closed"):
+        node.get_param("/gain")
+    with pytest.raises(rmpa.RmpaError, match=r"with rmpa\.connect"):
+        rmpa.connect("n").get_param("/gain")
+
+
+def test_without_a_master_it_says_what_to_do_in_a_short_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_MASTER_URI", "http://127.0.0.1:1")
+    with pytest.raises(rmpa.UnreachableError, match=r"no ROS master answers .* start one \(rmpa up") as caught:
+        rmpa.connect("n").__enter__()
+    assert caught.value.__cause__ is None
+    assert len(caught.traceback) <= 3

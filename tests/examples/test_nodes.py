@@ -1,0 +1,174 @@
+"""The nodes of ``examples/nodes``, each beside a real agent, and what others see of them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from lab.bed.processes import DEADLINE, Process, eventually
+from tests.interop.ros import PYTHON, environment, free_port
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+ROOT: Final = Path(__file__).parents[2]
+NODES: Final = ROOT / "examples" / "nodes"
+# Debian has no rospy_tutorials: the same two ends with a type that it has.
+ROSPY_SERVER: Final = """
+import rospy
+from std_srvs.srv import SetBool
+rospy.init_node("rospy_switch")
+rospy.Service("/switch", SetBool, lambda request: (request.data, "of rospy"))
+rospy.spin()
+"""
+OUR_SERVER: Final = """
+import rmpa
+with rmpa.connect("our_switch") as node:
+    node.advertise_service("/switch", "std_srvs/SetBool", lambda asked: {"success": asked.data, "message": "ours"})
+    node.spin()
+"""
+OUR_CLIENT: Final = """
+import rmpa
+with rmpa.connect("hand") as node:
+    node.wait_for_service("/switch", 30)
+    print(node.call_service("/switch", "std_srvs/SetBool", [True]).message)
+"""
+
+
+class Machine:
+    """A module: its agent, what runs beside it, and its user's environment."""
+
+    def __init__(self, home: Path, name: str, group: str) -> None:
+        self.home, self.name, self.port = home, name, free_port()
+        kept = {key: value for key, value in os.environ.items() if not key.startswith(("ROS_", "RMPA_", "XDG_"))}
+        self.environ = kept | {
+            "HOME": str(home),
+            "RMPA_RUNTIME_DIR": str(home),
+            "RMPA_AGENT": name,
+            "RMPA_MULTICAST": group,
+            "ROS_MASTER_URI": f"http://127.0.0.1:{self.port}",
+            "NO_COLOR": "1",
+        }
+        self.processes: list[Process] = []
+        self.agent = self.start(
+            *(sys.executable, "-m", "rmpa.cli.main", "up", "--name", name),
+            *("--interface", "lo", "--core-port", str(self.port)),
+        )
+        eventually(lambda: self.rmpa("node", "list"), DEADLINE, what=f"the agent {name}", every=0.2)
+
+    def start(self, *argv: str | Path) -> Process:
+        process = Process(argv, env=self.environ)
+        self.processes.append(process)
+        return process
+
+    def example(self, name: str, *argv: str) -> Process:
+        """Run one of the examples."""
+        return self.start(sys.executable, "-u", NODES / name, *argv)
+
+    def rmpa(self, *words: str) -> str:
+        """Run a command to its end; its output, empty where it fails."""
+        command = [sys.executable, "-m", "rmpa.cli.main", *words]
+        done = subprocess.run(command, env=self.environ, stdout=subprocess.PIPE, text=True, timeout=40, check=False)
+        return done.stdout if done.returncode == 0 else ""
+
+    def ros(self, *words: str) -> subprocess.CompletedProcess[str]:
+        """Run one of ROS's own tools."""
+        env = environment(self.home, self.port)
+        return subprocess.run(words, env=env, capture_output=True, text=True, timeout=40, check=False)
+
+    def close(self) -> None:
+        while self.processes:
+            self.processes.pop().end()
+
+
+@pytest.fixture(scope="module")
+def group() -> str:
+    return f"239.255.82.78:{20000 + os.getpid() % 12000}"
+
+
+@pytest.fixture(scope="module")
+def machine(group: str) -> Iterator[Machine]:
+    with tempfile.TemporaryDirectory(prefix="rmpa-test-") as home:
+        one = Machine(Path(home), "base", group)
+        yield one
+        one.close()
+
+
+def test_the_talker_the_listener_and_the_tools(machine: Machine) -> None:
+    talker = machine.example("talker.py")
+    listener = machine.example("listener.py")
+    listener.wait_for(r"^heard: hello \d+$")
+    assert 'data: "hello ' in machine.rmpa("topic", "echo", "/chatter", "-n", "1")
+    assert "/talker" in machine.rmpa("topic", "info", "/chatter")
+    assert "said hello" in machine.rmpa("topic", "echo", "/rosout_agg", "-n", "1")
+    for process in (listener, talker):
+        assert process.interrupt() == 0
+        assert "Traceback" not in process.output
+    talker.wait_for(r"^\[INFO\] \[\d+\.\d+\]: said hello 1 times$")
+    assert "/chatter" not in machine.rmpa("topic", "list")
+
+
+def test_the_service_and_its_client(machine: Machine) -> None:
+    client = machine.example("add_two_ints_client.py", "2", "3")  # which waits for the service
+    server = machine.example("add_two_ints_server.py")
+    client.wait_for(r"^2 \+ 3 = 5$")
+    assert client.wait() == 0
+    server.wait_for(r"^\[INFO\] \[\d+\.\d+\]: 2 \+ 3$")
+    assert "sum: 42" in machine.rmpa("service", "call", "/add_two_ints", "{a: 40, b: 2}")
+    os.kill(server.pid, signal.SIGTERM)
+    assert server.wait() == 0
+    assert "/add_two_ints" not in machine.rmpa("service", "list")
+
+
+@pytest.mark.parametrize("name", ["talker.py", "add_two_ints_server.py"])
+def test_without_a_master_the_last_line_says_what_to_do(machine: Machine, name: str) -> None:
+    done = subprocess.run(
+        [sys.executable, NODES / name],
+        env={**machine.environ, "ROS_MASTER_URI": "http://127.0.0.1:1"},
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+        timeout=DEADLINE,
+    )
+    assert done.returncode == 1
+    said = "no ROS master answers at http://127.0.0.1:1 (ROS_MASTER_URI); start one (rmpa up, or roscore), or set"
+    assert said in done.stderr.splitlines()[-1]
+
+
+@pytest.mark.ros
+def test_rospys_nodes_hear_them_and_are_heard(machine: Machine) -> None:
+    talker = machine.example("talker.py")
+    talker.wait_for("said hello")
+    heard = machine.ros("rostopic", "echo", "-n1", "/chatter")
+    assert heard.stdout.startswith('data: "hello '), heard
+    assert 'name: "/talker"' in machine.ros("rostopic", "echo", "-n1", "/rosout_agg").stdout
+    assert "/talker" in machine.ros("rosnode", "list").stdout
+    listener = machine.example("listener.py")
+    listener.wait_for("^heard: ")
+    killed = machine.ros("rosnode", "kill", "/talker")
+    assert "killed" in killed.stdout, killed
+    assert talker.wait() == 0
+    rospy = machine.start("rostopic", "pub", "-r", "20", "/chatter", "std_msgs/String", "data: of rospy")
+    listener.wait_for("^heard: of rospy$")
+    rospy.end()
+    assert listener.interrupt() == 0
+
+
+@pytest.mark.ros
+def test_rospys_clients_and_servers_know_them(machine: Machine) -> None:
+    ours = machine.start(sys.executable, "-c", OUR_SERVER)
+    eventually(lambda: "/switch" in machine.rmpa("service", "list"), DEADLINE, what="the service", every=0.2)
+    called = machine.ros("rosservice", "call", "/switch", "true")
+    assert called.stdout == 'success: True\nmessage: "ours"\n', called
+    assert ours.interrupt() == 0
+    with Process([PYTHON, "-c", ROSPY_SERVER], env=environment(machine.home, machine.port)):
+        client = machine.start(sys.executable, "-c", OUR_CLIENT)
+        client.wait_for("^of rospy$")
+        assert client.wait() == 0
