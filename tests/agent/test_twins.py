@@ -1,4 +1,4 @@
-"""Two identical robots that meet: each is told, and parted from the other by one setting."""
+"""Two identical robots that meet: each is told, and parted from the other by one setting (docs/guides/names.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A real roscore in place of the embedded core: ``rmpa up --core external``."""
+"""A real roscore in place of the embedded core: ``rmpa up --core external`` (docs/guides/running.md)."""
 
 from __future__ import annotations
 

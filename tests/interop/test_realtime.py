@@ -1,4 +1,4 @@
-"""``rmpa up --realtime``: the kernel's view of the process, with the rights and without."""
+"""``rmpa up --realtime``: the kernel's view of the process, with the rights and without (docs/guides/running.md)."""
 
 from __future__ import annotations
 

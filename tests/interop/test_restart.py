@@ -1,4 +1,7 @@
-"""An agent is killed and started again: its nodes are back, here and at its peers, and none of them was restarted."""
+"""An agent is killed and started again: its nodes are back, here and at its peers, and none of them was restarted.
+
+The commands of docs/guides/running.md are among them.
+"""
 
 from __future__ import annotations
 

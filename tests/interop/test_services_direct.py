@@ -1,4 +1,7 @@
-"""Direct calls of services: unmodified clients connect to the server itself, and the agents only arrange it."""
+"""Direct calls of services: unmodified clients connect to the server itself, and the agents only arrange it.
+
+The command of docs/guides/services.md is among them.
+"""
 
 from __future__ import annotations
 

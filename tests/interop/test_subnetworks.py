@@ -1,4 +1,7 @@
-"""Two networks: joined by a router that forwards no multicast, or by modules that have a cable in each."""
+"""Two networks: joined by a router that forwards no multicast, or by modules that have a cable in each.
+
+The commands of docs/guides/networks.md are among them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""``packaging/container``: the image is built by buildah, and the compose file's three modules run by podman."""
+"""``packaging/container``: the image is built by buildah, and the compose file's three modules run by podman.
+
+The commands of docs/guides/containers.md are among them, with podman in place of Docker.
+"""
 
 from __future__ import annotations
 

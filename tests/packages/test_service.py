@@ -1,4 +1,4 @@
-"""``rmpa service install`` on machines that run systemd, by each way to install."""
+"""``rmpa service install`` on machines that run systemd, by each way to install (docs/guides/running.md)."""
 
 from __future__ import annotations
 
