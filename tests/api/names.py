@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from types import ModuleType
 
-MODULES: Final = ("rmpa", "rmpa.resource")
+MODULES: Final = ("rmpa", "rmpa.client", "rmpa.resource")
 # What ``with``, ``async with`` and ``async for`` call.
 _SPECIAL: Final = {"__aenter__", "__aiter__", "__enter__"}
 # What a node and its publishers, subscribers and services call of each other.
@@ -25,6 +25,7 @@ _INSIDE: Final = {
 }
 # Classes whose objects others make.
 _MADE: Final = {"Publisher", "Received", "Service", "ServiceClient", "Subscriber", "SyncNode", "SyncPublisher"}
+_OURS: Final = r"rmpa\.[a-z._]+\."
 GOLDEN: Final = Path(__file__).with_name("names.txt")
 
 
@@ -44,7 +45,11 @@ def _module(module: ModuleType, done: set[str]) -> Iterator[str]:
 
 
 def _members(kind: type) -> Iterator[str]:
-    for name in () if issubclass(kind, msgspec.Struct) else dir(kind):
+    if issubclass(kind, msgspec.Struct):
+        for field in msgspec.structs.fields(kind):
+            yield f"    .{field.name}: {re.sub(_OURS, '', inspect.formatannotation(field.type))}"
+        return
+    for name in dir(kind):
         found = inspect.getattr_static(kind, name)
         public = name in _SPECIAL or not (name.startswith("_") or name in _INSIDE)
         if public and hasattr(found, "__get__") and not inspect.ismemberdescriptor(found):
@@ -55,8 +60,7 @@ def _text(value: object) -> str:
     if inspect.isclass(value) and issubclass(value, Enum):
         return f": {', '.join(member.name for member in value)}"
     if inspect.isclass(value) and issubclass(value, msgspec.Struct):
-        fields = (f"{field.name}: {field.type}" for field in msgspec.structs.fields(value))
-        return f"({', '.join(fields)})".replace("typing.", "")
+        return ""
     if inspect.isclass(value) and issubclass(value, BaseException):
         return f"({', '.join(base.__name__ for base in value.__bases__)})"
     if callable(value) and getattr(value, "__name__", "") not in _MADE:

@@ -172,3 +172,20 @@ def test_rospys_clients_and_servers_know_them(machine: Machine) -> None:
         client = machine.start(sys.executable, "-c", OUR_CLIENT)
         client.wait_for("^of rospy$")
         assert client.wait() == 0
+
+
+def test_the_watcher_shows_who_comes_and_goes(machine: Machine, group: str) -> None:
+    watcher = machine.example("watch_mesh.py")
+    with tempfile.TemporaryDirectory(prefix="rmpa-test-") as home:
+        arm = Machine(Path(home), "arm", group)
+        try:
+            watcher.wait_for(r"^\+ module arm$")
+            talker = arm.example("talker.py")
+            watcher.wait_for(r"^\+ topic /chatter std_msgs/String$")
+            assert talker.interrupt() == 0
+            watcher.wait_for("^- topic /chatter$")
+        finally:
+            arm.close()
+    watcher.wait_for("^- module arm ")
+    assert watcher.interrupt() == 0
+    assert "Traceback" not in watcher.output

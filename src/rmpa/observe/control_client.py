@@ -169,7 +169,7 @@ class NameLock:
 
 
 _T = TypeVar("_T")
-_START_ONE = "start one with `rmpa up`"
+START_ONE = "start one with `rmpa up`"
 
 
 class _Result(msgspec.Struct, Generic[_T], frozen=True):
@@ -178,6 +178,35 @@ class _Result(msgspec.Struct, Generic[_T], frozen=True):
     ok: Literal[True]
     value: _T
     follows: int = 0
+
+
+def read_reply(path: Path, op: str, line: bytes, type: type[_T]) -> _Result[_T]:  # noqa: A002 - as msgspec calls it
+    """Read the agent's reply to a request.
+
+    Args:
+        path: Its socket.
+        op: The operation.
+        line: What it sent, with its end.
+        type: The type of the value.
+
+    Raises:
+        PeerRefused: The agent refused, and said why.
+        UnreachableError: It closed the connection.
+        RemoteProtocolError: Its value has another type.
+    """
+    agent = f"agent {path.stem}"
+    if len(line) > limits.CONTROL_REPLY_MAX:
+        raise RemoteProtocolError(f"{agent} sends more than {limits.CONTROL_REPLY_MAX} bytes")
+    if not line.endswith(b"\n"):
+        raise UnreachableError("agent", f"{path}: it hung up", "its log says why")
+    try:
+        reply: _Result[_T] = msgspec.json.decode(line, type=_Result[type])  # type: ignore[valid-type]
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        refused = ControlReply.parse(line)
+        if not refused.ok:
+            raise PeerRefused(agent, refused.error, refused.remedy) from None
+        raise RemoteProtocolError(f"{agent} answers {op} in another way: {error}; is it older?") from None
+    return reply
 
 
 class ControlClient:
@@ -203,7 +232,7 @@ class ControlClient:
             self._sock.connect(str(path))
         except OSError:
             self._sock.close()
-            raise UnreachableError("agent", str(path), _START_ONE) from None
+            raise UnreachableError("agent", str(path), START_ONE) from None
         self._file = self._sock.makefile("rb", 256 * KIB)
 
     @property
@@ -242,19 +271,7 @@ class ControlClient:
             self._sock.sendall(ControlRequest(op, args).serialize())
             return self._file.readline(limits.CONTROL_REPLY_MAX + 1)
 
-        line = self._received(exchange)
-        if len(line) > limits.CONTROL_REPLY_MAX:
-            raise RemoteProtocolError(f"agent {self.name} sends more than {limits.CONTROL_REPLY_MAX} bytes")
-        if not line.endswith(b"\n"):
-            raise UnreachableError("agent", f"{self.path}: it hung up", "its log says why")
-        try:
-            reply: _Result[_T] = msgspec.json.decode(line, type=_Result[type])  # type: ignore[valid-type]
-        except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
-            refused = ControlReply.parse(line)
-            if not refused.ok:
-                raise PeerRefused(f"agent {self.name}", refused.error, refused.remedy) from None
-            text = f"agent {self.name} answers {op} in another way: {error}; is it older?"
-            raise RemoteProtocolError(text) from None
+        reply = read_reply(self.path, op, self._received(exchange), type)
         if reply.follows:
             with_text(reply.value, self._received(lambda: self._file.read(reply.follows)))
         return reply.value
@@ -273,7 +290,7 @@ class ControlClient:
         except TimeoutError:
             raise UnreachableError("agent", f"{self.path} in time", "is it stopped? its log may tell") from None
         except OSError as error:
-            raise UnreachableError("agent", f"{self.path} ({error.strerror})", _START_ONE) from None
+            raise UnreachableError("agent", f"{self.path} ({error.strerror})", START_ONE) from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,7 +326,7 @@ def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAg
         raise UnreachableError("agent", f"{_SYSTEM}, which users of the group {owner} may read", remedy)
     if not wanted and not agents:
         places = ", ".join(map(str, runtime_dirs(environ) or [runtime_dir(environ)]))
-        raise UnreachableError("agent", places, _START_ONE)
+        raise UnreachableError("agent", places, START_ONE)
     if not wanted:
         names: Mapping[NameSource, str] = {}
         if len(agents) > 1:

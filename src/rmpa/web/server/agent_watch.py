@@ -7,14 +7,13 @@ import contextlib
 import logging
 import time
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
-
-import msgspec
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.control import ControlReply, ControlRequest, GraphRevision
+from rmpa.observe.control import GraphRevision
 from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
+from rmpa.observe.control_stream import ControlStream
 from rmpa.trust.permissions import TrustStatus
 from rmpa.web import limits
 
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
     from rmpa.web.hub.graph import GraphWatch
 
 _log = logging.getLogger(__name__)
-_T = TypeVar("_T")
 
 
 class Reading(NamedTuple):
@@ -232,49 +230,33 @@ class AgentFollower:
         while not self.misfit.is_set():
             try:
                 agent = await asyncio.to_thread(self._find)
-                reader, writer = await asyncio.open_unix_connection(
-                    agent.path, limit=observe_limits.CONTROL_REPLY_MAX
-                )
-                pause = limits.TRUST_RETRY
-                with contextlib.closing(writer):
-                    await self._follow(agent.name, graph, reader, writer)
-            except (RmpaError, OSError, EOFError, asyncio.LimitOverrunError) as error:  # TimeoutError is an OSError
+                with await ControlStream.open(agent.path) as stream:
+                    pause = limits.TRUST_RETRY
+                    await self._follow(agent.name, graph, stream)
+            except (RmpaError, OSError) as error:  # TimeoutError is an OSError
                 _log.debug("! the agent is not followed: %s", error)
-                if isinstance(error, RemoteProtocolError):  # it will not tell more in a moment
+                if isinstance(error, PeerRefused | RemoteProtocolError):  # it will not tell more in a moment
                     pause = limits.NODE_RETRY
             finally:
                 graph.lose()
             await asyncio.sleep(pause)
             pause = min(2 * pause, limits.NODE_RETRY)
 
-    async def _follow(
-        self, name: str, graph: GraphWatch, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
-    ) -> None:
+    async def _follow(self, name: str, graph: GraphWatch, stream: ControlStream) -> None:
         """Ask one run of an agent until it ends."""
-
-        async def ask(op: str, args: dict[str, object], kind: type[_T], wait: float = 0.0) -> _T:
-            writer.write(ControlRequest(op, args).serialize())
-            async with asyncio.timeout(wait + limits.WEB_AGENT_TIMEOUT):
-                reply = ControlReply.parse(await reader.readuntil(b"\n"))
-            if not reply.ok:
-                raise RemoteProtocolError(reply.error)
-            try:
-                return msgspec.convert(reply.value, kind)
-            except msgspec.ValidationError as error:
-                raise RemoteProtocolError(f"the agent answers {op} in another way: {error}") from None
-
-        status = await ask("trust", {"what": "status"}, TrustStatus)
+        within = limits.WEB_AGENT_TIMEOUT
+        status = await stream.call("trust", TrustStatus, timeout=within, what="status")
         if not self._fits(status if status.on else None):
             self.misfit.set()
             return
         self._agent = self._agent or name
-        async with asyncio.timeout(limits.WEB_AGENT_TIMEOUT):  # the agent may have gone meanwhile
+        async with asyncio.timeout(within):  # the agent may have gone meanwhile
             master = await graph.master()
         # Only the first answer, and one after more changes than the agent keeps, has the whole graph.
         known: int | None = None
         while True:
-            args: dict[str, object] = {"after": known, "wait": limits.GRAPH_WAIT, "rows": True}
-            told = await ask("graph", args, GraphRevision, limits.GRAPH_WAIT)
+            args: dict[str, Any] = {"after": known, "wait": limits.GRAPH_WAIT, "rows": True}
+            told = await stream.call("graph", GraphRevision, timeout=limits.GRAPH_WAIT + within, **args)
             if told.rows is None:
                 if told.revision != known:
                     graph.look()
