@@ -1,4 +1,4 @@
-"""The commands of docs/guides/trust.md and web.md, typed on machines of their own, say what the pages say."""
+"""The commands of docs/guides/trust.md, web.md and sites.md, typed on machines of their own, do as the pages say."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ pytest.importorskip("cryptography")
 pytest.importorskip("aiohttp")
 
 from lab.bed.agents import RMPA
+from lab.bed.namespaces import why_no_nat
 from lab.bed.processes import Process, eventually
 
 if TYPE_CHECKING:
@@ -26,12 +27,17 @@ pytestmark = [pytest.mark.netns, pytest.mark.timeout(180)]
 
 GUIDES: Final = Path(__file__).parents[2] / "docs/guides"
 MARK: Final = "<!-- tested: tests/interop/test_guides.py -->\n```console\n"
+TOML: Final = re.compile(r"(?s)```toml\n(.*?)```")
 STEP: Final = re.compile(r"(?m)^(\w+)\$ (.*)\n((?:(?!\w+\$ |```).*\n)*)")
+
+
+def read(page: str) -> str:
+    return (GUIDES / page).read_text(encoding="utf-8")
 
 
 def steps(page: str) -> Iterator[tuple[str, str, list[str]]]:
     """Each command of the page: its host, the command, the lines that it says."""
-    for block in (GUIDES / page).read_text(encoding="utf-8").split(MARK)[1:]:
+    for block in read(page).split(MARK)[1:]:
         for host, command, said in STEP.findall(block.partition("```")[0]):
             yield host, command, said.splitlines()
 
@@ -55,6 +61,7 @@ class Machine:
 
     def __init__(self, host: Host, home: Path, stack: ExitStack, settings: str = "") -> None:
         self.host, self.stack, self.shared = host, stack, home
+        self.variables = {"RMPA_NAME": host.name}
         self.home = home / host.name
         file = self.home / ".config" / "rmpa" / "rmpa.toml"
         file.parent.mkdir(parents=True)
@@ -62,13 +69,13 @@ class Machine:
 
     def start(self, command: str) -> Process:
         kept = {key: value for key, value in os.environ.items() if not key.startswith(("ROS_", "RMPA_", "XDG_"))}
-        own = {"HOME": str(self.home), "XDG_RUNTIME_DIR": str(self.home), "RMPA_NAME": self.host.name}
+        own = {"HOME": str(self.home), "XDG_RUNTIME_DIR": str(self.home), **self.variables}
         path = f"{Path(RMPA).parent}:{kept['PATH']}"
         argv = self.host.command(["sh", "-c", f"cd {self.shared} && echo y | {command}"])
         return self.stack.enter_context(Process(argv, env={**kept, **own, "PATH": path}, name=command))
 
-    def start_agent(self) -> None:
-        self.start("rmpa up").wait_for("control socket")
+    def start_agent(self, command: str = "rmpa up") -> None:
+        self.start(command).wait_for("control socket" if command.startswith("rmpa up") else "zenoh session")
 
     def say(self, command: str) -> str:
         with self.start(command) as process:
@@ -133,3 +140,33 @@ def test_the_web_server_answers_as_its_page_says(lab: Lab, tmp_path: Path) -> No
                 base.check(command, lines)
             done.append(command.split()[0])
         assert done.count("rmpa") > 2 < done.count("curl")
+
+
+@pytest.mark.skipif(why_no_nat() != "", reason=why_no_nat())
+@pytest.mark.parametrize("secured", [False, True])
+def test_two_sites_meet_at_a_router(lab: Lab, tmp_path: Path, secured: bool) -> None:
+    pytest.importorskip("zenoh")
+    with ExitStack() as stack:
+        hosts = [lab.host("cloud", 0), lab.host("hall", 1), lab.host("yard", 2)]
+        settings = next(part for part in TOML.findall(read("sites.md")) if "relays" in part)
+        machines = {host.name: Machine(host, tmp_path, stack, settings if secured else "") for host in hosts}
+        for number, host in enumerate(hosts[1:], 1):
+            lab.route(host, lab.nat(f"nat{number}", number, 0))
+        for machine in machines.values():
+            machine.variables.clear()  # the page gives names
+        every = list(steps("sites.md"))
+        begin = next(number for number, step in enumerate(every) if "trust init" in step[1])
+        token = ""
+        for name, typed, lines in every[begin:] if secured else every[:begin]:
+            command = typed.replace("fleet.example", hosts[0].address).replace("TOKEN", token or "TOKEN")
+            if command.startswith(("rmpa up", "rmpa gateway")):
+                machines[name].start_agent(command)
+            elif " pub " in command:
+                machines[name].start(command).wait_for("publishing")
+                eventually(lambda: "/chatter" in machines["yard"].say("rmpa topic list --agent pad"), what="/chatter")
+            elif found := re.search(r"rmpa1-\w+", machines[name].check(command, lines)):
+                token = found.group()
+        if secured:
+            eventually(
+                lambda: says("hall this site", machines["hall"].say("rmpa site list --agent arm")), what="the site"
+            )
