@@ -1,0 +1,269 @@
+"""``rmpa bug-report``: what a maintainer needs to know of this machine, in one archive, redacted."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import platform
+import pwd
+import socket
+import subprocess
+import sys
+import tarfile
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import click
+import msgspec
+
+from rmpa.cli.options import Options, config_option, flag, json_verb
+from rmpa.cli.output import Table, print_text, size
+from rmpa.cli.redact import Redactor, is_secret
+from rmpa.cli.units import UNITS
+from rmpa.config.module_name import of_unit, state_dir
+from rmpa.core.errors import ConfigError, RmpaError, StartError
+from rmpa.core.limits import KIB
+from rmpa.observe.control_client import ControlClient, find_agents
+from rmpa.observe.doctor.machine import read_interfaces
+from rmpa.runtime.interpreter import own_command
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from rmpa.observe.snapshot import Snapshot
+
+# By its file: the command of rmpa that fills it. Those of an agent are asked of each.
+_COMMANDS: Final = {
+    "version.json": "--version --json",
+    "doctor.json": "doctor --json",
+    "settings.json": "config show --json",
+    "service.txt": "service status",
+    "trust.json": "trust status --json",
+}
+_OF_AGENTS: Final = {
+    "peers.txt": "peer list",
+    "topics.txt": "topic list --verbose",
+    "services.txt": "service list",
+    "nodes.txt": "node list",
+    "sites.txt": "site list",
+}
+# Seconds for all commands together; they run side by side, and an agent that does not answer takes each 10 s.
+DEADLINE: Final = 30.0
+# Seconds for the snapshot of an agent.
+_SNAPSHOT: Final = 5.0
+_LOG: Final = "journalctl --no-pager --quiet --output=short-iso-precise --lines=1000"
+_LOG_BYTES: Final = 512 * KIB
+_VARIABLES: Final = ("ROS_", "RMPA_", "XDG_", "ZENOH_", "RMW_", "CMAKE_PREFIX_PATH", "PYTHONPATH", "LANG", "PATH")
+_FILES_SHOWN: Final = 300
+_README: Final = """\
+A report of `rmpa bug-report`. It has no contents of messages and no parameters' values.
+Taken out: keys, tokens, passwords, user names and home directories{more}.
+Files that could not be filled say why.
+"""
+
+
+@json_verb(
+    config_option,
+    click.option(
+        "-o", "--output", metavar="PATH", help="A .tar.gz, or a folder that is made. [default: a .tar.gz here]"
+    ),
+    click.option("--log", metavar="FILE", type=click.Path(exists=True, dir_okay=False), help="A log of rmpa up."),
+    flag("--anonymous", help="Replace names of hosts and modules, and addresses, each by one word."),
+)
+def bug_report(config: str | None, output: str | None, log: str | None, anonymous: bool, options: Options) -> None:
+    """Collect what a maintainer needs into one archive: versions, doctor, lists, settings, the end of the log.
+
+    Keys, tokens, passwords, user names and home directories are taken out, and messages are never in it. Names of
+    hosts and addresses stay, unless --anonymous is given. Nothing is sent: look into it, and attach it to the issue.
+
+    ---
+    It works without an agent, beside one that hangs (after some 20 s), and as any user; sudo adds the log of the
+    units and the rules of the firewall.
+
+    Examples:
+      rmpa bug-report
+      rmpa bug-report --log up.log --anonymous
+      rmpa bug-report -o report/               a folder, to look at
+    """
+    path = Path(output or time.strftime("rmpa-bug-report-%Y-%m-%d-%H%M%S.tar.gz"))
+    if path.exists():
+        raise ConfigError("--output", f"{path} is there already", "name another one")
+    found, modules = collect(os.environ, config, log)
+    redactor = _redactor(os.environ, found)
+    if anonymous:
+        redactor.anonymise(found.values(), _hosts(os.environ, found), modules)
+    found["README.txt"] = _README.format(more=", names of hosts and modules, addresses" if anonymous else "")
+    clean = {redactor.text(name): _redacted(name, text, redactor) for name, text in sorted(found.items())}
+    try:
+        _write(path, clean)
+    except OSError as error:
+        raise StartError(
+            str(path), f"cannot be written: {error.strerror}", "name another place by --output"
+        ) from None
+    counts = {what: count for what, count in redactor.counts.items() if count}
+    sizes = {name: len(text.encode()) for name, text in clean.items()}
+    if options.as_json:
+        options.show({"file": str(path), "files": sizes, "redacted": counts})
+        return
+    print_text(Table("FILE, >SIZE", [(name, size(count)) for name, count in sizes.items()]), "")
+    print_text(f"redacted: {', '.join(f'{count} {what}' for what, count in counts.items()) or 'nothing'}")
+    print_text(f"{path} is written. Look into it before you attach it to an issue: it was not sent anywhere.")
+
+
+def collect(environ: Mapping[str, str], config: str | None, log: str | None) -> tuple[dict[str, str], list[str]]:
+    """Ask this machine.
+
+    Args:
+        environ: The shell's variables.
+        config: The settings' file; the usual places by default.
+        log: A file with the agent's log.
+
+    Returns:
+        The text of each file, not redacted, and the names of modules.
+    """
+    agents = find_agents(environ)
+    found, modules = {"system.json": json.dumps(_system(environ)), "state.txt": "\n".join(_state(environ))}, []
+    words = _COMMANDS | {
+        f"{a.name}/{file}": f"{of} --agent {a.name}" for a in agents for file, of in _OF_AGENTS.items()
+    }
+    chosen = ["--config", config] if config else []
+    programs = {
+        file: own_command(*of.split(), *(chosen if file in ("doctor.json", "settings.json") else []))
+        for file, of in words.items()
+    }
+    programs["log.txt"] = [*_LOG.split(), *(f"--unit={unit}" for unit in UNITS.values())]
+    found |= run_programs(programs, environ)
+    for agent in agents:
+        modules.append(agent.name)
+        try:
+            with ControlClient(agent.path, _SNAPSHOT) as client:
+                shown = client.snapshot()
+        except RmpaError as error:
+            found[f"{agent.name}/snapshot.json"] = json.dumps({"error": str(error)})
+        else:
+            found[f"{agent.name}/snapshot.json"] = msgspec.json.encode(shown).decode()
+            modules += _names(shown)
+    if log is not None:
+        found["up.log"] = Path(log).read_bytes()[-_LOG_BYTES:].decode("utf-8", "replace")
+    return found, modules
+
+
+def run_programs(programs: Mapping[str, list[str]], environ: Mapping[str, str]) -> dict[str, str]:
+    """What programs print, all run side by side; of one that fails or hangs also what it says, or that it hangs."""
+    until, found = time.monotonic() + DEADLINE, {}
+    running = {}
+    for file, words in programs.items():
+        try:
+            running[file] = subprocess.Popen(  # noqa: S603 - our own words
+                words,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                env={**environ, "NO_COLOR": "1"},
+            )
+        except OSError as error:
+            found[file] = f"{words[0]}: {error.strerror}\n"
+    for file, process in running.items():
+        try:
+            out, err = process.communicate(timeout=max(0.1, until - time.monotonic()))
+            said = f"exit code {process.returncode}\n" if process.returncode and not file.endswith(".json") else ""
+        except subprocess.TimeoutExpired:
+            process.kill()
+            out, err = process.communicate()
+            said = f"it was ended after {DEADLINE:g} s\n"
+        found[file] = out[-_LOG_BYTES * 8 :].decode("utf-8", "replace")
+        if (err or said) and not (file.endswith(".json") and out):
+            found[file] += said + err.decode("utf-8", "replace")
+    return found
+
+
+def _names(shown: Snapshot) -> Iterator[str]:
+    yield from (peer.name for peer in (*shown.peers, *shown.strangers))
+
+
+def _system(environ: Mapping[str, str]) -> dict[str, object]:
+    distribution: dict[str, str] = {}
+    with suppress(OSError):
+        distribution = platform.freedesktop_os_release()
+    return {
+        "system": distribution.get("PRETTY_NAME", "unknown"),
+        "kernel": f"{platform.system()} {platform.release()} {platform.version()} {platform.machine()}",
+        "python": f"{platform.python_implementation()} {sys.version}",
+        "program": [sys.executable, sys.prefix],
+        "host": socket.gethostname(),
+        "cpus": os.cpu_count(),
+        "load": os.getloadavg(),
+        "root": os.geteuid() == 0,
+        "ros": sorted(map(str, Path("/opt/ros").glob("*"))),
+        "variables": {name: value for name, value in sorted(environ.items()) if name.startswith(_VARIABLES)},
+        "interfaces": {
+            one.name: [*map(str, one.networks), *(["up"] if one.up else []), *(["used"] if one.used else [])]
+            for one in read_interfaces(())
+        },
+    }
+
+
+def _state(environ: Mapping[str, str]) -> Iterator[str]:
+    """The files that are kept, by mode, size and name; not what is in them."""
+    directory = state_dir(of_unit(environ))
+    yield f"{directory}:"
+    paths = sorted(directory.rglob("*")) if directory is not None else []
+    for path in paths[:_FILES_SHOWN]:
+        with suppress(OSError):
+            info = path.lstat()
+            yield f"{info.st_mode:06o} {info.st_uid:>6} {info.st_size:>10} {path.relative_to(directory or path)}"
+
+
+def _redactor(environ: Mapping[str, str], found: Mapping[str, str]) -> Redactor:
+    """One that knows this machine's secrets, users and homes."""
+    directory = state_dir(of_unit(environ))
+    files = [*directory.rglob("*token*")] if directory is not None else []
+    with suppress(ValueError, TypeError):
+        settings = json.loads(found["settings.json"])["settings"]
+        files += [Path(each["value"]) for each in settings if each["name"] == "web.token_file" and each["value"]]
+    secrets = [value for name, value in environ.items() if is_secret(name)]
+    for file in files:
+        with suppress(OSError):
+            secrets.append(file.read_bytes()[:KIB].decode("utf-8", "replace").strip())
+    ids = {os.geteuid(), os.getuid(), int(environ.get("SUDO_UID", "") or os.getuid())}
+    users, homes = [environ.get(name, "") for name in ("USER", "LOGNAME", "SUDO_USER")], [environ.get("HOME", "")]
+    for user in ids:
+        with suppress(KeyError):
+            entry = pwd.getpwuid(user)
+            users.append(entry.pw_name)
+            homes.append(entry.pw_dir)
+    return Redactor(secrets, homes, users)
+
+
+def _hosts(environ: Mapping[str, str], found: Mapping[str, str]) -> Iterator[str]:
+    yield from (socket.gethostname(), socket.gethostname().partition(".")[0], environ.get("ROS_HOSTNAME", ""))
+    with suppress(ValueError, TypeError, KeyError):
+        for each in json.loads(found["settings.json"])["settings"]:
+            if each["name"] in ("discovery.seeds", "web.hosts", "gateway.connect", "gateway.listen"):
+                yield from (str(one).rpartition("/")[2].partition(":")[0] for one in each["value"])
+
+
+def _redacted(name: str, text: str, redactor: Redactor) -> str:
+    if name.endswith(".json"):
+        with suppress(ValueError):
+            return json.dumps(redactor.value(json.loads(text)), indent=1, ensure_ascii=False) + "\n"
+    return redactor.text(text)
+
+
+def _write(path: Path, files: Mapping[str, str]) -> None:
+    if not path.name.endswith((".tar.gz", ".tgz")):
+        for name, text in files.items():
+            path.mkdir(mode=0o700, exist_ok=True)
+            (path / name).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            (path / name).write_text(text, "utf-8")
+        return
+    opened = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(opened, "wb") as file, tarfile.open(fileobj=file, mode="w:gz") as archive:
+        for name, text in files.items():
+            data = text.encode()
+            info = tarfile.TarInfo(f"{path.name.partition('.tar')[0]}/{name}")  # it has no user's name
+            info.size, info.mtime = len(data), int(time.time())
+            archive.addfile(info, io.BytesIO(data))
