@@ -18,7 +18,7 @@ from rmpa.core.counters import SampleSummary
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.observe import limits
 from rmpa.observe.control import GATEWAY_REPORT
-from rmpa.observe.peer_info import FOREIGN, SitesReport
+from rmpa.observe.peer_info import PENDING, SitesReport
 from rmpa.observe.snapshot import PingReply
 
 if TYPE_CHECKING:
@@ -33,8 +33,8 @@ _T = TypeVar("_T")
 # By the state of a peer or site.
 _COLOURS: Final = {
     **dict.fromkeys(("linked", "relayed", "this site", "joined"), "green"),
-    **dict.fromkeys(("linking", "foreign", "no gateway"), "yellow"),
-    **dict.fromkeys(("refused", "conflict", "unreachable"), "red"),
+    **dict.fromkeys(("linking", "pending", "foreign", "no gateway"), "yellow"),
+    **dict.fromkeys(("refused", "revoked", "conflict", "unreachable"), "red"),
 }
 # States that are no problem.
 _USUAL: Final = frozenset({"linked", "relayed"})
@@ -128,7 +128,14 @@ def _row(info: PeerInfo) -> list[str]:
 
 def _troubles(snapshot: Snapshot, peers: list[PeerInfo]) -> list[str]:
     found = list(snapshot.notes)
+    named: dict[str, list[str]] = {}  # to a module without keys all of a mesh are pending, by one text
     for info in peers:
+        named.setdefault(info.last_error, []).append(info.name)
+    for info in peers:
+        if info.state == PENDING:
+            if names := named.pop(info.last_error, []):
+                found.append(f"{', '.join(names)}: {info.last_error}")
+            continue
         found += [f"{info.name}: {conflict}" for conflict in info.conflicts]
         found += [bound.text for bound in info.beyond]
         if info.last_error and info.state not in _USUAL:
@@ -188,8 +195,7 @@ def _facts(info: PeerInfo) -> Iterator[tuple[str, str]]:
         return
     yield "State", f"{info.state} for {duration(info.since_ago)}"
     yield "Addresses", ", ".join(info.addresses) or "-"
-    source = info.source or ("a beacon" if info.state == FOREIGN else "a link")
-    yield "Found", f"{duration(info.found_ago)} ago by {source}"
+    yield "Found", f"{duration(info.found_ago)} ago by {info.source or 'a beacon'}"
     yield "Last beacon", f"{duration(info.beacon_ago)} ago" if info.beacon_ago is not None else "-"
     if (link := info.link) is not None:
         who = "dialled by us" if link.dialled else "dialled by it"
@@ -209,6 +215,8 @@ def _facts(info: PeerInfo) -> Iterator[tuple[str, str]]:
             yield "Direct", f"{ours}, {info.direct_out} of its subscribers to nodes here"
     if info.last_error:
         yield "Last error", info.last_error
+    if info.invite:
+        yield "Invitation", info.invite
     if info.next_attempt is not None:
         yield "Next attempt", f"in {duration(info.next_attempt)}"
     yield from (("Limit", bound.text) for bound in info.beyond)

@@ -78,12 +78,15 @@ class Stranger:
     Args:
         identity: As its last beacon said.
         problem: Why its beacons are refused, and what to do.
+        reason: Likewise, as a word; ``REVOKED``: it has a group key from before a revocation, and the deny list says
+            whether that was its own. ``None``: its clock, or its release.
         since: When it was first heard, monotonic seconds.
         heard: When it was last heard.
     """
 
     identity: Identity
     problem: str
+    reason: TrustReason | None
     since: float
     heard: float
 
@@ -207,13 +210,16 @@ class PacketFilter:
             if self._old_key_sources.take(host, now) and self._old_keys.take(now):
                 beacon = self._parsed(data)
                 self._counters.add("beacon.old_key" if beacon is not None else MALFORMED)
-                return None if beacon is None else (beacon, proof.key)
+                if beacon is None:
+                    return None
+                self._show(beacon, "", TrustReason.REVOKED, now)
+                return beacon, proof.key
             self._counters.add("beacon.limited")
         self.overrun = not self._unproved.take(now)
         if verdict is Verdict.OLD_KEY:
             return None
         problem = _problem(proof)
-        identity = self._stranger(data, problem, now) if problem else None
+        identity = self._stranger(data, problem, now, _REFUSED.get(verdict)) if problem else None
         if identity is not None:
             at = str(identity.guid.address)  # that of the packet is another one by each interface of a machine
             self._refusals.refuse(now, f"beacon.{verdict}", at, f"{identity.name} at {host} is {problem}")
@@ -227,14 +233,16 @@ class PacketFilter:
         except RemoteProtocolError:
             return None
 
-    def _stranger(self, data: bytes, problem: str, now: float) -> Identity | None:
-        """Take in a refused packet; return its sender if that is shown: few are, so a full table takes no more.
+    def _stranger(self, data: bytes, problem: str, now: float, reason: TrustReason | None = None) -> Identity | None:
+        """Take in a refused packet; return its sender if that is shown.
 
         One of the two modules has not joined a mesh, or is of another release.
         """
         beacon = self._parsed(data) if self._stranger_beacons.take(now) else None
-        if beacon is None:
-            return None
+        return None if beacon is None else self._show(beacon, problem, reason, now)
+
+    def _show(self, beacon: Beacon, problem: str, reason: TrustReason | None, now: float) -> Identity | None:
+        """Remember the sender of a beacon without a proof: few are, so a full table takes no more."""
         identity = beacon.identity
         key = identity.name, identity.guid.place
         if beacon.kind is BeaconKind.GOODBYE:
@@ -243,7 +251,7 @@ class PacketFilter:
         if key not in self._strangers and len(self.strangers(now)) >= limits.STRANGERS_SHOWN:
             return None
         since = self._strangers[key].since if key in self._strangers else now
-        self._strangers[key] = Stranger(identity, problem, since, now)
+        self._strangers[key] = Stranger(identity, problem, reason, since, now)
         return identity
 
     def _unlinked_limit(self, interface: int) -> TokenBucket:

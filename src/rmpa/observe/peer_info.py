@@ -14,12 +14,19 @@ import msgspec
 
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_problem
+from rmpa.trust.permissions import TrustReason, not_of_this_mesh
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection, Iterable
+
+    from rmpa.trust.permissions import TrustStatus
 
 # The state of a module that is heard, or refuses this one, because it is not of this mesh.
 FOREIGN: Final = "foreign"
+# The state of a module that an invitation would let in: it has no keys and this mesh is secured, or the other way.
+PENDING: Final = "pending"
+# The state of a module that was revoked and knocks again; of all others where it is this one.
+REVOKED: Final = "revoked"
 
 
 class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
@@ -107,7 +114,8 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         addresses: Where it can be reached, best first.
         state: ``linked``; ``linking`` (dialling, or waiting to be dialled); ``refused`` (by either side);
             ``conflict`` (shares a GUID or an address with another, so it cannot be linked); ``relayed`` (has no link;
-            another peer relays its topics); ``foreign`` (is not of this mesh).
+            another peer relays its topics); ``pending`` (either it or this module has no keys of a mesh, so that an
+            invitation would link them); ``revoked``; ``foreign`` (is not of this mesh).
         since_ago: Seconds since it came into this state.
         found_ago: Seconds since it was found.
         beacon_ago: Seconds since its last beacon.
@@ -123,6 +131,7 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         beyond: What this module hides of it by its limits.
         direct_in: Subscribers here that are connected to its nodes directly.
         direct_out: Its subscribers that may connect to nodes here directly.
+        invite: While it is pending: the command that makes the invitation, at the authority; else empty.
     """
 
     name: str
@@ -144,6 +153,72 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     beyond: tuple[BoundInfo, ...] = ()
     direct_in: int = 0
     direct_out: int = 0
+    invite: str = ""
+
+
+# --- Modules that knock ---------------------------------------------------------------------------------------------
+#
+# What is shown of a module that is heard and is not of this mesh. Nothing that it says is proved.
+
+
+def judge_stranger(
+    name: str,
+    address: str,
+    reason: TrustReason | None,
+    problem: str,
+    *,
+    trust: TrustStatus | None,
+    members: Collection[str],
+) -> tuple[str, str, str] | None:
+    """What is shown of a module whose beacons are refused.
+
+    Args:
+        name: Its name, as it says.
+        address: Its address, likewise.
+        reason: Why its beacons are refused, as ``discovery.Stranger`` has it.
+        problem: Likewise.
+        trust: The state of trust here; ``None``: it is off.
+        members: The names of this module and of those that are linked.
+
+    Returns:
+        Its state, the text for ``PeerInfo.last_error``, and the command that lets it in; ``None``: it is not shown.
+    """
+    revoked = trust is not None and name in trust.revoked
+    if trust is None or (reason is TrustReason.REVOKED and not revoked):
+        return None if reason is TrustReason.REVOKED else (FOREIGN, problem, "")
+    if name.casefold() in {member.casefold() for member in members}:
+        if reason is TrustReason.REVOKED:
+            return None  # it has joined again
+        text = f"not of this mesh: the module at {address} says that it is {name} too, and proves nothing"
+        return FOREIGN, f"{text}; do not invite it; if it is yours, give it another name: rmpa up --name", ""
+    invite = f"rmpa trust invite --module {name}"
+    where = "here" if trust.is_authority else f"on {trust.authority or 'the authority'}"
+    lets_in = f"run {where}: {invite} (it prints the line to run on {name})"
+    certified = name in (member.name for member in trust.members)
+    if revoked and not certified:
+        text = f"revoked: it knocks again; if it is to come back, rmpa trust leave --yes on {name}, then {lets_in}"
+        return REVOKED, text, ""
+    if reason is not TrustReason.UNSECURED:
+        return FOREIGN, problem, ""
+    if certified:
+        text = f"{name} has a certificate, but this module knocks without it; start it again if it has just joined"
+        return PENDING, f"pending: {text}, or if it has lost its files and is yours, {lets_in}", invite
+    text = "pending: it has no keys, so its name and address are not proved"
+    return PENDING, f"{text}; if it is yours, {lets_in}", invite
+
+
+def judge_refusal(reason: TrustReason, own: str) -> tuple[str, str, str]:
+    """What is shown of a peer that refuses this module, or is refused, as not of its mesh; as ``judge_stranger``.
+
+    Args:
+        reason: The word of the refusal.
+        own: The name of this module.
+    """
+    if reason is not TrustReason.PLAIN:
+        return FOREIGN, not_of_this_mesh(reason), ""
+    invite = f"rmpa trust invite --module {own}"
+    text = "pending: it is of a secured mesh, and this module has no keys; to join, run on the authority of that mesh"
+    return PENDING, f"{text}: {invite} (it prints the line to run here)", invite
 
 
 # --- What an agent tells its peers of itself ------------------------------------------------------------------------

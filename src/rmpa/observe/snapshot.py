@@ -390,8 +390,8 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
         trust: The module's membership of a secured mesh; ``None``: trust is off.
         topics_left: Topics that are not in it, as nothing here uses them, if only so many were asked for.
         services_left: Services, likewise.
-        strangers: Modules that are heard and are not of this mesh, in the state ``foreign``. ``last_error`` says what
-            to do; nothing that they say of themselves is proved.
+        strangers: Modules that are heard and are not of this mesh, in the states ``pending``, ``revoked`` and
+            ``foreign``. ``last_error`` says what to do; nothing that they say of themselves is proved.
     """
 
     agent: AgentInfo

@@ -18,13 +18,24 @@ import psutil
 import rmpa
 from rmpa.core.counters import SampleSummary
 from rmpa.discovery import limits as discovery_limits
-from rmpa.observe.peer_info import FOREIGN, BoundInfo, LaneInfo, LinkInfo, PeerAgent, PeerInfo
+from rmpa.observe.peer_info import (
+    FOREIGN,
+    PENDING,
+    REVOKED,
+    BoundInfo,
+    LaneInfo,
+    LinkInfo,
+    PeerAgent,
+    PeerInfo,
+    judge_refusal,
+    judge_stranger,
+)
 from rmpa.observe.snapshot import AgentInfo, FilesInfo, SampleSpread, ServiceInfo, Snapshot
 from rmpa.observe.topics import TopicFacts, first_names
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import DESCRIPTORS
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
-from rmpa.trust.permissions import not_of_this_mesh
+from rmpa.trust.permissions import TrustReason
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -143,12 +154,13 @@ class SnapshotBuilder:
             topics, topics_left = self.topics.used(most)
         if most is not None and services is None:
             services, services_left = self._services_used(most)
-        known = self._peers(*endpoint) if endpoint is not None and peers else ()
+        trust = parts.trust()
+        known, strangers = self._peers(*endpoint, trust) if endpoint is not None and peers else ((), ())
         return Snapshot(
             agent=self.agent(),
             taken=time.time(),
-            peers=tuple(info for info in known if info.state != FOREIGN),
-            strangers=tuple(info for info in known if info.state == FOREIGN),
+            peers=known,
+            strangers=strangers,
             topics=self.topics.infos(topics),
             services=self._services(services),
             topics_left=topics_left,
@@ -156,7 +168,7 @@ class SnapshotBuilder:
             counters=dict(sorted(counters.items())),
             notes=(*notes, *self._notes()),
             unreachable=self.topics.unreachable(),
-            trust=parts.trust(),
+            trust=trust,
         )
 
     def _notes(self) -> Iterator[str]:
@@ -211,8 +223,10 @@ class SnapshotBuilder:
 
     # --- peers --------------------------------------------------------------------------------------------------
 
-    def _peers(self, identity: Identity, mesh: Mesh, discovery: Discovery) -> tuple[PeerInfo, ...]:
-        """Every peer that is known, by name, and behind them the modules that are not of this mesh."""
+    def _peers(
+        self, identity: Identity, mesh: Mesh, discovery: Discovery, trust: TrustStatus | None
+    ) -> tuple[tuple[PeerInfo, ...], tuple[PeerInfo, ...]]:
+        """Every peer that is known, and the modules that are not of this mesh; both by name."""
         now, imports = time.monotonic(), self._parts.bridge.topics.imports
         links = {session.link.guid: session for session in self._parts.bridge.sessions.linked()}
         yield_to_data()  # a millisecond each with a full roster
@@ -234,31 +248,38 @@ class SnapshotBuilder:
             blank = PeerInfo(name=origin.name, guid=origin.guid, instance=origin.instance, state="", since_ago=0.0)
             changes = {"state": "relayed", "via": via, "topics_in": counts[origin.instance]}
             relayed[origin.instance] = msgspec.structs.replace(known.get(origin.instance, blank), **changes)
-        known_guids = {*roster, *statuses, *links}
-        strangers = [one for one in discovery.strangers() if one.identity.guid not in known_guids]
         own = {str(address) for address in (identity.guid.address, *identity.addresses)}
-        infos = [info for info in infos if info.instance not in relayed]
-        infos += [*relayed.values(), *(_stranger(one, now) for one in strangers)]
-        infos.sort(key=lambda info: (info.state == FOREIGN, info.name, info.guid))
-        return mark_shared_addresses(infos, own)
+        infos = [info for info in infos if info.instance not in relayed] + [*relayed.values()]
+        infos.sort(key=lambda info: (info.name, info.guid))
+        # A module that has joined was heard without keys before its link came up.
+        joined = {session.link.name: session.link.since or now for session in links.values()}
+        knocking = (
+            _stranger(one, now, trust, {self._settings.name, *joined})
+            for one in discovery.strangers()
+            if one.heard > joined.get(one.identity.name, 0.0)
+            and not any(one.identity.guid in known for known in (roster, statuses, links))
+        )
+        strange = [info for info in infos if info.state in (FOREIGN, PENDING)] + [info for info in knocking if info]
+        strange.sort(key=lambda info: (info.name, info.guid))
+        peers = [info for info in infos if info.state not in (FOREIGN, PENDING)]
+        return mark_shared_addresses(peers, own), tuple(strange)
 
     def _peer(self, view: PeerView | None, status: Peer | None, session: PeerSession | None, now: float) -> PeerInfo:
         run = view.run if view is not None else None
         identity = (run or status or session.link).identity  # type: ignore[union-attr] # one of the three is there
         since = status.since if status is not None and status.since is not None else run.since if run else now
+        next_attempt = status.next_attempt if status is not None else None
+        last_error, invite = status.last_error if status is not None else "", ""
         state = "linking"
         if session is not None:
             state, since = "linked", session.link.since or now
         elif status is not None and status.foreign is not None:
-            state = FOREIGN
+            next_attempt = None
+            state, last_error, invite = judge_refusal(status.foreign, self._settings.name)
         elif run is not None and view is not None and not view.present:
             state, since = "conflict", run.since
-        elif status is not None and status.state == "refused":
-            state = "refused"
-        next_attempt = status.next_attempt if status is not None else None
-        last_error = status.last_error if status is not None else ""
-        if status is not None and status.foreign is not None:
-            last_error, next_attempt = not_of_this_mesh(status.foreign), None
+        elif status is not None and status.refused is not None and status.state == "refused":
+            state = REVOKED if status.refused.code == TrustReason.REVOKED else "refused"
         return PeerInfo(
             name=identity.name,
             guid=str(identity.guid),
@@ -270,6 +291,7 @@ class SnapshotBuilder:
             beacon_ago=now - run.heard if run else None,
             source=run.found_by if run else "link",
             last_error=last_error,
+            invite=invite,
             next_attempt=max(0.0, next_attempt - now) if next_attempt is not None else None,
             **self._linked(session, view.conflicts if view is not None else (), now),
         )
@@ -396,18 +418,24 @@ class SnapshotBuilder:
         )
 
 
-def _stranger(one: Stranger, now: float) -> PeerInfo:
+def _stranger(one: Stranger, now: float, trust: TrustStatus | None, members: set[str]) -> PeerInfo | None:
     identity = one.identity
+    at = identity.guid.endpoint[0]
+    shown = judge_stranger(identity.name, at, one.reason, one.problem, trust=trust, members=members)
+    if shown is None:
+        return None
+    state, text, invite = shown
     return PeerInfo(
         name=identity.name,
         guid=str(identity.guid),
         instance=identity.instance.hex(),
-        state=FOREIGN,
+        state=state,
         since_ago=now - one.since,
         addresses=_endpoints(identity),
         found_ago=now - one.since,
         beacon_ago=now - one.heard,
-        last_error=one.problem,
+        last_error=text,
+        invite=invite,
     )
 
 

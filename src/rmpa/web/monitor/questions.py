@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import hashlib
+import logging
 import math
 import time
 from collections.abc import Mapping
@@ -22,6 +23,7 @@ from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.observe.operations import PeerParams, parameters_in
 from rmpa.resource.reconfigure import SERVICE_TYPE
 from rmpa.ros.types.codec import codec_for
+from rmpa.trust.permissions import InviteReply
 from rmpa.web import limits
 from rmpa.web.monitor.state import node_key
 
@@ -40,6 +42,8 @@ def shown_node(own: str) -> str:
     peer = proxied_node(own)
     return node_key(*peer) if peer is not None else own
 
+
+_log = logging.getLogger(__name__)
 
 Args: TypeAlias = dict[str, Any]  # the edge: each question has its own
 _Answer: TypeAlias = "Callable[[Answers, Args], Awaitable[Any]]"
@@ -82,6 +86,7 @@ class Answers:
         self._environ = environ
         self._agent_name = agent
         self._threads = ThreadPoolExecutor(limits.ANSWERS_AT_ONCE, "rmpa-answers")
+        self._invited: dict[str, str] = {}  # the id of the last token for each module
 
     async def answer(self, what: str, args: Args) -> Any:
         """The answer to one of ``QUESTIONS`` that the page may ask, as values for JSON.
@@ -210,6 +215,25 @@ class Answers:
             parameters_in(name, cast("XmlRpcValue", kept))
             await _in_time(self._hub.params.set(name, cast("ParamValue", kept)))
         return await self._params(args)
+
+    # --- modules that knock -----------------------------------------------------------------------------------
+
+    @question("invite", needs="control")
+    async def _invite(self, args: Args) -> Any:
+        """An invitation for a module that is pending; the answer is a secret, for the page that asks alone."""
+        name = _text(args, "name")
+
+        def invite(client: ControlClient) -> InviteReply:
+            if not any(one.invite and one.name == name for one in client.snapshot(topics=()).strangers):
+                raise RmpaError(f"no module {name[:80]!r} is pending")
+            if before := self._invited.pop(name, ""):  # one open token for each module that is pending
+                client.call("trust", object, what="withdraw", id=before)
+            return client.call("trust", InviteReply, what="invite", name=name)
+
+        made: InviteReply = await self._in_thread(invite)
+        self._invited[name] = made.id
+        _log.info("= a page has made an invitation for %s", name)
+        return {"line": f"rmpa trust join {made.token}", "until": made.expires}
 
     # --- services and resources -------------------------------------------------------------------------------
 

@@ -143,10 +143,9 @@ class StateBuilder:
                 if alarm.get("module") not in lost
             },
             "parameters": parameters,
-            "notes": [
-                *snapshot.notes[:100],
-                *(f"{one.name}: {one.last_error}" for one in snapshot.strangers),
-            ],
+            "notes": [*snapshot.notes[:100]],
+            # By GUID and name: each alone may be one that a member has.
+            "outside": self._steady("outside", self._outside(snapshot)),
             "unreachable": [str(each) for each in snapshot.unreachable[:100]],
             "hidden": {kind: count for kind, count in hidden.items() if count},
         }
@@ -194,6 +193,21 @@ class StateBuilder:
                 before = self._entries.get("modules", {}).get(name, (None, {}))[1]
                 since = before.get("since") if before.get("state") in _LOST else None
                 yield name, {"state": "away", "since": since or self._seen[name], "error": _GONE}
+
+    def _outside(self, snapshot: Snapshot) -> Iterable[tuple[str, Tree]]:
+        """The modules that are not of this mesh; for one that a page can invite here with ``here``."""
+        here = snapshot.trust is not None and snapshot.trust.is_authority
+        for one in snapshot.strangers:
+            entry = _told({
+                "name": one.name,
+                "state": one.state,
+                "address": one.guid.partition("#")[0],
+                "since": snapshot.taken - one.since_ago,
+                "text": one.last_error,
+                "invite": one.invite,
+                "here": here,
+            })  # fmt: skip
+            yield f"{one.guid} {one.name}", entry
 
     def _rates(
         self, name: str, taken: float, link: LinkInfo, links: Mapping[str, tuple[tuple[float, int, int], list[float]]]

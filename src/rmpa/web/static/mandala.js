@@ -3,6 +3,7 @@
 import { html, useEffect, useRef, useState } from "./markup.js";
 import { bandwidth, hertz, seconds } from "./format.js";
 import { entries, section } from "./state.js";
+import { Outside } from "./outside.js";
 import { CENTRE, SIZE, arrange, chord, emptyRing, geometry, outside, place } from "./ring.js";
 import { Link, Mark, Page, Panel, Since, Table, href, known, memo, shape } from "./parts.js";
 
@@ -364,6 +365,15 @@ function concerns(state) {
       to: several ? href("topics") : href("topic", names[0]),
     });
   }
+  const pending = entries(state, "outside").filter(([, one]) => one.state === "pending");
+  if (pending.length)
+    found.push({
+      id: "pending",
+      level: "WARN",
+      text: "pending: an invitation is needed for a link; see Not in this mesh",
+      who: pending.map(([, one]) => one.name).join(", "),
+      to: href(""),
+    });
   for (const note of state.notes || [])
     found.push({
       id: `n${note}`,
@@ -466,6 +476,7 @@ export function Mandala({ state, connection }) {
       </div>
       <div class="beside">
         <${Panel} title="What is wrong"><${Concerns} state=${state} connection=${connection} /><//>
+        <${Outside} state=${state} connection=${connection} />
         <${Panel} title="Modules"
           ><${Table}
             caption="Modules"

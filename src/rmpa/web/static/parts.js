@@ -12,6 +12,9 @@ export const STATES = {
   refused: { word: "refused", tone: "bad" },
   relayed: { word: "relayed", tone: "good" },
   away: { word: "away", tone: "idle" },
+  pending: { word: "pending", tone: "warn" },
+  revoked: { word: "revoked", tone: "bad" },
+  foreign: { word: "foreign", tone: "idle" },
   OK: { word: "OK", tone: "good" },
   WARN: { word: "warning", tone: "warn" },
   ERROR: { word: "error", tone: "bad" },
@@ -27,6 +30,12 @@ const SHAPES = {
   refused: html`<path class="stroke heavy" d="M3 3l10 10M13 3 3 13" />`,
   relayed: html`<circle class="stroke" cx="8" cy="8" r="6" /><circle class="fill" cx="8" cy="8" r="3" />`,
   away: html`<path class="stroke" d="M8 2 14 8 8 14 2 8Z" />`,
+  pending: html`<circle class="stroke" cx="8" cy="8" r="6" stroke-dasharray="2.4 2.3" /><path
+      class="stroke"
+      d="M8 5v6M5 8h6"
+    />`,
+  revoked: html`<circle class="stroke" cx="8" cy="8" r="6" /><path class="stroke" d="M4 12 12 4" />`,
+  foreign: html`<path class="stroke" d="M3 3h10v10H3Z" />`,
   OK: html`<path class="stroke heavy" d="M2.5 8.5 6.5 12.5 13.5 4" />`,
   WARN: html`<path class="fill" d="M8 1.5 15 14H1Z" />`,
   ERROR: html`<path class="fill" d="M5 1.5h6L14.5 5v6L11 14.5H5L1.5 11V5Z" />`,
