@@ -19,9 +19,19 @@ from msgspec.structs import replace
 from rmpa.cli.main import main
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.observe.control import ReloadReply
-from rmpa.observe.peer_info import Check, CheckLevel, PeerInfo, SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
+from rmpa.observe.peer_info import (
+    Check,
+    CheckLevel,
+    PeerInfo,
+    SiteInfo,
+    SiteModuleInfo,
+    SiteSourceInfo,
+    SitesReport,
+    judge_refusal,
+)
 from rmpa.observe.snapshot import FollowedInfo, PingReply
 from rmpa.observe.why.diagnosis import Diagnosis
+from rmpa.trust.permissions import TrustReason
 from tests.cli.conftest import with_core
 from tests.cli.test_resource import remote, running
 from tests.observe.samples import SNAPSHOT
@@ -153,6 +163,13 @@ def sites(*reports: SitesReport) -> dict[str, Callable[[object], object]]:
     return {"site": lambda _: reports}
 
 
+def _outside(name: str) -> PeerInfo:
+    """A module of another mesh, or one to which this module, without keys, is pending."""
+    reason = TrustReason.FOREIGN if name == "hand" else TrustReason.PLAIN
+    state, text, invite = judge_refusal(reason, "base")
+    return peer(name, state, last_error=text, invite=invite, addresses=("10.9.0.1:40001",))
+
+
 RELAYED: Final = peer("pad", "relayed", via="base2", topics_in=3, last_error="no route to host")
 CROWD: Final = (
     *(peer(f"arm{n}", "relayed") for n in range(999)),
@@ -183,6 +200,14 @@ KINDS: Final[dict[str, tuple[dict[str, Any], tuple[str, ...]]]] = {
     "crowd": (
         {"snapshot": replace(SNAPSHOT, peers=CROWD, notes=())},
         ("peer list --limit 5", "peer list arm99?", "peer list --state refused"),
+    ),
+    "pending": (
+        {
+            "snapshot": replace(
+                SNAPSHOT, peers=(), notes=(), strangers=tuple(_outside(n) for n in ("arm", "mast", "hand"))
+            )
+        },
+        ("peer list", "peer info arm", "peer list --state pending"),
     ),
     "reload": (
         {

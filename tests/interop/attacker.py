@@ -367,6 +367,17 @@ def tell_beacon(given: Arguments) -> None:
     say("done")
 
 
+def knock(given: Arguments) -> None:
+    """Knock without keys: ``group``, ``udp``, ``here``, under these ``names``, and under ``invented`` ones more."""
+    udp = udp_socket()
+    names = [*given["names"], *(f"arm{number}" for number in range(given["invented"]))]
+    for number, name in enumerate(names):
+        identity = Identity(Guid.of(given["here"], 1024 + number, 1), os.urandom(16), name, 0)
+        udp.sendto(Beacon(BeaconKind.ANNOUNCE, identity, 60_000, 1).serialize(), (given["group"], given["udp"]))
+        time.sleep(0.02)
+    say("done")
+
+
 def former(given: Arguments) -> None:
     """Be a member that was revoked: ``key`` (the group key before), ``cert``, ``private``, ``addresses`` (its own).
 
@@ -497,7 +508,7 @@ def middle(given: Arguments) -> None:
 
 MODES: dict[str, Callable[[Arguments], None]] = {
     each.__name__: each
-    for each in (record, replay, plain, lure, flood, slow, insider, tell_beacon, former, join, middle)
+    for each in (record, replay, plain, lure, flood, slow, insider, tell_beacon, knock, former, join, middle)
 }
 
 if __name__ == "__main__":

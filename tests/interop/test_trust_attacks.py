@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import sys
 import time
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ import pytest
 pytest.importorskip("cryptography")
 
 from lab.bed.processes import Process, eventually
+from rmpa.discovery.limits import STRANGERS_SHOWN
 from rmpa.trust import limits as trust_limits
 from rmpa.trust.store import CERTIFICATE, KEY
 from tests.interop.modules import Module, flows
@@ -94,13 +96,13 @@ def test_a_module_without_trust_is_told_so_and_stays_outside(fortress: Fortress,
     outsider = agent(fortress.eve, name="eve", flags=("--seed", seed))
     eventually(lambda: counter(fortress.a.agent, "beacon.untagged") > 0, what="beacons of eve are refused")
     assert not any(row["state"] == "linked" for row in outsider.peers().values())
-    for agent_, other, joins in ((fortress.a.agent, "eve", "there"), (outsider, "a", "here")):
+    for agent_, other in ((fortress.a.agent, "eve"), (outsider, "a")):
         line = functools.partial(_line_of, agent_, other)
-        assert "not of this mesh" in eventually(line, what=f"{other} is told as a stranger")
-        assert f"rmpa trust join TOKEN {joins}" in line()
+        assert "pending" in eventually(line, what=f"{other} is told as a stranger")
+        assert "rmpa trust invite --module eve" in line()
         code, why = agent_.rmpa("why", "--module", other)
         assert code == 1
-        assert f"{other} is not of this mesh" in why
+        assert f"{other} is pending" in why
     told = [line for line in fortress.a.agent.process.output.splitlines() if "not of this mesh" in line]
     assert told
     assert all("eve at " in line for line in told), "a packet of rmpa doctor is no module"
@@ -110,7 +112,23 @@ def test_a_module_without_trust_is_told_so_and_stays_outside(fortress: Fortress,
 def _line_of(agent: Agent, other: str) -> str:
     """What `rmpa peer list` says below its table of one module."""
     _, out = agent.rmpa("peer", "list")
-    return next((line for line in out.splitlines() if line.startswith(f"! {other}: ")), "")
+    return next((line for line in out.splitlines() if re.match(rf"! {other}\b.*: pending", line)), "")
+
+
+def test_knocks_of_an_outsider_flood_nothing_and_take_no_name(fortress: Fortress) -> None:
+    here, members = fortress.eve.address, ["a", "b", "B"]
+    fortress.attack("knock", group=GROUP, udp=UDP_PORT, here=here, names=members, invented=200)
+    shown = fortress.a.agent.snapshot().strangers
+    assert len(shown) == STRANGERS_SHOWN
+    taken = [one for one in shown if one.name.startswith(f"{here}:")]
+    assert [(one.state, one.invite) for one in taken] == [("foreign", "")] * 3, "they go by their addresses"
+    assert all("do not invite it" in one.last_error for one in taken)
+    assert {(one.name[:3], one.state) for one in shown if one not in taken} == {("arm", "pending")}
+    lines = [line for line in fortress.a.agent.process.output.splitlines() if "not of this mesh" in line]
+    assert len(lines) <= 20
+    _, info = fortress.a.agent.rmpa("peer", "info", "b")
+    assert "linked for" in info
+    fortress.held()
 
 
 def test_a_secured_agent_never_goes_back_to_plain(fortress: Fortress) -> None:

@@ -72,7 +72,8 @@ def _about_peers(settings: Settings, shown: Snapshot) -> str:
     if shown.peers:
         return f"{shown.peers[0].name} was found and is not linked: rmpa why --module {shown.peers[0].name}"
     if shown.strangers:
-        return f"{shown.strangers[0].name} is not of this mesh: rmpa doctor says what to do"
+        one = shown.strangers[0]
+        return f"{one.name} is {'pending' if one.invite else 'not of this mesh'}: rmpa peer list says what to do"
     if "lo" in settings.interfaces:
         return f"no peer yet; a second module here: rmpa up --name OTHER --core-port {settings.core_port + 1}"
     if shown.agent.addresses in ((), ("127.0.0.1",)):

@@ -163,7 +163,6 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
 
 def judge_stranger(
     name: str,
-    address: str,
     reason: TrustReason | None,
     problem: str,
     *,
@@ -174,11 +173,10 @@ def judge_stranger(
 
     Args:
         name: Its name, as it says.
-        address: Its address, likewise.
         reason: Why its beacons are refused, as ``discovery.Stranger`` has it.
         problem: Likewise.
         trust: The state of trust here; ``None``: it is off.
-        members: The names of this module and of those that are linked.
+        members: The names of this module and of those that are linked, in lower case.
 
     Returns:
         Its state, the text for ``PeerInfo.last_error``, and the command that lets it in; ``None``: it is not shown.
@@ -186,10 +184,10 @@ def judge_stranger(
     revoked = trust is not None and name in trust.revoked
     if trust is None or (reason is TrustReason.REVOKED and not revoked):
         return None if reason is TrustReason.REVOKED else (FOREIGN, problem, "")
-    if name.casefold() in {member.casefold() for member in members}:
+    if name.casefold() in members:
         if reason is TrustReason.REVOKED:
             return None  # it has joined again
-        text = f"not of this mesh: the module at {address} says that it is {name} too, and proves nothing"
+        text = f"not of this mesh: it says that it is {name}, and does not prove it"
         return FOREIGN, f"{text}; do not invite it; if it is yours, give it another name: rmpa up --name", ""
     invite = f"rmpa trust invite --module {name}"
     where = "here" if trust.is_authority else f"on {trust.authority or 'the authority'}"
@@ -217,7 +215,7 @@ def judge_refusal(reason: TrustReason, own: str) -> tuple[str, str, str]:
     if reason is not TrustReason.PLAIN:
         return FOREIGN, not_of_this_mesh(reason), ""
     invite = f"rmpa trust invite --module {own}"
-    text = "pending: it is of a secured mesh, and this module has no keys; to join, run on the authority of that mesh"
+    text = "pending: this module has no keys of that secured mesh; to join it, run on its authority"
     return PENDING, f"{text}: {invite} (it prints the line to run here)", invite
 
 

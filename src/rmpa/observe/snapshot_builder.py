@@ -254,7 +254,7 @@ class SnapshotBuilder:
         # A module that has joined was heard without keys before its link came up.
         joined = {session.link.name: session.link.since or now for session in links.values()}
         knocking = (
-            _stranger(one, now, trust, {self._settings.name, *joined})
+            _stranger(one, now, trust, {name.casefold() for name in (self._settings.name, *joined)})
             for one in discovery.strangers()
             if one.heard > joined.get(one.identity.name, 0.0)
             and not any(one.identity.guid in known for known in (roster, statuses, links))
@@ -420,14 +420,14 @@ class SnapshotBuilder:
 
 def _stranger(one: Stranger, now: float, trust: TrustStatus | None, members: set[str]) -> PeerInfo | None:
     identity = one.identity
-    at = identity.guid.endpoint[0]
-    shown = judge_stranger(identity.name, at, one.reason, one.problem, trust=trust, members=members)
+    shown = judge_stranger(identity.name, one.reason, one.problem, trust=trust, members=members)
     if shown is None:
         return None
     state, text, invite = shown
+    guid = str(identity.guid)
     return PeerInfo(
-        name=identity.name,
-        guid=str(identity.guid),
+        name=identity.name if identity.name.casefold() not in members else guid.partition("#")[0],
+        guid=guid,
         instance=identity.instance.hex(),
         state=state,
         since_ago=now - one.since,

@@ -12,6 +12,7 @@ from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.discovery import BEACONS_UNPROVED_PAUSE, STRANGER_KEPT, PacketFilter
 from rmpa.trust import limits as trust_limits
 from rmpa.trust.packets import GroupKey, KeyRing, PacketTrust
+from rmpa.trust.permissions import TrustReason
 
 if TYPE_CHECKING:
     import pytest
@@ -142,14 +143,14 @@ class RotatedDoor:
         ring = KeyRing([GroupKey(1, b"k" * 32), GroupKey(2, b"n" * 32)], 0.0)
         self.counters = Counters()
         self.member, self.old = PacketTrust(ring, lambda: WALL), PacketTrust(RING, lambda: WALL)
-        self._intake = PacketFilter(0, self.counters, trust=PacketTrust(ring, lambda: WALL))
+        self.intake = PacketFilter(0, self.counters, trust=PacketTrust(ring, lambda: WALL))
 
     def found(
         self, signer: PacketTrust, number: int, now: float, host: str = "10.0.0.2"
     ) -> tuple[Beacon, int | None] | None:
         beacon = Beacon(BeaconKind.HEARTBEAT, FRIEND, 16_000, number).serialize()
         data = signer.sign(beacon, now)
-        return self._intake.parse(data, (host, 4000), now, multicast=True, interface=1)
+        return self.intake.parse(data, (host, 4000), now, multicast=True, interface=1)
 
 
 def test_a_module_with_an_older_group_key_is_recognised_and_counts_for_no_limit() -> None:
@@ -213,6 +214,31 @@ def test_refused_packets_are_logged_with_what_to_do(caplog: pytest.LogCaptureFix
     (shown,) = door.intake.strangers(10.0)
     assert shown.identity == FRIEND
     assert "60 s ahead of ours" in shown.problem, "the last word on it"
+
+
+def test_a_stranger_has_the_reason_of_its_last_beacon_and_goes_with_a_goodbye() -> None:
+    door = SecuredDoor()
+    door.hears(packet(FRIEND, 1))
+    body = packet(FRIEND, 2)
+    for data, reason in (
+        (body, TrustReason.UNSECURED),
+        (PacketTrust(KeyRing([GroupKey(1, b"x" * 32)], 0.0), lambda: WALL).sign(body, 10.0), TrustReason.FOREIGN),
+        (PacketTrust(KeyRing([GroupKey(9, b"x" * 32)], 0.0), lambda: WALL).sign(body, 10.0), TrustReason.KEY),
+        (door.signed(1, WALL + 60), None),
+    ):
+        door.hears(data, now=12.0)
+        (shown,) = door.intake.strangers(12.0)
+        assert (shown.reason, shown.since, shown.heard) == (reason, 10.0, 12.0)
+    door.hears(Beacon(BeaconKind.GOODBYE, FRIEND, 16_000, 3).serialize())
+    assert not door.intake.strangers(12.0)
+
+
+def test_one_with_a_group_key_from_before_a_revocation_is_remembered_for_the_deny_list() -> None:
+    door = RotatedDoor()
+    assert door.found(door.old, 1, 10.0)
+    (shown,) = door.intake.strangers(10.0)
+    assert (shown.identity, shown.reason, shown.problem) == (FRIEND, TrustReason.REVOKED, "")
+    assert not door.intake.strangers(10.1 + STRANGER_KEPT)
 
 
 def test_a_packet_that_is_no_beacon_of_this_domain_is_not_told_of(caplog: pytest.LogCaptureFixture) -> None:

@@ -57,7 +57,7 @@ async def test_a_page_shows_its_thing_and_is_accessible_in_both_colours(site: Si
     assert (site.server.reports, page.errors) == ([], [])
 
 
-@pytest.mark.parametrize("scene", ["sick", "mute", "large"])
+@pytest.mark.parametrize("scene", ["sick", "mute", "large", "knock"])
 async def test_the_first_page_is_accessible_whatever_is_wrong(site: Site, scene: str) -> None:
     page = await site.open("", scene)
     assert await violations(page) == []
@@ -528,6 +528,40 @@ async def test_who_may_only_look_sees_no_way_to_change_anything(site: Site) -> N
     assert "Drive" not in await page.run("document.querySelector('nav').innerText")
     page = await site.open("drive")
     assert await page.run("document.querySelector('input[type=checkbox]').disabled") is True
+
+
+OUTSIDE = "[...document.querySelectorAll('.outside li')]"
+"""The modules that are not of this mesh."""
+
+
+async def test_a_pending_module_is_invited_by_a_button_that_shows_the_line_once(site: Site) -> None:
+    await site.page.look(360, 740)
+    page = await site.open("", "knock")
+    await page.wait(f"{OUTSIDE}.length === 3")
+    assert await page.run(f"{OUTSIDE}.map((each) => each.querySelector('.mark').textContent)") == [
+        "pending", "foreign", "revoked"
+    ]  # fmt: skip
+    assert await page.run(f"{OUTSIDE}.map((each) => each.querySelectorAll('button').length)") == [1, 0, 0]
+    await click(page, "Invite arm")
+    await page.wait_text("rmpa trust join rmpa1-forarm")
+    assert site.server.asked[-1].args == {"name": "arm"}
+    assert "rmpa1-" not in await page.run("JSON.stringify(window.rmpa.state) + location + document.cookie")
+    assert await page.run("document.documentElement.scrollWidth") == 360
+    assert await violations(page) == []
+    await page.run("location.hash = '#/topics'")
+    await page.wait_text("/velocity_order")
+    await page.run("location.hash = '#/'")
+    await page.wait(f"{OUTSIDE}.length === 3")
+    assert await page.run("document.querySelector('.token')") is None
+    site.server.agent.scene = "demo"  # it has joined, or has gone
+    await page.wait("!document.querySelector('.outside')")
+
+
+async def test_the_line_alone_is_shown_where_the_page_may_not_invite(site: Site) -> None:
+    site.server.rights = Rights(view=True)
+    page = await site.open("", "knock")
+    await page.wait_text("run here: rmpa trust invite --module arm")
+    assert await page.run("document.querySelectorAll('.outside button').length") == 0
 
 
 async def test_a_robot_moves_only_while_the_stick_is_held(site: Site) -> None:

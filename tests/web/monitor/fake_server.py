@@ -5,7 +5,7 @@
 It has the real pages and the real ``MonitorSession``; the agent, the hub and all answers are made up here.
 Scenes: ``demo`` (all is well), ``killed`` (the module base was killed), ``sick`` (one of each state, and alarms),
 ``large`` (16 modules, 300 topics), ``mute`` (the agent does not answer), ``sensors`` (a laser and a camera),
-``cut`` (18,000 topics are left out).
+``cut`` (18,000 topics are left out), ``knock`` (modules that are not of this mesh, at its authority).
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ from aiohttp import WSMsgType, web
 
 from rmpa.core.contract import ContractRule, Contracts
 from rmpa.core.errors import RmpaError
-from rmpa.observe.peer_info import LaneInfo, PeerAgent
+from rmpa.observe.peer_info import LaneInfo, PeerAgent, PeerInfo, judge_stranger
 from rmpa.observe.snapshot import Snapshot
 from rmpa.observe.why.services import diagnose_module
+from rmpa.trust.permissions import TrustReason, TrustStatus
 from rmpa.web.gateways.frame_writer import Opcode
 from rmpa.web.hub.node_link import FULL
 from rmpa.web.hub.topics import ReceivedMessage
@@ -50,7 +51,7 @@ FIXTURES = Path(__file__).with_name("fixtures")
 STATIC = Path(__file__).parents[3] / "src/rmpa/web/static"
 CSP = "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; object-src 'none'"
 TICK = 0.1
-SCENES = ("demo", "killed", "sick", "large", "cut", "mute", "sensors")
+SCENES = ("demo", "killed", "sick", "large", "cut", "mute", "sensors", "knock")
 _SPEEDS = struct.Struct("<6d")
 _SENSORS = {"/scan": "sensor_msgs/LaserScan", "/camera/image": "sensor_msgs/CompressedImage"}
 
@@ -64,6 +65,15 @@ def snapshots() -> list[Snapshot]:
 def resources() -> list[ResourceFacts]:
     """The demo's Smart Resources."""
     return msgspec.convert(json.loads((FIXTURES / "resources.json").read_text())["resources"], list[ResourceFacts])
+
+
+def outside(name: str, trust: TrustStatus) -> PeerInfo:
+    """A module without keys that knocks."""
+    shown = judge_stranger(name, TrustReason.UNSECURED, "", trust=trust, members={"pc", "base"})
+    assert shown is not None
+    state, text, invite = shown
+    guid = f"10.0.0.9:4000{len(name)}#7"
+    return PeerInfo(name=name, guid=guid, instance="", state=state, since_ago=9.0, last_error=text, invite=invite)
 
 
 class FakeAgent:
@@ -85,7 +95,7 @@ class FakeAgent:
             base = self._recorded[2 if now - since < 7 else 3]
         else:
             self._since.clear()
-        if self.scene in ("sick", "large", "cut", "sensors"):
+        if self.scene in ("sick", "large", "cut", "sensors", "knock"):
             base = getattr(self, f"_{self.scene}")(base)
         age = now - self._started
         wobble = 1 + 0.004 * math.sin(now * 3)
@@ -193,6 +203,12 @@ class FakeAgent:
     def _cut(self, base: Snapshot) -> Snapshot:
         topics = tuple(topic for topic in base.topics if topic.name != "/odom")
         return msgspec.structs.replace(base, topics=topics, topics_left=18_000)
+
+    def _knock(self, base: Snapshot) -> Snapshot:
+        trust = TrustStatus(on=True, module="pc", is_authority=True, authority="pc", revoked=("old",))
+        return msgspec.structs.replace(
+            base, trust=trust, strangers=tuple(outside(name, trust) for name in ("arm", "base", "old"))
+        )
 
     def _large(self, base: Snapshot) -> Snapshot:
         replace = msgspec.structs.replace
@@ -403,6 +419,9 @@ class FakeServer:
 
     def _answer_call(self, args: dict[str, Any]) -> Any:
         return {"response": {"success": True, "message": f"as asked: {args['request']}"}, "seconds": 0.0031}
+
+    def _answer_invite(self, args: dict[str, Any]) -> Any:
+        return {"line": f"rmpa trust join rmpa1-for{args['name']}{'x' * 80}", "until": int(time.time()) + 900}
 
     def _answer_profile(self, _args: dict[str, Any]) -> Any:
         return {"text": "chosen"}

@@ -15,13 +15,14 @@ import pytest
 
 from rmpa.config.peer_rules import Access, Effect, PermissionRule
 from rmpa.config.settings import Settings, TrustSettings, WebSettings
-from rmpa.core.errors import PeerRefused
+from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.resource import Resource
 from rmpa.resource.descriptor import describe
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.master.parameters import Parameters
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
+from rmpa.trust.permissions import InviteReply
 from rmpa.web.hub.hub import Hub
 from rmpa.web.hub.node_link import EVERYTHING, FULL, READ_ONLY, NodeRules, Rights
 from rmpa.web.monitor import questions
@@ -30,12 +31,14 @@ from rmpa.web.monitor.questions import Answers
 from rmpa.web.monitor.resources import MessageValues, ResourceWatch
 from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup
 from tests.ros.node.peers import DEADLINE, until
+from tests.web import snapshots
 from tests.web.hub.client import FakeClient, local_core, node, running_hub
 from tests.web.server.test_gateways import running
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from rmpa.observe.snapshot import Snapshot
     from rmpa.web.hub.node_link import ParamValue
 
 RULES = (
@@ -347,3 +350,41 @@ async def test_a_peers_parameters_are_judged_by_what_the_peer_has(monkeypatch: p
         await ask("delete_param", name="/speed")
         assert peer.names() == ["/motors/limit"]
         answers.close()
+
+
+class Authority:
+    """The control socket of an authority at which ``arm`` is pending."""
+
+    def __init__(self) -> None:
+        self.asked: list[dict[str, Any]] = []
+
+    def snapshot(self, **_: object) -> Snapshot:
+        arm = snapshots.peer("arm", state="pending", link=None, invite="rmpa trust invite --module arm")
+        return msgspec.structs.replace(
+            snapshots.FULL, strangers=(arm, snapshots.peer("pc", state="foreign", link=None))
+        )
+
+    def call(self, _op: str, _kind: object, **args: Any) -> InviteReply:
+        self.asked.append(args)
+        return InviteReply(token=f"rmpa1-{len(self.asked)}", id=f"id{len(self.asked)}", expires=9)
+
+
+async def test_a_page_invites_pending_modules_alone_and_each_by_one_open_token(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("DEBUG")
+    authority = Authority()
+    monkeypatch.setattr(questions, "choose_agent", lambda *_: SimpleNamespace(path=""))
+    monkeypatch.setattr(questions, "ControlClient", lambda *_: nullcontext(authority))
+    async with local_core() as core, running_hub(core, RULED) as hub:
+        answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
+        for name in ("pc", "base", "*", ""):
+            with pytest.raises(RmpaError, match="is pending"):
+                await answers.answer("invite", {"name": name})
+        assert await answers.answer("invite", {"name": "arm"}) == {"line": "rmpa trust join rmpa1-1", "until": 9}
+        assert await answers.answer("invite", {"name": "arm"}) == {"line": "rmpa trust join rmpa1-3", "until": 9}
+        invite, withdraw = {"what": "invite", "name": "arm"}, {"what": "withdraw", "id": "id1"}
+        assert authority.asked == [invite, withdraw, invite]
+        answers.close()
+    assert questions.QUESTIONS["invite"][0] == "control"
+    assert "rmpa1-" not in caplog.text

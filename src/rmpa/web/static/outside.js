@@ -39,8 +39,8 @@ function Knocking({ one, connection }) {
     ${one.here &&
     one.invite &&
     connection.may("control") &&
-    html`<button type="button" onClick=${invite} disabled=${state.waits} aria-label=${`Invite ${one.name}`}>
-      ${state.waits ? "Asking …" : state.value ? "Invite again" : "Invite"}
+    html`<button type="button" onClick=${invite} disabled=${state.waits}>
+      ${state.waits ? "Asking …" : `Invite ${one.name}${state.value ? " again" : ""}`}
     </button>`}
     <div aria-live="polite">
       <${Failure} failure=${state.failure} />${state.value && html`<${Token} name=${one.name} made=${state.value} />`}

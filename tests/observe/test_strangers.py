@@ -1,0 +1,68 @@
+"""What is shown of a module that knocks: what it says proves nothing, and takes no member's name."""
+
+from __future__ import annotations
+
+import pytest
+
+from rmpa.observe.peer_info import judge_refusal, judge_stranger
+from rmpa.trust.permissions import MemberInfo, TrustReason, TrustStatus
+
+MEMBER = TrustStatus(on=True, module="pc", authority="base", revoked=("old", "back"))
+LONE = TrustStatus(on=True, module="pc")
+AUTHORITY = TrustStatus(
+    on=True,
+    module="base",
+    is_authority=True,
+    revoked=("old", "back"),
+    members=tuple(MemberInfo(name=name, issued=1, expires=9) for name in ("base", "back", "lost")),
+)
+INVITE = "rmpa trust invite --module arm"
+PLAIN, OLD_KEY = TrustReason.UNSECURED, TrustReason.REVOKED
+
+
+@pytest.mark.parametrize(
+    ("trust", "name", "reason", "state", "words", "invite"),
+    [
+        (AUTHORITY, "arm", PLAIN, "pending", f"not proved; if it is yours, run here: {INVITE} (", INVITE),
+        (MEMBER, "arm", PLAIN, "pending", f"not proved; if it is yours, run on base: {INVITE} (", INVITE),
+        (LONE, "arm", PLAIN, "pending", f"run on the authority: {INVITE} (", INVITE),
+        # A member's name, and this module's own.
+        (AUTHORITY, "pc", PLAIN, "foreign", "it says that it is pc, and does not prove it", ""),
+        (AUTHORITY, "PC", PLAIN, "foreign", "do not invite it", ""),
+        (MEMBER, "pc", TrustReason.KEY, "foreign", "do not invite it", ""),
+        # One that has joined and was not started again, or has lost its files.
+        (AUTHORITY, "lost", PLAIN, "pending", "has a certificate, but", "rmpa trust invite --module lost"),
+        # Revoked ones, with their former group key or with none any more; and one that has joined again since.
+        (MEMBER, "old", OLD_KEY, "revoked", "rmpa trust leave --yes on old, then run on base: rmpa trust invite", ""),
+        (AUTHORITY, "old", PLAIN, "revoked", "then run here: rmpa trust invite --module old", ""),
+        (AUTHORITY, "back", PLAIN, "pending", "has a certificate, but", "rmpa trust invite --module back"),
+        # Another mesh, another release, another clock: as the beacons' refusal says.
+        (AUTHORITY, "arm", TrustReason.FOREIGN, "foreign", "the problem", ""),
+        (AUTHORITY, "arm", TrustReason.KEY, "foreign", "the problem", ""),
+        (AUTHORITY, "arm", None, "foreign", "the problem", ""),
+        (None, "arm", None, "foreign", "the problem", ""),
+    ],
+)
+def test_a_module_that_knocks(
+    trust: TrustStatus | None, name: str, reason: TrustReason | None, state: str, words: str, invite: str
+) -> None:
+    shown = judge_stranger(name, reason, "the problem", trust=trust, members={"base", "pc"})
+    assert shown is not None
+    assert (shown[0], shown[2]) == (state, invite)
+    assert words in shown[1]
+
+
+@pytest.mark.parametrize(("trust", "name"), [(MEMBER, "arm"), (AUTHORITY, "arm"), (None, "old")])
+def test_a_member_that_was_away_with_the_former_key_is_not_shown(trust: TrustStatus | None, name: str) -> None:
+    assert judge_stranger(name, OLD_KEY, "", trust=trust, members={"base", "pc"}) is None
+
+
+def test_one_that_joined_again_and_is_linked_is_not_shown_for_its_former_key() -> None:
+    assert judge_stranger("back", OLD_KEY, "", trust=MEMBER, members={"base", "back"}) is None
+
+
+def test_to_a_module_without_keys_a_secured_mesh_is_pending_and_another_mesh_is_foreign() -> None:
+    state, text, invite = judge_refusal(TrustReason.PLAIN, "arm")
+    assert (state, invite) == ("pending", INVITE)
+    assert f"to join it, run on its authority: {INVITE} (it prints the line to run here)" in text
+    assert judge_refusal(TrustReason.FOREIGN, "arm")[::2] == ("foreign", "")
