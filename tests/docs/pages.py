@@ -28,7 +28,7 @@ USER_PAGES: Final = [
 """The pages that users read."""
 UNMARKED: Final = {
     "README.md",
-    *(f"docs/guides/{name}.md" for name in ("monitor", "ros2", "smart-resources")),
+    *(f"docs/guides/{name}.md" for name in ("smart-resources",)),
     "docs/reference/compatibility.md",
     "docs/reference/settings.md",
     "docs/start/demo.md",

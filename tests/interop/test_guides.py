@@ -1,4 +1,4 @@
-"""The commands of docs/guides/trust.md, web.md and sites.md, typed on machines of their own, do as the pages say."""
+"""The commands of docs/guides: trust.md, web.md, monitor.md and sites.md, typed on machines of their own."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_the_web_server_answers_as_its_page_says(lab: Lab, tmp_path: Path) -> No
         eventually(lambda: "/joy" in base.say("rmpa topic list"), what="the topic of the joystick")
         served = base.start("rmpa web")
         done = []
-        for _, command, lines in steps("web.md"):
+        for _, command, lines in (*steps("web.md"), *steps("monitor.md")):
             wanted = command if command.startswith("rmpa web") else "rmpa web" if "curl" in command else served.name
             if served.name != wanted:
                 served.interrupt()
