@@ -41,19 +41,19 @@ def _module(module: ModuleType, done: set[str]) -> Iterator[str]:
         yield f"{module.__name__}.{name}{_text(value)}"
         if inspect.isclass(value) and name not in done and not issubclass(value, BaseException | Enum):
             done.add(name)
-            yield from sorted(_members(value))
+            yield from sorted(f"{module.__name__}.{name}.{member}" for member in _members(value))
 
 
 def _members(kind: type) -> Iterator[str]:
     if issubclass(kind, msgspec.Struct):
         for field in msgspec.structs.fields(kind):
-            yield f"    .{field.name}: {re.sub(_OURS, '', inspect.formatannotation(field.type))}"
+            yield f"{field.name}: {re.sub(_OURS, '', inspect.formatannotation(field.type))}"
         return
     for name in dir(kind):
         found = inspect.getattr_static(kind, name)
         public = name in _SPECIAL or not (name.startswith("_") or name in _INSIDE)
         if public and hasattr(found, "__get__") and not inspect.ismemberdescriptor(found):
-            yield f"    .{name}{_text(getattr(kind, name, found))}"
+            yield f"{name}{_text(getattr(kind, name, found))}"
 
 
 def _text(value: object) -> str:

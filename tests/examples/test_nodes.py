@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
+import rmpa
 from lab.bed.processes import DEADLINE, Process, eventually
 from tests.interop.ros import PYTHON, environment, free_port
 
@@ -40,6 +42,9 @@ with rmpa.connect("hand") as node:
     node.wait_for_service("/switch", 30)
     print(node.call_service("/switch", "std_srvs/SetBool", [True]).message)
 """
+
+
+PAGE: Final = (ROOT / "docs/start/first-node.md").read_text(encoding="utf-8")
 
 
 class Machine:
@@ -101,6 +106,33 @@ def machine(group: str) -> Iterator[Machine]:
         one.close()
 
 
+def test_the_code_of_the_page_is_that_of_the_examples() -> None:
+    shown = re.findall(r"`(\w+\.py)`:\n\n```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    assert sorted(name for name, _ in shown) == sorted({path.name for path in NODES.glob("*.py")} - {"watch_mesh.py"})
+    for name, text in shown:
+        assert (NODES / name).read_text(encoding="utf-8") == text, name
+
+
+def test_what_the_page_names_is_there() -> None:
+    names = set(re.findall(r"\bnode\.(\w+)", PAGE))
+    assert {"rate", "timer", "stopped", "call_service"} <= names
+    assert not [name for name in names if not hasattr(rmpa.SyncNode, name)]
+
+
+def test_the_commands_of_the_page_show_what_it_says(machine: Machine) -> None:
+    running = []
+    blocks = re.findall(r"^```console\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    steps = [step for block in blocks for step in re.findall(r"^\$ python3 (.*)\n(.*)$", block, re.MULTILINE)]
+    assert len(steps) == sum(block.count("$ ") for block in blocks) == 4
+    for command, shown in steps:
+        running.append((machine.example(*command.split()), shown))
+    for process, shown in running:
+        process.wait_for(f"^{re.sub(r'[0-9]+', '[0-9]+', re.escape(shown))}$")
+    for process, _ in running:
+        if process.returncode is None:
+            assert process.interrupt() == 0
+
+
 def test_the_talker_the_listener_and_the_tools(machine: Machine) -> None:
     talker = machine.example("talker.py")
     listener = machine.example("listener.py")
@@ -138,8 +170,8 @@ def test_without_a_master_the_last_line_says_what_to_do(machine: Machine, name: 
         timeout=DEADLINE,
     )
     assert done.returncode == 1
-    said = "no ROS master answers at http://127.0.0.1:1 (ROS_MASTER_URI); start one (rmpa up, or roscore), or set"
-    assert said in done.stderr.splitlines()[-1]
+    (said,) = re.findall(r"^rmpa\.core\.errors\.UnreachableError: .*$", PAGE, re.MULTILINE)
+    assert done.stderr.splitlines()[-1] == said.replace("localhost:11311", "127.0.0.1:1")
 
 
 @pytest.mark.ros
