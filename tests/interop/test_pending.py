@@ -41,7 +41,7 @@ class Gate:
         """Run the line of an invitation at ``arm``, and start its agent again, as the line's output says."""
         code, out = self.arm.rmpa(*line.split()[1:])
         assert code == 0, out
-        self.arm.terminate()
+        self.arm.kill()  # without a goodbye, so that the others have heard of it before as of a module without keys
         self.arm.restart()
         for member in (self.base, self.pc):
             member.wait_peer("arm")

@@ -194,8 +194,8 @@ def judge_stranger(
     lets_in = f"run {where}: {invite} (it prints the line to run on {name})"
     certified = name in (member.name for member in trust.members)
     if revoked and not certified:
-        text = f"revoked: it knocks again; if it is to come back, rmpa trust leave --yes on {name}, then {lets_in}"
-        return REVOKED, text, ""
+        text = f"revoked: it was a member, and knocks again; if it is to come back, rmpa trust leave --yes on {name}"
+        return REVOKED, f"{text}, then {lets_in}", ""
     if reason is not TrustReason.UNSECURED:
         return FOREIGN, problem, ""
     if certified:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from rmpa.core.limits import KIB
 from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo, UnreachableInfo
+from rmpa.trust.permissions import TrustStatus
 from rmpa.web import limits
 from rmpa.web.monitor import messages, questions, session
 from rmpa.web.monitor.messages import Tree, difference
@@ -107,6 +108,30 @@ def test_a_module_that_left_long_ago_is_forgotten_and_so_are_the_oldest_of_too_m
         last = builder.build(msgspec.structs.replace(later, taken=later.taken + start, peers=peers))
     assert len(last["modules"]) == limits.MODULES_SHOWN + 1
     assert not [name for name in last["modules"] if name.startswith("m0")]
+
+
+def test_modules_that_are_not_of_this_mesh_stand_apart_and_can_be_invited_at_the_authority() -> None:
+    invite = "rmpa trust invite --module arm2"
+    arm2 = peer("arm2", state="pending", link=None, last_error="pending: no keys; invite it", invite=invite)
+    impostor = peer("arm", state="foreign", link=None, last_error="not of this mesh")
+    for trust in (TrustStatus(on=True, module="base", is_authority=True), TrustStatus(on=True, module="base")):
+        state = build(msgspec.structs.replace(FULL, strangers=(arm2, impostor), trust=trust))
+        assert state["outside"]["g arm2"] == {
+            "name": "arm2", "state": "pending", "address": "g", "since": FULL.taken - 1,
+            "text": "pending: no keys; invite it", "invite": invite, **({"here": True} if trust.is_authority else {}),
+        }  # fmt: skip
+        assert state["outside"]["g arm"]["state"] == "foreign"
+        assert state["modules"]["arm"]["state"] == "up", "another one says that this is its name"
+        assert not any("arm2" in note for note in state["notes"])
+
+
+def test_to_a_module_without_keys_a_secured_mesh_that_it_met_is_not_away() -> None:
+    arm, hand = (peer(name, state="pending", link=None, invite="x") for name in ("arm", "hand"))
+    for trust, away in ((None, ["hand"]), (TrustStatus(on=True, module="base"), ["arm", "hand"])):
+        builder = StateBuilder(FULL.agent.name)
+        builder.build(msgspec.structs.replace(FULL, peers=(arm, hand)))
+        after: Any = builder.build(msgspec.structs.replace(FULL, peers=(), strangers=(arm,), trust=trust))
+        assert [name for name, one in after["modules"].items() if one["state"] == "away"] == away
 
 
 def test_a_module_is_silent_since_it_was_heard_last() -> None:

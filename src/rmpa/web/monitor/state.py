@@ -185,7 +185,10 @@ class StateBuilder:
         for peer in peers:
             rates = self._rates(peer.name, taken, peer.link, links) if peer.link is not None else []
             yield peer.name, _module(peer, taken, rates)
-        for name in sorted(self._seen.keys() - {peer.name for peer in snapshot.peers}):
+        present = {peer.name for peer in snapshot.peers}
+        if snapshot.trust is None:  # where a secured mesh is not this one's, its members are outside, and not away
+            present |= {one.name for one in snapshot.strangers}
+        for name in sorted(self._seen.keys() - present):
             if snapshot.agent.uptime < limits.AGENT_SETTLES:
                 text = "not found yet: the agent of this module has just started"
                 yield name, {"state": "linking", "since": started, "error": text}

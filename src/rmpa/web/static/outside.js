@@ -32,10 +32,8 @@ function Knocking({ one, connection }) {
       <strong>${one.name}</strong><${Mark} state=${one.state} /><code>${one.address}</code
       ><span class="muted"><${Since} moment=${one.since} /></span>
     </p>
-    <p>
-      ${fact}.
-      ${before && html`<br /><span class="muted">${before}${after && html`<code>${one.invite}</code>${after}`}</span>`}
-    </p>
+    <p>${fact}.</p>
+    ${before && html`<p class="muted">${before}${after && html`<code>${one.invite}</code>${after}`}.</p>`}
     ${one.here &&
     one.invite &&
     connection.may("control") &&
