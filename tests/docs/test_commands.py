@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 DEADLINE: Final = 40.0
-_COMMAND: Final = re.compile(r"^([a-z]*)\$ ((?:.*\\\n)*.*)$", re.MULTILINE)
+_COMMAND: Final = re.compile(r"^(\w*)\$ ((?:.*\\\n)*.*)$", re.MULTILINE)
 _STOCK: Final = re.compile(r"\b(?:ros(?:topic|node|service|param|run|launch|core)|catkin_make)\b")
 _PAGES: Final = [page for page in USER_PAGES if name_of(page) not in UNMARKED]
 _BLOCKS: Final = [block for page in _PAGES for block in blocks(page)]
