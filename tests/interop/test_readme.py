@@ -1,10 +1,9 @@
-"""The README's five minutes, word for word, on two hosts; ``make demo`` is run by ``tests/examples``."""
+"""The README's two robots in five lines, word for word, on two hosts; ``make demo`` is run by ``tests/examples``."""
 
 from __future__ import annotations
 
-import re
-import shlex
-from contextlib import ExitStack
+import subprocess
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -12,68 +11,55 @@ import pytest
 
 from lab.bed.agents import RMPA
 from lab.bed.processes import Process
+from tests.packages.tutorial import steps
 
 if TYPE_CHECKING:
     from lab.bed.agents import Agent
     from lab.bed.namespaces import Lab
     from tests.interop.conftest import AgentFactory, ShellFactory
 
-pytestmark = [pytest.mark.netns, pytest.mark.timeout(120)]
-
-README: Final = Path(__file__).parents[2] / "README.md"
-GUIDE: Final = README.read_text(encoding="utf-8").partition("## Five minutes")[2].partition("\n## ")[0]
-
-
-def commands(program: str) -> list[list[str]]:
-    """The commands of the guide that begin with a word, without prompts and comments."""
-    spans = re.findall(rf"`({program} [^`]+)`", GUIDE) + re.findall(rf"^\s*\$ ({program} .*)$", GUIDE, re.MULTILINE)
-    return [shlex.split(span, comments=True) for span in spans]
-
-
-def starts(program: str, *words: str) -> list[str]:
-    """The arguments of the guide's first command that begins with these words."""
-    return next(command[1:] for command in commands(program) if command[1 : len(words) + 1] == list(words))
+ROOT: Final = Path(__file__).parents[2]
+README: Final = (ROOT / "README.md").read_text(encoding="utf-8")
+ROBOTS: Final = ("robot1", "robot2")
+LINES: Final = steps(README.partition("## Two robots in five lines")[2].partition("\n## ")[0], ROBOTS)
 
 
 @pytest.fixture
-def two(lab: Lab, agent: AgentFactory) -> tuple[Agent, Agent]:
-    """The guide's two machines, as ``rmpa up`` makes them, with the names that the guide uses."""
-    first, second = lab.hosts("joystick", "base")
-    agents = agent(first, name="joystick"), agent(second, name="base")
-    agents[0].wait_peer("base")
-    agents[1].wait_peer("joystick")
-    return agents
+def robots(lab: Lab, agent: AgentFactory) -> dict[str, Agent]:
+    """The two robots, as the first two lines start them."""
+    assert [(step.machines, step.command) for step in LINES[:2]] == [
+        ((name,), f"rmpa up --name {name}") for name in ROBOTS
+    ]
+    both = {host.name: agent(host, name=host.name) for host in lab.hosts(*ROBOTS)}
+    both["robot1"].wait_peer("robot2")
+    return both
 
 
-def test_the_guide_without_ros(two: tuple[Agent, Agent]) -> None:
-    first, second = two
-    with ExitStack() as stack:
-        talk = [str(RMPA), *starts("rmpa", "topic", "pub")]
-        stack.enter_context(Process(first.host.command(talk), env=first.env))
-        hear = [str(RMPA), *starts("rmpa", "topic", "echo")]
-        stack.enter_context(Process(second.host.command(hear), env=second.env)).wait_for('data: "hello"')
-        watch = [str(RMPA), *starts("rmpa", "topic", "hz")]
-        stack.enter_context(Process(second.host.command(watch), env=second.env)).wait_for("average rate: (9|10)")
-        shown = {}
-        for words in (["peer", "list"], ["topic", "list"], ["topic", "info"]):
-            command = starts("rmpa", *words)
-            code, shown[" ".join(words)] = second.rmpa(*command)
-            assert code == 0, command
-    assert re.search(r"joystick +linked", shown["peer list"])
-    assert re.search(r"/chatter.*joystick", shown["topic list"])
-    assert "std_msgs/String" in shown["topic info"]
+@pytest.mark.netns
+@pytest.mark.timeout(120)
+def test_the_five_lines(robots: dict[str, Agent]) -> None:
+    assert len(LINES) == 5
+    look, talk, hear = (
+        Process(
+            robots[step.machines[0]].host.command(["sh", "-c", f"exec {RMPA.parent}/{step.command}"]),
+            env=robots[step.machines[0]].env,
+        )
+        for step in LINES[2:]
+    )
+    with look, talk, hear:
+        look.wait_for("robot2 +linked")
+        hear.wait_for('data: "hello"')
 
 
 @pytest.mark.ros
-def test_the_guide_with_the_stock_tools(two: tuple[Agent, Agent], shell: ShellFactory) -> None:
-    first, second = two
-    shell(first.host).start("rostopic", *starts("rostopic", "pub"))
-    shell(second.host).start("rostopic", *starts("rostopic", "echo")).wait_for('data: "hello"')
+@pytest.mark.netns
+@pytest.mark.timeout(120)
+def test_rostopic_does_the_same(robots: dict[str, Agent], shell: ShellFactory) -> None:
+    shell(robots["robot1"].host).start("rostopic", "pub", "-r", "10", "/chatter", "std_msgs/String", "hello")
+    shell(robots["robot2"].host).start("rostopic", "echo", "/chatter").wait_for('data: "hello"')
 
 
-def test_the_guide_names_every_command_that_it_shows() -> None:
-    assert {tuple(command[:2]) for command in commands("rmpa")} == {
-        ("rmpa", "up"),
-        ("rmpa", "topic"),
-        ("rmpa", "peer"),
-    }
+def test_it_is_short_and_its_figure_is_that_of_the_committed_numbers() -> None:
+    assert len(README.splitlines()) <= 120
+    assert len(README.split()) <= 1000
+    subprocess.run([sys.executable, ROOT / "scripts/draw-measured", "--check"], check=True)
