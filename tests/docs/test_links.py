@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _TEXTS: Final = {".py", ".js", ".toml", ".yml", ".yaml", ".txt", ".sh", ".html", ""}
 _NAMED: Final = re.compile(r"\b(?:docs/[\w/.-]+\.md|README\.md|CONTRIBUTING\.md)(?:#([\w-]+))?")
-_VERB: Final = re.compile(r"(?:`|: )rmpa ((?:[a-z]+ ?)+)")
+_VERB: Final = re.compile(r"(?:`|: )rmpa ((?:[a-z][a-z-]* ?)+)")
 
 
 def wrong(link: str, page: Path) -> str:
