@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import re
 import subprocess
 import sys
 from typing import TYPE_CHECKING, Any
@@ -57,12 +58,24 @@ def test_the_first_line_says_what_the_facts_ask_for(settings: Settings, changes:
 
 def test_a_wrong_master_of_this_shell_is_named_with_the_right_one() -> None:
     assert "ROS_MASTER_URI" not in steps()[2]
-    assert (
-        steps(master="http://10.9.9.9:11311")[2] == f"ROS_MASTER_URI names another core: export ROS_MASTER_URI={CORE}"
-    )
+    assert steps(master="http://10.9.9.9:11311")[2] == f"ROS_MASTER_URI is wrong: export ROS_MASTER_URI={CORE}"
     second = {"core_uri": "http://localhost:11312/"}
-    assert steps(master="", agent=second)[2].endswith("is needed: export ROS_MASTER_URI=http://localhost:11312")
+    assert steps(master="", agent=second)[2].endswith("needs: export ROS_MASTER_URI=http://localhost:11312")
     assert "in a browser: http://localhost:9000/" in steps(Settings(web=WebSettings(enabled=True, port=9000)))[1]
+
+
+def test_no_line_is_too_long_and_no_command_is_cut() -> None:
+    long, far = "m" * 40, {"guid": "255.255.255.255:65535#1", "core_uri": "http://a.rather.long.name.example:65535/"}
+    known = tuple(msgspec.structs.replace(peer, name=long) for peer in (JOYSTICK, PC))
+    settings = Settings(domain=232, multicast=Multicast(enabled=False), web=WebSettings(enabled=True, port=65535))
+    every = [
+        steps(settings, "http://x:1", agent=far, **{key: peers})
+        for key, peers in (("peers", known[:1]), ("peers", known[1:]), ("strangers", known[1:]), ("peers", ()))
+    ]
+    assert all(len(line) <= 74 for lines in every for line in lines)
+    assert every[1][0].endswith(f"rmpa why --module {long}")
+    assert every[3][0] == "there: rmpa up --name OTHER --domain 232 --seed 255.255.255.255:65535"
+    assert every[0][2] == "export ROS_MASTER_URI=http://a.rather.long.name.example:65535"
 
 
 def test_programs_get_no_advice() -> None:
@@ -91,5 +104,5 @@ def test_a_terminal_gets_three_lines_and_a_log_none(place: Place) -> None:
     lines = said[said.index("Next:") :].splitlines()[:3]
     assert lines[0].startswith("Next: no peer yet; a second module here: rmpa up --name OTHER --core-port ")
     assert "rmpa peer list" in lines[1]
-    assert "export ROS_MASTER_URI=http://" in lines[2], "it is another port than ROS's own"
+    assert re.search(r"export ROS_MASTER_URI=http://[\w.]+:\d{4,5}$", lines[2]), "it is another port than ROS's own"
     assert all(len(line) <= 80 for line in lines)

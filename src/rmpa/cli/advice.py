@@ -43,7 +43,7 @@ def advise(settings: Settings) -> None:
             time.sleep(_LOOK)
             shown = client.snapshot(topics=(), services=())
         lines = next_steps(settings, shown, os.environ.get("ROS_MASTER_URI", ""))
-        text = [printable(f"{head} {line}")[:_COLUMNS] for head, line in zip(_HEADS, lines, strict=True)]
+        text = [printable(f"{head} {line}") for head, line in zip(_HEADS, lines, strict=True)]
         click.echo("\n".join(text), err=True)
 
 
@@ -58,22 +58,31 @@ def next_steps(settings: Settings, shown: Snapshot, master: str) -> list[str]:
     core = shown.agent.core_uri.rstrip("/")
     nodes = "nodes of this machine join as soon as they start"
     if not same_core(core, master or DEFAULT_MASTER_URI):
-        wrong = "names another core" if master else "is needed"
-        nodes = f"ROS_MASTER_URI {wrong}: export ROS_MASTER_URI={core}"
+        wrong = "ROS_MASTER_URI is wrong" if master else "each shell of nodes needs"
+        nodes = _fitting(f"{wrong}: export ROS_MASTER_URI={core}", f"export ROS_MASTER_URI={core}")
     page = f"http://localhost:{settings.web.port}/" if settings.web.enabled else "rmpa web"
-    return [_about_peers(settings, shown), f"to look: rmpa peer list, rmpa topic list; in a browser: {page}", nodes]
+    return [_about_peers(settings, shown), f"to look: rmpa peer list; in a browser: {page}", nodes]
+
+
+def _fitting(*lines: str) -> str:
+    """The first of several ways to say something that fits a terminal, else the last: no command is cut."""
+    most = _COLUMNS - len(_HEADS[0]) - 1
+    return next((line for line in lines if len(line) <= most), lines[-1])
 
 
 def _about_peers(settings: Settings, shown: Snapshot) -> str:
     linked = [peer.name for peer in shown.peers if peer.link]
     if linked:
         others = f" and {len(linked) - 1} more" if len(linked) > 1 else ""
-        return f"linked with {linked[0]}{others}; if a topic does not come: rmpa why NAME"
+        hint = "if a topic does not come: rmpa why NAME"
+        return _fitting(f"linked with {linked[0]}{others}; {hint}", f"linked with {len(linked)}; {hint}")
     if shown.peers:
-        return f"{shown.peers[0].name} was found and is not linked: rmpa why --module {shown.peers[0].name}"
+        hint = f"rmpa why --module {shown.peers[0].name}"
+        return _fitting(f"{shown.peers[0].name} was found and is not linked: {hint}", f"no link: {hint}", hint)
     if shown.strangers:
         one = shown.strangers[0]
-        return f"{one.name} is {'pending' if one.invite else 'not of this mesh'}: rmpa peer list says what to do"
+        hint = f"{'pending' if one.invite else 'not of this mesh'}: rmpa peer list says what to do"
+        return _fitting(f"{one.name} is {hint}", f"a module is {hint}")
     if "lo" in settings.interfaces:
         return f"no peer yet; a second module here: rmpa up --name OTHER --core-port {settings.core_port + 1}"
     if shown.agent.addresses in ((), ("127.0.0.1",)):
@@ -82,5 +91,6 @@ def _about_peers(settings: Settings, shown: Snapshot) -> str:
     if shown.trust is not None:
         return "no peer yet: rmpa trust invite here, rmpa trust join and rmpa up there"
     if not settings.multicast.enabled:
-        return f"no peer yet; there: rmpa up --name OTHER{domain} --seed {shown.agent.guid.partition('#')[0]}"
+        there = f"rmpa up --name OTHER{domain} --seed {shown.agent.guid.partition('#')[0]}"
+        return _fitting(f"no peer yet; there: {there}", f"there: {there}")
     return f"no peer yet; on the other machine: rmpa up --name OTHER{domain}"
