@@ -27,7 +27,6 @@ USER_PAGES: Final = [
 ] + [ROOT / "README.md"]
 """The pages that users read."""
 UNMARKED: Final = {
-    *(f"docs/guides/{name}.md" for name in ("smart-resources",)),
     "docs/reference/compatibility.md",
     "docs/reference/settings.md",
     "docs/start/demo.md",

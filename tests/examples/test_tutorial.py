@@ -10,12 +10,14 @@ import sys
 import tempfile
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
 from lab.bed.processes import Process, eventually
+from rmpa.cli.messages import read_values
 from rmpa.cli.run import load
+from rmpa.resource.quality import at_least, parse_requirement
 from tests.interop.ros import free_port
 
 if TYPE_CHECKING:
@@ -31,10 +33,31 @@ NUMBER: Final = re.compile(r"\d+(?:\.\d+)?(?:e-?\d+)?")
 
 
 def test_its_files_are_the_examples() -> None:
-    shown = re.findall(r"`(\w+\.py)`[^`]*:\n\n```python\n(.*?)^```$", TUTORIAL, re.MULTILINE | re.DOTALL)
-    assert [name for name, _ in shown] == ["sonar.py", "keeper.py", "ask.py"]
-    for name, text in shown:
-        assert (FILES / name).read_text(encoding="utf-8") == text, name
+    before, *blocks = TUTORIAL.split("\n```python\n")
+    for name in ("sonar.py", "keeper.py", "ask.py"):
+        text, _, after = blocks.pop(0).partition("```\n")
+        assert f"`{name}`" in before.rpartition("\n\n")[0].rpartition("\n\n")[2] + before.rpartition("\n\n")[2]
+        whole = (FILES / name).read_text(encoding="utf-8")
+        lines = {line.strip() for line in whole.splitlines()}
+        assert text == whole or (name != "sonar.py" and {line.strip() for line in text.splitlines()} <= lines), name
+        before = after
+    assert not blocks
+
+
+def test_what_a_file_may_declare_can_be_declared() -> None:
+    (block,) = re.findall(r"^```python\n(.*?)^```$", PAGE.removeprefix(TUTORIAL), re.MULTILINE | re.DOTALL)
+    (sonar,) = load(FILES / "sonar.py")
+    exec(block, {"sonar": sonar, "at_least": at_least})
+    assert list(sonar.contexts) == ["docked", "quiet"]
+    assert "/battery" in sonar.inputs
+    (asked,) = re.findall(r"/sonar/requirements \S+ \\\n +'(.*)'$", PAGE, re.MULTILINE)
+    array: Any = read_values((asked,))
+    values = [(pair["key"], pair["value"]) for pair in array["status"][0]["values"]]
+    bounds = parse_requirement("/someone", values, sonar.attributes, "sonar", 0.0).bounds
+    assert {name: (bound.hard, bound.weight) for name, bound in bounds.items()} == {
+        "rate": (True, 1.0),
+        "accuracy": (False, 2.0),
+    }
 
 
 def test_the_keeper_says_how_close_it_keeps() -> None:
@@ -120,5 +143,5 @@ def test_its_commands_do_what_it_says(terminals: Terminals) -> None:
         for command, shown in COMMAND.findall(step[1] or ""):
             terminals.type(command, shown)
             typed += 1
-    assert typed == 18
+    assert typed == 17
     assert all("Traceback" not in process.output for process in terminals.running.values())
