@@ -368,6 +368,8 @@ def run_process(
             runner.run(main(outcomes))
     except OSError as error:
         if is_shortage(error):
-            raise StartError(f"agent {settings.name}", "no file descriptors left", remedy()) from error
+            raise StartError(
+                f"agent {settings.name}", "no file descriptors left", remedy(), code="out-of-descriptors"
+            ) from error
         raise
     return 0

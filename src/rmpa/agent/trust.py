@@ -85,12 +85,12 @@ def open_membership(settings: Settings, clock: SystemClock) -> Membership | None
         from rmpa.trust.membership import Membership  # noqa: PLC0415 - its library takes memory: only when needed
     except ModuleNotFoundError as error:
         missing = f"the library {error.name} is not installed, but this module has joined a secured mesh"
-        raise StartError(str(store.folder), missing, missing_extra("trust")) from None
+        raise StartError(str(store.folder), missing, missing_extra("trust"), code="extra-missing") from None
     membership = Membership.load(store, clock, time.time)
     if membership.name != settings.name:
         text = f"is of {membership.name}, but this agent is named {settings.name}"
         remedy = f"start it with --name {membership.name}, or let it join: rmpa trust leave, rmpa trust join TOKEN"
-        raise StartError(str(store.path("module.crt")), text, remedy)
+        raise StartError(str(store.path("module.crt")), text, remedy, code="certificate-trouble")
     return membership
 
 
@@ -322,7 +322,7 @@ class AgentTrust(Part):
     def _renew_other(self, session: PeerSession, args: dict[str, Any]) -> dict[str, str]:
         """Renew the certificate of a linked module."""
         if self.authority is None:
-            raise RmpaError(NOT_AUTHORITY)
+            raise RmpaError(NOT_AUTHORITY, code="not-authority")
         name = session.link.name
         presented = session.link.connection.certificate
         if presented is not None:
@@ -393,7 +393,7 @@ class TrustCommands:
         if self._part is None:
             begin = "rmpa trust init, or rmpa trust join TOKEN; then start it again"
             remedy = _JOINED if self._plain().problems else begin
-            raise PeerRefused(f"agent {self._settings.name}", "it runs without trust", remedy)
+            raise PeerRefused(f"agent {self._settings.name}", "it runs without trust", remedy, code="not-a-member")
         return self._part
 
     def status(self, _args: Args) -> TrustStatus:
@@ -486,7 +486,7 @@ class TrustCommands:
         if trust.authority is None:
             name = trust.authority_name()
             remedy = f"do it at {name}" if name else "do it at the authority"
-            raise PeerRefused(f"agent {trust.membership.name}", NOT_AUTHORITY, remedy)
+            raise PeerRefused(f"agent {trust.membership.name}", NOT_AUTHORITY, remedy, code="not-authority")
         return trust.authority
 
 

@@ -261,14 +261,16 @@ class Nodes(Part):
         peer, gate = asker.link.name, self._shared.context.gate
         named = str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
         if why := gate.why_not(Access.KILL, peer, named):
-            raise RmpaError(why)  # before whether there is such a node
+            raise RmpaError(why, code="not-permitted")  # before whether there is such a node
         nodes = [node for node in self._core.state().nodes if gate.judge(Access.KILL, peer, node).allowed]
         node, uri = self._own(args, nodes)
         who = f"{peer}'s {str(args.get('by', ''))[: limits.ASK_NAME_MAX]}"
         if not any(matches(glob, node) for glob in self._shared.context.settings.nodes.kill):
             _log.warning("! %s may not end %s: no glob of nodes.kill fits", who, node)
             here = self._shared.context.settings.name
-            raise RmpaError(f"no glob of nodes.kill in the rmpa.toml of {here} fits {node}; allow it there")
+            raise RmpaError(
+                f"no glob of nodes.kill in the rmpa.toml of {here} fits {node}; allow it there", code="not-permitted"
+            )
         _log.warning("= %s ends %s", who, node)
         gone = await end_node(node, uri, OWN_NODE, f"killed by {who}")
         self._core.suspect(node)  # roscpp does not unregister when it ends in a hurry
@@ -291,12 +293,14 @@ class Nodes(Part):
         if is_own(node):
             origin = proxied_node(node)
             whose = f"it is {origin[0]}'s {origin[1]}: ask there" if origin is not None else "it is its agent"
-            raise RmpaError(f"{node} is no node of {here}: {whose}")
+            raise RmpaError(f"{node} is no node of {here}: {whose}", code="unknown-name")
         nodes = self._core.state().nodes
         known = nodes if told is None else told
         if node not in known or node not in nodes:
             near = did_you_mean(node, [name for name in known if not is_own(name)])
-            raise RmpaError(f"{here} has no node {node}" + (f"; did you mean {near}?" if near else ""))
+            raise RmpaError(
+                f"{here} has no node {node}" + (f"; did you mean {near}?" if near else ""), code="unknown-name"
+            )
         return node, nodes[node]
 
 

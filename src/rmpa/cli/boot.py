@@ -129,7 +129,10 @@ def choose_user(program: str) -> str:
     if owner == 0:
         problem = f"other users than root cannot run {program}"
         raise StartError(
-            "rmpa service install", problem, "install it elsewhere, such as in /opt/rmpa; or --user root"
+            "rmpa service install",
+            problem,
+            "install it elsewhere, such as in /opt/rmpa; or --user root",
+            code="service-unit",
         )
     return pwd.getpwuid(owner).pw_name
 
@@ -198,7 +201,9 @@ def service_install(
         raise ConfigError("--user", "the package's units have the user rmpa", "change it by: systemctl edit rmpa")
     wanted = [UNITS["up"], *([UNITS["web"]] if web else []), *([UNITS["gateway"]] if gateway else [])]
     if re.search(r"[\x00-\x1f\x7f'\"\\]", program):
-        raise StartError("rmpa service install", f"systemd cannot start {program!r}", "install it elsewhere")
+        raise StartError(
+            "rmpa service install", f"systemd cannot start {program!r}", "install it elsewhere", code="service-unit"
+        )
     for unit in wanted:
         machine.check_unmasked(unit)
     _check_parts(machine, before, web=web, gateway=gateway)  # reads the settings: below they are sound
@@ -268,7 +273,7 @@ def _check_parts(machine: Machine, before: Former, *, web: bool, gateway: bool) 
     if holder := program_at(settings.core_port):
         problem = f"{holder} has port {settings.core_port}, which the agent's core needs"
         if not machine.dry:
-            raise StartError("rmpa service install", problem, "end it first")
+            raise StartError("rmpa service install", problem, "end it first", code="service-unit")
         machine.note(f"! {problem}: end it first")
 
 
@@ -376,7 +381,9 @@ def _start(machine: Machine, wanted: Sequence[str], changed: Sequence[str]) -> N
             if again:
                 machine.systemctl("restart", unit)
         except RmpaError as error:
-            raise RmpaError("\n".join([str(error), *(f"  {line}" for line in _log(unit))])) from None
+            raise RmpaError(
+                "\n".join([str(error), *(f"  {line}" for line in _log(unit))]), code="service-unit"
+            ) from None
 
 
 # --- status ---------------------------------------------------------------------------------------------------------
@@ -521,9 +528,11 @@ def service_uninstall(purge: bool, yes: bool, dry_run: bool, root: str, options:
     check_machine(root, "uninstall", dry=dry_run)
     machine = Machine(root, dry=dry_run, tell=(lambda _: None) if options.as_json else click.echo)
     if purge and machine.packaged:
-        raise StartError("rmpa service uninstall", "the package has settings and state", "sudo apt purge rmpa")
+        raise StartError(
+            "rmpa service uninstall", "the package has settings and state", "sudo apt purge rmpa", code="service-unit"
+        )
     if purge and not (yes or dry_run) and not confirm(f"Remove {CONFIG} and all of {STATE}, keys too?"):
-        raise ConfigError("rmpa service uninstall", "nothing was removed")
+        raise ConfigError("rmpa service uninstall", "nothing was removed", code="not-confirmed")
     parts = [unit for unit in UNITS.values() if _is_installed(machine, unit)]
     if parts:
         machine.systemctl("disable", *([] if root else ["--now"]), *parts)

@@ -225,7 +225,9 @@ def _check_libraries(program: str, extra: str, libraries: Mapping[str, str]) -> 
     """
     missing = [package for name, package in libraries.items() if not _is_there(name)]
     if missing:
-        raise ConfigError(program, f"{' and '.join(missing)} not installed", f"run {missing_extra(extra)}")
+        raise ConfigError(
+            program, f"{' and '.join(missing)} not installed", f"run {missing_extra(extra)}", code="extra-missing"
+        )
 
 
 def _is_there(name: str) -> bool:

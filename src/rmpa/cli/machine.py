@@ -67,10 +67,10 @@ class Machine:
         try:
             done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own words
         except OSError as error:
-            raise RmpaError(f"{command[0]}: {error.strerror}") from None
+            raise RmpaError(f"{command[0]}: {error.strerror}", code="service-unit") from None
         if done.returncode:
             problem = (done.stderr or done.stdout).strip() or f"exit code {done.returncode}"
-            raise RmpaError(f"{' '.join(command)}: {problem}")
+            raise RmpaError(f"{' '.join(command)}: {problem}", code="service-unit")
 
     def systemctl(self, *words: str) -> None:
         """Run ``systemctl`` on the machine."""
@@ -130,7 +130,7 @@ class Machine:
         if path.is_symlink() and str(path.readlink()) == os.devnull:
             below = f"--root {self.root} " if self.root else ""
             remedy = f"systemctl {below}unmask {unit.removesuffix('.service')}"
-            raise StartError(f"{UNIT_FOLDER}/{unit}", "the unit is masked", remedy)
+            raise StartError(f"{UNIT_FOLDER}/{unit}", "the unit is masked", remedy, code="service-unit")
 
 
 def check_machine(root: str, verb: str, *, dry: bool) -> None:
@@ -144,10 +144,17 @@ def check_machine(root: str, verb: str, *, dry: bool) -> None:
             raise ConfigError("--root", f"{root} is no folder")
     elif not _BOOTED.is_dir() or shutil.which("systemctl") is None:
         problem = "this machine was not started by systemd (a container?)"
-        raise StartError(f"rmpa service {verb}", problem, "have `rmpa up` started by what starts programs here")
+        raise StartError(
+            f"rmpa service {verb}",
+            problem,
+            "have `rmpa up` started by what starts programs here",
+            code="service-unit",
+        )
     if os.geteuid() and not root and not dry:
         words = [own_program(), *sys.argv[1:]] if sys.argv[1:2] == ["service"] else [own_program(), "service", verb]
-        raise StartError(f"rmpa service {verb}", "only root may change the machine", f"sudo {' '.join(words)}")
+        raise StartError(
+            f"rmpa service {verb}", "only root may change the machine", f"sudo {' '.join(words)}", code="root-needed"
+        )
 
 
 def own_program() -> str:
@@ -161,7 +168,12 @@ def own_program() -> str:
         if path.name == "rmpa" and path.is_file() and os.access(path, os.X_OK):
             packaged = Path(PACKAGED)
             return PACKAGED if packaged.exists() and packaged.samefile(path) else str(path.absolute())
-    raise StartError("rmpa", f"there is no program rmpa in {prefix}/bin", "install it there, or use the bundle")
+    raise StartError(
+        "rmpa",
+        f"there is no program rmpa in {prefix}/bin",
+        "install it there, or use the bundle",
+        code="service-unit",
+    )
 
 
 def copy_state(state: Path, place: Path, ids: tuple[int, int] | None) -> None:
@@ -188,7 +200,9 @@ def copy_state(state: Path, place: Path, ids: tuple[int, int] | None) -> None:
     except OSError as error:
         if new is not None:
             shutil.rmtree(new, ignore_errors=True)
-        raise StartError(str(place), f"{state} cannot be copied there: {error}", "nothing was copied") from None
+        raise StartError(
+            str(place), f"{state} cannot be copied there: {error}", "nothing was copied", code="directory-unusable"
+        ) from None
 
 
 def _copy_files(state: Path, new: Path) -> None:
@@ -221,4 +235,4 @@ def remove_folder(place: Path, root: str) -> None:
         if place.is_symlink():
             place.unlink()
     except OSError as error:
-        raise StartError(str(place), f"cannot be removed: {error}") from None
+        raise StartError(str(place), f"cannot be removed: {error}", code="directory-unusable") from None

@@ -3,8 +3,8 @@
 Exit codes: 0 success; 1 failure, with the reason on stderr; 2 a usage error (a flag, a variable, a line of
 ``rmpa.toml``); 130 after Ctrl-C and 141 after a closed pipe, as in shells.
 
-With ``--json`` an error is also one JSON object on stdout, ``{"error": text}``, so that a program that reads stdout
-never finds it empty.
+With ``--json`` an error is also one JSON object on stdout, ``{"error": text, "code": code}``, so that a program that
+reads stdout never finds it empty. Codes are those of ``core.codes``.
 """
 
 from __future__ import annotations
@@ -226,7 +226,7 @@ class LazyGroup(click.Group):
         if args and args[0] not in self.commands_at:
             words = " ".join((*ctx.command_path.split()[1:], args[0]))
             if remedy := REMOVED_VERBS.get(words):
-                raise ConfigError(f"rmpa {words}", "is not a command any more", remedy)
+                raise ConfigError(f"rmpa {words}", "is not a command any more", remedy, code="removed")
             if not args[0].startswith("-"):
                 near = did_you_mean(args[0], self.commands_at)
                 others = (not self._path and MEANT.get(args[0])) or ([near] if near else [])
@@ -435,25 +435,27 @@ def _run(arguments: Sequence[str] | None) -> int:
 
             if remedy := REMOVED.get(error.option_name):
                 error = click.UsageError(f"No such option: {error.option_name}; {remedy}", error.ctx)
+        text = error.format_message()
+        error.format_message = lambda: f"{text} [usage]"  # type: ignore[method-assign]
         error.show()
-        return _failed(arguments, error.format_message(), error.exit_code)
+        return _failed(arguments, text, "usage", error.exit_code)
     except (click.Abort, KeyboardInterrupt):
         return 130
     except RmpaError as error:
         from rmpa.cli.output import print_error
 
-        print_error(error)
-        return _failed(arguments, str(error), 2 if isinstance(error, ConfigError) else 1)
+        print_error(error, error.code)
+        return _failed(arguments, str(error), error.code, 2 if isinstance(error, ConfigError) else 1)
     return code if isinstance(code, int) else 0
 
 
-def _failed(arguments: Sequence[str] | None, text: str, code: int) -> int:
+def _failed(arguments: Sequence[str] | None, text: str, code: str, status: int) -> int:
     """Print an error as JSON too if ``--json`` was given; return the exit code."""
     if wants_json(sys.argv[1:] if arguments is None else arguments):
         from rmpa.cli.output import print_json  # it imports msgspec, which --help does without
 
-        print_json({"error": text})
-    return code
+        print_json({"error": text, "code": code})
+    return status
 
 
 def wants_json(arguments: Sequence[str]) -> bool:

@@ -54,14 +54,14 @@ def pick(plain: Plain, path: list[str]) -> Plain:
     for part in path:
         match = _PART.fullmatch(part)
         if match is None:
-            raise RmpaError(f"{part!r} is not a field; one looks like name or name[0]")
+            raise RmpaError(f"{part!r} is not a field; one looks like name or name[0]", code="invalid-value")
         if not isinstance(plain, dict) or match["name"] not in plain:
             known = ", ".join(plain) if isinstance(plain, dict) else "none"
-            raise RmpaError(f"no field {match['name']!r} in the message; it has {known}")
+            raise RmpaError(f"no field {match['name']!r} in the message; it has {known}", code="invalid-value")
         plain = plain[match["name"]]
         for index in re.findall(r"[0-9]+", match["indices"]):
             if not isinstance(plain, list) or int(index) >= len(plain):
-                raise RmpaError(f"no element {index} in {match['name']!r}")
+                raise RmpaError(f"no element {index} in {match['name']!r}", code="invalid-value")
             plain = plain[int(index)]
     return plain
 

@@ -92,7 +92,9 @@ def _ask_peer(master: Master, wanted: GraphName, what: str, kind: type[_T]) -> _
         return _ask(master, kind, what, wanted.peer, node=wanted.name)
     except PeerRefused as error:
         # The peer's agent refuses, not this one; its name is in the text.
-        raise RmpaError(f"{error.reason}; {error.remedy}" if error.remedy else error.reason) from None
+        raise RmpaError(
+            f"{error.reason}; {error.remedy}" if error.remedy else error.reason, code=error.code
+        ) from None
 
 
 def _untold(told: Iterable[PeerNodes]) -> Iterator[str]:

@@ -119,14 +119,15 @@ def paint(text: str, colour: str | None) -> Painted:
     return Painted(click.style(printable(text), fg=colour) if colour else printable(text))
 
 
-def warn(text: str) -> None:
-    """One line on stderr, yellow on a terminal; control characters are escaped."""
-    click.secho(f"! {printable(text)}", err=True, fg="yellow")
+def warn(text: str, code: str) -> None:
+    """One line on stderr with a code of ``core.codes``, yellow on a terminal; control characters are escaped."""
+    click.secho(f"! {printable(text)} [{code}]", err=True, fg="yellow")
 
 
-def print_error(error: object) -> None:
-    """``rmpa: …`` on stderr. An error may hold the words of a peer or a node: control characters are escaped."""
-    click.echo("\n".join(map(printable, f"rmpa: {error}".split("\n"))), err=True)
+def print_error(error: object, code: str) -> None:
+    """``rmpa: … [code]`` on stderr. It may hold the words of a peer or a node: control characters are escaped."""
+    first, *more = f"rmpa: {error}".split("\n")
+    click.echo("\n".join(map(printable, (f"{first} [{code}]", *more))), err=True)
 
 
 def printable(text: str) -> str:

@@ -88,7 +88,7 @@ class MasterParams:
         for name, one in parameters:
             reply = self._call("setParam", name, one)
             if reply.code != 1:
-                raise RmpaError(f"{self.title} does not set {name}: {reply.status}")
+                raise RmpaError(f"{self.title} does not set {name}: {reply.status}", code="refused")
         return len(parameters)
 
     def delete(self, key: str) -> None:
@@ -103,7 +103,10 @@ class MasterParams:
         reply = self._call(method, key)
         if reply.code != 1:
             known = {name for full in self.names() for name in with_namespaces(full)}
-            raise RmpaError(f"{self.title} has no parameter {key}; {suggestion(key, known, '`rmpa param list`')}")
+            raise RmpaError(
+                f"{self.title} has no parameter {key}; {suggestion(key, known, '`rmpa param list`')}",
+                code="unknown-name",
+            )
         return reply
 
     def _call(self, method: str, *params: XmlRpcValue) -> RosReply:
@@ -271,12 +274,15 @@ def read_documents(text: str, where: str) -> list[XmlRpcValue]:
     """
     if len(text) > ros_limits.HTTP_BODY_MAX:
         bound = f"{ros_limits.HTTP_BODY_MAX} ({ros_limits.HTTP_BODY_MAX >> 20} MiB)"
-        raise RmpaError(f"{where}: {len(text)} characters, above the {bound} that a core takes at once; split it")
+        raise RmpaError(
+            f"{where}: {len(text)} characters, above the {bound} that a core takes at once; split it",
+            code="limit-reached",
+        )
     try:
         documents = list(yaml.load_all(text, _Loader))
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         problem = str(getattr(error, "problem", None) or error).splitlines()[0]
-        raise RmpaError(f"{where}{_place(error)}: not YAML: {problem}") from None
+        raise RmpaError(f"{where}{_place(error)}: not YAML: {problem}", code="invalid-value") from None
     return [_storable(document, where) for document in documents]
 
 
@@ -310,7 +316,7 @@ def _storable(value: Any, where: str, key: str = "", depth: int = 0) -> Any:
     elif not isinstance(value, bool | int | float | str | bytes | date):
         problem = f"a {type(value).__name__} cannot be a parameter"
     if problem:
-        raise RmpaError(f"{where}: {f'{key}: ' if key else ''}{problem}")
+        raise RmpaError(f"{where}: {f'{key}: ' if key else ''}{problem}", code="invalid-value")
     return value
 
 
@@ -441,7 +447,7 @@ def param_dump(file: str, namespace: str, peer: str | None, options: Options) ->
     try:
         Path(file).write_text(text, encoding="utf-8")
     except OSError as error:
-        raise RmpaError(f"{file} cannot be written: {error.strerror}") from None
+        raise RmpaError(f"{file} cannot be written: {error.strerror}", code="directory-unusable") from None
 
 
 @param_verb(argument("file"), argument("namespace", "param", default=""))
@@ -466,11 +472,13 @@ def param_load(file: str, namespace: str, peer: str | None, options: Options) ->
 def _placed(document: XmlRpcValue, namespace: str, file: str) -> tuple[str, XmlRpcValue]:
     """The namespace of a document, and its parameters."""
     if not isinstance(document, dict):
-        raise RmpaError(f"{file}: a document is {str(document)[:60]!r}, not a dictionary of parameters")
+        raise RmpaError(
+            f"{file}: a document is {str(document)[:60]!r}, not a dictionary of parameters", code="invalid-value"
+        )
     value = dict(document)
     inner = value.pop("_ns", "")
     if not isinstance(inner, str):
-        raise RmpaError(f"{file}: _ns is {inner!r}, not a namespace")
+        raise RmpaError(f"{file}: _ns is {inner!r}, not a namespace", code="invalid-value")
     key = read_key(namespace, os.environ, root=True)
     if inner:
         key = read_key(inner if inner.startswith("/") else f"{key.rstrip('/')}/{inner}", os.environ)
@@ -481,14 +489,16 @@ def _read(file: str) -> bytes:
     try:
         return sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()
     except OSError as error:
-        raise RmpaError(f"{file} cannot be read: {error.strerror}") from None
+        raise RmpaError(f"{file} cannot be read: {error.strerror}", code="directory-unusable") from None
 
 
 def _text(file: str) -> str:
     try:
         return _read(file).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise RmpaError(f"{file}: byte {error.start} is not UTF-8; set binary data with -b") from None
+        raise RmpaError(
+            f"{file}: byte {error.start} is not UTF-8; set binary data with -b", code="invalid-value"
+        ) from None
 
 
 @agent_verb()

@@ -282,7 +282,7 @@ def _ask(client: ControlClient, what: str, kind: type[_T], **args: object) -> _T
     try:
         value: object = client.call("site", object, what=what, args=args)
     except PeerRefused as error:
-        raise RmpaError(error.reason) from None  # the agent only passes on what a gateway says
+        raise RmpaError(error.reason, code=error.code) from None  # the agent only passes on what a gateway says
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
@@ -367,7 +367,7 @@ def site_info(site: str, name: str | None, options: Options) -> int:
     if found is None:
         known = [each.name for each in report.sites]
         hint = suggestion(site, known, f"known are {', '.join(known)}")
-        raise RmpaError(f"{report.gateway} knows no site {printable(site)!r}; {hint}")
+        raise RmpaError(f"{report.gateway} knows no site {printable(site)!r}; {hint}", code="unknown-name")
     options.show(report, _site_text(report, found))
     return 0 if found.state in ("this site", "joined") else 1
 

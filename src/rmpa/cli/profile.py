@@ -47,11 +47,11 @@ async def _decision(graph: ResourceGraph, one: SeenResource) -> dict[str, Any]:
     """
     (said,) = await graph.texts([one], "decision")
     if not said.get(one):
-        raise RmpaError(f"{one} has decided nothing yet; is it active?")
+        raise RmpaError(f"{one} has decided nothing yet; is it active?", code="resource-trouble")
     try:
         return msgspec.json.decode(said[one], type=dict[str, Any])
     except msgspec.DecodeError as error:
-        raise RmpaError(f"it says something strange about its decision: {error}") from None
+        raise RmpaError(f"it says something strange about its decision: {error}", code="resource-trouble") from None
 
 
 @resource_verb()
@@ -213,7 +213,7 @@ async def _context(graph: ResourceGraph, one: SeenResource) -> dict[str, str]:
         return {"context": "", "chosen": ""}
     (said,), values = await asyncio.gather(graph.texts([one], "context"), graph.configuration(one))
     if one not in said:
-        raise RmpaError(f"{one} does not say its context; does it run?")
+        raise RmpaError(f"{one} does not say its context; does it run?", code="resource-trouble")
     return {"context": said[one], "chosen": str(values.get("context", ""))}
 
 

@@ -55,7 +55,7 @@ class Probed:
             RmpaError: It does not answer.
         """
         if self.description is None:
-            raise RmpaError(f"{name} does not say what it is: {self.problem}")
+            raise RmpaError(f"{name} does not say what it is: {self.problem}", code="no-server")
         return self.description
 
 
@@ -71,7 +71,9 @@ async def _lookup(master: Master, name: str) -> str:
     except UnreachableError:
         raise master.unreachable() from None
     if reply.code != 1:
-        raise RmpaError(f"no service {name} is registered at {master.uri}; `rmpa service list` shows all")
+        raise RmpaError(
+            f"no service {name} is registered at {master.uri}; `rmpa service list` shows all", code="unknown-name"
+        )
     return str(reply.value)
 
 
@@ -355,7 +357,7 @@ def service_call(service: str, values: tuple[str, ...], wait: bool, timeout: flo
             connection.close()
         if not ok:
             text = printable(str(bytes(body), "utf-8", "replace")) or "it gave no reason"
-            raise PeerRefused(f"service {wanted.name}", text)
+            raise PeerRefused(f"service {wanted.name}", text, code="service-failed")
         response = kind.response.to_plain(kind.response.deserialize(body))
         if options.as_json:
             print_json({"service": wanted.name, "response": response, "took": time.monotonic() - began})

@@ -284,7 +284,7 @@ def topic_type(topic: str, options: Options) -> None:
     wanted, _, graph = _find(topic, options)
     kind = graph.types.get(wanted.name)
     if kind is None:
-        raise RmpaError(f"the type of {wanted.name} is not known yet: its publisher tells it")
+        raise RmpaError(f"the type of {wanted.name} is not known yet: its publisher tells it", code="unknown-type")
     options.show({"name": wanted.name, "type": kind}, kind)
 
 
@@ -430,7 +430,9 @@ class _Delay(_Figures):
             stamp = received.message.header.stamp
             self.delays.append((received.stamp_ns - stamp.sec * 1_000_000_000 - stamp.nanosec) / 1e9)
         elif self.master.agent is None or proxied_peer(received.caller_id) is None:
-            raise RmpaError(f"{received.kind.name} has no header, and so no stamp to tell its age by")
+            raise RmpaError(
+                f"{received.kind.name} has no header, and so no stamp to tell its age by", code="invalid-value"
+            )
 
     def values(self, routes: tuple[RouteInfo, ...]) -> dict[str, object]:
         """Seconds; without headers those of the agent, if there is one remote source."""

@@ -75,7 +75,12 @@ class Module:
             StartError: There is none.
         """
         if self.state is None:
-            raise StartError("the state directory", "is not known: there is no home", "set RMPA_STATE_DIR")
+            raise StartError(
+                "the state directory",
+                "is not known: there is no home",
+                "set RMPA_STATE_DIR",
+                code="no-state-directory",
+            )
         return self.state
 
     @property
@@ -108,7 +113,7 @@ class Module:
         check_library()
         if not self.store.exists:
             remedy = "make a mesh: rmpa trust init; or join one: rmpa trust join TOKEN"
-            raise StartError(f"the module {self.name}", "has joined no secured mesh", remedy)
+            raise StartError(f"the module {self.name}", "has joined no secured mesh", remedy, code="not-a-member")
         from rmpa.runtime.loop import SystemClock
         from rmpa.trust.membership import Membership
 
@@ -126,7 +131,9 @@ class Module:
         if not self.store.is_authority:
             place = self.store.load_authority()
             where = f"do it at {place.name}" if place is not None and place.name else "do it at the authority"
-            raise StartError(f"the module {self.name}", "is not the authority of its mesh", where)
+            raise StartError(
+                f"the module {self.name}", "is not the authority of its mesh", where, code="not-authority"
+            )
         return MeshAuthority(membership)
 
     def refuse_member(self, leaving: str) -> None:
@@ -141,7 +148,9 @@ class Module:
         check_library()
         if self.store.exists:
             remedy = f"rmpa trust status shows it; rmpa trust leave {leaving}"
-            raise StartError(f"the module {self.name}", "is a member of a secured mesh already", remedy)
+            raise StartError(
+                f"the module {self.name}", "is a member of a secured mesh already", remedy, code="already-a-member"
+            )
 
 
 def find_module(
@@ -224,7 +233,7 @@ def check_library() -> None:
         import cryptography  # noqa: F401
     except ModuleNotFoundError:
         problem = "the library cryptography is not installed"
-        raise StartError("rmpa trust", problem, missing_extra("trust")) from None
+        raise StartError("rmpa trust", problem, missing_extra("trust"), code="extra-missing") from None
 
 
 def confirm(question: str) -> bool:
@@ -241,7 +250,9 @@ def confirm(question: str) -> bool:
                 line = terminal.readline()
         except OSError:
             click.echo(err=True)
-            raise ConfigError("the question", "has no answer: there is no terminal", "add --yes") from None
+            raise ConfigError(
+                "the question", "has no answer: there is no terminal", "add --yes", code="not-confirmed"
+            ) from None
     return line.strip().lower() in {"y", "yes"}
 
 
@@ -431,7 +442,12 @@ def _renew_files(module: Module) -> int:
     membership, known = module.membership(), module.store.load_authority()
     if known is None:
         remedy = "start the agent (rmpa up), or join again: rmpa trust invite at the authority"
-        raise StartError("the authority", "was never linked with this module: its address is not known", remedy)
+        raise StartError(
+            "the authority",
+            "was never linked with this module: its address is not known",
+            remedy,
+            code="not-a-member",
+        )
     asyncio.run(renew_at_authority(membership, known.address, known.port))
     return int(membership.certificate.expires)
 
@@ -476,12 +492,17 @@ def trust_leave(module: Module, options: Options, yes: bool) -> None:
       rmpa trust leave --yes   in a script
     """
     if not module.store.exists:
-        raise StartError(f"the module {module.name}", "has joined no secured mesh", "there is nothing to remove")
+        raise StartError(
+            f"the module {module.name}",
+            "has joined no secured mesh",
+            "there is nothing to remove",
+            code="not-a-member",
+        )
     what = "its keys"
     if module.store.is_authority:
         what = "the AUTHORITY's keys: the mesh ends when its certificates do"
     if not yes and not confirm(f"Remove {module.name} from its mesh, with {what}?"):
-        raise ConfigError("rmpa trust leave", "nothing was removed")
+        raise ConfigError("rmpa trust leave", "nothing was removed", code="not-confirmed")
     removed = module.store.remove()
     done = f"{module.name} has left its mesh: {len(removed)} files are removed"
     options.show(TrustReply(module=module.name, done=True, text=", ".join(removed)), done)

@@ -91,7 +91,7 @@ def trust_invite(
         problem, remedy = "does not run", "start it: rmpa up"
         if module.socket is not None:
             problem, remedy = "runs without trust", "start it again"
-        raise StartError(f"the agent {module.name}", f"{problem}, so no module can join", remedy)
+        raise StartError(f"the agent {module.name}", f"{problem}, so no module can join", remedy, code="not-a-member")
     invited = module.call("invite", InviteReply, name=invitee or "", lifetime=seconds, address=host, port=port)
     try:
         if not options.as_json:
@@ -119,7 +119,7 @@ def _await_join(module: Module, invited: InviteReply, *, as_json: bool) -> None:
         if following.step == step.step:
             if time.time() > invited.expires:
                 problem = "the token has ended, and no module came"
-                raise PeerRefused("the authority", problem, "rmpa trust invite again")
+                raise PeerRefused("the authority", problem, "rmpa trust invite again", code="token-refused")
             continue
         step = following
         if as_json:
@@ -153,7 +153,7 @@ def _sign(module: Module, request: Path, out: Path, invitee: str, options: Optio
     key = wanted.key_hash[: limits.FINGERPRINT_BYTES].hex()
     click.echo(f"{wanted.name} asks with the key {grouped(key)}", err=True)
     if not yes and not confirm(f"Does {wanted.name} show this key?"):
-        raise ConfigError("rmpa trust invite --sign", "nothing was signed")
+        raise ConfigError("rmpa trust invite --sign", "nothing was signed", code="not-confirmed")
     if module.agent == "secured":
         reply = module.call("sign", dict[str, str], request=b64encode(data).decode(), module=invitee)
         answer = reply["answer"].encode()
@@ -177,7 +177,7 @@ def _write_secret(path: Path, data: bytes) -> None:
     except FileExistsError:
         raise ConfigError(str(path), "exists already", "choose another --out, or remove it") from None
     except OSError as error:
-        raise StartError(str(path), f"cannot be written: {error.strerror}") from None
+        raise StartError(str(path), f"cannot be written: {error.strerror}", code="directory-unusable") from None
 
 
 def _seconds(text: str) -> float:
@@ -272,7 +272,7 @@ def _join_by_token(module: Module, text: str) -> MemberFiles:
     try:
         token = Token.parse(sys.stdin.readline() if text == "-" else text)
     except TokenError as error:
-        raise ConfigError("TOKEN", str(error)) from None
+        raise ConfigError("TOKEN", str(error), code="token-refused") from None
     module.store.check_writable()  # before the token is used up
     files = asyncio.run(join_mesh(token, module.name))
     module.store.save_authority(AuthorityPlace("", str(token.address), token.port))
@@ -291,7 +291,7 @@ def _write_request(module: Module, out: Path, options: Options) -> None:
     try:
         out.write_bytes(request_pem(request))
     except OSError as error:
-        raise StartError(str(out), f"cannot be written: {error.strerror}") from None
+        raise StartError(str(out), f"cannot be written: {error.strerror}", code="directory-unusable") from None
     options.show(
         {"module": module.name, "key": key, "file": str(out)},
         f"{out} is the request of {module.name}, with the key {grouped(key)}; it is no secret",

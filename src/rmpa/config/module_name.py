@@ -102,7 +102,9 @@ def running_agent(
     if len(modules) == 1:
         return modules[0]
     listed = ", ".join(running)
-    raise RmpaError(f"several agents run on this machine: {listed}; name one with --agent NAME or RMPA_AGENT")
+    raise RmpaError(
+        f"several agents run on this machine: {listed}; name one with --agent NAME or RMPA_AGENT", code="several-fit"
+    )
 
 
 # The directory of files that survive a program's end, and the name of this machine's module, which is kept there.
@@ -242,7 +244,9 @@ def keep_name(directory: Path, name: str, *, instead: bool = False) -> bool:
             finally:
                 temporary.unlink(missing_ok=True)
     except OSError as error:
-        raise StartError(str(path), f"cannot be written: {error.strerror}", "say --name at each start") from None
+        raise StartError(
+            str(path), f"cannot be written: {error.strerror}", "say --name at each start", code="directory-unusable"
+        ) from None
     return True
 
 

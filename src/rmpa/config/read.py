@@ -111,13 +111,19 @@ def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
     """
     if len(data) > limits.CONFIG_FILE_MAX:
         raise ConfigError(
-            "the file", f"{len(data)} bytes, more than {limits.CONFIG_FILE_MAX}", "is it the right file?", path
+            "the file",
+            f"{len(data)} bytes, more than {limits.CONFIG_FILE_MAX}",
+            "is it the right file?",
+            path,
+            code="unreadable-settings",
         )
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise ConfigError("the file", "not UTF-8 text", "save it as UTF-8", path, line) from None
+        raise ConfigError(
+            "the file", "not UTF-8 text", "save it as UTF-8", path, line, code="unreadable-settings"
+        ) from None
     table = _parse_toml(text, path)
     for place, problem, remedy in _mistakes((), table, json_schema()):
         raise ConfigError(dotted(place), problem, remedy, path, line_of(text, place))
@@ -153,13 +159,17 @@ def _parse_toml(text: str, path: Path | None) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except RecursionError:
-        raise ConfigError("the file", "lists or tables nested too deeply", "", path) from None
+        raise ConfigError(
+            "the file", "lists or tables nested too deeply", "", path, code="unreadable-settings"
+        ) from None
     except ValueError as error:  # TOMLDecodeError, and int() on thousands of digits
         message = str(error)
         match = _AT_LINE.search(message)
         line = int(match[1]) if match else text.rstrip().count("\n") + 1
         problem = f"not TOML: {_AT_LINE.sub('', message).removesuffix(' (at end of document)')}"
-        raise ConfigError("the file", problem, _toml_remedy(text, line), path, line) from None
+        raise ConfigError(
+            "the file", problem, _toml_remedy(text, line), path, line, code="unreadable-settings"
+        ) from None
 
 
 def _toml_remedy(text: str, line: int) -> str:
@@ -424,14 +434,18 @@ def _named_file(named: str, source: str) -> Path:
         problem = error.strerror or str(error)
     except RuntimeError:
         problem = "there is no such home"
-    raise ConfigError(source, f"{named}: {problem}", "name a file in TOML (docs/reference/settings.md)")
+    raise ConfigError(
+        source, f"{named}: {problem}", "name a file in TOML (docs/reference/settings.md)", code="unreadable-settings"
+    )
 
 
 def _file_layer(path: Path) -> _Layer:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise ConfigError("the file", f"cannot be read: {error.strerror}", "", path) from None
+        raise ConfigError(
+            "the file", f"cannot be read: {error.strerror}", "", path, code="unreadable-settings"
+        ) from None
     found = parse_config(data, path)
     text = data.decode("utf-8-sig")
     return {
@@ -444,7 +458,7 @@ def _file_layer(path: Path) -> _Layer:
 def _variable_layer(environ: Mapping[str, str], notes: list[str]) -> _Layer:
     for variable in sorted(environ):
         if variable in REMOVED:
-            raise ConfigError(variable, "is not a variable any more", REMOVED[variable])
+            raise ConfigError(variable, "is not a variable any more", REMOVED[variable], code="removed")
         if variable.startswith("RMPA_") and variable not in VARIABLES:
             near = did_you_mean(variable, VARIABLES)
             notes.append(f"{variable} is not a variable of ours" + (f"; did you mean {near}?" if near else ""))

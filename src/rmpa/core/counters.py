@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from heapq import heapify, heappop, heappush
 from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
 
-from rmpa.core import limits
+from rmpa.core import codes, limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -100,7 +100,7 @@ class RefusalLog:
         if len(self._last) > limits.LOG_KINDS_MAX:
             del self._last[next(iter(self._last))]
         more = f" ({suppressed + hidden} more like this since the last line)" if suppressed + hidden else ""
-        self._logger.warning("! %s%s", text, more)
+        self._logger.warning("! %s%s [%s]", text, more, codes.of_counter(name))
 
 
 # --- The formats of log records -------------------------------------------------------------------------------------
@@ -156,12 +156,17 @@ class _Formatter(logging.Formatter):
         """``12:00:01.250 warning mesh       ! text``; local time, a traceback on the following lines.
 
         In a journal, which has the time itself: ``<4>warning mesh       ! text``, each line with its priority.
-        In JSON: time (ISO 8601, UTC), level, room, logger, text, and traceback if there is one.
+        In JSON: time (ISO 8601, UTC), level, room, logger, text, and code and traceback if there is one.
+        A line with a traceback and without a code tells of a fault in RMPA.
         """
         level, room = record.levelname.lower(), _room_of(record.name)
         trace = self.formatException(record.exc_info) if record.exc_info else ""
+        text = record.getMessage()
+        if not (code := codes.of_line(text)) and trace and record.levelno >= logging.WARNING:
+            code = "internal-error"
+            text += f" [{code}]"
         if not self.as_json:
-            line = f"{level:<7} {room:<9} {_one_line(record.getMessage())}"
+            line = f"{level:<7} {room:<9} {_one_line(text)}"
             lines = f"{line}\n{trace}" if trace else line
             if self.in_journal:
                 priority = next(word for number, word in _PRIORITIES.items() if number <= record.levelno)
@@ -173,8 +178,8 @@ class _Formatter(logging.Formatter):
             "level": level,
             "room": room,
             "logger": record.name,
-            "text": record.getMessage(),
-        }
+            "text": text,
+        } | ({"code": code} if code else {})
         return json.dumps(fields | {"traceback": trace} if trace else fields, ensure_ascii=False)
 
 

@@ -12,13 +12,14 @@
     └── UnreachableError       no program answers at an address where one should
         └── OutOfDescriptors   … or this process has no file descriptor left to ask it
 
-Errors hold fields and build their text in ``__str__``. A text says what happened, where, and what to do.
+Errors hold fields and build their text in ``__str__``. A text says what happened, where, and what to do. ``code`` is
+its code of ``core.codes``, by its class or by what raises it; the command line and the log show it behind the text.
 """
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,12 @@ if TYPE_CHECKING:
 
 class RmpaError(Exception):
     """Root of every error that this package raises on purpose."""
+
+    code: str = "failed"
+
+    def __init__(self, *args: object, code: str = "") -> None:
+        super().__init__(*args)
+        self.code = code or self.code
 
 
 @dataclass(eq=False)
@@ -47,6 +54,7 @@ class ConfigError(RmpaError):
     remedy: str = ""
     path: Path | None = None
     line: int | None = None
+    code: str = field(default="invalid-value", kw_only=True)
 
     def __str__(self) -> str:
         """Say ``file:line: key: problem; remedy``."""
@@ -63,6 +71,7 @@ class StartError(RmpaError):
     what: str
     problem: str
     remedy: str = ""
+    code: str = field(default="cannot-start", kw_only=True)
 
     def __str__(self) -> str:
         """Say ``what: problem; remedy``."""
@@ -72,9 +81,13 @@ class StartError(RmpaError):
 class LocalProtocolError(RmpaError):
     """Our side used a protocol machine in a way that its state does not allow."""
 
+    code = "internal-error"
+
 
 class RemoteProtocolError(RmpaError):
     """The other side sent bytes that its protocol does not allow."""
+
+    code = "protocol-error"
 
 
 @dataclass(eq=False)
@@ -84,6 +97,7 @@ class LimitExceeded(RemoteProtocolError):  # noqa: N818 - the name says what hap
     what: str
     claimed: int
     limit: int
+    code: str = field(default="limit-reached", kw_only=True)
 
     def __str__(self) -> str:
         """Say what was claimed and what is allowed."""
@@ -97,10 +111,26 @@ class PeerRefused(RmpaError):  # noqa: N818 - an event's name
     peer: str
     reason: str
     remedy: str = ""
+    code: str = field(default="refused", kw_only=True)
 
     def __str__(self) -> str:
         """``<peer> refused: reason; remedy``."""
         return _advised(f"{self.peer} refused: {self.reason}", self.remedy)
+
+
+# By the first word of what does not answer.
+_UNREACHABLE = {
+    "agent": "no-agent",
+    "ROS master": "master-unreachable",
+    "server": "no-server",
+    "service": "no-server",
+    "gateway": "site-unreachable",
+    "site": "site-unreachable",
+    "XML-RPC": "node-unreachable",
+    "machine": "unresolved-name",
+    "linked peer": "unknown-name",
+    "authority": "certificate-trouble",
+}
 
 
 @dataclass(eq=False)
@@ -110,6 +140,12 @@ class UnreachableError(RmpaError):
     what: str
     where: str
     remedy: str = ""
+    code: str = field(default="", kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Take the code from what does not answer, where none is given."""
+        kinds = (code for word, code in _UNREACHABLE.items() if self.what.startswith(word))
+        self.code = self.code or next(kinds, "unreachable")
 
     def __str__(self) -> str:
         """``no <what> answers at <where>; remedy``."""
@@ -119,6 +155,8 @@ class UnreachableError(RmpaError):
 @dataclass(eq=False)
 class OutOfDescriptors(UnreachableError):  # noqa: N818 - the name says what happened
     """This process has no file descriptor left for a connection; the other side was not asked."""
+
+    code: str = field(default="out-of-descriptors", kw_only=True)
 
     def __str__(self) -> str:
         """Say what could not be reached, why, and what to do."""

@@ -278,7 +278,7 @@ class AgentGraph(Part):
                 f"server of service {source.here}", f"{source.module} within {timeout:g} s"
             ) from None
         if not ok:
-            raise PeerRefused(f"service {source.here}", bytes(body).decode(errors="replace"))
+            raise PeerRefused(f"service {source.here}", bytes(body).decode(errors="replace"), code="service-failed")
         return body if isinstance(body, bytes | bytearray) else bytes(body)
 
     def show_topic(self, source: ForeignSource, on_demand: Callable[[bool], None]) -> ProxiedTopic:

@@ -6,7 +6,7 @@ The protocol of the control socket: one JSON object a line each way.
 
     {"op": "ping", "args": {"peer": "base", "count": 1}}
     {"ok": true, "value": {"times": [0.0004], "remote": "10.0.0.2:40001"}}
-    {"ok": false, "error": "no peer named 'bse'", "remedy": "did you mean base?"}
+    {"ok": false, "error": "no peer named 'bse'", "remedy": "did you mean base?", "code": "unknown-name"}
 
 A long ``text`` in the arguments or the value is not part of the JSON, whose reading would delay data: ``follows`` has
 the number of its bytes, and they follow the line.
@@ -230,6 +230,7 @@ class ControlReply(_Line, frozen=True, omit_defaults=True):
         error: What happened.
         remedy: What to do; may be empty.
         follows: Bytes of the value's ``text`` that follow the line.
+        code: The error's code (``core.codes``).
     """
 
     _NAME = "control reply"
@@ -239,6 +240,7 @@ class ControlReply(_Line, frozen=True, omit_defaults=True):
     error: str = ""
     remedy: str = ""
     follows: int = 0
+    code: str = ""
 
     def serialize(self, yielder: Yielder = iter) -> bytes:
         """One line.

@@ -105,16 +105,20 @@ def make_runtime_dir(place: Path, group: int | None = None) -> None:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
         info = place.lstat()
         if not stat.S_ISDIR(info.st_mode):
-            raise StartError(str(place), "is not a directory", _REMEDY)
+            raise StartError(str(place), "is not a directory", _REMEDY, code="directory-unusable")
         if info.st_uid != os.geteuid():
-            raise StartError(str(place), f"belongs to user {info.st_uid}, not to us", _REMEDY)
+            raise StartError(
+                str(place), f"belongs to user {info.st_uid}, not to us", _REMEDY, code="directory-unusable"
+            )
         if group is not None:
             os.chown(place, -1, group)
             place.chmod(0o750)
         elif info.st_mode & 0o077:
             place.chmod(0o700)
     except OSError as error:
-        raise StartError(str(place), f"cannot be made: {error.strerror}", _REMEDY) from None
+        raise StartError(
+            str(place), f"cannot be made: {error.strerror}", _REMEDY, code="directory-unusable"
+        ) from None
 
 
 class NameLock:
@@ -136,7 +140,9 @@ class NameLock:
             try:
                 fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
             except OSError as error:
-                raise StartError(str(self.path), f"cannot be opened: {error.strerror}", _REMEDY) from None
+                raise StartError(
+                    str(self.path), f"cannot be opened: {error.strerror}", _REMEDY, code="directory-unusable"
+                ) from None
             try:
                 fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
@@ -144,7 +150,9 @@ class NameLock:
                 os.close(fd)
                 whose = f" (pid {pid})" if pid else ""
                 problem = f"an agent named {name!r} already runs on this machine{whose}"
-                raise StartError("rmpa up", problem, "stop it, or give this one a --name of its own") from None
+                raise StartError(
+                    "rmpa up", problem, "stop it, or give this one a --name of its own", code="name-in-use"
+                ) from None
             if self._still_there(fd):
                 break
             os.close(fd)  # the last holder removed the file after it was opened here

@@ -69,7 +69,7 @@ def control_group(name: str) -> int | None:
         return None if not name else int(name) if name.isdecimal() else grp.getgrnam(name).gr_gid
     except KeyError:
         remedy = f"make it (sudo groupadd {name}), or change group of [control]"
-        raise StartError("control.group", f"there is no group {name!r}", remedy) from None
+        raise StartError("control.group", f"there is no group {name!r}", remedy, code="invalid-value") from None
 
 
 class ControlServer:
@@ -128,7 +128,9 @@ class ControlServer:
         """Bind and serve. The socket of an agent that was killed is replaced, since its name's lock is ours."""
         if len(os.fsencode(self.path)) > limits.CONTROL_PATH_MAX:
             problem = f"longer than the {limits.CONTROL_PATH_MAX} bytes that a socket's path may have"
-            raise StartError(str(self.path), problem, "set RMPA_RUNTIME_DIR to a shorter directory")
+            raise StartError(
+                str(self.path), problem, "set RMPA_RUNTIME_DIR to a shorter directory", code="directory-unusable"
+            )
         sock = await asyncio.to_thread(self._bind)
         self._acceptor = Acceptor(sock, self._connected, name="control socket", use=Use.LINK)
         self._acceptor.start()
@@ -148,7 +150,9 @@ class ControlServer:
             sock.listen(128)
         except OSError as error:
             sock.close()
-            raise StartError(str(self.path), f"cannot be bound: {error.strerror}") from None
+            raise StartError(
+                str(self.path), f"cannot be bound: {error.strerror}", code="directory-unusable"
+            ) from None
         return sock
 
     async def close(self) -> None:
@@ -243,13 +247,15 @@ class ControlServer:
                 value = handler(request.args)
                 return ControlReply(ok=True, value=await value if inspect.isawaitable(value) else value)
         except RmpaError as error:
-            return ControlReply(ok=False, error=str(error))
+            return ControlReply(ok=False, error=str(error), code=error.code)
         except TimeoutError:
             return ControlReply(ok=False, error=f"{request.op} took more than {limits.CONTROL_HANDLER_TIMEOUT:.0f} s")
         except Exception:  # noqa: BLE001 - one handler's bug must not end the client's connection
             self.counters.add("control.failed")
             _log.exception("! control handler %s failed", request)
-            return ControlReply(ok=False, error=f"the agent failed at {request.op}", remedy="its log says why")
+            return ControlReply(
+                ok=False, error=f"the agent failed at {request.op}", remedy="its log says why", code="internal-error"
+            )
 
     @staticmethod
     async def _send(writer: asyncio.StreamWriter, reply: ControlReply) -> None:

@@ -408,7 +408,9 @@ class ControlOperations:
         if len(fitting) == 1:
             return fitting[0]
         if fitting:
-            raise PeerRefused(self.name, f"{len(fitting)} peers are named {peer}", "name one by its GUID")
+            raise PeerRefused(
+                self.name, f"{len(fitting)} peers are named {peer}", "name one by its GUID", code="several-fit"
+            )
         similar = did_you_mean(peer, [session.link.name for session in sessions])
         remedy = "`rmpa peer list` shows which modules are there, and why one is not linked"
         raise UnreachableError("linked peer", repr(peer), f"did you mean {similar}?" if similar else remedy)
@@ -500,7 +502,7 @@ class PeerParams:
         except LocalProtocolError as error:
             raise RmpaError(f"{key}: {error}") from None
         if len(text) > bridge_limits.PARAM_TEXT_MAX:
-            raise RmpaError(transfer.too_large(key, len(text)))
+            raise RmpaError(transfer.too_large(key, len(text)), code="limit-reached")
         return transfer.count_of(self._ask(transfer.SET, key=key, text=text.decode()))
 
     def delete(self, key: str) -> None:
@@ -514,4 +516,6 @@ class PeerParams:
         try:
             return self.client.call("param", dict[str, Any], peer=self.peer, what=what, **args)
         except PeerRefused as error:
-            raise RmpaError(error.reason) from None  # this agent only passes on the answer of the peer's agent
+            raise RmpaError(
+                error.reason, code=error.code
+            ) from None  # this agent only passes on the answer of the peer's agent

@@ -59,6 +59,8 @@ _CONTEXT_CLIENT: Final = "context "
 class HungError(RmpaError):
     """A function of a profile or context has not returned within its time-out; the resource ends."""
 
+    code = "resource-trouble"
+
 
 async def call_function(function: Hook, what: str, name: str, limit: float, remedy: str) -> None:
     """Call a function of a profile or context: a coroutine function in the event loop, a plain one in a thread.

@@ -77,7 +77,7 @@ def _refused(port: int, error: OSError) -> StartError:
         problem, remedy = "is not for this user", "choose one above 1023 with --port"
     else:
         problem, remedy = f"cannot be opened ({error.strerror})", ""
-    return StartError(f"mesh port {port}", problem, remedy)
+    return StartError(f"mesh port {port}", problem, remedy, code="port-in-use")
 
 
 # --- The file descriptors of this process ---------------------------------------------------------------------------

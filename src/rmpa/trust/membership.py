@@ -59,7 +59,9 @@ def private_key(data: bytes, where: str) -> ec.EllipticCurvePrivateKey:
     except (ValueError, TypeError):
         key = None
     if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise StartError(where, "is broken: not a private key in PEM", "join again, or take it from a copy")
+        raise StartError(
+            where, "is broken: not a private key in PEM", "join again, or take it from a copy", code="keys-unusable"
+        )
     return key
 
 
@@ -257,7 +259,7 @@ def _named(store: TrustStore, name: str) -> Iterator[None]:
     try:
         yield
     except RemoteProtocolError as error:
-        raise StartError(str(store.path(name)), f"is broken: {error}", _REMEDY) from None
+        raise StartError(str(store.path(name)), f"is broken: {error}", _REMEDY, code="keys-unusable") from None
 
 
 _SERIAL_BITS: Final = 159
@@ -277,7 +279,7 @@ def found_mesh(store: TrustStore, name: str, label: str, wall: float) -> None:
         StartError: The clock is not set, or a file cannot be written.
     """
     if wall < limits.EARLIEST_TIME:
-        raise StartError("the clock of this machine", "is not set", _CLOCK)
+        raise StartError("the clock of this machine", "is not set", _CLOCK, code="clock-not-set")
     ca_pem, key_pem = new_key(), new_key()
     ca_key, key = private_key(ca_pem, files_of.CA_KEY), private_key(key_pem, files_of.KEY)
     ca = certificates.make_ca(ca_key, label, _serial(), wall)
@@ -304,7 +306,12 @@ class MeshAuthority:
         self._store = store = membership.store
         self._ca_key = private_key(store.load_ca_key(), str(store.path(files_of.CA_KEY)))
         if self._ca_key.public_key() != certificates.ca_public_key(membership.files.ca):
-            raise StartError(str(store.path(files_of.CA_KEY)), "is not the key of ca.crt", "take it from a copy")
+            raise StartError(
+                str(store.path(files_of.CA_KEY)),
+                "is not the key of ca.crt",
+                "take it from a copy",
+                code="keys-unusable",
+            )
         self._issued = store.load_issued()
         # The tokens.
         self.book = store.load_tokens()
@@ -356,7 +363,7 @@ class MeshAuthority:
         """
         wall = self.membership.wall()
         if wall is None:
-            raise StartError("the clock of this machine", "is not set", _CLOCK)
+            raise StartError("the clock of this machine", "is not set", _CLOCK, code="clock-not-set")
         return wall
 
     def _wall_for(self, name: str) -> float:

@@ -17,6 +17,7 @@ import msgspec
 
 from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, Access, Effect, PermissionRule
 from rmpa.config.values import PEER
+from rmpa.core import codes
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import matches
 from rmpa.core.limits import UINT32_MAX
@@ -334,7 +335,7 @@ class TrustError(RemoteProtocolError):
     """
 
     def __init__(self, reason: TrustReason, text: str) -> None:
-        super().__init__(text)
+        super().__init__(text, code=codes.of_counter(f"link.refused.{reason.label}"))
         self.reason = reason
 
 

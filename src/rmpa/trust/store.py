@@ -172,7 +172,9 @@ class TrustStore:
         try:
             invitations = msgspec.json.decode(self._read(TOKENS, remedy), type=list[Invitation])
         except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
-            raise StartError(str(self.path(TOKENS)), f"is broken: {error!s:.200}", remedy) from None
+            raise StartError(
+                str(self.path(TOKENS)), f"is broken: {error!s:.200}", remedy, code="keys-unusable"
+            ) from None
         return TokenBook(invitations)
 
     def save_tokens(self, book: TokenBook) -> None:
@@ -225,7 +227,9 @@ class TrustStore:
                 _write(folder, name, data)
         except OSError as error:
             remedy = _USER if isinstance(error, PermissionError) else "is the disk full?"
-            raise StartError(str(self.path(name)), f"cannot be written: {error.strerror}", remedy) from None
+            raise StartError(
+                str(self.path(name)), f"cannot be written: {error.strerror}", remedy, code="directory-unusable"
+            ) from None
 
     def remove(self) -> list[str]:
         """Leave the mesh: remove all files; return the names of those that were there.
@@ -241,7 +245,9 @@ class TrustStore:
                 try:
                     (folder / name).unlink()
                 except OSError as error:
-                    raise StartError(str(self.path(name)), f"cannot be removed: {error.strerror}") from None
+                    raise StartError(
+                        str(self.path(name)), f"cannot be removed: {error.strerror}", code="directory-unusable"
+                    ) from None
             with contextlib.suppress(OSError):
                 folder.rmdir()
         return removed
@@ -260,15 +266,24 @@ class TrustStore:
                 problem = _exposed(os.fstat(file.fileno()), self._owners())
                 data = b"" if problem else file.read(_FILE_MAX + 1)
         except FileNotFoundError:
-            raise StartError(str(path), "is missing", remedy) from None
+            raise StartError(str(path), "is missing", remedy, code="keys-unusable") from None
         except PermissionError as error:
-            raise StartError(str(path), f"cannot be read: {error.strerror}", _USER) from None
+            raise StartError(
+                str(path), f"cannot be read: {error.strerror}", _USER, code="directory-unusable"
+            ) from None
         except OSError as error:
-            raise StartError(str(path), f"cannot be read: {error.strerror}", remedy) from None
+            raise StartError(
+                str(path), f"cannot be read: {error.strerror}", remedy, code="directory-unusable"
+            ) from None
         if problem:
-            raise StartError(str(path), problem, f"if the others are trusted: chmod 600 {path}; else {remedy}")
+            raise StartError(
+                str(path),
+                problem,
+                f"if the others are trusted: chmod 600 {path}; else {remedy}",
+                code="keys-unusable",
+            )
         if not data or len(data) > _FILE_MAX:
-            raise StartError(str(path), f"is broken: {len(data)} bytes", remedy)
+            raise StartError(str(path), f"is broken: {len(data)} bytes", remedy, code="keys-unusable")
         return data
 
     def _owners(self) -> set[int]:
@@ -280,7 +295,9 @@ class TrustStore:
         try:
             return ssl.PEM_cert_to_DER_cert(found[name].decode("ascii"))
         except ValueError:
-            raise StartError(str(self.path(name)), "is broken: not a certificate in PEM", _JOIN) from None
+            raise StartError(
+                str(self.path(name)), "is broken: not a certificate in PEM", _JOIN, code="keys-unusable"
+            ) from None
 
 
 def modules_with_keys(state: Path) -> list[str]:
@@ -294,7 +311,7 @@ def modules_with_keys(state: Path) -> list[str]:
     try:
         names = _modules_in(state)
     except OSError as error:
-        raise StartError(str(state), f"cannot be read: {error.strerror}", _USER) from None
+        raise StartError(str(state), f"cannot be read: {error.strerror}", _USER, code="directory-unusable") from None
     return [name for name in names if TrustStore(state, name).exists]
 
 
@@ -323,7 +340,12 @@ def is_folder(path: Path) -> bool:
         problem, remedy = f"cannot be searched: {error.strerror}", f"{_USER}; or {_ELSEWHERE}"
     except OSError as error:
         problem, remedy = f"cannot be searched: {error.strerror}", f"mend it, or {_ELSEWHERE}"
-    raise StartError(str(path), f"{problem}, so whether this module has joined a secured mesh is not known", remedy)
+    raise StartError(
+        str(path),
+        f"{problem}, so whether this module has joined a secured mesh is not known",
+        remedy,
+        code="keys-unusable",
+    )
 
 
 def _is_there(path: Path) -> bool:
@@ -418,7 +440,9 @@ def member_context(certificate: Path, key: Path, ca: bytes, *alpn: str, server_s
         context.load_verify_locations(cadata=ca)
     except (ssl.SSLError, OSError) as error:
         remedy = "join again: rmpa trust invite at the authority, rmpa trust join TOKEN here"
-        raise StartError(str(certificate), f"does not fit {key.name}, or is broken: {error!s:.100}", remedy) from None
+        raise StartError(
+            str(certificate), f"does not fit {key.name}, or is broken: {error!s:.100}", remedy, code="keys-unusable"
+        ) from None
     return context
 
 
@@ -468,7 +492,7 @@ def check_open(
     if trust.require:
         problem = f"the module {module} has joined no secured mesh"
         remedy = "join one: rmpa trust join TOKEN, with a token of rmpa trust invite at the authority"
-        raise StartError("trust.require", problem, remedy)
+        raise StartError("trust.require", problem, remedy, code="not-a-member")
     if trust.insecure:
         return
     here = modules_with_keys(state) if state is not None else []
@@ -492,7 +516,7 @@ def _refused(module: str, others: str, start: list[str]) -> StartError:
     problem = f"has no keys, and would start without trust, beside keys of {others}"
     join = f"let {module} join: rmpa trust join TOKEN --name {module}"
     open_word = "start it open: --insecure (insecure = true in [trust])"
-    return StartError(f"the module {module}", problem, "; or ".join((*start, join, open_word)))
+    return StartError(f"the module {module}", problem, "; or ".join((*start, join, open_word)), code="keys-unusable")
 
 
 def _keys_in(place: Path) -> list[str]:

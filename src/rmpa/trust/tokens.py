@@ -68,6 +68,7 @@ class TokenError(RmpaError):
 
     problem: str
     remedy: str = _REMEDY
+    code = "token-refused"
 
     def __str__(self) -> str:
         """``the token …; …``."""

@@ -128,7 +128,7 @@ class ParamCore:
         """
         reply = await self.ask("setParam", caller, key, value)
         if reply.code != 1:
-            raise PeerRefused("the ROS core", f"{key}: {reply.status}")
+            raise PeerRefused("the ROS core", f"{key}: {reply.status}", code="core-refuses")
 
     async def delete(self, key: str, caller: str = OWN_NODE) -> bool:
         """Delete a parameter or namespace; return whether it existed."""
@@ -296,7 +296,7 @@ class ParamOwner:
         # The permissions come first: the error of ``[params]`` may name a parameter that they hide.
         self._refuse(self._why_denied(asker, key, value) or self._why_not_get(key, value))
         if not found:
-            raise RmpaError(f"there is no parameter {key}")
+            raise RmpaError(f"there is no parameter {key}", code="unknown-name")
         return {"text": await write_text(key, value)}
 
     async def _names(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
@@ -315,7 +315,10 @@ class ParamOwner:
         parameters: list[tuple[str, XmlRpcValue]] = []
         for given, one in yielding_to_data(leaves(key, value)):
             if len(parameters) >= limits.PARAMS_SET_MAX:
-                raise RmpaError(f"{key} has more than {limits.PARAMS_SET_MAX} parameters: set its parts one by one")
+                raise RmpaError(
+                    f"{key} has more than {limits.PARAMS_SET_MAX} parameters: set its parts one by one",
+                    code="limit-reached",
+                )
             if len(parameters) % limits.APPLIED_AT_ONCE == 0:
                 await asyncio.sleep(0)
             # A member may be named "" or "a/": the core drops the slash at the end, so the name is judged without it.
@@ -327,7 +330,7 @@ class ParamOwner:
             _, present = await self._core.get(around)
             lost = list(replaced((name for name, _ in parameters), around, present))
             if any(self._why_denied(asker, name) for name in yielding_to_data(lost)):
-                raise RmpaError(refusal(Access.PARAM, str(asker), key))
+                raise RmpaError(refusal(Access.PARAM, str(asker), key), code="not-permitted")
         for number, (name, one) in enumerate(parameters):
             await self._core.set(name, one, PEERS)
             yield_to_data()
@@ -344,7 +347,7 @@ class ParamOwner:
             _, value = await self._core.get(key)
             self._refuse(self._why_denied(asker, key) or self._why_denied(asker, key, value))
         if not await self._core.delete(key, PEERS):
-            raise RmpaError(f"there is no parameter {key}")
+            raise RmpaError(f"there is no parameter {key}", code="unknown-name")
         _log.info("< %s deletes parameter %s", asker, key)
         return {}
 
@@ -410,7 +413,7 @@ class ParamOwner:
 
     def _refuse(self, why: str) -> None:
         if why:
-            raise RmpaError(why)
+            raise RmpaError(why, code="not-permitted")
 
     # --- telling the followers -----------------------------------------------------------------------------------
 

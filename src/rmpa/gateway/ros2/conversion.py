@@ -53,9 +53,13 @@ _ERRORS: Final = (
 class NoConversion(RmpaError):  # noqa: N818 - the name says what happened
     """Two types are no pair; the text says which fields, and what to write."""
 
+    code = "no-conversion"
+
 
 class ConversionError(RmpaError):
     """A message does not fit the other side's type."""
+
+    code = "no-conversion"
 
 
 class Ros2Codec:

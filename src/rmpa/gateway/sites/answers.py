@@ -253,7 +253,9 @@ class SiteAnswers:
             return
         ago = self._sites.history.since_ago(site)
         if ago is not None:
-            raise RmpaError(f"site {site} is unreachable since {ago:.0f} s; `rmpa site list` shows all")
+            raise RmpaError(
+                f"site {site} is unreachable since {ago:.0f} s; `rmpa site list` shows all", code="site-unreachable"
+            )
         known = f"known are: {', '.join(sites) or 'none'}"
         raise UnreachableError(f"site {site!r}", "any Zenoh router that this gateway reaches", known)
 

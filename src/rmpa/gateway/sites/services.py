@@ -160,6 +160,7 @@ class ExportedService:
                             f"the md5 sum of service {source.name} is {known.md5sum} ({known.type}) at its site, and "
                             f"the client takes it for {md5}: another definition, or the server was replaced; build "
                             "both from the same package",
+                            code="service-failed",
                         )
                 return bytes(await graph.call(source, request, timeout))
         except TimeoutError:
@@ -253,11 +254,11 @@ class ImportedService:
         for reply in sorted(replies, key=lambda each: not each.ok):
             if reply.ok:
                 return reply.payload
-            raise PeerRefused(where, reply.payload.decode(errors="replace"))
+            raise PeerRefused(where, reply.payload.decode(errors="replace"), code="service-failed")
         text = f"service {source.name} of {where} has left: no gateway there answers for it"
         if loop.time() - began >= within:
             text = f"service {source.name} of {where} has not answered within {within:g} s ([[service]] timeout)"
-        raise PeerRefused(f"site {source.site}", text)
+        raise PeerRefused(f"site {source.site}", text, code="service-failed")
 
 
 class SiteServices:

@@ -156,7 +156,7 @@ def gateway_config(settings: GatewaySettings, certificates: MeshCertificates | N
     for endpoint in (*settings.connect, *settings.listen):
         problem = _problem(endpoint, certificates)
         if problem and not settings.insecure:
-            raise StartError(f"zenoh {endpoint}", *problem)
+            raise StartError(f"zenoh {endpoint}", *problem, code="port-in-use")
     mode = "router" if settings.router else "peer" if settings.listen else "client"
     return ZenohConfig(mode, settings.connect, settings.listen, certificates, uplink=settings.uplink)
 
@@ -317,7 +317,9 @@ def revoked_modules(settings: Settings) -> tuple[str, ...]:
     try:
         deny = read_document(files.deny, ca_public_key(files.ca), DenyList)
     except RemoteProtocolError as error:
-        raise StartError(str(store.path(DENY)), f"is broken: {error}", "see rmpa trust status") from None
+        raise StartError(
+            str(store.path(DENY)), f"is broken: {error}", "see rmpa trust status", code="keys-unusable"
+        ) from None
     ended = time.time() - CERTIFICATE_LIFETIME
     return tuple(sorted(entry.name for entry in deny.entries if entry.before > ended))
 

@@ -437,7 +437,9 @@ async def open_session(config: ZenohConfig, changed: Callable[[], bool] = lambda
     try:
         import zenoh  # noqa: PLC0415 - it is an extra
     except ImportError:
-        raise StartError("zenoh", "eclipse-zenoh is not installed", missing_extra("zenoh")) from None
+        raise StartError(
+            "zenoh", "eclipse-zenoh is not installed", missing_extra("zenoh"), code="extra-missing"
+        ) from None
     settings = zenoh.Config()
     try:
         for key, value in config.entries().items():

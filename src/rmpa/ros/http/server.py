@@ -522,7 +522,7 @@ class XmlRpcServer:
 
     def _failed(self, method: str, error: Exception) -> bytes:
         if isinstance(error, RosFault):
-            return serialize_fault(error.code, error.text)
+            return serialize_fault(error.number, error.text)
         self.counters.add("xmlrpc.failed")
         _log.error("! %s: %s failed", self._name, method, exc_info=error)
         return serialize_fault(1, f"{method} failed here: {type(error).__name__}: {error}")
@@ -559,7 +559,7 @@ async def _listen(name: str, host: str, port: int, use: Use) -> socket.socket:
             errno.EMFILE: ("no file descriptors left", remedy()),
         }
         problem = problems.get(error.errno or 0, (error.strerror or str(error), ""))
-        raise StartError(f"{name} at {host}:{port}", *problem) from error
+        raise StartError(f"{name} at {host}:{port}", *problem, code="port-in-use") from error
     return sock
 
 

@@ -78,7 +78,9 @@ class MasterClient:
         """
         reply = await self._call(method, *params)
         if reply.code != 1:
-            raise PeerRefused(f"the ROS master at {self.master_uri}", f"{method}: {reply.status}")
+            raise PeerRefused(
+                f"the ROS master at {self.master_uri}", f"{method}: {reply.status}", code="core-refuses"
+            )
         return reply.value
 
     async def _call(self, method: str, *params: XmlRpcValue) -> RosReply:
@@ -255,7 +257,9 @@ class ServiceClient:
         """
         ok, body = await self.connection.call(_serialize(self.kind.request, request), timeout)
         if not ok:
-            raise PeerRefused(f"service {self.connection.service}", str(bytes(body), "utf-8", "replace"))
+            raise PeerRefused(
+                f"service {self.connection.service}", str(bytes(body), "utf-8", "replace"), code="service-failed"
+            )
         return self.kind.response.deserialize(body)
 
     def close(self) -> None:

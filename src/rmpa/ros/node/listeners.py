@@ -192,7 +192,7 @@ class TcprosServer:
                 on_error.pop_all()
         except OSError as error:
             problem = ("no file descriptors left", remedy()) if is_shortage(error) else (str(error),)
-            raise StartError(f"{name} at {host}:{port}", *problem) from error
+            raise StartError(f"{name} at {host}:{port}", *problem, code="port-in-use") from error
         self.address = sock.getsockname()[:2]
         self._acceptor = Acceptor(sock, self.adopt, name=name)
         self._acceptor.start()
@@ -317,7 +317,7 @@ class SharedListener:
             await self.close()
             if isinstance(error, OSError):
                 problem = error.strerror or str(error) or type(error).__name__
-                raise StartError("one listening socket for all proxies", problem) from error
+                raise StartError("one listening socket for all proxies", problem, code="port-in-use") from error
             raise
         _log.info("= proxies listen at 127.x addresses of their own, ports %d (XML-RPC) and %d (TCPROS)", *self.ports)
 

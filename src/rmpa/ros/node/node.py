@@ -400,7 +400,7 @@ class Node(MasterClient):
         if reply.code == 1:
             return reply.value
         if default is _NO_DEFAULT:
-            raise PeerRefused(f"the ROS master at {self.master_uri}", reply.status)
+            raise PeerRefused(f"the ROS master at {self.master_uri}", reply.status, code="core-refuses")
         return default  # type: ignore[return-value]
 
     async def set_param(self, key: str, value: XmlRpcValue) -> None:

@@ -43,6 +43,7 @@ class ServiceFailed(RmpaError):  # noqa: N818 - an event's name
     service: str
     problem: str
     sent: bool = True
+    code = "service-failed"
 
     def __str__(self) -> str:
         """The service and the reason."""
@@ -284,7 +285,7 @@ def _checked(fields: tcpros.Header | None, service: str, md5sum: str) -> tcpros.
     problem = tcpros.check_server(fields, service, md5sum)
     if problem is not None:
         server = tcpros.printable(fields.get("callerid", "")) or "its server"
-        raise PeerRefused(f"service {service}: {server}", problem)
+        raise PeerRefused(f"service {service}: {server}", problem, code="service-failed")
     return fields
 
 

@@ -43,6 +43,7 @@ class DefinitionError(RmpaError):
     problem: str
     remedy: str = ""
     what: str = "message type"
+    code = "unknown-type"
 
     def __str__(self) -> str:
         """The type, the problem and the remedy."""

@@ -52,6 +52,8 @@ _DTYPES: Final = {"bool": "bool_", "byte": "int8", "char": "uint8"}
 class MessageError(RmpaError):
     """A value does not fit a message type, or bytes are not a message of it."""
 
+    code = "invalid-message"
+
 
 class MessageType:
     """One message type.

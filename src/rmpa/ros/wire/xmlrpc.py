@@ -170,13 +170,15 @@ class RosFault(RmpaError):  # noqa: N818 - XML-RPC calls it a fault
     """The other side answered a call with an XML-RPC fault.
 
     Args:
-        code: The fault code; Python's servers, rosmaster among them, always have 1.
+        number: The fault code; Python's servers, rosmaster among them, always have 1.
         text: The fault string.
     """
 
-    def __init__(self, code: int, text: str) -> None:
-        super().__init__(code, text)
-        self.code = code
+    code = "refused"
+
+    def __init__(self, number: int, text: str) -> None:
+        super().__init__(number, text)
+        self.number = number
         self.text = text
 
     def __str__(self) -> str:

@@ -263,7 +263,7 @@ class TypeLibrary:
         """
         if md5sum:
             if (name, md5sum) not in self._versions:
-                raise RmpaError(f"no publisher has told the version {md5sum} of {name}")
+                raise RmpaError(f"no publisher has told the version {md5sum} of {name}", code="type-mismatch")
             return self._versions[name, md5sum]
         return self._messages.get(name) or await self._finding.get(name, lambda: self._find(name))
 

@@ -296,12 +296,12 @@ class HubClient:
 
     def _check_view(self, what: str) -> None:
         if not self.rights.view:
-            raise PeerRefused(_WHO, f"this client may not {what}", READ_REMEDY)
+            raise PeerRefused(_WHO, f"this client may not {what}", READ_REMEDY, code="not-permitted")
 
     def check_control(self, what: str) -> None:
         """Refuse what changes something to a client that may only look."""
         if not self.rights.control:
-            raise PeerRefused(_WHO, f"this client may not {what}", CONTROL_REMEDY)
+            raise PeerRefused(_WHO, f"this client may not {what}", CONTROL_REMEDY, code="not-permitted")
 
     def check_command(self, what: str) -> None:
         """Refuse also what may be too old."""

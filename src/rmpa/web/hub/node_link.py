@@ -75,7 +75,7 @@ class NodeRules:
         if self.permissions is not None:
             decision = self.permissions.judge(access, _NODE, _resolved(name))
             if not decision.allowed:
-                raise PeerRefused(_WHO, f"{_NODE} may not {access} {name}", decision.rule)
+                raise PeerRefused(_WHO, f"{_NODE} may not {access} {name}", decision.rule, code="not-permitted")
 
     def check_param_change(self, name: str, value_of: Callable[[str], ParamValue], after: ParamValue = None) -> None:
         """Check each parameter that a change of a name replaces, makes or removes; raises as ``check``.

@@ -83,7 +83,7 @@ def read_asset(uri: str, most: int, environ: Mapping[str, str]) -> bytes:
     try:
         return _find(package, path, most, environ)
     except OSError as error:  # such as a name that is too long
-        raise RmpaError(f"{uri[:200]} cannot be read: {error.strerror}") from error
+        raise RmpaError(f"{uri[:200]} cannot be read: {error.strerror}", code="unknown-name") from error
 
 
 def _find(package: str, path: str, most: int, environ: Mapping[str, str]) -> bytes:
@@ -101,8 +101,10 @@ def _find(package: str, path: str, most: int, environ: Mapping[str, str]) -> byt
                 raise LimitExceeded(f"asset {file.name}", file.stat().st_size, most)
             return data
     if found:
-        raise RmpaError(f"package {package} has no file {path[:200]}")
-    raise RmpaError(f"package {package[:200]} is not found; source its workspace where rmpa web starts")
+        raise RmpaError(f"package {package} has no file {path[:200]}", code="unknown-name")
+    raise RmpaError(
+        f"package {package[:200]} is not found; source its workspace where rmpa web starts", code="unknown-name"
+    )
 
 
 def _folders(package: str, environ: Mapping[str, str]) -> Iterator[Path]:
@@ -290,7 +292,7 @@ class ServiceCalls:
             server.users -= 1
             self._forget_unused(key)
         if not ok:
-            raise PeerRefused(f"service {service}", str(bytes(body), "utf-8", "replace"))
+            raise PeerRefused(f"service {service}", str(bytes(body), "utf-8", "replace"), code="service-failed")
         return body
 
     async def find(self, service: str) -> tuple[str, str]:

@@ -297,7 +297,7 @@ class Answers:
         name, peer = _name(args, "service"), _text(args, "peer")
         known = self._hub.graph.services.get(name)
         if known is None:
-            raise RmpaError(f"the graph of this module has no service {name}")
+            raise RmpaError(f"the graph of this module has no service {name}", code="unknown-name")
         peers = [proxied_peer(node) or "" for node in known.providers]
         if peers and peer not in peers:
             whose = peers[0] or "this module"

@@ -243,7 +243,9 @@ def token_from(path: Path) -> tuple[str, bool]:
             file.write(f"{token}\n")
     except OSError as error:
         problem = f"the token's file cannot be used: {error.strerror}"
-        raise StartError(str(path), problem, "choose another one with --token-file") from None
+        raise StartError(
+            str(path), problem, "choose another one with --token-file", code="directory-unusable"
+        ) from None
     return token, True
 
 
@@ -252,11 +254,11 @@ def _read(path: Path) -> str:
         mode = os.fstat(file.fileno()).st_mode
         if stat.S_ISREG(mode) and mode & 0o077:
             problem = f"other users may use the token's file (mode {stat.S_IMODE(mode):03o})"
-            raise StartError(str(path), problem, f"chmod 600 {path}")
+            raise StartError(str(path), problem, f"chmod 600 {path}", code="directory-unusable")
         text = file.read(limits.WEB_TOKEN_FILE_MAX).decode("utf-8", "replace").strip()
     if len(text) < limits.WEB_TOKEN_LENGTH_MIN or not _TOKEN.fullmatch(text):
         problem = f"holds no token of {limits.WEB_TOKEN_LENGTH_MIN} letters, digits or ._~+/=- and more"
-        raise StartError(str(path), problem, "remove the file, and rmpa web makes one")
+        raise StartError(str(path), problem, "remove the file, and rmpa web makes one", code="directory-unusable")
     return text
 
 

@@ -193,7 +193,7 @@ class WebServer:
             except OSError as error:
                 problem = f"cannot be listened at: {error.strerror or error}"
                 remedy = "choose another --port or --listen" if port == self._policy.port else "see ports of [web]"
-                raise StartError(f"{host}:{port}", problem, remedy) from None
+                raise StartError(f"{host}:{port}", problem, remedy, code="port-in-use") from None
             self._servers.append(server)
 
     @property

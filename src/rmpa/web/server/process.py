@@ -136,11 +136,13 @@ def tls_context(files: CertificateFiles) -> ssl.SSLContext | None:
     try:
         context.load_cert_chain(files.cert, files.key or None, password=_no_password)
     except FileNotFoundError as error:
-        raise StartError(error.filename or files.cert, "there is no such file", "see cert and key of [web]") from None
+        raise StartError(
+            error.filename or files.cert, "there is no such file", "see cert and key of [web]", code="web-certificate"
+        ) from None
     except (OSError, ValueError) as error:  # an SSLError is an OSError
         text = getattr(error, "reason", None) or getattr(error, "strerror", None) or str(error)
         remedy = "the certificate and its unencrypted private key are wanted, as PEM"
-        raise StartError(files.cert, f"cannot be used with its key: {text}", remedy) from None
+        raise StartError(files.cert, f"cannot be used with its key: {text}", remedy, code="web-certificate") from None
     return context
 
 
@@ -299,7 +301,12 @@ def access_of(web: WebSettings, module: str, environ: Mapping[str, str], state: 
     place = state_dir(environ, state or None)
     folder = module_dir(place, module) if place is not None else None
     if not web.token_file and folder is None:
-        raise StartError("rmpa web", "there is no state directory for the token", "choose a --token-file")
+        raise StartError(
+            "rmpa web",
+            "there is no state directory for the token",
+            "choose a --token-file",
+            code="no-state-directory",
+        )
     file = Path(web.token_file) if web.token_file or folder is None else folder / "web-token"
     token, is_new = token_from(file)
     return TokenAccess(token, file, is_new)
