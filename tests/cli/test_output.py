@@ -60,9 +60,9 @@ def test_nothing_from_outside_moves_the_cursor() -> None:
 
 
 def test_an_error_in_the_words_of_a_peer_turns_and_hides_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    print_error(PeerRefused("arm", "\x1b[2Jfine\u202e\nand so on"))
+    print_error(PeerRefused("arm", "\x1b[2Jfine\u202e\nand so on"), "refused")
     error = capsys.readouterr().err
-    assert "\\x1b[2Jfine\\u202e\nand so on" in error
+    assert "\\x1b[2Jfine\\u202e [refused]\nand so on" in error
     assert all(character.isprintable() for character in error.replace("\n", ""))
 
 

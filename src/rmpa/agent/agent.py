@@ -208,7 +208,9 @@ class Network:
         """
         await self._join(self.settings.port)
         if self.trust is None and self.endpoint is not None:
-            text = "! trust is off: every program that reaches port %d may join this mesh; rmpa trust init"
+            text = (
+                "! trust is off: every program that reaches port %d may join; secure it: rmpa trust init [trust-off]"
+            )
             _log.warning(text, self.endpoint.port)
 
     async def close(self) -> None:
@@ -247,7 +249,7 @@ class Network:
                 try:
                     await self._join(port)
                 except RmpaError as error:
-                    _log.warning("! cannot join with the new address yet: %s", error)
+                    _log.warning("! cannot join the mesh with the new address; tried again: %s [cannot-start]", error)
                     with contextlib.suppress(TimeoutError):
                         await asyncio.wait_for(self._over.wait(), JOIN_RETRY)
         finally:
@@ -362,7 +364,7 @@ def make_core(settings: Settings) -> Core:
     if settings.core_mode == "embedded":
         state = core_file(os.environ, settings.core_port, settings.name, settings.state_dir)
         if state is None and settings.core_port:
-            _log.warning("! the core keeps nothing over a restart: there is no home; set RMPA_STATE_DIR")
+            _log.warning("! the core keeps nothing when it restarts: set RMPA_STATE_DIR [no-state-directory]")
         return RosCore(
             settings.core_host,
             settings.core_port,
@@ -476,7 +478,7 @@ class Agent:
             StartError: The name, the core's port or the mesh's port is taken.
         """
         for note in permission_notes(self.settings, secured=self.bridge.gate.on):
-            _log.warning("! %s", note)
+            _log.warning("! %s [doubtful-setting]", note)
         self._warn_of_stale_connections()
         async with contextlib.AsyncExitStack() as undo:
             self.control.lock()
@@ -518,7 +520,7 @@ class Agent:
             reason, _, remedy = problem.partition("; ")
             effect = "when that of a direct subscriber does, a rospy publisher without queue_size may hang"
             text = f"the agent may not end connections that a vanished host leaves behind ({reason}): {effect}"
-            _log.warning("! %s; %s (docs/guides/running.md#at-boot)", text, remedy)
+            _log.warning("! %s; %s (docs/guides/running.md#at-boot) [stale-connections]", text, remedy)
 
     def apply_settings(self, settings: Settings) -> None:
         """Take settings that were read again; only those of ``agent.process.LIVE`` differ."""

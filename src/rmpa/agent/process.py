@@ -92,8 +92,8 @@ class Reloader:
                 loaded = await asyncio.to_thread(self._load)
             except ConfigError as error:
                 if not check:
-                    _log.error("! the settings stay as they are: %s", error)
-                return ReloadReply(problem=str(error))
+                    _log.error("! the settings stay as they are: %s [%s]", error, error.code)
+                return ReloadReply(problem=str(error), code=error.code)
             reply = self._compare(loaded)
             if not check:
                 self._take(loaded.settings, reply)
@@ -121,9 +121,9 @@ class Reloader:
             self._apply(self._settings)
         _log.info("= settings read again: %s", ", ".join(reply.changed) if reply.changed else "nothing has changed")
         for note in reply.notes:
-            _log.warning("%s", note)
+            _log.warning("! %s [doubtful-setting]", note)
         for key in reply.restart:
-            _log.warning("! %s only holds after a restart", key)
+            _log.warning("! %s takes effect after a restart [needs-restart]", key)
 
     async def follow(self, came: asyncio.Event, stop: Callable[[], object], *, had_terminal: bool) -> None:
         """Read the settings again at each SIGHUP, until cancelled.
@@ -143,7 +143,7 @@ class Reloader:
             try:
                 await self.reload()
             except ConfigError as error:
-                _log.error("! the settings stay as they are: %s", error)
+                _log.error("! the settings stay as they are: %s [%s]", error, error.code)
             except Exception:  # noqa: BLE001 - a fault of one reload must not stop the next one
                 _log.exception("! the settings could not be read again")
             finally:
@@ -251,15 +251,17 @@ class WebProcess:
             try:
                 code = await self._run()
             except OSError as error:
-                _log.warning("! rmpa web cannot be started: %s", error)
+                _log.warning("! rmpa web cannot be started: %s [web-stopped]", error)
                 code = 1
             if code == _USAGE:
-                _log.warning("! rmpa web cannot run with these settings (see above); it is not started again")
+                _log.warning(
+                    "! rmpa web cannot run with these settings (see above); it is not started again [web-stopped]"
+                )
                 return
             if loop.time() - began >= WEB_STEADY:
                 self._backoff.reset()
             delay = self._backoff.delay()
-            _log.warning("! rmpa web ended with code %d; it is started again in %.1f s", code, delay)
+            _log.warning("! rmpa web ended with code %d; it is started again in %.1f s [web-stopped]", code, delay)
             await asyncio.sleep(delay)
 
     async def _run(self) -> int:

@@ -240,7 +240,7 @@ class AgentTrust(Part):
             try:
                 store.save_authority(place)
             except StartError as error:
-                _log.warning("! %s", error)
+                _log.warning("! %s [%s]", error, error.code)
         self.look_now()
 
     def look_now(self) -> None:
@@ -272,7 +272,9 @@ class AgentTrust(Part):
             delay = self._backoff.delay()
             self._retry_at = self._clock.now() + delay
             self._problem = f"the last attempt to renew it: {error}"
-            _log.warning("! the certificate is not renewed: %s; tried again in %.0f s", error, delay)
+            _log.warning(
+                "! the certificate is not renewed: %s; tried again in %.0f s [certificate-trouble]", error, delay
+            )
 
     def _lacks_hosts(self) -> bool:
         """Whether the certificate is not for a name or address of this machine, and the authority may be asked.
@@ -461,7 +463,7 @@ class TrustCommands:
             deny = self._authority().revoke_known(name, self._trust.linked(), force=args.get("force") is True)
         finally:
             self._trust.spread()  # what was made holds here, so it must hold everywhere
-        _log.warning("= %s is revoked (deny list %d); there is a new group key", name, deny.number)
+        _log.warning("= %s is revoked (deny list %d); there is a new group key [member-revoked]", name, deny.number)
         return TrustReply(module=name, done=True, number=deny.number)
 
     def sign(self, args: Args) -> dict[str, str]:

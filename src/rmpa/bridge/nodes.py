@@ -266,12 +266,12 @@ class Nodes(Part):
         node, uri = self._own(args, nodes)
         who = f"{peer}'s {str(args.get('by', ''))[: limits.ASK_NAME_MAX]}"
         if not any(matches(glob, node) for glob in self._shared.context.settings.nodes.kill):
-            _log.warning("! %s may not end %s: no glob of nodes.kill fits", who, node)
+            _log.warning("! %s may not end %s: no glob of nodes.kill fits [not-permitted]", who, node)
             here = self._shared.context.settings.name
             raise RmpaError(
                 f"no glob of nodes.kill in the rmpa.toml of {here} fits {node}; allow it there", code="not-permitted"
             )
-        _log.warning("= %s ends %s", who, node)
+        _log.warning("= %s ends %s [node-killed]", who, node)
         gone = await end_node(node, uri, OWN_NODE, f"killed by {who}")
         self._core.suspect(node)  # roscpp does not unregister when it ends in a hurry
         return {"gone": gone}
@@ -352,11 +352,11 @@ class ProxyKills:
         whose = f"{session.link.name}:{node}"
         if caller == MASTER_ID:
             # Another local node took the proxy's name. That does not concern the node at the peer.
-            _log.warning("! another node has the name of the proxy of %s", whose)
+            _log.warning("! another node has the name of the proxy of %s [name-taken]", whose)
             return RosReply(1, "shutdown", 0)
         problem = await self._ask(session, node, caller, reason)
         if problem:
-            _log.warning("! %s, which %s asks to end, lives on: %s", whose, caller, problem)
+            _log.warning("! %s did not end, although %s asked it to: %s [node-killed]", whose, caller, problem)
             return RosReply(_REFUSED, problem, 0)
         _log.info("= %s was ended for %s (%s)", whose, caller, reason)
         return RosReply(1, "shutdown", 0)

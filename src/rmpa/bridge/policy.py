@@ -253,7 +253,7 @@ class PermissionGate:
             return
         logged.add(whose)
         what = prohibition(access, module, name) + (f" by way of {relay}" if relay else "")
-        _log.warning("! %s: %s (logged once, then counted)", what, decision.rule)
+        _log.warning("! %s: %s (logged once, then counted) [not-permitted]", what, decision.rule)
 
     def why_not(self, access: Access, module: str, name: str) -> str:
         """What a peer is told if it may not do something, which is reported here; empty if it may."""

@@ -341,4 +341,4 @@ class PeerProxies:
         if self.problems.get(node) != text:
             self.problems[node] = text
             level = logging.DEBUG if is_shortage(error) else logging.ERROR  # a shortage is reported for the process
-            _log.log(level, "! %s: %s is not in the local graph: %s", self.prefix, node, text)
+            _log.log(level, "! %s: %s is not in the local graph: %s [name-taken]", self.prefix, node, text)

@@ -1,4 +1,4 @@
-"""Verbs about this machine's agent: ``rmpa up``, ``reload``, ``config``, ``why`` and ``completion``."""
+"""Verbs about this machine's agent: ``rmpa up``, ``reload``, ``config``, ``why``, ``explain`` and ``completion``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from rmpa.cli.advice import advise, advises
-from rmpa.cli.graph import read_name
+from rmpa.cli.graph import read_name, suggestion
 from rmpa.cli.options import (
     Options,
     agent_verb,
@@ -30,6 +30,7 @@ from rmpa.cli.output import Painted, Table, paint, print_error, printable, warn
 from rmpa.config.module_name import GATEWAY_SUFFIX, NameSource, choose_name, keep_name, state_dir
 from rmpa.config.read import load_settings
 from rmpa.config.settings import SETTINGS, json_value, schema_text, toml_value
+from rmpa.core import codes
 from rmpa.core.counters import configure_logging
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import proxied_node, proxied_peer
@@ -75,17 +76,16 @@ def reload(check: bool, options: Options) -> int:
 
     def text() -> Iterator[str]:
         if reply.problem:
-            print_error(reply.problem)
+            print_error(reply.problem, reply.code)
             return
         what = f"nothing {'would change' if check else 'has changed'}"
         if reply.changed:
             what = f"{', '.join(reply.changed)} {'would take effect' if check else 'in effect'}"
         yield f"{reply.file or 'no file'}: {what}"
-        for note in (
-            *reply.notes,
-            *(f"{key} {'needs' if check else 'waits for'} a restart" for key in reply.restart),
-        ):
-            warn(note)
+        for note in reply.notes:
+            warn(note, "doubtful-setting")
+        for key in reply.restart:
+            warn(f"{key} {'would take' if check else 'takes'} effect after a restart", "needs-restart")
 
     options.show(reply, text())
     return 2 if reply.problem else 0
@@ -108,7 +108,7 @@ def config_show(config: str | None, options: Options) -> None:
     file = str(loaded.settings.config_file or "")
     options.show({"file": file, "settings": settings, "notes": loaded.notes}, table)
     for note in () if options.as_json else loaded.notes:
-        warn(note)
+        warn(note, "doubtful-setting")
 
 
 def _shown(setting: Setting, value: object) -> str:
@@ -121,6 +121,27 @@ def _shown(setting: Setting, value: object) -> str:
 def config_schema() -> None:
     """Print the JSON Schema of rmpa.toml: editors check and complete the file with it."""
     click.echo(schema_text(), nl=False)
+
+
+@json_verb(click.argument("code", required=False))
+def explain(code: str | None, options: Options) -> None:
+    """Say what a code such as [port-in-use], at the end of an error or a warning, means, and what to do.
+
+    Without CODE all codes are shown, as docs/reference/codes.md has them.
+
+    ---
+
+    Examples:
+      rmpa explain port-in-use
+    """
+    wanted = (code or "").strip("[]")
+    if wanted and wanted not in codes.CODES:
+        remedy = suggestion(wanted, codes.CODES, "`rmpa explain` shows all")
+        raise ConfigError("CODE", f"there is no code {wanted!r}", remedy, code="unknown-name")
+    found = [(one, *map(codes.plain, codes.CODES[one])) for one in codes.CODES if wanted in ("", one)]
+    fields = ("code", "meaning", "remedy")
+    texts = ((one, *(click.wrap_text(text, 78, "  ", "  ").splitlines() for text in about)) for one, *about in found)
+    options.show([dict(zip(fields, each, strict=True)) for each in found], texts)
 
 
 @agent_verb(
@@ -170,7 +191,8 @@ def stage_lines(diagnosis: Diagnosis) -> Iterator[str]:
     for stage in diagnosis.stages:
         mark = paint_level(f"{stage.level.value:<7}", stage.level)
         advice = f" ({stage.remedy})" if stage.remedy and stage.level is WARN else ""
-        yield Painted(f"  {mark}  {printable(stage.name):<{width}}  {printable(stage.text + advice)}")
+        code = f" [{stage.code}]" if stage.code else ""
+        yield Painted(f"  {mark}  {printable(stage.name):<{width}}  {printable(stage.text + advice + code)}")
     failed = diagnosis.failed
     if diagnosis.unasked:
         yield paint_level("nothing is in its way: it flows as soon as a node subscribes", WARN)
@@ -220,7 +242,7 @@ def up(quiet: bool, **options: object) -> int:
     journal = in_journal(os.environ, sys.stderr.fileno())
     configure_logging(loaded.settings.log_level, writer, as_json=loaded.settings.log_json, in_journal=journal)
     for note in loaded.notes:
-        _log.warning("%s", note)
+        _log.warning("! %s [doubtful-setting]", note)
     chosen = choose_name(loaded.names)
     if chosen.source is NameSource.KEPT:
         _log.info("= the module is %s, as at its first start (%s)", chosen.name, loaded.given["name"])
@@ -254,7 +276,7 @@ def _keep_first_name(settings: Settings, names: Mapping[NameSource, str]) -> Non
         if all(agent.name == name for agent in find_agents(os.environ)):
             keep_name(directory, name)
     except RmpaError as error:
-        _log.warning("! the name %s is not kept: %s", name, error)
+        _log.warning("! the name %s is not kept: %s [directory-unusable]", name, error)
 
 
 # Seconds that the agent or master has for its answer: a person waits with the key pressed.

@@ -72,13 +72,13 @@ def doctor(config: str | None, quiet: bool, listen: float | None, fix: bool, yes
 def check_json(check: Check) -> dict[str, str]:
     """A result of ``rmpa doctor`` for programs."""
     keys = {"check": check.name, "subject": check.where, "level": check.level, "text": check.text}
-    return keys | ({"remedy": check.remedy} if check.remedy else {})
+    return keys | {key: text for key, text in (("remedy", check.remedy), ("code", check.code)) if text}
 
 
 def check_lines(check: Check) -> Iterator[str]:
     """A result of ``rmpa doctor`` for people."""
     what = printable(f"{check.name} {check.where}".strip())
-    yield Painted(f"{paint_level(f'{check.level.value:<7}', check.level)}  {what}: {printable(check.text)}")
+    yield Painted(f"{paint_level(f'{check.level.value:<7}', check.level)}  {what}: {printable(check.line)}")
     if check.remedy:
         yield f"{'':<9}{check.remedy}"
 
@@ -134,7 +134,7 @@ def _plan_lines(plan: Sequence[Repair], by_hand: Sequence[Check]) -> Iterator[st
     if advised := [check for check in by_hand if check.remedy]:
         yield "By hand, for it is yours to decide:"
     for check in advised:
-        yield f"  {check.name} {check.where}".rstrip() + f": {check.text}"
+        yield f"  {check.name} {check.where}".rstrip() + f": {check.line}"
         yield f"    {check.remedy}"
 
 
@@ -143,7 +143,7 @@ def _agreed(plan: Sequence[Repair], options: Options, *, yes: bool) -> bool:
     if not plan or yes:
         return bool(plan)
     if options.as_json or not sys.stdin.isatty():
-        warn("nothing was changed: there is no terminal to ask on; --yes does it")
+        warn("nothing was changed: there is no terminal to ask on; --yes does it", "not-confirmed")
         return False
     return confirm(f"Run {'this command' if len(plan) == 1 else f'these {len(plan)} commands'}?")
 
@@ -151,9 +151,9 @@ def _agreed(plan: Sequence[Repair], options: Options, *, yes: bool) -> bool:
 def _run(repair: Repair) -> bool:
     """Run one command; what it prints goes to standard error. Return whether it succeeded."""
     if shutil.which(repair.words[0]) is None:
-        warn(f"{repair}: there is no {repair.words[0]} here; run it as root without it")
+        warn(f"{repair}: there is no {repair.words[0]} here; run it as root without it", "failed")
         return False
     code = subprocess.run(repair.words, stdout=sys.stderr.fileno(), check=False).returncode  # noqa: S603 - as shown
     if code:
-        warn(f"{repair}: exit code {code}")
+        warn(f"{repair}: exit code {code}", "failed")
     return not code

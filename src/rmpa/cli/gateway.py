@@ -99,7 +99,7 @@ def gateway(context: click.Context, /, **options: object) -> int:
     journal = in_journal(os.environ, sys.stderr.fileno())
     configure_logging(loaded.settings.log_level, writer, as_json=loaded.settings.log_json, in_journal=journal)
     for note in loaded.notes:
-        _log.warning("%s", note)
+        _log.warning("! %s [doubtful-setting]", note)
     gc.disable()  # as in rmpa up: the start takes a third less time; the agent turns it on again
     from rmpa.gateway.gateway import run
 
@@ -299,7 +299,7 @@ def web(config: str | None, with_agent: bool, insecure: bool, options: Options, 
     journal = in_journal(os.environ, sys.stderr.fileno())
     configure_logging(setup.settings.log_level, sys.stderr, as_json=setup.settings.log_json, in_journal=journal)
     for note in module.loaded.notes:
-        _web_log.warning("%s", note)
+        _web_log.warning("! %s [doubtful-setting]", note)
     from rmpa.web.server.process import serve
 
     def announce(url: str, access: TokenAccess) -> None:
@@ -441,7 +441,7 @@ def gateway_zenoh_config(**options: object) -> None:
     """
     loaded = load_gateway(options, dict(os.environ), socket.gethostname())
     for note in loaded.notes:
-        warn(note)
+        warn(note, "doubtful-setting")
     from rmpa.gateway.zenoh.config import zenohd_config
 
     click.echo(zenohd_config(loaded.settings), nl=False)

@@ -257,7 +257,7 @@ def warn_unpublished(master: Master, graph: Graph, wanted: GraphName) -> None:
         return
     why = f"`rmpa why {wanted}` says why" if master.agent is not None else ""
     hint = why if wanted.name in graph.publishers else suggestion(wanted.name, graph.publishers, why)
-    warn(f"{wanted} is not published yet; waiting" + (f" ({hint})" if hint else ""))
+    warn(f"{wanted} is not published yet; waiting" + (f" ({hint})" if hint else ""), "no-publisher")
 
 
 @dataclass(frozen=True, slots=True)
@@ -426,7 +426,7 @@ async def watch_topic(
         finally:
             stopped.cancel()
             for refusal in subscriber.refusals.values():
-                warn(refusal)
+                warn(refusal, "refused")
         if tick is not None:
             await tick()
 

@@ -99,6 +99,7 @@ VERBS: Final = {
     "trust join": ("trust_join", "Join a secured mesh with a token, or by files."),
     "trust check": ("trust", "Say whether a peer may do something here, and by which rule."),
     "why": ("agent", "Say why a topic of a peer does not arrive, and what to do."),
+    "explain": ("agent", "Say what the code of an error or a warning means, and what to do."),
     "doctor": ("doctor", "Check this machine: network, clock, rights, ROS environment."),
     "bug-report": ("bug_report", "Collect what a maintainer needs to know of this machine, redacted."),
     "web": ("gateway", "Serve this module's state over HTTP: metrics, REST."),

@@ -335,7 +335,8 @@ async def _version(node: Node, topic: str, found: MessageType | str) -> MessageT
         if there is not None and there.kind.md5sum != found.md5sum:
             warn(
                 f"{there.node} publishes {topic} with another version of {found.name} (md5 {there.kind.md5sum}) "
-                f"than {found.source} has ({found.md5sum}); that of {there.node} is used"
+                f"than {found.source} has ({found.md5sum}); that of {there.node} is used",
+                "type-mismatch",
             )
             return there.kind
     return found

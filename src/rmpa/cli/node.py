@@ -129,7 +129,7 @@ def _of_peers(master: Master, graph: Graph, peer: str | None) -> list[_Line]:
         if peer is None or not shown:
             raise
     for line in _untold(told):
-        warn(line)
+        warn(line, "refused")
     asked = {one.peer for one in told}
     found: list[_Line] = [(one.peer, line) for one in told for line in one.nodes]
     found += [(name, line) for name, line in shown if name not in asked]
@@ -231,7 +231,7 @@ def node_kill(nodes: tuple[str, ...], everything: bool, options: Options) -> int
         print_json([{"node": node, "killed": not error, "error": error or None} for node, error in found])
     for node, error in found:
         if error:
-            print_error(f"{node}: {error}")
+            print_error(f"{node}: {error}", "refused")
         elif not options.as_json:
             print_text(f"killed {node}")
     return int(any(error for _, error in found))
@@ -302,7 +302,7 @@ def node_list(namespace: str, verbose: bool, selection: Selection, options: Opti
     options.show([_json(peer, line, here) for peer, line in found], text())
     for peer, line in found:
         if line.problem:
-            warn(f"{GraphName(line.name, peer)} cannot be reached at {line.uri}: {line.problem}")
+            warn(f"{GraphName(line.name, peer)} cannot be reached at {line.uri}: {line.problem}", "node-unreachable")
 
 
 def _own(master: Master, graph: Graph, *, with_uris: bool) -> list[NodeLine]:
@@ -366,7 +366,7 @@ def node_info(node: str, options: Options) -> None:
         yield from ("", "Services:" + ("" if facts.services else " none"))
         yield from (f" * {service}" for service in facts.services)
         if facts.problem:
-            warn(facts.problem)
+            warn(facts.problem, "node-unreachable")
 
     about: dict[str, object] = {"name": facts.name, "peer": wanted.peer, "module": module}
     about |= {"uri": facts.uri, "pid": facts.pid, "reachable": not facts.problem, "problem": facts.problem or None}

@@ -119,9 +119,9 @@ def paint(text: str, colour: str | None) -> Painted:
     return Painted(click.style(printable(text), fg=colour) if colour else printable(text))
 
 
-def warn(text: str, code: str) -> None:
+def warn(text: str, code: str = "") -> None:
     """One line on stderr with a code of ``core.codes``, yellow on a terminal; control characters are escaped."""
-    click.secho(f"! {printable(text)} [{code}]", err=True, fg="yellow")
+    click.secho(f"! {printable(text)}" + (f" [{code}]" if code else ""), err=True, fg="yellow")
 
 
 def print_error(error: object, code: str) -> None:

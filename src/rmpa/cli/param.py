@@ -523,6 +523,6 @@ def param_followed(options: Options) -> None:
         yield Table("KEY, STATE, OWNER, >SIZE", rows, colours)
         for one in found:
             if one.problem:
-                warn(f"{one.key}: {one.problem}")
+                warn(f"{one.key}: {one.problem}", "param-trouble")
 
     options.show(found, text())

@@ -92,10 +92,10 @@ def peer_list(
             yield selection.rest(peers, "peers", "rmpa peer list 'arm*', --state linked")
         troubles = _troubles(snapshot, sorted(peers, key=_urgency) if selection.is_long(peers) else peers)
         for trouble in troubles[: selection.lines]:
-            warn(trouble)
+            warn(*trouble)
         if selection.is_long(troubles):
             left = len(troubles) - (selection.lines or 0)
-            warn(f"... {left:,} more of this kind; all: rmpa peer list --all")
+            warn(f"... {left:,} more of this kind; all: rmpa peer list --all", "peer-unlinked")
 
     options.show(peers, text())
 
@@ -126,21 +126,22 @@ def _row(info: PeerInfo) -> list[str]:
     ]
 
 
-def _troubles(snapshot: Snapshot, peers: list[PeerInfo]) -> list[str]:
-    found = list(snapshot.notes)
+def _troubles(snapshot: Snapshot, peers: list[PeerInfo]) -> list[tuple[str, str]]:
+    """Each with its code."""
+    found = [(note, "agent-trouble") for note in snapshot.notes]
     named: dict[str, list[str]] = {}  # to a module without keys all of a mesh are pending, by one text
     for info in peers:
         named.setdefault(info.last_error, []).append(info.name)
     for info in peers:
         if info.state == PENDING:
             if names := named.pop(info.last_error, []):
-                found.append(f"{', '.join(names)}: {info.last_error}")
+                found.append((f"{', '.join(names)}: {info.last_error}", info.code))
             continue
-        found += [f"{info.name}: {conflict}" for conflict in info.conflicts]
-        found += [bound.text for bound in info.beyond]
+        found += [(f"{info.name}: {conflict}", "name-conflict") for conflict in info.conflicts]
+        found += [(bound.text, "limit-reached") for bound in info.beyond]
         if info.last_error and info.state not in _USUAL:
             again = "" if info.next_attempt is None else f"; next attempt in {duration(info.next_attempt)}"
-            found.append(f"{info.name}: {info.last_error}{again}")
+            found.append((f"{info.name}: {info.last_error}{again}", info.code))
     return found
 
 
@@ -309,7 +310,7 @@ def site_list(name: str | None, options: Options) -> int:
     with _connect(options, name) as client:
         reports = _ask(client, REPORT, tuple[SitesReport, ...])
         if not reports:
-            warn(_why_none(client))
+            warn(_why_none(client), "site-unreachable")
 
     def text() -> Iterator[Text]:
         rows = [(report, site) for report in reports for site in report.sites]
@@ -318,12 +319,12 @@ def site_list(name: str | None, options: Options) -> int:
             yield Table(titles, [_site_row(*row) for row in rows], [_COLOURS.get(s.state, "") for _, s in rows])
         for report in reports:
             if report.problem:
-                warn(f"{report.gateway}: {report.problem}")
+                warn(f"{report.gateway}: {report.problem}", "zenoh-trouble")
             if not any(site.state != "this site" for site in report.sites):
                 where = ": it is connected to nothing; is the router of gateway.connect there?"
                 if report.endpoints:
                     where = f": it is connected to {', '.join(report.endpoints)}, where no other gateway is"
-                warn(f"{report.gateway} of site {report.site} knows no other site{where}")
+                warn(f"{report.gateway} of site {report.site} knows no other site{where}", "site-unreachable")
 
     options.show(reports, text())
     well = all(s.state in ("this site", "joined") for report in reports for s in report.sites)
@@ -394,4 +395,4 @@ def _site_text(report: SitesReport, site: SiteInfo) -> Iterator[Text]:
         yield Table("  NAME, KIND, TYPE, MODULE, NODE, HERE", rows)
     for source in site.sources:
         if source.problem:
-            warn(f"{source.name} of {source.module}: {source.problem}")
+            warn(f"{source.name} of {source.module}: {source.problem}", "rule-excludes")

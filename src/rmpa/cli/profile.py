@@ -286,7 +286,7 @@ def _info(one: SeenResource, about: dict[str, Any]) -> Iterator[Text]:
     if said.contexts:
         yield f"Context: {about['context'] or 'none'}"
     if health is None:
-        warn(f"{one} has sent no quality while we listened")
+        warn(f"{one} has sent no quality while we listened", "resource-trouble")
     else:
         yield f"Health: {health['level']}: {health['message']}"
     tables: dict[str, Iterable[Sequence[str]]] = {

@@ -257,7 +257,7 @@ def resource_list(options: Options) -> None:
         for path, count in Counter(one.path for one in graph.seen).items():
             if count > 1:
                 text = "what is asked of that name is heard by all of them; docs/guides/names.md tells them apart"
-                warn(f"{count} modules have a resource {path}: {text}")
+                warn(f"{count} modules have a resource {path}: {text}", "same-names")
         states, profiles, contexts = await graph.texts(graph.seen, "state", "profile", "context")
         found: list[dict[str, Any]] = []
         rows = []
@@ -367,7 +367,7 @@ async def _echo(master: Master, resource: str | None, count: int | None, *, as_j
                         await node.subscribe(topic, MessageType(ARRAY_TYPE), functools.partial(take, path))
             if not known and not warned:
                 warned = True
-                warn("there is no resource yet; waiting")
+                warn("there is no resource yet; waiting", "unknown-name")
             await asyncio.wait((enough,), timeout=_LOOK)
 
     await with_node(master, "rmpa_alarm", look)

@@ -349,7 +349,9 @@ def _state_dir(module: str, state: str | None) -> Path | None:
 
     directory = state_dir(os.environ, state)
     if directory is None:
-        _log.warning("! there is no home to remember anything in; set RMPA_STATE_DIR, or --no-state")
+        _log.warning(
+            "! there is no home directory to keep state in; set RMPA_STATE_DIR, or --no-state [no-state-directory]"
+        )
         return None
     return module_dir(directory, module)
 
@@ -367,7 +369,7 @@ async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, s
 
     def on_signal(number: int) -> None:
         if stop.is_set():
-            _log.warning("! told twice: ending at once")
+            _log.warning("! second signal: ending at once [ending-slowly]")
             _leave(128 + number)
         stop.set()
 
@@ -394,9 +396,9 @@ async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, s
         failure = StartError("the module's agent", f"it ended with code {process.returncode}", "its log says why")
     threads.shutdown(wait=False, cancel_futures=True)
     if left := await _left_behind():
-        _log.warning("! %s does not come back; it is left behind", ", ".join(left))
+        _log.warning("! %s does not return; the program ends without it [ending-slowly]", ", ".join(left))
         if failure is not None:
-            print_error(failure)
+            print_error(failure, failure.code)
         if agent is not None:
             agent.end()
         _leave(1)

@@ -121,7 +121,7 @@ def _crossing(infos: Sequence[ServiceInfo]) -> Iterator[str]:
         yield f" * {_headline(info)}"
         yield from (f"     {label:<10} {text}" for label, text in _facts(info))
         if info.problem:
-            warn(f"{info.peer or info.node}: {info.problem}")
+            warn(f"{info.peer or info.node}: {info.problem}", "service-failed")
 
 
 def _headline(info: ServiceInfo) -> str:
@@ -263,7 +263,7 @@ def service_info(service: str, options: Options) -> None:
             yield f"Type: {said.type}"
             yield f"MD5: {said.md5sum}"
             if unknown:
-                warn(unknown)
+                warn(unknown, "unknown-type")
             else:
                 yield f"Args: {' '.join(names['request'] or ())}"
             for title, half in halves.items():
@@ -304,7 +304,7 @@ def service_find(kind: str, options: Options) -> None:
     found = []
     for name, each in probe(master, sorted(graph.services)).items():
         if each.description is None:
-            warn(f"{name}: {each.problem}")
+            warn(f"{name}: {each.problem}", "no-server")
         elif each.description.type == kind:
             found.append(name)
     options.show(found, marked(found, graph.services))

@@ -267,9 +267,11 @@ def _described(graph: Graph, wanted: GraphName, crossing: TopicInfo | None) -> I
         yield f" * {way} {route.peer}: {route.node} {shown_state(route)}{relayed}"
         yield from (f"     {label:<10} {text}" for label, text in facts(route))
         if route.problem:
-            warn(f"{route.peer} {route.node}: {route.problem}")
-    for trouble in (*crossing.mismatches, *crossing.unreachable):
-        warn(trouble)
+            warn(f"{route.peer} {route.node}: {route.problem}", "route-not-open")
+    for trouble in crossing.mismatches:
+        warn(trouble, "type-mismatch")
+    for trouble in crossing.unreachable:
+        warn(trouble, "node-unreachable")
 
 
 @graph_verb(argument("topic", "topic"))

@@ -223,7 +223,7 @@ def keep_member_name(module: Module) -> str:
         config = {"config": module.loaded.settings.config_file}
         usual = load_settings(config, os.environ, host_name=socket.gethostname()).settings.name
     except RmpaError as error:
-        warn(f"the name {module.name} is not kept: {error}")
+        warn(f"the name {module.name} is not kept: {error}", "directory-unusable")
     return "rmpa up" if usual == module.name else f"rmpa up --name {module.name}"
 
 
@@ -299,7 +299,7 @@ def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str
     text = f"{'yes' if decision.allowed else 'no'}: {decision.rule}"
     options.show({**told, "groups": permissions.groups_of(peer), "files": files}, text)
     if not files and not options.as_json:
-        warn("no rmpa.toml was found here; --config names the file that rmpa up was started with")
+        warn("no rmpa.toml was found here; --config names the file that rmpa up was started with", "doubtful-setting")
     ctx.exit(0 if decision.allowed else 1)
 
 
@@ -329,7 +329,7 @@ def trust_init(module: Module, options: Options, label: str) -> None:
         yield f"fingerprint of the CA: {grouped(status.fingerprint)}"
         yield "Keep a copy of that folder in a safe place: without ca.key no module can join or be renewed."
         if module.socket is not None:
-            warn(_RESTART.format(module.name))
+            warn(_RESTART.format(module.name), "needs-restart")
         again = " again" if module.socket is not None else ""
         yield f"Next: {start} here{again}, and rmpa trust invite for each module."
         yield "Modules may do here only what [[permission]] in rmpa.toml allows: docs/guides/trust.md#permissions"
@@ -363,7 +363,7 @@ def trust_status(module: Module, options: Options) -> None:
             else:
                 yield "make one: rmpa trust init; or join one: rmpa trust join TOKEN"
         for problem in shown.problems:
-            warn(problem)
+            warn(problem, "certificate-trouble")
 
     options.show(shown, text())
 
@@ -475,7 +475,7 @@ def trust_revoke(module: Module, options: Options, target: str, force: bool) -> 
         reply = TrustReply(module=target, done=True, number=deny.number)
     options.show(reply, f"{target} is revoked (deny list {reply.number}); there is a new group key")
     if module.socket is None and not options.as_json:
-        warn("no agent runs here: the other modules learn it when it is started (rmpa up)")
+        warn("no agent runs here: the other modules learn it when it is started (rmpa up)", "no-agent")
 
 
 @trust_verb(flag("--yes", help="Do not ask."))
@@ -507,4 +507,4 @@ def trust_leave(module: Module, options: Options, yes: bool) -> None:
     done = f"{module.name} has left its mesh: {len(removed)} files are removed"
     options.show(TrustReply(module=module.name, done=True, text=", ".join(removed)), done)
     if module.socket is not None and not options.as_json:
-        warn(f"the agent {module.name} keeps its membership until it is started again")
+        warn(f"the agent {module.name} keeps its membership until it is started again", "needs-restart")

@@ -125,7 +125,7 @@ def _await_join(module: Module, invited: InviteReply, *, as_json: bool) -> None:
         if as_json:
             print_json(step)
         elif step.state == "refused":
-            warn(f"{step.module} was refused: {step.text} ({step.reason}); the token is still valid")
+            warn(f"{step.module} was refused: {step.text} ({step.reason}); the token is still valid", "token-refused")
         else:
             click.echo(f"{step.module} has joined", err=True)
 
@@ -244,9 +244,9 @@ def trust_join(
     if options.as_json:
         return
     if text := _clock_problem(time.time(), found.issued, by_files=accept is not None):
-        warn(text)
+        warn(text, "clock-skew")
     if module.socket is not None:
-        warn(f"the agent {module.name} runs without trust until it is started again")
+        warn(f"the agent {module.name} runs without trust until it is started again", "needs-restart")
     else:
         click.echo(f"Next: {start}; rmpa trust check says what other modules may do here.")
 

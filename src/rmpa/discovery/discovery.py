@@ -532,7 +532,7 @@ class Discovery:
     def _warn(self, text: str) -> None:
         if text not in self._warned:
             self._warned.add(text)
-            _log.warning("! %s", text)
+            _log.warning("! %s [multicast-blocked]", text)
 
     # --- outputs and events -----------------------------------------------------------------------------------
 

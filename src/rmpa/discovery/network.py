@@ -196,7 +196,9 @@ async def follow_seed(
             addresses = await in_thread(partial(resolve, host), f"resolve {host}")
         except (OSError, UnicodeError) as error:  # UnicodeError: a label that is empty or too long
             if not failed:
-                _log.warning("! seed %s: cannot be resolved (%s); tried again for ever", host, error)
+                _log.warning(
+                    "! seed %s: the name has no address (%s); it is tried again [unresolved-name]", host, error
+                )
             failed = True
             await asyncio.sleep(backoff.delay())
         else:
@@ -334,7 +336,7 @@ class Sender:
                 self._counters.add("beacon.send_failed")
                 if self._failing.get(name) != error.errno:
                     self._failing[name] = error.errno
-                    text = "! %s: beacons cannot be sent there (%s); tried again with each beacon"
+                    text = "! %s: beacons cannot be sent (%s); tried again with each beacon [multicast-blocked]"
                     _log.warning(text, name, error.strerror)
             else:
                 self._counters.add("beacon.out_multicast")

@@ -278,9 +278,9 @@ class ProxiedSource:
     def _call(self, method: str, node: SlaveNode, *args: str) -> None:
         """Register it with the core; what the core says against it is its problem."""
         code, status, _ = self._site.core.call(method, node.name, self.source.name, *args)
-        self.refused = "" if code == 1 else f"the gateway's core does not take it: {status}"
+        self.refused = "" if code == 1 else f"the gateway's core does not accept it: {status}"
         if self.refused:
-            _log.error("! %s of %s: %s", self.source.name, node.name, self.refused)
+            _log.error("! %s of %s: %s [core-refuses]", self.source.name, node.name, self.refused)
 
     def _withdraw(self) -> None:
         """End what subscribers or clients have of it."""

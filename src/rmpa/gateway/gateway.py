@@ -211,7 +211,7 @@ class Gateway:
     def _failed(self, error: StartError) -> None:
         if str(error) != self._problem:
             self._problem = str(error)
-            _log.warning("! %s; it is tried again", error)
+            _log.warning("! %s; it is tried again [zenoh-trouble]", error)
 
     def _try_to_join(self, session: OpenSession) -> None:
         """Makes the neighbours while the gateway runs: what is wrong with them is told, and ends nothing else."""
@@ -219,7 +219,7 @@ class Gateway:
             self._join(session)
         except RmpaError as error:
             self._problem = str(error)
-            _log.error("! %s", error)
+            _log.error("! %s [%s]", error, error.code)
 
 
 def _rules(settings: Settings) -> tuple[object, ...]:

@@ -40,6 +40,7 @@ class ReloadReply(msgspec.Struct, kw_only=True, frozen=True):
         restart: Those that hold after a restart only, each with both values: ``mesh.port (40001 instead of 0)``.
         notes: Doubtful settings, each ready to read.
         problem: Why the settings cannot be used, with the file's line, and nothing has changed; empty if they can.
+        code: The problem's code (``core.codes``).
     """
 
     file: str = ""
@@ -47,6 +48,7 @@ class ReloadReply(msgspec.Struct, kw_only=True, frozen=True):
     restart: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     problem: str = ""
+    code: str = ""
 
 
 # --- Encodes large JSON values in pieces, between which other work can be done --------------------------------------

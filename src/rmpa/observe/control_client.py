@@ -212,7 +212,7 @@ def read_reply(path: Path, op: str, line: bytes, type: type[_T]) -> _Result[_T]:
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         refused = ControlReply.parse(line)
         if not refused.ok:
-            raise PeerRefused(agent, refused.error, refused.remedy) from None
+            raise PeerRefused(agent, refused.error, refused.remedy, code=refused.code or "refused") from None
         raise RemoteProtocolError(f"{agent} answers {op} in another way: {error}; is it older?") from None
     return reply
 

@@ -181,7 +181,8 @@ _LEVELS: Final = {
 
 def diagnostic_status(check: Check, module: str) -> DiagnosticStatus:
     """A check as an element of ``/diagnostics``; ``module`` is the agent's name, which stands as hardware id."""
-    return DiagnosticStatus(_LEVELS[check.level], check.name, check.message, module, check.evidence)
+    evidence = check.evidence | ({"code": check.code} if check.code else {})
+    return DiagnosticStatus(_LEVELS[check.level], check.name, check.message, module, evidence)
 
 
 class Health:
@@ -426,7 +427,7 @@ class Diagnostics(PublicationEvents):
         node.add_publication(self._publication)
         code, text, _ = self._core.call("registerPublisher", node.name, TOPIC, ARRAY_TYPE, node.uri)
         if code != 1:
-            _log.error("! the local core does not take %s: %s", TOPIC, text)
+            _log.error("! the ROS core does not accept %s: %s [core-refuses]", TOPIC, text)
         self._again()
 
     def close(self) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 import msgspec
 
+from rmpa.core import codes
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_problem
 from rmpa.trust.permissions import TrustReason, not_of_this_mesh
@@ -132,6 +133,7 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         direct_in: Subscribers here that are connected to its nodes directly.
         direct_out: Its subscribers that may connect to nodes here directly.
         invite: While it is pending: the command that makes the invitation, at the authority; else empty.
+        code: Why it is not linked, by ``core.codes``; empty where nothing is wrong.
     """
 
     name: str
@@ -154,6 +156,14 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     direct_in: int = 0
     direct_out: int = 0
     invite: str = ""
+    code: str = ""
+
+    def __post_init__(self) -> None:
+        """Take the code from the state, where there is something to tell."""
+        told = self.last_error or self.conflicts or self.state not in ("linked", "linking", "relayed")
+        code = codes.PEER_STATES.get(self.state, "name-conflict" if self.conflicts else "")
+        if told and code and not self.code:
+            msgspec.structs.force_setattr(self, "code", code)
 
 
 # --- Modules that knock ---------------------------------------------------------------------------------------------
@@ -410,6 +420,7 @@ class Check(msgspec.Struct, frozen=True, omit_defaults=True):
         remedy: What to do, where something is to be done.
         where: Which of several: an interface, a variable, a peer; empty where there is one only.
         evidence: Figures by their name, as ``/diagnostics`` shows them; units stand in the names.
+        code: What is wrong, by ``core.codes``: that of the name where none is given; empty where nothing is wrong.
     """
 
     name: str
@@ -418,6 +429,17 @@ class Check(msgspec.Struct, frozen=True, omit_defaults=True):
     remedy: str = ""
     where: str = ""
     evidence: dict[str, str] = {}
+    code: str = ""
+
+    def __post_init__(self) -> None:
+        """Take the code from the name."""
+        if not self.code and self.level in (WARN, FAIL) and (code := codes.CHECKS.get(self.name)):
+            msgspec.structs.force_setattr(self, "code", code)
+
+    @property
+    def line(self) -> str:
+        """The text with its code."""
+        return f"{self.text} [{self.code}]" if self.code else self.text
 
     @classmethod
     def from_message(cls, name: str, level: CheckLevel, message: str, remedy: str = "", where: str = "") -> Self:

@@ -368,7 +368,7 @@ class Adapter(RuntimePart):
 
     def refuse(self, client: str, text: str) -> None:
         """Publish a response that the client's last message is invalid; ``text`` is the reason."""
-        _log.warning("! %s: %s: %s", self._name, printable(client), text)
+        _log.warning("! %s: %s: %s [resource-trouble]", self._name, printable(client), text)
         self.clients.refuse(client, text)
         self._tell()
 
@@ -437,7 +437,7 @@ class Adapter(RuntimePart):
             return
         except Exception as error:  # noqa: BLE001 - the top of the user's code
             why = f"{type(error).__name__}: {error}"
-            _log.warning("! %s: profile %s: %s", self._name, profile, why)
+            _log.warning("! %s: profile %s: %s [resource-trouble]", self._name, profile, why)
         self._runtime.release(drop=bool(why))
         self._tasks.resume()
         self.observed.clear()
@@ -471,7 +471,7 @@ class Adapter(RuntimePart):
 
     def end(self, hung: HungError) -> None:
         """Raise an alarm about a function that has exceeded its time-out, and let the resource end."""
-        _log.error("! %s: %s", self._name, hung)
+        _log.error("! %s: %s [%s]", self._name, hung, hung.code)
         self.hung = hung
         values = {"before": self.adaptation.profile, "after": "", "cleared": "false"}
         self._report("alarms", DiagnosticLevel.ERROR, str(hung), values)
@@ -544,7 +544,10 @@ class Adapter(RuntimePart):
             self._report(topic, level, message, values)
 
     def _log_change(self, text: str, *, over: bool) -> None:
-        _log.log(logging.INFO if over else logging.WARNING, "%s %s: %s", "=" if over else "!", self._name, text)
+        if over:
+            _log.info("= %s: %s", self._name, text)
+        else:
+            _log.warning("! %s: %s [resource-trouble]", self._name, text)
 
     def _report(self, topic: str, level: DiagnosticLevel, message: str, values: Mapping[str, str]) -> None:
         name = self._runtime.resource.name

@@ -272,7 +272,7 @@ class Demands(RuntimePart):
             try:
                 outputs = Descriptor.parse(str(received.message.data)).outputs
             except RmpaError as error:
-                _log.warning("! %s: %s: %s", self._runtime.node.name, name, error)
+                _log.warning("! %s: %s: %s [resource-trouble]", self._runtime.node.name, name, error)
             else:
                 self._first[name] = outputs[0].name if outputs else ""
 
@@ -284,9 +284,11 @@ class Demands(RuntimePart):
         async for answer in client.answers():
             demand.answer = answer
             if last != (last := (answer.level, answer.message)):
-                well = answer.level is DiagnosticLevel.OK
-                texts = "=" if well else "!", self._runtime.node.name, demand.resource, printable(answer.message)
-                _log.log(logging.INFO if well else logging.WARNING, "%s %s: %s says: %s", *texts)
+                texts = self._runtime.node.name, demand.resource, printable(answer.message)
+                if answer.level is DiagnosticLevel.OK:
+                    _log.info("= %s: %s says: %s", *texts)
+                else:
+                    _log.warning("! %s: %s says: %s [resource-trouble]", *texts)
 
 
 async def _ended(task: asyncio.Task[None]) -> None:

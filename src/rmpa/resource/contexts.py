@@ -99,7 +99,7 @@ class Contexts(RuntimePart):
             try:
                 await self._switch(self.chosen)
             except RmpaError as error:
-                _log.warning("! %s: %s", node.name, error)
+                _log.warning("! %s: %s [resource-trouble]", node.name, error)
                 self.chosen = ""
         if self._fields:
             self._spawn(self._find_topics(), "find topics of rules")
@@ -220,7 +220,7 @@ class Contexts(RuntimePart):
             try:
                 await self._switch(self._wanted(self._loop.time()))
             except RmpaError as error:
-                _log.warning("! %s: %s", self._runtime.node.name, error)
+                _log.warning("! %s: %s [resource-trouble]", self._runtime.node.name, error)
                 self._retry = self._loop.time() + limits.CONTEXT_RETRY
 
     def _choice_received(self, message: Received) -> None:
@@ -316,5 +316,5 @@ class _TopicField:
             problem = str(error)
         before, self.problem = self.problem, f"{self._reference}: {problem}" if problem else ""
         if problem and self.problem != before:
-            _log.warning("! rule over %s", self.problem)
+            _log.warning("! the context rule with %s [resource-trouble]", self.problem)
         return None if problem else value

@@ -95,7 +95,9 @@ class ResourceNode:
             for output in missing:
                 if not await self._learn(output) and output.type_name not in logged:
                     logged.add(output.type_name)
-                    _log.warning("! %s waits for the type of output %s: %s", name, output.name, output.problem)
+                    _log.warning(
+                        "! %s waits for the type of output %s: %s [unknown-type]", name, output.name, output.problem
+                    )
             if any(output.known is None for output in missing):
                 await asyncio.sleep(TYPE_LOOK)
 
@@ -225,7 +227,7 @@ class ResourceNode:
                     await outcome
         except Exception as error:  # noqa: BLE001 - the top of the user's code
             why = f"{type(error).__name__}: {error}"
-            _log.warning("! %s: %s: %s", runtime.node.name, transition, why)
+            _log.warning("! %s: %s: %s [resource-trouble]", runtime.node.name, transition, why)
         refused = bool(why) and transition in ("configure", "activate")
         self._under_way = ""
         runtime.state = runtime.state if refused else target
@@ -240,7 +242,7 @@ class ResourceNode:
     def _deactivate_soon(self, why: str) -> None:
         over = self._deactivating is None or self._deactivating.done()
         if over and self.runtime.state is _ACTIVE and not self._under_way:
-            _log.error("! %s is deactivated: %s", self.runtime.node.name, why)
+            _log.error("! %s is deactivated: %s [resource-trouble]", self.runtime.node.name, why)
             self._deactivating = asyncio.get_running_loop().create_task(self.deactivate(), name="deactivate")
 
     def _state(self, now: float, now_ns: int) -> SavedState:

@@ -238,7 +238,7 @@ class Reconfigure(RuntimePart):
             try:
                 value = checked(name, found[name], self._known)
             except ConfigError as error:
-                _log.warning("! %s: the parameter server: %s; it is left out", node.name, error)
+                _log.warning("! %s: from the parameter server: %s; it is ignored [invalid-value]", node.name, error)
                 continue
             if name == PROFILE:
                 self._adapter.preset = str(value)

@@ -233,7 +233,9 @@ class Runtime:
             if (item.name, caller) not in self._unusable:
                 self._unusable.add((item.name, caller))
                 text = "its messages are dropped; this is said once"
-                _log.warning("! %s: input %s from %s: %s; %s", self.node.name, item.name, caller, error, text)
+                _log.warning(
+                    "! %s: input %s from %s: %s; %s [unknown-type]", self.node.name, item.name, caller, error, text
+                )
             return False
         if item.known is None:
             item.known = kind
@@ -302,7 +304,7 @@ class Runtime:
             self._refused[output.name] += 1
             if self._refused[output.name] == 1:
                 text = "is refused while the resource is not active; this is said once"
-                _log.warning("! %s: what is published on %s %s", self.node.name, output.name, text)
+                _log.warning("! %s: what is published on %s %s [resource-trouble]", self.node.name, output.name, text)
         elif self._holders:
             self._held.append((output, raw, caller))
             self._held_bytes += len(raw)

@@ -345,7 +345,7 @@ class Persistence(RuntimePart):
         except OSError as error:
             self._set_problem(str(error) or "it does not answer")
         for text in lost:
-            _log.warning("! %s: not remembered: %s", name, text)
+            _log.warning("! %s: not restored: %s [state-lost]", name, text)
         for key, value in found.parameters.items():
             if not resource.parameters[key].given:
                 resource.parameters[key].value = value
@@ -414,7 +414,7 @@ class Persistence(RuntimePart):
         except (msgspec.DecodeError, RecursionError) as error:
             what, why = "damaged", f"is damaged ({error})"
         aside = set_aside(self._path, what)
-        _log.warning("! %s %s; it is set aside as %s and begun anew", self._path, why, aside.name)
+        _log.warning("! %s %s; it is kept as %s, and a new file begins [state-lost]", self._path, why, aside.name)
         return SavedState()
 
     def _replace(self, content: bytes) -> None:
@@ -454,6 +454,6 @@ class Persistence(RuntimePart):
         """Log a problem when it begins and when it is over."""
         before, self._problem = self._problem, problem
         if problem and not before:
-            _log.warning("! %s: nothing is kept: %s", self._path, problem)
+            _log.warning("! %s: nothing is kept: %s [state-lost]", self._path, problem)
         elif before and not problem:
             _log.info("= %s: everything is kept again", self._path)

@@ -225,7 +225,7 @@ class TaskRunner:
         self._in_a_row += 1
         before, self.problem = self.problem, f"task {self.task.name} failed: {type(error).__name__}: {error}"
         if self.problem != before:  # a repeated error is logged once
-            _log.warning("! task %s failed:", self.task.name, exc_info=error)
+            _log.warning("! task %s failed [resource-trouble]", self.task.name, exc_info=error)
         return restart_delay(self._in_a_row)
 
 
@@ -327,7 +327,7 @@ class ThreadTaskRunner(TaskRunner):
             async with asyncio.timeout(limits.TASK_END_TIMEOUT):
                 await self._done.wait()
         except TimeoutError:
-            _log.warning("! task %s does not end; it is left behind", self.task.name)
+            _log.warning("! task %s does not end; the program goes on without it [ending-slowly]", self.task.name)
 
     def _in_loop(self, function: Callable[..., object], *args: object) -> None:
         with contextlib.suppress(RuntimeError):  # the event loop has ended already
@@ -403,7 +403,7 @@ class Tasks(RuntimePart):
 
     def report(self, problem: str) -> str:
         """Log a new problem of a task, and return it."""
-        _log.warning("! %s: %s", self._runtime.node.name, problem)
+        _log.warning("! %s: %s [resource-trouble]", self._runtime.node.name, problem)
         return problem
 
     def problems(self) -> tuple[list[str], list[str]]:

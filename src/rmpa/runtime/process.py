@@ -101,7 +101,9 @@ class LogWriter:
                 self._write()
             if self.lost:
                 lost, self.lost = self.lost, 0
-                _log.warning("! %d log lines were lost: the reader of the log has stopped for a while", lost)
+                _log.warning(
+                    "! %d log lines were lost: the program that reads the log had stopped [log-lines-lost]", lost
+                )
 
     def _write(self) -> None:
         lines = [self._waiting.popleft() for _ in range(min(len(self._waiting), limits.LOG_BATCH))]
@@ -155,7 +157,7 @@ def apply(priority: int, *, lock_memory: bool) -> tuple[str, ...]:
         asked["memory lock"] = _lock_memory()
     for name, problem in asked.items():
         if problem:
-            _log.warning("! realtime: no %s: %s. To have it: %s", name, problem, REMEDY)
+            _log.warning("! realtime: no %s: %s; to get it: %s [realtime-denied]", name, problem, REMEDY)
         else:
             _log.info("= realtime: %s", name)
     return tuple(f"no {name}: {problem}" if problem else name for name, problem in asked.items())
@@ -207,7 +209,7 @@ def _lock_memory() -> str:
 SERVICE_VARIABLES: Final = ("NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC")
 # Seconds after which a sign of life that could not be sent is tried again.
 _WATCHDOG_RETRY: Final = 1.0
-_CANNOT_TELL: Final = "the service manager at NOTIFY_SOCKET=%s cannot be told %s: %s"
+_CANNOT_TELL: Final = "! the service manager at NOTIFY_SOCKET=%s cannot be told %s: %s [watchdog]"
 
 
 def notify_service_manager(state: str) -> bool:

@@ -190,7 +190,7 @@ class Membership:
         try:
             self.save(files_of.DENY if kind is Document.DENY else files_of.KEYS, data)
         except StartError as error:
-            _log.error("! %s", error)
+            _log.error("! %s [%s]", error, error.code)
         return True
 
     def take_grant(self, grant: CertificateGrant) -> None:
@@ -512,12 +512,16 @@ class MeshAuthority:
             if invitation.name == name:
                 self.book.withdraw(invitation.token_id)
         if open_to_all := sum(not each.name and each.expires > self.wall() for each in unused):
-            _log.warning("! %d open tokens are for any name: %s can join again with one", open_to_all, name)
+            _log.warning(
+                "! %d unused tokens are for any name: %s can join again with one of them [member-revoked]",
+                open_to_all,
+                name,
+            )
         try:
             self._store.save_issued(self.issued)
             self.save_tokens()
         except StartError as error:
-            _log.error("! %s is revoked, but not all files are written: %s", name, error)
+            _log.error("! %s is revoked, but not all files are written: %s [directory-unusable]", name, error)
         return deny
 
     def rotate(self, *, revoking: bool = False) -> int:

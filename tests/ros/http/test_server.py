@@ -151,7 +151,7 @@ async def test_faults_bugs_and_unwritable_values(server: XmlRpcServer, caplog: p
     for method, code, text in (("fault", 7, "as asked"), ("bug", 1, "KeyError"), ("unsayable", 1, "cannot be said")):
         with pytest.raises(RosFault, match=text) as caught:
             await call(uri, method)
-        assert caught.value.code == code
+        assert caught.value.number == code
     assert server.counters["xmlrpc.failed"] == 2
     assert "KeyError" in caplog.text
 

@@ -150,7 +150,7 @@ def test_golden_response_and_fault() -> None:
     assert parse_response(response) == [1, "ok", []]
     with pytest.raises(RosFault) as caught:
         parse_response(serialize_fault(4, "no <such> \x01 method"))
-    assert (caught.value.code, caught.value.text) == (4, "no <such> ? method")
+    assert (caught.value.number, caught.value.text) == (4, "no <such> ? method")
 
 
 @pytest.mark.trap(27)

@@ -165,7 +165,7 @@ class Params(Part):
         except UnreachableError:
             pass  # reported by the core itself
         except RmpaError as error:
-            _log.warning("! parameters cannot be looked at: %s", error)
+            _log.warning("! parameters cannot be read: %s [param-trouble]", error)
         except Exception:  # noqa: BLE001 - a task's top
             _log.exception("! looking at parameters failed")
         finally:

@@ -201,7 +201,7 @@ class ServicePaths(Paths["RemoteService"]):
         for endpoint in () if session.same_machine else endpoints:
             self._shared.counters.add("direct.service_stopped")
             if problem := end_all(connections(remote=endpoint)):
-                text = "! %s: calls under way to %s:%d may hang: they cannot be ended (%s); see rmpa doctor"
+                text = "! %s: calls to %s:%d may hang: they cannot be ended (%s); see rmpa doctor [stale-connections]"
                 _log.warning(text, session.link.name, *endpoint, problem)
 
     # --- carrying out --------------------------------------------------------------------------------------------

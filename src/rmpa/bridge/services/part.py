@@ -289,7 +289,7 @@ class Services(GraphPart):
             return  # another node was first: the scan hides this service, or did so already
         code, status, _ = self._core.call("registerService", proxy.name, service, proxy.service_uri, proxy.uri)
         if code != 1:
-            _log.error("! the local core does not take %s of %s: %s", service, proxy.name, status)
+            _log.error("! the ROS core does not accept %s of %s: %s [core-refuses]", service, proxy.name, status)
 
     def _is_taken(self, service: str, proxy: SlaveNode) -> bool:
         return any(node != proxy.name for node in self._core.state().services.get(service, {}))

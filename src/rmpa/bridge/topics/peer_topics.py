@@ -110,7 +110,7 @@ class PeerTopic(PublicationEvents):
         node = self.node
         code, status, _ = self._peer.core.call("registerPublisher", node.name, self.topic, self.type, node.uri)
         if code != 1:
-            _log.error("! the local core does not take %s of %s: %s", self.topic, node.name, status)
+            _log.error("! the ROS core does not accept %s of %s: %s [core-refuses]", self.topic, node.name, status)
 
     def first_subscriber(self) -> None:
         """The source is wanted."""

@@ -189,7 +189,7 @@ class Ros2Context(OwnedTasks):
             if len(self.problems) >= limits.ROS2_PROBLEMS_MAX:
                 del self.problems[next(iter(self.problems))]
             self.problems[subject] = text
-            _log.warning("ROS 2: %s: %s", subject, text)
+            _log.warning("! ROS 2: %s: %s [no-conversion]", subject, text)
 
 
 class OfferedService:
@@ -287,7 +287,7 @@ class OfferedService:
             attachment = Ros2Attachment(asked.sequence, time.time_ns(), asked.gid)
             return self._pair.response.to_ros2(response), attachment.serialize()
         except RmpaError as error:
-            _log.warning("a call of %s by ROS 2 failed: %s", self.source.here, error)
+            _log.warning("! a call of %s by ROS 2 failed: %s [service-failed]", self.source.here, error)
             raise
 
 

@@ -143,7 +143,7 @@ class SiteNeighbour:
                     _log.info("= site %s is joined", site)
             for site in before:
                 if site not in self._sites:
-                    text = "! site %s is unreachable: its gateway has ended, or the way to it; `rmpa site list`"
+                    text = "! site %s is unreachable; `rmpa site list` shows all [site-unreachable]"
                     _log.warning(text, site)
             self.exports.sites_seen(self._sites)
             self.history.seen(self._sites)

@@ -57,7 +57,7 @@ class SerialWorker:
                     job()
             except Exception as error:  # noqa: BLE001 - one declaration that fails must not stop the others
                 if not self._discard:
-                    _log.warning("zenoh: %s", error)
+                    _log.warning("! zenoh: %s [zenoh-trouble]", error)
             del job
 
 

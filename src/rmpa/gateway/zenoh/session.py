@@ -302,7 +302,7 @@ class OpenSession:
                     cancellation_token=cancellation,
                 )
             except zenoh.ZError as error:
-                _log.warning("zenoh: the query %s was not sent: %s", selector, error)
+                _log.warning("! zenoh: the query %s was not sent: %s [zenoh-trouble]", selector, error)
                 pending.finish()
 
         self._queries.submit(ask)
@@ -345,7 +345,7 @@ class OpenSession:
         for each in (closing.thread, self._declarations.thread, self._queries.thread, *lanes):
             each.join(_CLOSE_MAX)
             if each.is_alive():
-                _log.warning("zenoh: a thread of the session did not end within %g s", _CLOSE_MAX)
+                _log.warning("! zenoh: a thread of the session did not end within %g s [ending-slowly]", _CLOSE_MAX)
 
     def _direct(self, callback: Callable[[Any], None], ended: Callable[[], None] | None = None) -> Any:
         """A callback that Zenoh calls in its own thread.
@@ -493,7 +493,7 @@ async def open_trusted_session(settings: Settings) -> OpenSession:
     """
     config, note = session_config(settings)
     if note:
-        _log.warning("! zenoh: %s", note)
+        _log.warning("! zenoh: %s [zenoh-trouble]", note)
 
     def changed() -> bool:
         """Whether the table of access would be another one now: a module was revoked, or has joined since."""

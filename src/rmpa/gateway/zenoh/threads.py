@@ -245,7 +245,7 @@ class ArrivalQueue(BoundedQueue[_T]):
         try:
             self._deliver(item)
         except Exception:  # noqa: BLE001 - the last frame of the loop: others must get theirs
-            _log.exception("zenoh: what arrived could not be handled")
+            _log.exception("! zenoh: what arrived could not be handled")
 
 
 class Arrivals:
@@ -544,6 +544,6 @@ class SendingLane:
         except self._failures as error:
             if not self._failed:
                 self._failed = True
-                _log.warning("zenoh: a message by %s was not sent: %s", key, error)
+                _log.warning("! zenoh: a message by %s was not sent: %s [zenoh-trouble]", key, error)
             return False
         return True

@@ -227,7 +227,7 @@ class Mesh(LinkOwner):
     def _distrusted(self, connection: Connection, refuse: Refuse, *, by_us: bool) -> None:
         """Show a refusal for trust that concerns a connection which the peer dialled, or which was up."""
         if not by_us:
-            _log.warning("! %s refuses a link: %s", connection.name, refuse.text)
+            _log.warning("! %s refuses a link: %s [peer-refused]", connection.name, refuse.text)
         link = self._links.get(connection.id)
         if link is not None and link.used:
             # Not when its socket is closed: a revoked peer need not answer the refusal.
@@ -311,7 +311,7 @@ class Mesh(LinkOwner):
                 link.use(used=False)
                 self.handlers.down(link, reason)
             case ("refused", identity, refuse):
-                _log.warning("! %s refuses a link: %s", identity, refuse.text)
+                _log.warning("! %s refuses a link: %s [peer-refused]", identity, refuse.text)
 
     def _due(self, now: float) -> None:
         self._peering.handle_timer(now)

@@ -478,7 +478,7 @@ def judge_routes(routes: Mapping[str, str]) -> Iterator[Check]:
     remedy = "`ip route get ADDRESS`; a gateway is missing, or the interface of that network is down"
     for target, problem in routes.items():
         if problem:
-            yield Check("route", FAIL, f"there is no way: {problem}", remedy, where=target)
+            yield Check("route", FAIL, f"there is no route: {problem}", remedy, where=target, code="no-route")
         elif len(routes) <= limits.DOCTOR_PEERS_LISTED:
             yield Check("route", OK, "there is a way", where=target)
     reached = sum(not problem for problem in routes.values())

@@ -222,7 +222,9 @@ class Rosout:
         while self._node is None:
             if (holder := self._core.registrations.node_api(NODE)) is not None:
                 if not told:
-                    _log.warning("= another node is %s now, at %s; ours waits until it leaves", NODE, holder)
+                    _log.warning(
+                        "= another node has the name %s, at %s; ours waits until it ends [name-taken]", NODE, holder
+                    )
                     told = True
                 with contextlib.suppress(TimeoutError):
                     # The end of a node that only subscribed to parameters is not reported, so it is polled for.
@@ -233,7 +235,7 @@ class Rosout:
             try:
                 await self._begin()
             except (RmpaError, OSError) as error:
-                _log.error("! %s cannot be started again yet: %s", NODE, error)
+                _log.error("! %s cannot be started again; it is tried again: %s [cannot-start]", NODE, error)
                 await asyncio.sleep(ROSOUT_LOOK)
         self._core.counters.add("rosout.restarted")
         _log.info("= %s is back at %s", NODE, self.uri)

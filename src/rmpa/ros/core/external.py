@@ -242,7 +242,9 @@ class ExternalCore(Core):
                 async with asyncio.timeout(MASTER_FAREWELL):
                     await asyncio.shield(self._task)
             if self._writes and not self._problem:
-                _log.warning("! the roscore at %s was not told of %d changes", self.uri, len(self._writes))
+                _log.warning(
+                    "! the roscore at %s was not told of %d changes [core-slow]", self.uri, len(self._writes)
+                )
         tasks = [task for task in (self._task, self._revival) if task is not None]
         for task in tasks:
             task.cancel()
@@ -342,7 +344,9 @@ class ExternalCore(Core):
         self._wake.set()
         if len(self._writes) > MASTER_WRITES_MAX:
             # Dropping all is cheaper than choosing: the next poll finds what is missing.
-            _log.warning("! the roscore at %s is slow: %d changes are told anew", self.uri, len(self._writes))
+            _log.warning(
+                "! the roscore at %s is slow: %d changes are sent again [core-slow]", self.uri, len(self._writes)
+            )
             self._drop_writes()
             self._poll_soon()
 
@@ -387,7 +391,9 @@ class ExternalCore(Core):
     def _refused(self, write: mirror.Call, error: Exception) -> None:
         self.counters.add("master.refused")
         method, params = write
-        _log.error("! the roscore at %s does not take %s%s: %s", self.uri, method, brief(params), error)
+        _log.error(
+            "! the roscore at %s does not accept %s%s: %s [core-refuses]", self.uri, method, brief(params), error
+        )
         self._mirror.forget(write)
         self._report_changes()
 
@@ -426,7 +432,7 @@ class ExternalCore(Core):
         if self._ending:
             return True
         if self._problem and self._task is not None:
-            _log.warning("= the roscore at %s answers", self.uri)
+            _log.warning("= the roscore at %s answers again [core-slow]", self.uri)
         self._problem = ""
         self._take(survey, seen)
         return True
@@ -448,7 +454,11 @@ class ExternalCore(Core):
     def _take(self, survey: mirror.Survey, seen: int) -> None:
         if other := self._mirror.taken(survey, self._own_node, seen):
             if not self._other_agent:
-                _log.error("! another agent (its node at %s) is at the roscore %s too: end one", other, self.uri)
+                _log.error(
+                    "! another agent (its node is %s) uses the roscore %s too: end one of them [core-refuses]",
+                    other,
+                    self.uri,
+                )
             self._other_agent, self._other_until = other, self._loop.time() + _MASTER_OTHER_AGENT
         again = self._mirror.update(survey, seen)
         self._report_changes()
@@ -473,7 +483,9 @@ class ExternalCore(Core):
     def _lost(self, error: RmpaError) -> None:
         problem = str(error)
         if not self._problem or self._task is None:
-            _log.warning("! the roscore at %s: %s; it is waited for, and what flows goes on", self.uri, problem)
+            _log.warning(
+                "! the roscore at %s: %s; rmpa waits for it, open connections go on [core-slow]", self.uri, problem
+            )
         self._problem = problem
         self._drop_writes()
 

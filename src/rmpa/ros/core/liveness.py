@@ -213,7 +213,7 @@ class Liveness:
         except ConnectionRefusedError:
             await asyncio.sleep(NODE_RECHECK_DELAY)
             if await refuses(api) and self._nodes().get(node) == api:
-                _log.warning("= node %s at %s is dead: no process listens there", node, api)
+                _log.warning("= node %s at %s is dead: no process listens there [node-gone]", node, api)
                 self._on_dead(node, api)
             return
         except OutOfDescriptors:
@@ -234,13 +234,13 @@ class Liveness:
         was_withdrawn = known is not None and known.withdrawn
         if not problem:
             if was_withdrawn:
-                _log.warning("= node %s can be reached again", node)
+                _log.warning("= node %s can be reached again [node-unreachable]", node)
             return
         since = known.since if known is not None and known.api == api else now
         withdrawn = now - since >= limits.NODE_UNREACHABLE_AFTER
         self.unreachable[node] = Unreachable(api, problem, since, withdrawn)
         if withdrawn and not was_withdrawn:
-            text = "! node %s at %s cannot be reached (%s): peers are not offered it until it can"
+            text = "! node %s at %s cannot be reached (%s); until then peers are not offered it [node-unreachable]"
             _log.warning(text, node, api, problem)
 
 
@@ -479,5 +479,5 @@ class Notifier:
             _log.info("= %s is not asked to end: %s is at %s now", node, found, api)
             self._counters.add("notify.stale")
             return
-        _log.warning("> %s at %s is asked to end: another node has its name", node, api)
+        _log.warning("> %s at %s is asked to end: another node has its name [node-killed]", node, api)
         await call(api, "shutdown", MASTER_ID, f"[{node}] Reason: new node registered with same name", use=Use.CORE)

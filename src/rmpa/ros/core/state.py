@@ -194,7 +194,7 @@ class CoreState:
             self._unread = True
             why = self._reason(error)
             self._problem = why if isinstance(error, OSError) else ""
-            _log.warning("! the core begins empty: %s; before it is written anew, it is set aside", why)
+            _log.warning("! the core starts empty: %s; the old file is kept under another name [state-lost]", why)
             return
         if self._keep == "never":
             self._drop(state, "core.keep is never")
@@ -206,7 +206,9 @@ class CoreState:
             return
         if not left and state.params.pop(_SIMULATED, None) is not None:
             # With that parameter and no clock, a node that starts would wait for ever.
-            _log.warning("= /use_sim_time of the run before is not taken up: no node of it is left")
+            _log.warning(
+                "= /use_sim_time of the run before is not restored: no node of that run is left [state-lost]"
+            )
         self._api.parameters.set("/", state.params)
         self._params = sum(1 for name in self._api.parameters.names() if name not in _OF_A_CORE)
 
@@ -372,7 +374,7 @@ class CoreState:
             await in_thread(lambda: self._put(StoredState(FORMAT, boot, nodes, tree)), "core state")
         except (OSError, ValueError, TypeError, OverflowError, RecursionError) as error:
             if not self._problem:
-                _log.warning("! nothing of the core is kept over a restart: %s", self._reason(error))
+                _log.warning("! the core keeps nothing when it restarts: %s [state-lost]", self._reason(error))
             self._problem = self._reason(error)
         else:
             if self._problem:
@@ -392,7 +394,7 @@ class CoreState:
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if self._unread:
             with contextlib.suppress(FileNotFoundError):
-                _log.warning("! %s is set aside as %s", self.path, set_aside(self.path, "before").name)
+                _log.warning("! %s is kept as %s [state-lost]", self.path, set_aside(self.path, "before").name)
             self._unread = False
         new = self.path.with_name(f"{self.path.name}.new")
         with open(new, "wb", opener=lambda path, flags: os.open(path, flags, 0o600)) as file:

@@ -156,7 +156,7 @@ class MasterApi:
     # --- the node's own API -----------------------------------------------------------------------------------
 
     def _shutdown(self, caller_id: str, reason: XmlRpcValue) -> RosReply:
-        _log.warning("< %s asks this core to end: %s", caller_id, brief(reason))
+        _log.warning("< %s asks this core to end: %s [core-asked-to-end]", caller_id, brief(reason))
         self._on_shutdown(f"{caller_id}: {brief(reason)}")
         return RosReply(SUCCESS, "the core ends", 0)
 

@@ -135,7 +135,9 @@ class ServiceEndpoint:
         *,
         description: tcpros.ServiceDescription | None = None,
         timeout: float = config_limits.SERVICE_TIMEOUT,
-        on_mismatch: Callable[[Mapping[str, str], str], None] = lambda _, text: _log.warning("! %s", text),
+        on_mismatch: Callable[[Mapping[str, str], str], None] = lambda _, text: _log.warning(
+            "! %s [type-mismatch]", text
+        ),
     ) -> None:
         self.service = service
         self.caller_id = caller_id
@@ -362,7 +364,7 @@ class _ClientConnection:
             f"request of {size} bytes to service [{self._endpoint.service}] exceeds the limit of "
             f"{limits.SERVICE_MESSAGE_MAX}"
         )
-        _log.warning("! %s: a %s", tcpros.printable(self.caller_id), text)
+        _log.warning("! %s: a %s [message-too-long]", tcpros.printable(self.caller_id), text)
         self._discard = size
         self._respond(False, text.encode())
         self._watch(self._connection.bytes_in)
@@ -441,7 +443,9 @@ class _ClientConnection:
 
     def _left(self, _connection: AcceptedConnection, error: Exception | None) -> None:
         if error is not None and not isinstance(error, OSError):
-            _log.warning("! %s: %s: %s", self._endpoint.service, tcpros.printable(self.caller_id), error)
+            _log.warning(
+                "! %s: %s: %s [protocol-error]", self._endpoint.service, tcpros.printable(self.caller_id), error
+            )
         self._release()
 
     def _release(self) -> None:

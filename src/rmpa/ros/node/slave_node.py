@@ -332,7 +332,7 @@ class LoggerServices:
             node.add_service(endpoint)
             code, text, _ = self._call("registerService", node.name, endpoint.service, node.service_uri, node.uri)
             if code != 1:
-                _log.error("! the local core does not take %s: %s", endpoint.service, text)
+                _log.error("! the ROS core does not accept %s: %s [core-refuses]", endpoint.service, text)
 
     def close(self) -> None:
         """Unregister, and stop serving."""

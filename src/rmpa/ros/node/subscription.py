@@ -553,7 +553,7 @@ class Subscription:
     def _oversized(self, connection: PublisherConnection, size: int) -> None:
         if connection.oversized == 1:
             _log.warning(
-                "! %s: a message of %d bytes of %s is left out: more than %d; others come as usual",
+                "! %s: a message of %d bytes of %s is left out: more than %d; shorter ones come [message-too-long]",
                 self.topic,
                 size,
                 connection.uri,

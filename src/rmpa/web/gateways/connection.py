@@ -485,7 +485,7 @@ class ClientConnection:
             return
         self.queue.push(stream, entry, size + _OVERHEAD, self._priority(stream.topic) if stream else 0)
         if self.queue.overflow:
-            _log.warning("! %s does not read its answers, and is disconnected", self._session.name)
+            _log.warning("! %s does not read its answers, and is disconnected [reader-slow]", self._session.name)
             self._abort()
         self._wake.set()
 

@@ -385,6 +385,8 @@ def _socket_of(transport: asyncio.Transport) -> socket.socket | None:
     try:
         found: socket.socket = sock.dup()
     except OSError as error:
-        _log.warning("! no further descriptor for a client, which costs a copy of each message: %s", error)
+        _log.warning(
+            "! no file descriptor is left for a client, so each message is copied: %s [out-of-descriptors]", error
+        )
         return None
     return found

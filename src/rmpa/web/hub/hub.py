@@ -354,4 +354,4 @@ class ClientCounts:
 
     @staticmethod
     def _refused(error: RmpaError) -> None:
-        _log.warning("! %s", error)
+        _log.warning("! %s [%s]", error, error.code)

@@ -267,11 +267,11 @@ class NodeLink:
                     finally:
                         self.node = None
                         self._ready.clear()
-                _log.warning("! the node %s was shut down; it is started anew", node.name)
+                _log.warning("! the node %s was shut down; it is started again [node-killed]", node.name)
                 self.problem = "the node was shut down, and is started anew"
             except RmpaError as error:
                 if str(error) != self.problem:
-                    _log.warning("! %s", error)
+                    _log.warning("! %s [%s]", error, error.code)
                 self.problem = str(error)
             except Exception as error:  # noqa: BLE001 - a task's top: without it the server has no node until it ends
                 _log.exception("! the node of the web server failed")

@@ -283,10 +283,10 @@ class MonitorSession(Session):
         """What the page ordered cannot be done: a watch, a question, or (0) neither."""
         remedy = str(getattr(error, "remedy", ""))
         text = str(error).removesuffix(f"; {remedy}") if remedy else str(error)
-        self._refuse(id_, text, remedy)
+        self._refuse(id_, text, remedy, error.code)
 
-    def _refuse(self, id_: int, error: str, remedy: str = "") -> None:
-        self._send({"op": "failed", "id": id_, "error": error, "remedy": remedy})
+    def _refuse(self, id_: int, error: str, remedy: str = "", code: str = "refused") -> None:
+        self._send({"op": "failed", "id": id_, "error": error, "remedy": remedy, "code": code})
 
     # --- states and details -----------------------------------------------------------------------------------
 

@@ -310,6 +310,7 @@ def _module(peer: PeerInfo, taken: float, rates: Sequence[float]) -> Tree:
         "state": state,
         "since": taken - ago,
         "error": "; ".join(filter(None, ("" if link else peer.last_error, *peer.conflicts))),
+        "code": peer.code,
         "guid": peer.guid,
         "source": peer.source,
         "via": peer.via,

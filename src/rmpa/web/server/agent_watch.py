@@ -103,7 +103,7 @@ class AgentWatch:
         if snapshot is not None and not was_up:
             _log.info("= the agent %s answers", snapshot.agent.name)
         elif snapshot is None and (before is None or was_up):
-            _log.warning("! the agent does not answer: %s", problem)
+            _log.warning("! the agent does not answer: %s [no-agent]", problem)
         return made
 
     async def close(self) -> None:

@@ -118,7 +118,9 @@ def certificate_files(cert: str, key: str, store: TrustStore | None) -> Certific
     try:
         store.load()
     except StartError as error:
-        _log.warning("! rmpa web serves HTTPS in a secured mesh: run it as the agent's user, or name a --cert")
+        _log.warning(
+            "! rmpa web serves HTTPS in a secured mesh: run it as the agent's user, or name a --cert [keys-unusable]"
+        )
         raise error from None
     return CertificateFiles(str(store.path(CERTIFICATE)), str(store.path(KEY)))
 
@@ -185,7 +187,7 @@ class ServerCertificate:
             tls_context(self._files)  # a context that fails half-way has the new one in part
             self.context.load_cert_chain(self._files.cert, self._files.key or None, password=_no_password)
         except (StartError, OSError, ValueError) as error:
-            _log.warning("! the changed certificate is not used yet: %s", error)
+            _log.warning("! the changed certificate is not used yet: %s [web-certificate]", error)
             return False
         self._stamps = stamps
         _log.info("= HTTPS has the renewed certificate of %s", self._files.cert)
@@ -405,10 +407,10 @@ async def _changed(setup: WebSetup, load: Callable[[], WebSetup], asked: asyncio
         try:
             new = await asyncio.to_thread(load)
         except RmpaError as error:
-            _log.error("! rmpa web keeps its settings: %s", error)
+            _log.error("! rmpa web keeps its settings: %s [%s]", error, error.code)
             continue
         if setup.trusted and not new.trusted:  # the agent is away, and another module was found meanwhile
-            _log.error("! rmpa web keeps its settings: the module with keys is not found now")
+            _log.error("! rmpa web keeps its settings: the module with keys is not found now [keys-unusable]")
         elif not setup.serves_as(new):
             return
 

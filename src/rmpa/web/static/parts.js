@@ -164,7 +164,7 @@ export const Gone = ({ kind, name }) =>
 export const Failure = ({ failure }) =>
   failure &&
   html`<p class="failure" role="alert">
-    <${Mark} state="ERROR" word="" /> ${failure.error}${failure.remedy &&
+    <${Mark} state="ERROR" word="" /> ${failure.error} ${failure.code && `[${failure.code}]`}${failure.remedy &&
     html`<br /><span class="muted">${failure.remedy}</span>`}
   </p>`;
 

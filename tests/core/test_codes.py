@@ -1,0 +1,177 @@
+"""Each error, warning and problem that a user sees has a code of the table, and each code of the table is used."""
+
+import ast
+import logging
+import re
+from collections.abc import Iterator
+from importlib import import_module
+from io import StringIO
+from pathlib import Path
+from pkgutil import walk_packages
+
+import pytest
+
+import rmpa
+from rmpa.core import codes
+from rmpa.core.counters import Counters, RefusalLog, configure_logging
+from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
+
+SRC = Path(rmpa.__path__[0])
+TREES = {path.relative_to(SRC): ast.parse(path.read_text()) for path in sorted(SRC.rglob("*.py"))}
+# The constant texts that variables are set to, by module and name.
+VARIABLES: dict[tuple[Path, str], list[str]] = {}
+for file, tree in TREES.items():
+    for each in ast.walk(tree):
+        target = (
+            each.targets[0]
+            if isinstance(each, ast.Assign)
+            else each.target
+            if isinstance(each, ast.AnnAssign)
+            else None
+        )
+        if isinstance(target, ast.Name) and isinstance(each.value, ast.Constant):  # type: ignore[attr-defined]
+            VARIABLES.setdefault((file, target.id), []).append(str(each.value.value))  # type: ignore[attr-defined]
+# Methods that take the name of a counter first, or second behind the time.
+REFUSALS = {"refuse", "warn", "_on_warning", "_refuse"}
+
+
+def calls(*names: str) -> Iterator[tuple[Path, ast.Call, str]]:
+    """All calls of methods or functions of these names, each with what it is called on."""
+    for path, tree in TREES.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call):
+                of = node.func
+                name = of.attr if isinstance(of, ast.Attribute) else of.id if isinstance(of, ast.Name) else ""
+                if name in names:
+                    yield path, node, ast.unparse(of.value) if isinstance(of, ast.Attribute) else ""
+
+
+def texts(path: Path, node: ast.expr) -> list[str]:
+    """The constant texts that an expression may be: itself, or what its variable is set to in that module."""
+    if isinstance(node, ast.Constant):
+        return [str(node.value)]
+    if isinstance(node, ast.JoinedStr):
+        return ["".join(str(part.value) if isinstance(part, ast.Constant) else "*" for part in node.values)]
+    return VARIABLES.get((path, node.id), []) if isinstance(node, ast.Name) else []
+
+
+def test_each_warning_of_the_log_ends_with_a_code() -> None:
+    bare = []
+    for path, call, of in calls("warning", "error", "log"):
+        if "log" not in of or any(keyword.arg == "exc_info" for keyword in call.keywords):
+            continue  # a traceback has the code internal-error, by the formatter
+        by_level = isinstance(call.func, ast.Attribute) and call.func.attr == "log"
+        if by_level and "DEBUG if" in ast.unparse(call.args[0]) and "INFO" in ast.unparse(call.args[0]):
+            continue
+        known = texts(path, call.args[1 if by_level else 0])
+        by_error = ast.unparse(call.args[-1]).endswith(".code") or "of_counter" in ast.unparse(call.args[-1])
+        if not any((codes.of_line(text) in codes.CODES) or (text.endswith(" [%s]") and by_error) for text in known):
+            bare.append(f"{path}:{call.lineno}: {ast.unparse(call)}")
+    assert not bare
+
+
+def test_each_refusal_has_a_code_by_its_counter() -> None:
+    names = {
+        text.rstrip("*.")
+        for path, call, _ in calls(*REFUSALS)
+        for argument in call.args[:2]
+        for text in texts(path, argument)
+        if re.fullmatch(r"[a-z_*]+(\.[a-z_*]+)+", text)
+    }
+    assert len(names) > 40
+    assert not {
+        name
+        for name in names - {"*.too_many"}  # of nodes, topics and services
+        if codes.of_counter(f"{name}.x") not in codes.CODES or codes.of_counter(f"{name}.x") == "failed"
+    }
+
+
+def test_each_warning_of_a_command_has_a_code() -> None:
+    bare = [
+        f"{path}:{call.lineno}"
+        for path, call, of in calls("warn", "print_error")
+        if path.parts[0] == "cli" and not of
+        if not (
+            len(call.args) == 2
+            and (ast.unparse(call.args[1]).endswith(".code") or texts(path, call.args[1])[0] in codes.CODES)
+        )
+        if not isinstance(call.args[0], ast.Starred)
+    ]
+    assert not bare
+
+
+def test_each_check_that_can_fail_has_a_code() -> None:
+    named = {
+        str(call.args[at].value)
+        for name, at in (("Check", 0), ("from_message", 0), ("partial", 1))
+        for path, call, _ in calls(name)
+        if len(call.args) > at + 1 or name == "partial"
+        if len(call.args) > at and isinstance(call.args[at], ast.Constant)
+        if name != "Check" or ast.unparse(call.args[1]) not in ("OK", "SKIPPED", "UNKNOWN", "STALE")
+    }
+    assert named - codes.CHECKS.keys() == set()
+    assert set(codes.CHECKS.values()) <= codes.CODES.keys()
+
+
+def test_each_error_has_a_code_of_the_table() -> None:
+    for module in walk_packages(rmpa.__path__, "rmpa."):
+        if "__main__" not in module.name:
+            try:
+                import_module(module.name)
+            except (ImportError, RmpaError):  # of an extra
+                continue
+    kinds = [RmpaError]
+    for kind in kinds:
+        kinds += kind.__subclasses__()
+    assert len(kinds) > 15
+    assert not {kind.__name__ for kind in kinds if kind.code not in codes.CODES and kind.code}
+    given = {
+        str(keyword.value.value)
+        for tree in TREES.values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        for keyword in node.keywords
+        if keyword.arg == "code" and isinstance(keyword.value, ast.Constant) and isinstance(keyword.value.value, str)
+    }
+    assert given - {""} <= codes.CODES.keys()
+
+
+def test_each_code_is_used() -> None:
+    table = (SRC / "core/codes.py").read_text()
+    rest = table.partition("\nCHECKS")[2] + "".join(
+        (SRC / path).read_text() for path in TREES if path.name != "codes.py"
+    )
+    assert not [code for code in codes.CODES if f'"{code}"' not in rest and f" [{code}]" not in rest]
+    assert all(re.fullmatch(r"[a-z]+(-[a-z]+)*", code) for code in codes.CODES)
+
+
+def test_an_error_has_the_code_of_its_class_or_that_which_it_is_given() -> None:
+    assert ConfigError("--port", "is taken").code == "invalid-value"
+    assert ConfigError("--port", "is taken", code="port-in-use").code == "port-in-use"
+    assert RmpaError("no").code == "failed"
+    assert str(RmpaError("no", code="refused")) == "no"
+    assert UnreachableError("ROS master", "http://localhost:11311").code == "master-unreachable"
+    assert UnreachableError("broker", "there").code == "unreachable"
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_a_log_line_shows_the_code_of_a_refusal_and_of_a_fault(as_json: bool) -> None:
+    root = logging.getLogger()
+    before, level, raises = root.handlers[:], root.level, logging.raiseExceptions
+    lines = StringIO()
+    try:
+        configure_logging("info", lines, as_json=as_json)
+        log = logging.getLogger("rmpa.mesh")
+        RefusalLog(log, Counters()).refuse(0.0, "link.refused.version", "10.0.0.2", "too old")
+        try:
+            int("x")
+        except ValueError:
+            log.exception("! a part failed")
+    finally:
+        root.handlers[:], logging.raiseExceptions = before, raises
+        root.setLevel(level)
+    refused, fault = lines.getvalue().split("\n")[:2]
+    assert "! too old [other-release]" in refused
+    assert "! a part failed [internal-error]" in fault
+    if as_json:
+        assert '"code": "other-release"' in refused
