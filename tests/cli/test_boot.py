@@ -156,7 +156,8 @@ def test_a_masked_unit_stays_masked(
     unit.parent.mkdir(parents=True)
     unit.symlink_to(null)
     assert main(["service", "install", "--root", str(root)]) == 1
-    said = f"rmpa: /etc/systemd/system/rmpa.service: the unit is masked; systemctl --root {root} unmask rmpa\n"
+    unit_is = "rmpa: /etc/systemd/system/rmpa.service: the unit is masked"
+    said = f"{unit_is}; systemctl --root {root} unmask rmpa [service-unit]\n"
     assert (capsys.readouterr().err, systemd.calls()) == (said, [])
 
 
@@ -177,7 +178,7 @@ def test_a_name_that_the_settings_outweigh_is_refused(
     config.parent.mkdir()
     config.write_text('domain = 7\nname = "base"\n')
     assert main(["service", "install", "--name", "arm", "--root", str(root)]) == 2
-    said = f"rmpa: {config}:2: name: base outweighs --name arm; write it there, or remove the line\n"
+    said = f"rmpa: {config}:2: name: base outweighs --name arm; write it there, or remove the line [invalid-value]\n"
     assert (capsys.readouterr().err, systemd.calls()) == (said, [])
     assert main(["service", "install", "--name", "base", "--root", str(root)]) == 0
 
@@ -389,7 +390,7 @@ def test_what_it_needs_is_said_in_one_line(
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     assert main(["service", "install", "--web"]) == 1
     problem = "rmpa: rmpa service install: only root may change the machine; sudo /opt/rmpa/bin/rmpa service install"
-    assert capsys.readouterr().err == f"{problem}\n"
+    assert capsys.readouterr().err == f"{problem} [root-needed]\n"
     monkeypatch.setattr(machine, "_BOOTED", tmp_path / "none")
     for verb in ("install", "status", "uninstall"):
         assert main(["service", verb]) == 1

@@ -61,6 +61,7 @@ def test_an_option_that_is_gone_says_what_to_use(command: str, capfd: pytest.Cap
 
 WORDS = {"values": "{}", "value": "1"}
 QUIET = {
+    "rmpa explain",
     "rmpa config show",
     "rmpa bug-report",
     "rmpa doctor",
@@ -97,7 +98,7 @@ def test_an_error_is_json_too(
         out, err = capsys.readouterr()
         said = json.loads(out)
         assert code in {1, 2}, out
-        assert list(said) == ["error"]
+        assert list(said) == ["error", "code"]
         assert said["error"] in " ".join(err.split()) or said["error"] in err, path
 
 
@@ -105,7 +106,7 @@ def test_an_error_is_json_only_where_that_is_asked_for(capsys: pytest.CaptureFix
     assert main(["peer", "info", "--no-such-flag"]) == 2
     assert capsys.readouterr().out == ""
     assert main(["peer", "info", "--no-such-flag", "--json"]) == 2
-    assert list(json.loads(capsys.readouterr().out)) == ["error"]
+    assert list(json.loads(capsys.readouterr().out)) == ["error", "code"]
     assert main(["peer", "info", "--no-such-flag", "--", "--json"]) == 2
     assert capsys.readouterr().out == ""
 
@@ -146,7 +147,11 @@ def test_a_setting_that_cannot_be_exits_2(place: Place) -> None:
 
 def test_a_mistake_in_the_file_names_file_line_and_key(place: Place) -> None:
     (place.path / "rmpa.toml").write_text("[core]\nprot = 1\n")
-    assert place.run("up") == (2, "", "rmpa: rmpa.toml:2: core.prot: an unknown key; did you mean core.port?\n")
+    assert place.run("up") == (
+        2,
+        "",
+        "rmpa: rmpa.toml:2: core.prot: an unknown key; did you mean core.port? [invalid-value]\n",
+    )
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

@@ -134,7 +134,7 @@ def test_info_and_ping(rmpa: Rmpa, talker: str) -> None:
     code, out, _ = rmpa("ping", "--all", "--json")
     assert (code, json.loads(out)["node"]) == (0, "/talker")
     code, out, err = rmpa("info", "/talked")
-    assert (code, out, err) == (1, "", "rmpa: no node /talked; did you mean /talker?\n")
+    assert (code, out, err) == (1, "", "rmpa: no node /talked; did you mean /talker? [unknown-name]\n")
     code, out, _ = rmpa("ping", "/talked", "-c", "1")
     assert (code, out) == (1, "/talked: seq=1 no node /talked; did you mean /talker?\n")
 
@@ -155,8 +155,8 @@ def test_kill(rmpa: Rmpa, talker: str, core: RosCore) -> None:
     code, out, err = rmpa("kill", "/talker", "/nobody", "/rmpa")
     assert (code, out) == (1, "killed /talker\n")
     assert err.splitlines() == [
-        "rmpa: /nobody: no node /nobody; `rmpa node list` shows all",
-        "rmpa: /rmpa: it is the agent itself; end `rmpa up` instead",
+        "rmpa: /nobody: no node /nobody; `rmpa node list` shows all [unknown-name]",
+        "rmpa: /rmpa: it is the agent itself; end `rmpa up` instead [refused]",
     ]
     assert "/talker" not in core.state().nodes
     assert rmpa("kill")[0] == rmpa("kill", "--all", "/x")[0] == rmpa("ping")[0] == 2
@@ -172,9 +172,9 @@ def test_nodes_of_peers(rmpa: Rmpa, talker: str, peer: list[dict[str, Any]]) -> 
     code, out, err = rmpa("list")
     assert (code, out.splitlines()) == (0, ["/rosout", "/talker", "joystick:/joy", "older:/x"])
     assert err.splitlines() == [
-        "! older does not tell its nodes, only those that stand here: it is older",
-        f"! /talker cannot be reached at {talker}: no such name",
-        f"! joystick:/joy cannot be reached at {JOY}: no answer in 3 s",
+        "! older does not tell its nodes, only those that stand here: it is older [refused]",
+        f"! /talker cannot be reached at {talker}: no such name [node-unreachable]",
+        f"! joystick:/joy cannot be reached at {JOY}: no answer in 3 s [node-unreachable]",
     ]
     rows = [line.split() for line in rmpa("list", "-v", "joystick:/")[1].splitlines()]
     assert rows[1] == ["joystick:/joy", "joystick", "1", "0", "0", JOY]

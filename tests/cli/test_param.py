@@ -35,7 +35,7 @@ def test_the_verbs(place: Place, core: RosCore) -> None:
     assert place.run("param", "set", "/base/deep", "-5") == (0, "", "")
     assert place.run("param", "list", "/base")[1].split() == ["/base/deep", "/base/names", "/base/speed"]
     code, _, err = place.run("param", "get", "/base/sped")
-    assert (code, err.split("; ")[1]) == (1, "did you mean /base/speed?\n")
+    assert (code, err.split("; ")[1]) == (1, "did you mean /base/speed? [unknown-name]\n")
     assert place.run("param", "dump", "base.yaml", "/base")[0] == 0
     assert place.run("param", "load", "base.yaml", "/copy")[0] == 0
     assert core.call("getParam", "/x", "/copy").value == core.call("getParam", "/x", "/base").value

@@ -32,7 +32,7 @@ def test_ctrl_c_shows_the_summary(place: Place, agent: Agent) -> None:
 
 @pytest.mark.parametrize("command", [("list",), ("info", "x"), ("ping", "x")])
 def test_without_an_agent(place: Place, command: tuple[str, ...]) -> None:
-    expected = f"rmpa: no agent answers at {place.path}; start one with `rmpa up`\n"
+    expected = f"rmpa: no agent answers at {place.path}; start one with `rmpa up` [no-agent]\n"
     assert place.run("peer", *command) == (1, "", expected)
 
 

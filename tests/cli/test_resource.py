@@ -129,7 +129,7 @@ def test_resources_here_and_at_peers(rmpa: Rmpa, running: ResourceNode, remote: 
     for name, peer in (("sonar", None), ("base:/sonar", "base"), ("/lidar", "base")):
         assert as_json(rmpa, "profile", "get", name)["peer"] == peer
     assert rmpa("profile", "get") == (0, "slow\n", "")
-    assert rmpa("resource", "info", "sonra")[2] == "rmpa: no resource /sonra; did you mean /sonar?\n"
+    assert rmpa("resource", "info", "sonra")[2] == "rmpa: no resource /sonra; did you mean /sonar? [unknown-name]\n"
     assert rmpa("resource", "info", "other:/sonar")[0] == 1
     assert rmpa("resource", "info", "a b")[0] == 2
 
@@ -158,12 +158,12 @@ def test_a_profile_by_hand(rmpa: Rmpa, running: ResourceNode, remote: list[dict[
     assert (code, out) == (1, "")
     assert err == (
         "rmpa: /sonar: profile broken: it could not be applied: OSError: no such device; "
-        "what was chosen before stays\n"
+        "what was chosen before stays [service-failed]\n"
     )
     assert as_json(rmpa, "profile", "get", "sonar")["chosen"] == "fast"
     assert as_json(rmpa, "profile", "list", "sonar")["left_out"] == {"broken": "OSError: no such device"}
     assert rmpa("profile", "set", "sonar", "fsat") == (
-        2, "", "rmpa: PROFILE: there is no profile 'fsat'; did you mean fast?\n"
+        2, "", "rmpa: PROFILE: there is no profile 'fsat'; did you mean fast? [invalid-value]\n"
     )  # fmt: skip
     assert rmpa("profile", "set", "sonar")[0] == rmpa("profile", "set", "sonar", "fast", "--auto")[0] == 2
     assert rmpa("profile", "set", "sonar", "--auto")[0] == 0
@@ -171,7 +171,7 @@ def test_a_profile_by_hand(rmpa: Rmpa, running: ResourceNode, remote: list[dict[
     # A peer's is set at the peer; one whose services ours hide cannot be.
     assert rmpa("profile", "set", "base:/lidar", "slow")[0] == 0
     assert rmpa("profile", "set", "lidar", "fast")[2] == (
-        "rmpa: base:/lidar: profile fast: it could not be applied: jammed\n"
+        "rmpa: base:/lidar: profile fast: it could not be applied: jammed [service-failed]\n"
     )
     assert remote == [{"profile": "slow"}, {"profile": "fast"}]
     code, _, err = rmpa("profile", "set", "base:/sonar", "slow")
@@ -218,7 +218,7 @@ def test_a_context_by_hand(rmpa: Rmpa, running: ResourceNode) -> None:
     assert running.adapter.adaptation.profile == "fast"
     assert rmpa("context", "get", "sonar") == (0, "away\n", "")
     code, _, err = rmpa("context", "set", "sonar", "awya")
-    assert (code, err) == (2, "rmpa: CONTEXT: there is no context 'awya'; did you mean away?\n")
+    assert (code, err) == (2, "rmpa: CONTEXT: there is no context 'awya'; did you mean away? [invalid-value]\n")
     assert rmpa("context", "set", "sonar", "--auto")[0] == 0
     assert as_json(rmpa, "context", "get")["context"] == ""
 
@@ -267,5 +267,5 @@ def test_alarms(rmpa: Rmpa, core: RosCore, running: ResourceNode, background: Ba
 
 def test_no_resource(rmpa: Rmpa, core: RosCore) -> None:
     assert as_json(rmpa, "resource", "list") == []
-    text = "rmpa: there is no resource; `rmpa run` runs one, `rmpa resource list` shows all\n"
+    text = "rmpa: there is no resource; `rmpa run` runs one, `rmpa resource list` shows all [unknown-name]\n"
     assert rmpa("profile", "list") == (1, "", text)

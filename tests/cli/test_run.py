@@ -227,7 +227,7 @@ def test_a_thread_that_hangs_does_not_keep_it_from_its_end(ground: Ground) -> No
     run.wait_for("hangs")
     agent = agent_of(run)
     assert run.interrupt() == 1  # the interpreter would wait for the user's own thread for ever
-    assert "! of mine does not come back; it is left behind" in run.output
+    assert "! of mine does not return; the program ends without it" in run.output
     assert not agent.is_running()
 
 

@@ -97,7 +97,7 @@ def test_info_type_and_find(rmpa: Rmpa, served: RosCore) -> None:
     assert (info["peer"], info["type"], info["request"]) == ("base", "std_srvs/SetBool", ["data"])
     assert rmpa("type", "/add")[1] == "rospy_tutorials/AddTwoInts\n"
     assert rmpa("find", "std_srvs/SetBool")[1] == "/arm/enable  [base]\n"
-    assert rmpa("info", "/ad") == (1, "", "rmpa: no service /ad; did you mean /add?\n")
+    assert rmpa("info", "/ad") == (1, "", "rmpa: no service /ad; did you mean /add? [unknown-name]\n")
     code, _, err = rmpa("info", "joystick:/arm/enable")
     assert (code, "is served by /rmpa/base/arm, not by peer joystick" in err) == (1, True)
     code, out, err = rmpa("info", "/my/do")
@@ -133,16 +133,19 @@ def test_call(rmpa: Rmpa, served: RosCore) -> None:
     assert rmpa("call", "/arm/enable", "true") == (
         1,
         "",
-        "rmpa: service /arm/enable refused: the arm is jammed\\x1b[2J\n",
+        "rmpa: service /arm/enable refused: the arm is jammed\\x1b[2J [service-failed]\n",
     )
 
 
 def test_what_cannot_be_called(rmpa: Rmpa, served: RosCore) -> None:
     code, _, err = rmpa("call", "/add", "{c: 1}")
-    assert (code, err) == (1, "rmpa: rospy_tutorials/AddTwoIntsRequest has no field 'c'; it has a, b\n")
+    assert (code, err) == (
+        1,
+        "rmpa: rospy_tutorials/AddTwoIntsRequest has no field 'c'; it has a, b [invalid-message]\n",
+    )
     assert rmpa("call", "/add", "{a")[0] == 2
     code, _, err = rmpa("call", "/none")
-    assert (code, err) == (1, "rmpa: no service /none; `rmpa service list` shows all\n")
+    assert (code, err) == (1, "rmpa: no service /none; `rmpa service list` shows all [unknown-name]\n")
     code, _, err = rmpa("call", "/none", "--wait", "-t", "0.3")
     assert code == 1
     assert "no service /none answers at http" in err
@@ -162,7 +165,7 @@ def test_a_type_of_this_machines_packages(
     assert code == 1
     assert "my_pkg/Do: has the md5 sum " in err
     assert f"here ({folder}/Do.srv), and " in err
-    assert err.endswith(" there; source the workspace that the node over there was built in\n")
+    assert err.endswith(" there; source the workspace that the node over there was built in [unknown-type]\n")
 
 
 def test_info_tells_what_crosses(
@@ -195,7 +198,7 @@ def test_info_tells_what_crosses(
         "     calls      9, 1 failed\n"
         "     latency    p50 2.00 ms, p99 3.00 ms, max 4.00 ms\n"
     )
-    assert err == "! base: its server died\\x1b in the middle of the call\n"
+    assert err == "! base: its server died\\x1b in the middle of the call [service-failed]\n"
     out = rmpa("info", "/add")[1]
     assert (
         " * may cross: [services] allow, open at base\n * from base: /adder, not here: /server serves it here\n"

@@ -141,7 +141,10 @@ def test_without_the_extra_it_says_what_to_install(place: Place) -> None:
         [sys.executable, "-c", block], capture_output=True, text=True, env=place.environ, cwd=place.path, check=False
     )
     assert done.returncode == 2
-    assert done.stderr == f"rmpa: rmpa web: aiohttp not installed; run {sys.executable} -m pip install 'rmpa[web]'\n"
+    assert (
+        done.stderr
+        == f"rmpa: rmpa web: aiohttp not installed; run {sys.executable} -m pip install 'rmpa[web]' [extra-missing]\n"
+    )
 
 
 def test_mistakes_are_told_with_their_option(place: Place) -> None:

@@ -32,10 +32,10 @@ def test_one_line_a_kind_and_interval(caplog: pytest.LogCaptureFixture) -> None:
     log.refuse(2.0, "beacon.version", "10.0.0.1", "other kind")
     log.refuse(LOG_INTERVAL, "beacon.malformed", "10.0.0.1", "again")
     assert [r.getMessage() for r in caplog.records] == [
-        "! text",
-        "! other address",
-        "! other kind",
-        "! again (2 more like this since the last line)",
+        "! text [protocol-error]",
+        "! other address [protocol-error]",
+        "! other kind [other-release]",
+        "! again (2 more like this since the last line) [protocol-error]",
     ]
     assert counters.as_dict() == {"beacon.malformed": 5, "beacon.version": 1}
 
@@ -49,8 +49,8 @@ def test_forged_addresses_do_not_flood_the_log(caplog: pytest.LogCaptureFixture)
     log.refuse(0.5, "beacon.version", "10.0.0.1", "another name has lines of its own")
     log.refuse(LOG_INTERVAL, "beacon.malformed", "10.9.9.9", "later")
     assert [record.getMessage() for record in caplog.records[-2:]] == [
-        "! another name has lines of its own",
-        f"! later ({5000 - limits.LOG_LINES_MAX} more like this since the last line)",
+        "! another name has lines of its own [other-release]",
+        f"! later ({5000 - limits.LOG_LINES_MAX} more like this since the last line) [protocol-error]",
     ]
     assert counters["beacon.malformed"] == 5001
 

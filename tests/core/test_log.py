@@ -50,7 +50,7 @@ def test_a_journal_gets_priorities_and_no_time(stream: io.StringIO) -> None:
         log.exception("! c")
     first, second, third, *trace = stream.getvalue().splitlines()
     assert (first, second) == ("<7>debug   mesh      > a", "<4>warning mesh      ! b")
-    assert third == "<3>error   mesh      ! c"
+    assert third == "<3>error   mesh      ! c [internal-error]"
     assert {line[:3] for line in trace} == {"<3>"}
 
 
@@ -66,7 +66,7 @@ def test_json_with_a_traceback(stream: io.StringIO) -> None:
         "level": "error",
         "room": "bridge",
         "logger": "rmpa.bridge",
-        "text": "! failed\nat it",
+        "text": "! failed\nat it [internal-error]",
     }
     assert "ValueError: invalid literal" in record["traceback"]
     assert record["time"].endswith("+00:00")

@@ -274,11 +274,11 @@ async def test_a_file_of_a_later_release_is_set_aside_whole(
     later = b'{"format":2,"parameters":{"gain":{"value":2.5}},"more":[1]}'
     path.write_bytes(later)
     await (await started(core, path)).close()
-    assert "is of another release of rmpa (format 2, not 1); it is set aside as sonar.json.before" in caplog.text
+    assert "is of another release of rmpa (format 2, not 1); it is kept as sonar.json.before," in caplog.text
     assert path.with_name("sonar.json.before").read_bytes() == later
     path.write_bytes(second := later.replace(b"2.5", b"3.5"))  # after another update, and back
     await (await started(core, path)).close()
-    assert "it is set aside as sonar.json.before-2 and begun anew" in caplog.text
+    assert "it is kept as sonar.json.before-2, and a new file begins" in caplog.text
     assert path.with_name("sonar.json.before").read_bytes() == later
     assert path.with_name("sonar.json.before-2").read_bytes() == second
 

@@ -162,7 +162,7 @@ def test_a_refusal_is_logged_with_what_grants_it(
         realtime.apply(50, lock_memory=True)
     lines = [(record.levelname, record.getMessage()) for record in caplog.records]
     refusal = (
-        "! realtime: no SCHED_FIFO, priority 50: Operation not permitted. To have it: systemd: sudo rmpa service "
+        "! realtime: no SCHED_FIFO, priority 50: Operation not permitted; to get it: systemd: sudo rmpa service "
     )
     assert [level for level, _ in lines] == ["WARNING", "INFO"]
     assert lines[0][1].startswith(refusal)

@@ -76,7 +76,7 @@ def reload(check: bool, options: Options) -> int:
 
     def text() -> Iterator[str]:
         if reply.problem:
-            print_error(reply.problem, reply.code)
+            print_error(reply.problem, reply.code or "invalid-value")
             return
         what = f"nothing {'would change' if check else 'has changed'}"
         if reply.changed:

@@ -228,17 +228,17 @@ def node_kill(nodes: tuple[str, ...], everything: bool, options: Options) -> int
     master = options.master()
     found = [(str(wanted), _kill(master, wanted)) for wanted in _named(master, nodes, everything=everything)]
     if options.as_json:
-        print_json([{"node": node, "killed": not error, "error": error or None} for node, error in found])
-    for node, error in found:
+        print_json([{"node": node, "killed": not error, "error": error or None} for node, (error, _) in found])
+    for node, (error, code) in found:
         if error:
-            print_error(f"{node}: {error}", "refused")
+            print_error(f"{node}: {error}", code)
         elif not options.as_json:
             print_text(f"killed {node}")
-    return int(any(error for _, error in found))
+    return int(any(error for _, (error, _) in found))
 
 
-def _kill(master: Master, wanted: GraphName) -> str:
-    """End a node; return why it lives on, or an empty text."""
+def _kill(master: Master, wanted: GraphName) -> tuple[str, str]:
+    """End a node; return why it lives on, with the code, or empty texts."""
 
     async def here() -> bool:
         uri = await _find_uri(master, await read_graph(master), wanted.name)
@@ -248,12 +248,13 @@ def _kill(master: Master, wanted: GraphName) -> str:
         if wanted.peer is not None:
             gone = _ask_peer(master, wanted, "node.kill", dict[str, bool]).get("gone", False)
         elif is_own(wanted.name):
-            return "it is the agent itself; end `rmpa up` instead"
+            return "it is the agent itself; end `rmpa up` instead", "refused"
         else:
             gone = asyncio.run(here())
     except RmpaError as error:
-        return str(error)
-    return "" if gone else f"it was asked to end, and is still there after {ros_limits.NODE_KILL_WAIT:g} s"
+        return str(error), error.code
+    still = f"it was asked to end, and is still there after {ros_limits.NODE_KILL_WAIT:g} s"
+    return ("", "") if gone else (still, "node-killed")
 
 
 @graph_verb(

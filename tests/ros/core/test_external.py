@@ -226,7 +226,7 @@ async def test_refused_registration_is_reported_and_dropped(
     looks = core.counters.as_dict()["master.looks"]
     await until(lambda: core.counters.as_dict()["master.looks"] >= looks + 2)
     assert core.counters.as_dict()["master.refused"] == 2
-    assert "does not take registerPublisher('/rmpa', 'no good'" in caplog.text
+    assert "does not accept registerPublisher('/rmpa', 'no good'" in caplog.text
     assert core.call("getParam", "/rmpa", "/good").code == -1, "only the master knows"
 
 

@@ -496,7 +496,7 @@ async def test_a_file_that_cannot_be_read_is_set_aside(
     path.write_bytes(b"another")
     async with running(path) as core:
         core.call("setParam", "/x", "/c", 1)
-    assert "is set aside as core.state.before-2" in caplog.text
+    assert "is kept as core.state.before-2" in caplog.text
     assert path.with_name("core.state.before").read_bytes() == data
     assert path.with_name("core.state.before-2").read_bytes() == b"another"
 
