@@ -98,16 +98,18 @@ def test_each_warning_of_a_command_has_a_code() -> None:
 
 
 def test_each_check_that_can_fail_has_a_code() -> None:
-    named = {
-        str(call.args[at].value)
-        for name, at in (("Check", 0), ("from_message", 0), ("partial", 1))
-        for path, call, _ in calls(name)
-        if len(call.args) > at + 1 or name == "partial"
-        if len(call.args) > at and isinstance(call.args[at], ast.Constant)
-        if name != "Check" or ast.unparse(call.args[1]) not in ("OK", "SKIPPED", "UNKNOWN", "STALE")
-    }
+    named = set[str]()
+    for path, call, _ in calls("Check", "from_message", "partial"):
+        of_partial = "partial" in ast.unparse(call.func)
+        arguments = call.args[1:] if of_partial else call.args
+        if of_partial and ast.unparse(call.args[0]) != "Check":
+            continue
+        well = len(arguments) > 1 and ast.unparse(arguments[1]) in ("OK", "SKIPPED", "UNKNOWN", "STALE")
+        if arguments and isinstance(arguments[0], ast.Constant) and not well:
+            named |= {*texts(path, arguments[0])}
+    assert len(named) > 40
     assert named - codes.CHECKS.keys() == set()
-    assert set(codes.CHECKS.values()) <= codes.CODES.keys()
+    assert set(codes.CHECKS.values()) | set(codes.PEER_STATES.values()) <= codes.CODES.keys()
 
 
 def test_each_error_has_a_code_of_the_table() -> None:

@@ -98,7 +98,7 @@ def init(file: str | None, system: bool, force: bool, dry_run: bool, options: Op
         print_text(Table("SETTING, VALUE, FOUND", rows))
         print_text(f"{path} is written. Next: {'sudo systemctl restart rmpa' if system else 'rmpa up'}")
     for note in notes:
-        warn(note)
+        warn(note, "doubtful-setting")
 
 
 def _write(path: Path, text: str, *, force: bool, system: bool) -> None:

@@ -502,6 +502,7 @@ CHECKS: Final = {
     **dict.fromkeys(("multicast", "heard"), "multicast-blocked"),
     **dict.fromkeys(("answer", "calls"), "service-failed"),
     "agent": "agent-trouble",
+    "directory": "directory-unusable",
     "interface": "no-interface",
     "firewall": "firewall-blocks",
     "rp_filter": "rp-filter-strict",

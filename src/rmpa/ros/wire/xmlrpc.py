@@ -182,7 +182,7 @@ class RosFault(RmpaError):  # noqa: N818 - XML-RPC calls it a fault
         self.text = text
 
     def __str__(self) -> str:
-        return f"XML-RPC fault {self.code}: {self.text}"
+        return f"XML-RPC fault {self.number}: {self.text}"
 
 
 class RosReply(NamedTuple):
