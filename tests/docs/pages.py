@@ -29,8 +29,6 @@ USER_PAGES: Final = [
 UNMARKED: Final = {
     "docs/reference/compatibility.md",
     "docs/reference/settings.md",
-    "docs/start/demo.md",
-    "docs/start/install.md",
 }
 """User pages whose words and blocks of commands are not checked before they are written anew; empty at the end."""
 _OPTIONS: Final = MarkdownIt("commonmark").enable("table")

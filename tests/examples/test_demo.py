@@ -351,12 +351,11 @@ def test_wrong_flags_are_refused_plainly(tidy: dict[str, str], flags: list[str],
         assert "Traceback" not in demo.output
 
 
-def test_the_readme_s_commands(tidy: dict[str, str]) -> None:
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    commands = list(
-        dict.fromkeys(re.findall(r"^\$ make (demo(?:-kill|-start)?\b(?!-)[^#\n]*?) *(?:#.*)?$", readme, re.MULTILINE))
-    )
-    assert commands == ["demo", "demo-kill MODULE=base", "demo-start MODULE=base"]
+def test_the_commands_of_the_pages(tidy: dict[str, str]) -> None:
+    commands = ["demo", "demo-kill MODULE=base", "demo-start MODULE=base"]
+    for page in ("README.md", "docs/start/demo.md"):
+        text = (ROOT / page).read_text(encoding="utf-8")
+        assert re.findall(r"^\$ make (demo[^#\n]*?) *(?:#.*)?$", text, re.MULTILINE) == commands, page
     # The environment that `make` would build first is the one that these tests run in.
     make = ["make", "-C", str(ROOT), "-o", ".venv/.installed", f"BIN={Path(sys.executable).parent}"]
     with Process([*make, *commands[0].split()], env=tidy, name="make demo") as demo:
