@@ -1,4 +1,4 @@
-"""What mkdocs.yml cannot say: anchors as GitHub's, and links that leave docs/ lead to the published repository."""
+"""What mkdocs.yml cannot say: anchors as GitHub's, links into the published repository, accessible HTML."""
 
 import posixpath
 import re
@@ -41,3 +41,15 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         return f"{url}/{'tree' if (ROOT / place).is_dir() else 'blob'}/HEAD/{place}"
 
     return LINK.sub(published, markdown)
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """The page with what the theme and Markdown leave out for screen readers and keyboards."""
+    del page, config
+    for plain, accessible in {
+        'data-md-component="search" role="dialog">': 'data-md-component="search" role="dialog" aria-label="Search">',
+        '<nav class="md-nav" aria-label="': '<nav class="md-nav" aria-label="Part ',  # a section has that name too
+        "<th></th>": "<td></td>",  # of a table without headings
+    }.items():
+        output = output.replace(plain, accessible)
+    return output
