@@ -7,6 +7,7 @@ import re
 import shutil
 from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
 import pytest
@@ -63,13 +64,14 @@ class Machine:
         self.host, self.stack, self.shared = host, stack, home
         self.variables = {"RMPA_NAME": host.name}
         self.home = home / host.name
+        self.runtime = stack.enter_context(TemporaryDirectory(prefix="rmpa-test-"))  # short, for sockets
         file = self.home / ".config" / "rmpa" / "rmpa.toml"
         file.parent.mkdir(parents=True)
         file.write_text(settings, encoding="utf-8")
 
     def start(self, command: str) -> Process:
         kept = {key: value for key, value in os.environ.items() if not key.startswith(("ROS_", "RMPA_", "XDG_"))}
-        own = {"HOME": str(self.home), "XDG_RUNTIME_DIR": str(self.home), **self.variables}
+        own = {"HOME": str(self.home), "XDG_RUNTIME_DIR": self.runtime, **self.variables}
         path = f"{Path(RMPA).parent}:{kept['PATH']}"
         argv = self.host.command(["sh", "-c", f"cd {self.shared} && echo y | {command}"])
         return self.stack.enter_context(Process(argv, env={**kept, **own, "PATH": path}, name=command))
