@@ -12,7 +12,7 @@ import sys
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from rmpa.ros import MessageType, Node
+from rmpa import MessageType, Node
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Coroutine

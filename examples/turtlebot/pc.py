@@ -31,8 +31,8 @@ from watch import HERE, MODULES, TOPICS, PoseView, View, Watch
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    from rmpa import Node, Received
     from rmpa.observe.snapshot import Snapshot
-    from rmpa.ros import Node, Received
 
 PROFILE = "std_msgs/String"
 """The type of a resource's topic that says which profile it runs."""

@@ -25,7 +25,8 @@ _MODULES = {
     "rmpa.ros.node.node": ["Node", "Publisher", "Received", "Service", "ServiceClient", "Subscriber"],
     "rmpa.ros.node.service_client": ["ServiceFailed"],
     "rmpa.ros.types.definitions": ["DefinitionError"],
-    "rmpa.ros.types.messages": ["MessageError"],
+    "rmpa.ros.types.installed": ["ServiceType"],
+    "rmpa.ros.types.messages": ["MessageError", "MessageType"],
     "rmpa.sync": ["SyncNode", "SyncPublisher", "connect"],
 }
 _LAZY = {name: module for module, names in _MODULES.items() for name in names}
@@ -36,6 +37,7 @@ __all__ = [
     "ConfigError",
     "DefinitionError",
     "MessageError",
+    "MessageType",
     "Node",
     "PeerRefused",
     "Publisher",
@@ -44,6 +46,7 @@ __all__ = [
     "Service",
     "ServiceClient",
     "ServiceFailed",
+    "ServiceType",
     "Subscriber",
     "SyncNode",
     "SyncPublisher",

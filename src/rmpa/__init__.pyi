@@ -2,7 +2,8 @@ from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableErr
 from rmpa.ros.node.node import Node, Publisher, Received, Service, ServiceClient, Subscriber
 from rmpa.ros.node.service_client import ServiceFailed
 from rmpa.ros.types.definitions import DefinitionError
-from rmpa.ros.types.messages import MessageError
+from rmpa.ros.types.installed import ServiceType
+from rmpa.ros.types.messages import MessageError, MessageType
 from rmpa.sync import SyncNode, SyncPublisher, connect
 
 COMMIT: str
@@ -17,6 +18,7 @@ __all__ = [
     "ConfigError",
     "DefinitionError",
     "MessageError",
+    "MessageType",
     "Node",
     "PeerRefused",
     "Publisher",
@@ -25,6 +27,7 @@ __all__ = [
     "Service",
     "ServiceClient",
     "ServiceFailed",
+    "ServiceType",
     "Subscriber",
     "SyncNode",
     "SyncPublisher",

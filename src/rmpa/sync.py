@@ -16,6 +16,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import signal
+import sys
 import threading
 from concurrent.futures import CancelledError, Future
 from contextlib import suppress
@@ -27,10 +28,11 @@ from rmpa.ros import limits
 from rmpa.ros.node.node import Node
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+    from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
     from types import FrameType, TracebackType
 
-    from rmpa.ros.node.endpoints import ParamCallback, Publisher, Service, Subscriber
+    from rmpa.ros.node.endpoints import ParamCallback, Publisher
+    from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 _T = TypeVar("_T")
@@ -45,15 +47,19 @@ class _WaitFor(Protocol):
     def __call__(self, coroutine: Coroutine[Any, Any, _T], /) -> _T: ...
 
 
-def connect(name: str, *, master_uri: str = "", anonymous: bool = False) -> SyncNode:
+def connect(
+    name: str, *, master_uri: str = "", anonymous: bool = False, argv: Sequence[str] | None = None
+) -> SyncNode:
     """Make a node for a script; use the result in a ``with``, which Ctrl-C and SIGTERM end.
 
     Args:
         name: The node's name, resolved in the namespace.
         master_uri: Replaces ROS_MASTER_URI.
         anonymous: Whether the name is made unique.
+        argv: Arguments that replace names and set private parameters (``chatter:=/other __name:=me _gain:=2``), as
+            roslaunch gives them; ``None``: those of the program.
     """
-    return SyncNode(name, master_uri=master_uri, anonymous=anonymous)
+    return SyncNode(name, master_uri=master_uri, anonymous=anonymous, argv=sys.argv[1:] if argv is None else argv)
 
 
 class SyncPublisher:
@@ -89,6 +95,10 @@ class SyncPublisher:
 
         return self._wait_for(publish())
 
+    def close(self) -> None:
+        """Send the queued messages, and publish the topic no more."""
+        self._wait_for(self._publisher.close())
+
     def wait_for_subscriber(self, timeout: float | None = None) -> bool:
         """Wait until there is a subscriber; false if there is none in time."""
 
@@ -114,10 +124,16 @@ class SyncNode:
         name: The node's name, resolved in the namespace.
         master_uri: Replaces ROS_MASTER_URI.
         anonymous: Whether the name is made unique.
+        argv: Arguments that replace names and set private parameters.
     """
 
-    def __init__(self, name: str, *, master_uri: str = "", anonymous: bool = False) -> None:
-        self._arguments: dict[str, Any] = {"name": name, "master_uri": master_uri, "anonymous": anonymous}
+    def __init__(self, name: str, *, master_uri: str, anonymous: bool, argv: Sequence[str]) -> None:
+        self._arguments: dict[str, Any] = {
+            "name": name,
+            "master_uri": master_uri,
+            "anonymous": anonymous,
+            "argv": argv,
+        }
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread = threading.Thread(target=self._run, name=f"rmpa {name}", daemon=True)
         self._node: Node | None = None
@@ -180,7 +196,7 @@ class SyncNode:
     def advertise(
         self,
         topic: str,
-        kind: str,
+        kind: str | MessageType,
         *,
         latch: bool = False,
         queue_messages: int = limits.SUBSCRIBER_QUEUE_MESSAGES,
@@ -189,7 +205,7 @@ class SyncNode:
 
         Args:
             topic: Resolved in the namespace; ``~name`` is the node's own.
-            kind: The type, ``package/Name``.
+            kind: The type, ``package/Name``, or one that is made.
             latch: Whether each new subscriber gets the last message.
             queue_messages: Messages queued for one slow subscriber; above it the oldest is dropped.
         """
@@ -201,7 +217,7 @@ class SyncNode:
 
     def subscribe(
         self, topic: str, kind: str | None, callback: Callable[[Any], object], *, queue_messages: int = _QUEUE
-    ) -> Subscriber:
+    ) -> Callable[[], None]:
         """Subscribe to a topic; see ``rmpa.Node.subscribe``.
 
         Args:
@@ -209,10 +225,13 @@ class SyncNode:
             kind: The type, ``package/Name``; ``None`` accepts any.
             callback: Called with each message, in a thread, one after the other; its exceptions are logged.
             queue_messages: Messages that wait for the callback; above it the oldest is dropped.
+
+        Returns:
+            A function that ends it.
         """
         made = self._wait_for(self._open_node.subscribe(topic, kind, queue_messages=queue_messages))
         self._for_each(aiter(made), lambda received: callback(received.message), f"callback for {topic}")
-        return made
+        return lambda: self._wait_for(made.close())
 
     def wait_for_message(self, topic: str, kind: str | None = None, timeout: float | None = None) -> Any:
         """The next message of a topic; see ``rmpa.Node.wait_for_message``.
@@ -222,11 +241,15 @@ class SyncNode:
         """
         return self._wait_for(self._open_node.wait_for_message(topic, kind, timeout)).message
 
+    def get_published_topics(self) -> list[tuple[str, str]]:
+        """Topics that have a publisher, with their types."""
+        return self._wait_for(self._open_node.get_published_topics())
+
     # --- services ---------------------------------------------------------------------------------------------
 
     def advertise_service(
         self, name: str, kind: str, handler: Callable[[Any], Any], *, timeout: float = SERVICE_TIMEOUT
-    ) -> Service:
+    ) -> Callable[[], None]:
         """Serve a service; see ``rmpa.Node.advertise_service``.
 
         Args:
@@ -235,6 +258,9 @@ class SyncNode:
             handler: Called with each request, in a thread; returns the response as an object or plain values. An
                 exception becomes the client's error.
             timeout: Seconds for a call before the client gets an error.
+
+        Returns:
+            A function that ends it.
         """
 
         async def handle(request: Any) -> Any:
@@ -250,7 +276,8 @@ class SyncNode:
             threading.Thread(target=run, name=f"call of {name}", daemon=True).start()
             return await asyncio.wrap_future(future)
 
-        return self._wait_for(self._open_node.advertise_service(name, kind, handle, timeout=timeout))
+        made = self._wait_for(self._open_node.advertise_service(name, kind, handle, timeout=timeout))
+        return lambda: self._wait_for(made.close())
 
     def wait_for_service(self, name: str, timeout: float | None = None) -> None:
         """Wait until a service answers; raises UnreachableError where it does not in time."""

@@ -143,6 +143,26 @@ def test_parameters_messages_timers_and_the_log(core: RosCore) -> None:
         assert node.wait_for_message("/rosout", timeout=DEADLINE).msg == "low"
 
 
+def test_each_end_can_be_closed(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["script.py", "t:=/talk", "__name:=me"])
+    pair = rmpa.MessageType.learn("my_msgs/Pair", "int32 a\nint32 b\n")
+    with rmpa.connect("n") as node:
+        assert node.name == "/me"
+        heard = node.subscribe("t", "std_msgs/String", print)
+        serves = node.advertise_service("/s", "std_srvs/Trigger", lambda _: {"success": True})
+        publisher = node.advertise("/pair", pair, latch=True)
+        publisher.publish([1, 2])
+        assert node.wait_for_message("/pair", timeout=DEADLINE).b == 2
+        assert ("/pair", "my_msgs/Pair") in node.get_published_topics()
+        assert "/talk" in core.state().subscribers
+        assert "/s" in core.state().services
+        for close in (heard, serves, publisher.close):
+            close()
+        assert "/talk" not in core.state().subscribers
+        assert "/s" not in core.state().services
+        assert "/pair" not in core.state().publishers
+
+
 def test_ctrl_c_ends_the_with_and_nothing_else(core: RosCore) -> None:
     for number, wait in (
         (signal.SIGINT, lambda n: n.spin()),

@@ -176,3 +176,13 @@ async def test_a_signal_closes_a_node_that_handles_it(core: RosCore, number: sig
         await one.close()
     assert "/t" not in core.state().subscribers
     assert signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL)
+
+
+async def test_arguments_replace_names_and_set_private_parameters(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROS_MASTER_URI", core.uri)
+    argv = ("2", "chatter:=/talk", "__name:=speaker", "_gain:=2", "--loud", "__log:=/tmp/speaker.log")
+    async with Node("talker", argv=argv) as one:
+        assert (one.name, await one.get_param("/speaker/gain")) == ("/speaker", 2)
+        assert (await one.advertise("chatter", "std_msgs/String")).topic == "/talk"

@@ -50,7 +50,7 @@ from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import ANY, TopicDescription
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
+    from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
     from types import TracebackType
 
     from rmpa.ros.types.installed import ServiceType
@@ -81,7 +81,9 @@ class Node(MasterClient):
         name: Resolved in the namespace; ``__name:=`` replaces it.
         master_uri: Replaces that of the environment.
         anonymous: Whether the name is made unique.
-        environment: Replaces that of this process's variables; pass one to use command-line arguments.
+        argv: Arguments that replace names and set private parameters, such as ``sys.argv[1:]`` of a node that
+            roslaunch starts. Others are left alone.
+        environment: Replaces what is read of this process's variables and of ``argv``.
         on_shutdown: ``(reason)``: called when the master shuts the node down, before the node closes.
         on_param_update: ``(key, value)``: a parameter subscribed to by ``follow_param`` has changed.
         handle_signals: Whether SIGINT (Ctrl-C) and SIGTERM close the node, so that its loops end and the program goes
@@ -101,13 +103,14 @@ class Node(MasterClient):
         *,
         master_uri: str = "",
         anonymous: bool = False,
+        argv: Sequence[str] = (),
         environment: RosEnvironment | None = None,
         on_shutdown: Callable[[str], None] | None = None,
         on_param_update: ParamCallback | None = None,
         handle_signals: bool = False,
     ) -> None:
         if environment is None:
-            environment = RosEnvironment.read(os.environ, (), local_addresses())
+            environment = RosEnvironment.read(os.environ, argv, local_addresses())
         if anonymous:
             name = f"{name}_{os.getpid()}_{time.time_ns() // 1_000_000}"
         self.environment = environment
@@ -142,6 +145,8 @@ class Node(MasterClient):
         await self.slave.start()
         try:
             await self.call_master("getPid")
+            for key, value in self.environment.parameters.items():
+                await self.set_param(f"~{key}", value)
         except BaseException:
             await self.slave.close()
             raise
