@@ -16,6 +16,7 @@ CLIENTS: Final = Path(__file__).parent / "clients"
 """Our own programs that use those packages, and the versions that are wanted."""
 _FILES: Final = ("package.json", "package-lock.json")
 _INSTALL: Final = 180.0
+_NODE: Final = 18
 _OFFLINE: Final = ("EAI_AGAIN", "ENOTFOUND", "ECONNREFUSED", "ENETUNREACH", "EHOSTUNREACH", "ETIMEDOUT", "ENOTCACHED")
 """How npm says that it reaches no registry; any other failure is one of the test."""
 
@@ -23,8 +24,10 @@ _OFFLINE: Final = ("EAI_AGAIN", "ENOTFOUND", "ECONNREFUSED", "ENETUNREACH", "EHO
 @functools.cache
 def why_not() -> str:
     """Why no client in JavaScript can run here, or an empty string."""
-    missing = [name for name in ("node", "npm") if shutil.which(name) is None]
-    return f"no {' and no '.join(missing)} here (apt install nodejs npm)" if missing else ""
+    if missing := [name for name in ("node", "npm") if shutil.which(name) is None]:
+        return f"no {' and no '.join(missing)} here (apt install nodejs npm)"
+    said = subprocess.run(["node", "--version"], capture_output=True, text=True, check=True).stdout.strip()
+    return "" if int(said[1:].split(".")[0]) >= _NODE else f"node is {said}, and the clients need {_NODE}"
 
 
 @functools.cache
