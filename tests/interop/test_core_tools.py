@@ -196,9 +196,8 @@ def test_parameters(shell: ShellFactory, tmp_path: Path) -> None:
             "dump": param("dump", str(ros.home / "dump.yaml"), "/"),
         }
         found["dumped"] = (ros.home / "dump.yaml").read_text("utf-8")
-        found["dumped"] = re.sub(
-            r"(?s)^roslaunch:.*?(?=^\w)|^run_id:.*?\n|^ros(?:distro|version): .*?'\n", "", found["dumped"], flags=re.MULTILINE
-        )
+        variable = r"(?s)^roslaunch:.*?(?=^\w)|^run_id:.*?\n|^ros(?:distro|version): .*?'\n"
+        found["dumped"] = re.sub(variable, "", found["dumped"], flags=re.MULTILINE)
         return found
 
     both(shell, scenario)
