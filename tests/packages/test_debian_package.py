@@ -95,7 +95,7 @@ def test_there_is_a_manual_for_every_command_and_setting(tree: Path) -> None:
         family = words.partition(" ")[0]
         if module != "main":  # those are families
             assert f"\\fBrmpa {words}\\fR".replace("-", r"\-") in pages[f"rmpa-{family}.1.gz"], words
-        assert f"rmpa\\-{family}\\fR(1)" in pages["rmpa.1.gz"]
+        assert f"rmpa-{family}\\fR(1)".replace("-", r"\-") in pages["rmpa.1.gz"]
     for setting in SETTINGS:
         name = setting.title if setting.is_list_of_tables or not setting.key else setting.key[-1]
         assert name in pages["rmpa.toml.5.gz"]

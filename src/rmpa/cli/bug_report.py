@@ -8,13 +8,14 @@ import os
 import platform
 import pwd
 import socket
-import subprocess
 import sys
 import tarfile
 import time
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from subprocess import DEVNULL, PIPE, Popen, TimeoutExpired
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 import msgspec
@@ -26,14 +27,13 @@ from rmpa.cli.units import UNITS
 from rmpa.config.module_name import of_unit, state_dir
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.core.limits import KIB
+from rmpa.discovery.network import list_interfaces
 from rmpa.observe.control_client import ControlClient, find_agents
-from rmpa.observe.doctor.machine import read_interfaces
 from rmpa.runtime.interpreter import own_command
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from rmpa.observe.snapshot import Snapshot
 
 # By its file: the command of rmpa that fills it. Those of an agent are asked of each.
 _COMMANDS: Final = {
@@ -67,9 +67,7 @@ Files that could not be filled say why.
 
 @json_verb(
     config_option,
-    click.option(
-        "-o", "--output", metavar="PATH", help="A .tar.gz, or a folder that is made. [default: a .tar.gz here]"
-    ),
+    click.option("-o", "--output", metavar="PATH", help="A .tar.gz, else a folder. [default: a .tar.gz here]"),
     click.option("--log", metavar="FILE", type=click.Path(exists=True, dir_okay=False), help="A log of rmpa up."),
     flag("--anonymous", help="Replace names of hosts and modules, and addresses, each by one word."),
 )
@@ -91,18 +89,20 @@ def bug_report(config: str | None, output: str | None, log: str | None, anonymou
     path = Path(output or time.strftime("rmpa-bug-report-%Y-%m-%d-%H%M%S.tar.gz"))
     if path.exists():
         raise ConfigError("--output", f"{path} is there already", "name another one")
-    found, modules = collect(os.environ, config, log)
-    redactor = _redactor(os.environ, found)
+    environ = {**os.environ, "RMPA_CONFIG": config} if config else dict(os.environ)
+    found, modules = collect(environ, log)
+    settings: dict[str, Any] = {}
+    with suppress(ValueError, KeyError):  # they cannot be read: the file says why
+        settings = {each["name"]: each["value"] for each in json.loads(found["settings.json"])["settings"]}
+    redactor = _redactor(environ, settings.get("web.token_file", ""))
     if anonymous:
-        redactor.anonymise(found.values(), _hosts(os.environ, found), modules)
+        redactor.anonymise(found.values(), _hosts(environ, settings), modules)
     found["README.txt"] = _README.format(more=", names of hosts and modules, addresses" if anonymous else "")
     clean = {redactor.text(name): _redacted(name, text, redactor) for name, text in sorted(found.items())}
     try:
         _write(path, clean)
     except OSError as error:
-        raise StartError(
-            str(path), f"cannot be written: {error.strerror}", "name another place by --output"
-        ) from None
+        raise StartError(str(path), f"cannot be written: {error.strerror}", "name another by --output") from None
     counts = {what: count for what, count in redactor.counts.items() if count}
     sizes = {name: len(text.encode()) for name, text in clean.items()}
     if options.as_json:
@@ -113,27 +113,22 @@ def bug_report(config: str | None, output: str | None, log: str | None, anonymou
     print_text(f"{path} is written. Look into it before you attach it to an issue: it was not sent anywhere.")
 
 
-def collect(environ: Mapping[str, str], config: str | None, log: str | None) -> tuple[dict[str, str], list[str]]:
+def collect(environ: Mapping[str, str], log: str | None) -> tuple[dict[str, str], list[str]]:
     """Ask this machine.
 
     Args:
         environ: The shell's variables.
-        config: The settings' file; the usual places by default.
         log: A file with the agent's log.
 
     Returns:
         The text of each file, not redacted, and the names of modules.
     """
     agents = find_agents(environ)
-    found, modules = {"system.json": json.dumps(_system(environ)), "state.txt": "\n".join(_state(environ))}, []
-    words = _COMMANDS | {
-        f"{a.name}/{file}": f"{of} --agent {a.name}" for a in agents for file, of in _OF_AGENTS.items()
-    }
-    chosen = ["--config", config] if config else []
-    programs = {
-        file: own_command(*of.split(), *(chosen if file in ("doctor.json", "settings.json") else []))
-        for file, of in words.items()
-    }
+    system = json.dumps(_system(environ), default=str)
+    found, modules = {"system.json": system, "state.txt": "\n".join(_state(environ))}, []
+    programs = {file: own_command(*of.split()) for file, of in _COMMANDS.items()}
+    for name in (agent.name for agent in agents):
+        programs |= {f"{name}/{file}": own_command(*of.split(), "--agent", name) for file, of in _OF_AGENTS.items()}
     programs["log.txt"] = [*_LOG.split(), *(f"--unit={unit}" for unit in UNITS.values())]
     found |= run_programs(programs, environ)
     for agent in agents:
@@ -145,7 +140,9 @@ def collect(environ: Mapping[str, str], config: str | None, log: str | None) -> 
             found[f"{agent.name}/snapshot.json"] = json.dumps({"error": str(error)})
         else:
             found[f"{agent.name}/snapshot.json"] = msgspec.json.encode(shown).decode()
-            modules += _names(shown)
+            modules += [peer.name for peer in (*shown.peers, *shown.strangers)]
+    if not found["log.txt"]:
+        found["log.txt"] = "nothing: no unit of rmpa has a log here, or only root may read it; see --log\n"
     if log is not None:
         found["up.log"] = Path(log).read_bytes()[-_LOG_BYTES:].decode("utf-8", "replace")
     return found, modules
@@ -153,24 +150,17 @@ def collect(environ: Mapping[str, str], config: str | None, log: str | None) -> 
 
 def run_programs(programs: Mapping[str, list[str]], environ: Mapping[str, str]) -> dict[str, str]:
     """What programs print, all run side by side; of one that fails or hangs also what it says, or that it hangs."""
-    until, found = time.monotonic() + DEADLINE, {}
-    running = {}
+    until, running, found = time.monotonic() + DEADLINE, {}, {}
     for file, words in programs.items():
         try:
-            running[file] = subprocess.Popen(  # noqa: S603 - our own words
-                words,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                env={**environ, "NO_COLOR": "1"},
-            )
+            running[file] = Popen(words, stdin=DEVNULL, stdout=PIPE, stderr=PIPE, env=environ)  # noqa: S603 - ours
         except OSError as error:
             found[file] = f"{words[0]}: {error.strerror}\n"
     for file, process in running.items():
         try:
             out, err = process.communicate(timeout=max(0.1, until - time.monotonic()))
             said = f"exit code {process.returncode}\n" if process.returncode and not file.endswith(".json") else ""
-        except subprocess.TimeoutExpired:
+        except TimeoutExpired:
             process.kill()
             out, err = process.communicate()
             said = f"it was ended after {DEADLINE:g} s\n"
@@ -178,10 +168,6 @@ def run_programs(programs: Mapping[str, list[str]], environ: Mapping[str, str]) 
         if (err or said) and not (file.endswith(".json") and out):
             found[file] += said + err.decode("utf-8", "replace")
     return found
-
-
-def _names(shown: Snapshot) -> Iterator[str]:
-    yield from (peer.name for peer in (*shown.peers, *shown.strangers))
 
 
 def _system(environ: Mapping[str, str]) -> dict[str, object]:
@@ -195,14 +181,10 @@ def _system(environ: Mapping[str, str]) -> dict[str, object]:
         "program": [sys.executable, sys.prefix],
         "host": socket.gethostname(),
         "cpus": os.cpu_count(),
-        "load": os.getloadavg(),
         "root": os.geteuid() == 0,
         "ros": sorted(map(str, Path("/opt/ros").glob("*"))),
         "variables": {name: value for name, value in sorted(environ.items()) if name.startswith(_VARIABLES)},
-        "interfaces": {
-            one.name: [*map(str, one.networks), *(["up"] if one.up else []), *(["used"] if one.used else [])]
-            for one in read_interfaces(())
-        },
+        "interfaces": [asdict(one) for one in list_interfaces()],
     }
 
 
@@ -217,20 +199,17 @@ def _state(environ: Mapping[str, str]) -> Iterator[str]:
             yield f"{info.st_mode:06o} {info.st_uid:>6} {info.st_size:>10} {path.relative_to(directory or path)}"
 
 
-def _redactor(environ: Mapping[str, str], found: Mapping[str, str]) -> Redactor:
+def _redactor(environ: Mapping[str, str], token_file: str) -> Redactor:
     """One that knows this machine's secrets, users and homes."""
     directory = state_dir(of_unit(environ))
     files = [*directory.rglob("*token*")] if directory is not None else []
-    with suppress(ValueError, TypeError):
-        settings = json.loads(found["settings.json"])["settings"]
-        files += [Path(each["value"]) for each in settings if each["name"] == "web.token_file" and each["value"]]
     secrets = [value for name, value in environ.items() if is_secret(name)]
-    for file in files:
+    for file in (*files, Path(token_file)):
         with suppress(OSError):
             secrets.append(file.read_bytes()[:KIB].decode("utf-8", "replace").strip())
-    ids = {os.geteuid(), os.getuid(), int(environ.get("SUDO_UID", "") or os.getuid())}
+    caller = environ.get("SUDO_UID", "")
     users, homes = [environ.get(name, "") for name in ("USER", "LOGNAME", "SUDO_USER")], [environ.get("HOME", "")]
-    for user in ids:
+    for user in (os.geteuid(), int(caller) if caller.isdecimal() else os.getuid()):
         with suppress(KeyError):
             entry = pwd.getpwuid(user)
             users.append(entry.pw_name)
@@ -238,12 +217,10 @@ def _redactor(environ: Mapping[str, str], found: Mapping[str, str]) -> Redactor:
     return Redactor(secrets, homes, users)
 
 
-def _hosts(environ: Mapping[str, str], found: Mapping[str, str]) -> Iterator[str]:
+def _hosts(environ: Mapping[str, str], settings: Mapping[str, list[str]]) -> Iterator[str]:
     yield from (socket.gethostname(), socket.gethostname().partition(".")[0], environ.get("ROS_HOSTNAME", ""))
-    with suppress(ValueError, TypeError, KeyError):
-        for each in json.loads(found["settings.json"])["settings"]:
-            if each["name"] in ("discovery.seeds", "web.hosts", "gateway.connect", "gateway.listen"):
-                yield from (str(one).rpartition("/")[2].partition(":")[0] for one in each["value"])
+    for name in ("discovery.seeds", "web.hosts", "gateway.connect", "gateway.listen"):
+        yield from (each.rpartition("/")[2].partition(":")[0] for each in settings.get(name, ()))
 
 
 def _redacted(name: str, text: str, redactor: Redactor) -> str:
@@ -255,8 +232,8 @@ def _redacted(name: str, text: str, redactor: Redactor) -> str:
 
 def _write(path: Path, files: Mapping[str, str]) -> None:
     if not path.name.endswith((".tar.gz", ".tgz")):
+        path.mkdir(mode=0o700)
         for name, text in files.items():
-            path.mkdir(mode=0o700, exist_ok=True)
             (path / name).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             (path / name).write_text(text, "utf-8")
         return

@@ -100,7 +100,8 @@ def put_right(look: Callable[[], DoctorInput], options: Options, *, yes: bool) -
     """
     given = look()
     before, plan = list(examine(given)), find_repairs(given)
-    by_hand = [check for check in before if check.level in (WARN, FAIL) and not _covers(plan, check)]
+    planned = {(repair.check, repair.where) for repair in plan}
+    by_hand = [one for one in before if one.level in (WARN, FAIL) and (one.name, one.where) not in planned]
     if not options.as_json:
         print_text(_plan_lines(plan, by_hand))
     wanted = plan if _agreed(plan, options, yes=yes) else []
@@ -115,14 +116,9 @@ def put_right(look: Callable[[], DoctorInput], options: Options, *, yes: bool) -
         "failed": [str(repair) for repair in failed],
         "checks": [*map(check_json, after)],
     }
-    then = [repair.then for repair in done if repair.then and repair not in failed]
     again = ["", "Checked again:", *(line for check in rest for line in check_lines(check))] if wanted else []
-    options.show(value, [*then, *again, checks_summary(after)])
+    options.show(value, [*again, checks_summary(after)])
     return 1 if failed or (plan and not wanted) else exit_code(after)
-
-
-def _covers(plan: Sequence[Repair], check: Check) -> bool:
-    return any((repair.check, repair.where) == (check.name, check.where) for repair in plan)
 
 
 def _plan_lines(plan: Sequence[Repair], by_hand: Sequence[Check]) -> Iterator[str]:

@@ -31,9 +31,7 @@ if TYPE_CHECKING:
     from rmpa.observe.doctor.machine import NetworkInterface
     from rmpa.observe.snapshot import AgentInfo
 
-_HEAD: Final = (
-    "# Written by `rmpa init`: each line without a comment sign is for what was found, which stands above it.\n"
-)
+_HEAD: Final = "# Written by `rmpa init`: what was found stands above each line that is no comment.\n"
 _COLUMNS: Final = 118
 
 
@@ -85,10 +83,8 @@ def init(file: str | None, system: bool, force: bool, dry_run: bool, options: Op
         _write(path, text, force=force, system=system)
         other = None if system else find_config_file(None, {**os.environ, "RMPA_CONFIG": ""}, path, [])
         notes += [f"{other} is not read where {path} is"] if other else []
-    shown = [
-        {"setting": ".".join(key), "value": json_value(value), "found": printable(said)} for key, said, value in found
-    ]
     if options.as_json:
+        shown = [{"setting": ".".join(key), "value": json_value(value), "found": said} for key, said, value in found]
         options.show({"file": str(path), "written": not dry_run, "found": shown, "notes": notes})
         return
     rows = [(".".join(key), "default" if value is None else toml_value(value), said) for key, said, value in found]
@@ -124,10 +120,8 @@ def file_text(found: Sequence[Finding], *, system: bool = False) -> str:
         table = lines.index(f"[{'.'.join(key[:-1])}]") if key[1:] else 0
         at = next(number for number in range(table, len(lines)) if lines[number].startswith(f"# {key[-1]} = "))
         comment = textwrap.wrap(f"Found: {printable(said)}", _COLUMNS - 2, break_on_hyphens=False)
-        lines[at:at] = [
-            *(f"# {line}" for line in comment),
-            *([f"{key[-1]} = {toml_value(value)}"] * (value is not None)),
-        ]
+        line = [f"{key[-1]} = {toml_value(value)}"] if value is not None else []
+        lines[at:at] = [*(f"# {each}" for each in comment), *line]
     return "\n".join(lines) + "\n"
 
 

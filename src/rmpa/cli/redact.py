@@ -14,25 +14,18 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
 _GONE: Final = "[redacted]"
-_WORDS: Final = (
-    r"passw(?:or)?d|passphrase|secret|token|credential|api_?key|private_?key|access_?key|psk\b|authorization|cookie"
-)
+_WORDS: Final = r"passw|passphrase|secret|token|credential|(?:api|private|access)_?key|psk\b|authorization|cookie"
 _IS_SECRET: Final = re.compile(_WORDS, re.IGNORECASE)
 # Names of files and the like: that they hold a secret does not make them one.
 _IS_PLACE: Final = re.compile(r"(file|path|dir|folder)s?$", re.IGNORECASE)
 _USER_INFO: Final = re.compile(r"(\b[a-zA-Z][\w+.-]*://)[^/\s@\"'<>]+@")
 # By what is counted: the pattern, and what takes its place.
 _RULES: Final = (
-    (
-        "private keys and certificates",
-        re.compile(r"-----BEGIN ([A-Z0-9 ]+)-----.*?(?:-----END \1-----|\Z)", re.DOTALL),
-    ),
+    ("private keys", re.compile(r"(?s)-----BEGIN ([A-Z0-9 ]+)-----.*?(?:-----END \1-----|\Z)")),
     ("tokens", re.compile(r"(?i)\brmpa1-[a-z2-7]{8,}|(?<=bearer )[\w.~+/=-]{6,}|(?<=basic )[\w.~+/=-]{6,}")),
-    # A random text as base64 has it, or the hexadecimal digits of a key.
-    (
-        "random texts",
-        re.compile(r"\b(?=[\w+-]*\d)(?=[\w+-]*[a-z])(?=[\w+-]*[A-Z])[\w+-]{40,}={0,2}|\b[0-9a-fA-F]{64,}\b"),
-    ),
+    # As base64 has it, and the hexadecimal digits of a key.
+    ("random texts", re.compile(r"\b(?=[\w+-]*\d)(?=[\w+-]*[a-z])(?=[\w+-]*[A-Z])[\w+-]{40,}={0,2}")),
+    ("random texts", re.compile(r"\b[0-9a-fA-F]{64,}\b")),
 )
 _VALUE: Final = r"(\\?\"(?:[^\"\\]|\\.)*\"|'[^']*'|[^\s\"',;&}\])]+)"
 _NAMED: Final = tuple(

@@ -45,7 +45,6 @@ class Repair:
         command: What puts it right, as the arguments of a program.
         undo: What undoes that, ready to read.
         root: Whether it takes the rights of root.
-        then: What the user has to do behind it; may be empty.
     """
 
     check: str
@@ -54,7 +53,6 @@ class Repair:
     command: tuple[str, ...]
     undo: str
     root: bool = False
-    then: str = ""
 
     @property
     def words(self) -> tuple[str, ...]:
@@ -106,12 +104,9 @@ def of_group(group: str, user: str, member: bool) -> Iterator[Repair]:
         member: Whether the group has the user; then only a new session is missing.
     """
     if group and not member:
-        text, command = (
-            f"users of the group {group} may ask the agent at boot, and {user} may not",
-            ("usermod", "-aG", group, user),
-        )
-        undo, then = f"sudo gpasswd -d {user} {group}", "log in again: a session keeps its groups"
-        yield Repair("directory", "/run/rmpa", text, command, undo, root=True, then=then)
+        text = f"users of the group {group} may ask the agent at boot, and {user} may not (a new log-in will have it)"
+        command, undo = ("usermod", "-aG", group, user), f"sudo gpasswd -d {user} {group}"
+        yield Repair("directory", "/run/rmpa", text, command, undo, root=True)
 
 
 def of_directories(given: DoctorInput) -> Iterator[Repair]:
@@ -133,19 +128,13 @@ def of_owner(directory: Path, home: Path | None) -> Iterator[Repair]:
     there = next(place for place in (directory, *directory.absolute().parents) if place.exists())
     owner, user = there.stat().st_uid, os.geteuid()
     if owner != user and user and home is not None and there.absolute().is_relative_to(home):
-        every = ("-R",) if there == directory else ()
-        command, text = (
-            ("chown", *every, f"{user}:", str(there)),
-            f"belongs to user {owner}: this user's agent keeps nothing",
+        change = ("chown", *(("-R",) if there == directory else ()))
+        text, undo = (
+            "belongs to another user, so this user's agent can keep nothing there",
+            (*change, str(owner), str(there)),
         )
-        yield Repair(
-            "directory",
-            str(there),
-            text,
-            command,
-            f"sudo {shlex.join(('chown', *every, str(owner), str(there)))}",
-            root=True,
-        )
+        command = (*change, f"{user}:", str(there))
+        yield Repair("directory", str(there), text, command, f"sudo {shlex.join(undo)}", root=True)
 
 
 def of_mode(directory: Path, forbidden: int, mode: str) -> Iterator[Repair]:
