@@ -126,7 +126,7 @@ def test_the_examples_rules_load(load: Load) -> None:
 
 def test_the_rules_of_the_documentation_load(load: Load) -> None:
     blocks = re.findall(r"```toml\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
-    assert len(blocks) > 5
+    assert len(blocks) >= 4
     for block in blocks:
         loaded = load(block)
         assert loaded.settings.contracts
@@ -137,7 +137,7 @@ def test_the_rules_of_the_documentation_load(load: Load) -> None:
 
 
 def test_the_documentation_has_every_key_and_every_default() -> None:
-    text = DOCUMENT.read_text().partition("## Both sides")[0]
+    text = DOCUMENT.read_text().partition("\nBoth modules may have rules")[0]
     written = dict(re.findall(r"^\| `(\w+)` \| `\"?([\w ]+)\"?`", text, re.MULTILINE))
     defaults = {
         key: str(
