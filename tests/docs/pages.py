@@ -27,8 +27,6 @@ USER_PAGES: Final = [
 ] + [ROOT / "README.md"]
 """The pages that users read."""
 UNMARKED: Final = {
-    "docs/reference/compatibility.md",
-    "docs/reference/settings.md",
 }
 """User pages whose words and blocks of commands are not checked before they are written anew; empty at the end."""
 _OPTIONS: Final = MarkdownIt("commonmark").enable("table")
