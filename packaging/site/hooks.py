@@ -21,11 +21,6 @@ def slug(heading: str, _separator: str = "-") -> str:
 def on_config(config: MkDocsConfig) -> None:
     """Set what is made by code."""
     config.mdx_configs["toc"]["slugify"] = slug
-    for section in config.nav or []:  # pages that are still being written
-        for name, pages in section.items():
-            if isinstance(pages, list):
-                section[name] = [page for page in pages if Path(config.docs_dir, page).exists()]
-    config.nav = [section for section in config.nav or [] if all(section.values())]
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:

@@ -26,9 +26,6 @@ USER_PAGES: Final = [
     path for path in PAGES if path.relative_to(ROOT).parts[:2] != ("docs", "design") and "docs" in path.parts
 ] + [ROOT / "README.md"]
 """The pages that users read."""
-UNMARKED: Final = {
-}
-"""User pages whose words and blocks of commands are not checked before they are written anew; empty at the end."""
 _OPTIONS: Final = MarkdownIt("commonmark").enable("table")
 
 

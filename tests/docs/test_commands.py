@@ -35,7 +35,7 @@ import pytest
 from lab.bed.agents import Agent
 from lab.bed.namespaces import MACHINE
 from lab.bed.processes import Process, eventually
-from tests.docs.pages import ROOT, UNMARKED, USER_PAGES, Block, blocks, name_of
+from tests.docs.pages import ROOT, USER_PAGES, Block, blocks, name_of
 from tests.interop import ros
 
 if TYPE_CHECKING:
@@ -44,8 +44,7 @@ if TYPE_CHECKING:
 DEADLINE: Final = 40.0
 _COMMAND: Final = re.compile(r"^(\w*)\$ ((?:.*\\\n)*.*)$", re.MULTILINE)
 _STOCK: Final = re.compile(r"\b(?:ros(?:topic|node|service|param|run|launch|core)|catkin_make)\b")
-_PAGES: Final = [page for page in USER_PAGES if name_of(page) not in UNMARKED]
-_BLOCKS: Final = [block for page in _PAGES for block in blocks(page)]
+_BLOCKS: Final = [block for page in USER_PAGES for block in blocks(page)]
 _CONSOLE: Final = [block for block in _BLOCKS if block.language == "console"]
 _RUN: Final = [block for block in _CONSOLE if not block.mark]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from tests.docs.pages import UNMARKED, USER_PAGES, name_of
+from tests.docs.pages import USER_PAGES, name_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -23,7 +23,7 @@ _REFUSED: Final = re.compile(
 )
 
 
-@pytest.mark.parametrize("page", [page for page in USER_PAGES if name_of(page) not in UNMARKED], ids=name_of)
+@pytest.mark.parametrize("page", USER_PAGES, ids=name_of)
 def test_a_user_page_tells_what_there_is(page: Path) -> None:
     text = re.sub(r"```.*?```", lambda block: "\n" * block[0].count("\n"), page.read_text("utf-8"), flags=re.DOTALL)
     found = [
