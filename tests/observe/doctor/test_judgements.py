@@ -187,6 +187,11 @@ AGENTS: dict[str, tuple[Callable[[], Iterable[Check]], str, str]] = {
         "peer",
         "fail warn",
     ),
+    "a peer that refuses has been reached by TCP": (
+        agent(peers=(msgspec.structs.replace(PC, state="refused", conflicts=()),)),
+        "peer",
+        "fail",
+    ),
     "a module that is not of this mesh, and no advice on multicast": (
         agent(
             peers=(),

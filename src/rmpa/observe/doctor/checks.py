@@ -154,7 +154,9 @@ def _peer(agent: str, peer: PeerInfo) -> Iterator[Check]:
         yield check(OK, "relayed: another peer passes on its topics")
     elif link is None:
         text = f"{peer.state}: {peer.last_error or 'no TCP connection yet'}"
-        remedy = "see that TCP gets through on both machines: firewall, routes; or do what the text says"
+        remedy = "do what the text says"
+        if peer.state != "refused":  # else TCP got through
+            remedy = f"see that TCP gets through on both machines: firewall, routes; or {remedy}"
         yield check(FAIL if peer.state == "refused" else WARN, text, remedy)
     else:
         rest = ", at rest" if link.rests else ""
