@@ -127,9 +127,9 @@ def test_beside_another_agent_the_core_gets_another_port(
     ("there", "value", "words"),
     [
         ((LO, WLAN), None, "wlan0 (192.168.1.5/24) can be used"),
-        ((LO, WLAN, CABLE, DOCKER), ("lo", "wlan0", "eth1"), "docker0 of containers"),
+        ((LO, WLAN, CABLE, DOCKER), ("lo", "wlan0", "eth1"), "left out: docker0 (containers"),
         ((LO,), None, "no network but loopback"),
-        ((LO, DOCKER), None, "docker0 of containers"),
+        ((LO, DOCKER), None, "left out: docker0 (containers"),
     ],
 )
 def test_interfaces(there: tuple[NetworkInterface, ...], value: object, words: str) -> None:

@@ -174,10 +174,10 @@ def _core(agents: Sequence[AgentInfo], name: str, port: int) -> Iterator[Finding
         free = next(each for each in count(port + 1) if each not in ports)
         yield Finding(("core", "port"), f"the agent {owner.name} has port {port}, so this is a second module", free)
     if owner is None and asyncio.run(is_other_master(port)):
-        holder = program_at(port) or "a roscore"
+        holder = program_at(port).partition(" (")[0] or "a program"
         text = f'{holder} is the ROS master at port {port}, so the agent joins it; end it before you say "embedded"'
         yield Finding(("core", "mode"), text, "external")
-        yield Finding(("core", "master"), "it answers there", f"http://localhost:{port}/")
+        yield Finding(("core", "master"), "the master answers there", f"http://localhost:{port}/")
 
 
 def _interfaces(there: Sequence[NetworkInterface]) -> Iterator[Finding]:
@@ -189,7 +189,7 @@ def _interfaces(there: Sequence[NetworkInterface]) -> Iterator[Finding]:
     used = [f"{one.name} ({', '.join(map(str, one.networks))})" for one in own if one.used]
     text = f"{', '.join(used)} can be used" if used else "no network but loopback can be used at present"
     if inner:
-        text += f"; {', '.join(inner)} of containers or virtual machines left out: add interfaces that come later"
+        text += f"; left out: {', '.join(inner)} (containers, virtual machines). Add here what comes later"
     yield Finding(("discovery", "interfaces"), text, ("lo", *(one.name for one in own)) if inner and own else None)
     networks = {str(at.network): one.name for one in own if one.used for at in one.networks if not at.is_link_local}
     if len(networks) > 1:
