@@ -520,7 +520,7 @@ class Agent:
             reason, _, remedy = problem.partition("; ")
             effect = "when that of a direct subscriber does, a rospy publisher without queue_size may hang"
             text = f"the agent may not end connections that a vanished host leaves behind ({reason}): {effect}"
-            _log.warning("! %s; %s (docs/guides/running.md#at-boot) [stale-connections]", text, remedy)
+            _log.warning("! %s; %s (docs/guides/running.md#direct-transport) [stale-connections]", text, remedy)
 
     def apply_settings(self, settings: Settings) -> None:
         """Take settings that were read again; only those of ``agent.process.LIVE`` differ."""

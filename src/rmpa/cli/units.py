@@ -103,7 +103,7 @@ WantedBy=multi-user.target
 """
 # The agent's alone.
 _NET_ADMIN: Final = """\
-# To end connections whose host has vanished, where topics go from node to node (docs/guides/running.md#at-boot).
+# To end connections whose host has vanished (docs/guides/running.md#direct-transport).
 AmbientCapabilities=CAP_NET_ADMIN
 CapabilityBoundingSet=CAP_NET_ADMIN"""
 _REALTIME: Final = """\

@@ -387,7 +387,7 @@ CODES: Final[dict[str, tuple[str, str]]] = {
             "The agent may not end connections of nodes to a machine that has vanished; a publisher without "
             "queue_size, or a call, may hang."
         ),
-        "Give the agent CAP_NET_ADMIN: [at boot](../guides/running.md#at-boot).",
+        "Give the agent CAP_NET_ADMIN: [direct transport](../guides/running.md#direct-transport).",
     ),
     "no-server": (
         "No node provides this service, or its server does not answer.",

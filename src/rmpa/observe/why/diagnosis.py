@@ -251,7 +251,8 @@ def remedy_for(one: SubscriberTransport) -> str:
     """What to do about a subscriber that is relayed, or has to be."""
     if one.transport == "direct":
         return (
-            "if it lasts, give the agent CAP_NET_ADMIN (docs/guides/running.md#at-boot), or restart that subscriber"
+            "if it lasts, give the agent CAP_NET_ADMIN (docs/guides/running.md#direct-transport), "
+            "or restart that subscriber"
         )
     return _REMEDIES.get(one.condition, "docs/guides/contracts.md explains the conditions")
 
