@@ -161,7 +161,7 @@ class JoinedSites:
             self._wait_settled()
 
     def _wait_settled(self) -> None:
-        """Wait until the router's session names all that have joined: it is opened anew for that, and links fall."""
+        """Wait until the router's session names all that have joined: it is opened again for that, and links fall."""
 
         def settled() -> bool:
             report = self.router.report()

@@ -292,7 +292,7 @@ Four hosts: *joystick* sends CMD, *velocity* answers each with VEL, *base* takes
 Nodes have fixed names; those of a host are started as soon as its agent is ready or its master answers. A message is
 lost if it was due between the failure and the end of the observation and never came. RMPA runs twice: through its
 agents, and *direct*, from node to node, as it is shown to be before anything fails. Where classic ROS does not
-recover, it gets one more chance: in the end whatever still runs from before the failure is started anew by hand.
+recover, it gets one more chance: in the end whatever still runs from before the failure is started again by hand.
 """
 
 

@@ -104,7 +104,7 @@ class FlowLosses:
         after_start: Seconds from the start of what was started again (the agent or master, a node; the cable) until
             it ran again; ``None`` if it never stood still, or never came back.
         after_up: Seconds from the moment at which all of that was up.
-        by_hand: Whether it ran after all nodes had been started anew by hand; ``None`` if they were not.
+        by_hand: Whether it ran after all nodes had been started again by hand; ``None`` if they were not.
     """
 
     flow: Flow
@@ -257,7 +257,7 @@ def _grid(told: Sequence[tuple[Cell, list[FlowLosses]]]) -> Grid:
     note = (
         "* needs the host that fails, or the node that crashes. Runs again: seconds from the start of what was"
         " started again (agent or master, node; the cable), and in brackets from when all of that was up. Late:"
-        " more than 0.1 s. By hand: after every node that ran since before the failure was started anew."
+        " more than 0.1 s. By hand: after every node that ran since before the failure was started again."
     )
     return Grid("What became of each flow", heads, rows, note)
 
@@ -333,7 +333,7 @@ def _notes(told: Sequence[tuple[Cell, Measured, list[FlowLosses]]]) -> Iterable[
                 f"Classic, {cell.settings['client']}, {SCENARIOS[str(cell.settings['scenario'])].title}:"
                 " connections that existed went on without the master. A node that is started while it is away"
                 " waits for it; the master that came back knows nothing of the nodes that had run on, so nobody"
-                f" that is new finds them: {never} flows needed {by_hand} nodes of other hosts to be started anew"
+                f" that is new finds them: {never} flows needed {by_hand} nodes of other hosts to be started again"
                 " by hand."
             )
     if any(str(cell.settings["scenario"]).startswith("cable") for cell, _, _ in told):

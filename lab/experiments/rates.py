@@ -69,7 +69,7 @@ network namespaces of one machine, with one clock.
 percentiles with fewer than ten samples beyond them are left out. The first tenth of a second of each step is not
 counted. Systems take turns.
 
-RMPA stands there twice: *RMPA*, through the agents, and *RMPA direct*, from node to node. Classic ROS runs with
+RMPA is there twice: *RMPA*, through the agents, and *RMPA direct*, from node to node. Classic ROS runs with
 tcp_nodelay. Beside it, in one round of 50 messages at each of the paper's rates and 1,000 at
 1 kHz: classic ROS *without tcp_nodelay*, where Nagle's algorithm may hold a message back until the one before it
 was acknowledged; and classic ROS through *two relays* in C++ (roscpp, tcp_nodelay), one on each host, which tells

@@ -124,7 +124,7 @@ def test_a_bug_report_has_the_formats_and_the_system(capsys: pytest.CaptureFixtu
     assert (told["protocols"]["beacon"], told["protocols"]["link"]) == (2, 3)
     assert told["python"] == ".".join(map(str, sys.version_info[:3]))
     assert main(["--json", "topic", "list"]) == 2
-    assert "--json stands behind the command: rmpa topic list --json" in capsys.readouterr().err
+    assert "--json belongs after the command: rmpa topic list --json" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("words", "remedy"), REMOVED_VERBS.items())
@@ -182,8 +182,8 @@ def test_help_imports_no_command() -> None:
         ("help", "Did you mean `rmpa --help`?"),
         ("version", "Did you mean `rmpa --version`?"),
         ("start", "Did you mean `rmpa up` or `rmpa service install`?"),
-        ("--json peer list", "--json stands behind the command: rmpa peer list --json"),
-        ("topic --agent base list", "--agent stands behind the command: rmpa topic list --agent"),
+        ("--json peer list", "--json belongs after the command: rmpa peer list --json"),
+        ("topic --agent base list", "--agent belongs after the command: rmpa topic list --agent"),
     ],
 )
 def test_a_word_at_the_wrong_place_leads_to_the_right_verb(

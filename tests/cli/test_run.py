@@ -189,7 +189,7 @@ def test_without_its_agent_a_resource_ends_and_says_so(ground: Ground) -> None:
     wrong = ground.run(HEAD + TALK, "--", "--interfaze", "lo", options=False)
     assert wrong.wait() == 1
     assert "--interfaze" in wrong.output
-    assert "rmpa: agent nose: it ended with code 2; what it said stands above" in wrong.output
+    assert "rmpa: agent nose: it ended with code 2; see its lines above" in wrong.output
 
 
 def test_a_bad_file_leaves_no_agent(ground: Ground) -> None:

@@ -165,7 +165,7 @@ def test_a_type_of_this_machines_packages(
     assert code == 1
     assert "my_pkg/Do: has the md5 sum " in err
     assert f"here ({folder}/Do.srv), and " in err
-    assert err.endswith(" there; source the workspace that the node over there was built in [unknown-type]\n")
+    assert err.endswith(" there; source the workspace that the node there was built in [unknown-type]\n")
 
 
 def test_info_tells_what_crosses(

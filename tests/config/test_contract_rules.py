@@ -168,7 +168,7 @@ RULE = '[[contract]]\ntopics = ["/a"]\n'
         ("[[contract]]\ntopics = '/a'", "2: contract.topics: '/a' is not a list; did you mean [\"/a\"]?"),
         ("[[contract]]\ntopics = ['/a',\n1]", "3: contract.topics: 1 is not a text in quotes"),
         ("[[contract]]\ntopics = [\n'/a',\n\n'cmd']", "5: contract.topics: 'cmd' matches no topic: topics begin wi"),
-        ("[[contract]]\ntopics = ['/a', '/a']", "2: contract.topics: '/a' stands there twice; delete one of them"),
+        ("[[contract]]\ntopics = ['/a', '/a']", "2: contract.topics: '/a' is there twice; delete one of them"),
         ("[[contract]]\ntypes = ['Image']", "2: contract.types: 'Image' matches no message type: types have a pack"),
         ("[[contract]]\ntopics = []", "2: contract.topics: an empty list fits nothing; leave topics out, or name s"),
         (RULE + "\n[[contract]]\ndepth = 1", '4: contract: a rule without topics and types; topics = ["/**"] mak'),

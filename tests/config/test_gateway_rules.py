@@ -127,7 +127,7 @@ def test_a_size_has_the_units_of_files_and_of_links(tmp_path: Path, size: str, e
         ("[gateway.rule]\nrate = 1", 1, "write [[gateway.rule]]"),
         ("[[gateway.rules]]\nrate = 1", 1, "did you mean gateway.rule?"),
         ("[[gateway.rule]]\nrates = 1", 2, "did you mean gateway.rule.rate?"),
-        ("[[gateway.rule]]\nnames = ['/a']", 1, "a rule that says nothing of what it selects"),
+        ("[[gateway.rule]]\nnames = ['/a']", 1, "a rule that selects nothing"),
         ("[[gateway.rule]]\nrate = 1\n[[gateway.rule]]\nrate = 0", 4, "gateway.rule.rate: 0 is out of range"),
         ("[[gateway.rule]]\nnames = ['a']\nrate = 1", 2, 'did you mean "/a"?'),
         ("[[gateway.rule]]\nsites = []\nrate = 1", 2, "leave sites out, or name some"),

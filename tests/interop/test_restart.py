@@ -78,7 +78,7 @@ def test_a_killed_agent_has_its_nodes_back_and_they_each_other(modules: ModuleFa
     assert a.ros.tool("rosparam", "get", "/robot/names").split() == ["-", "left", "-", "right"]
     code, told = a.agent.rmpa("doctor", "--json")
     (memory,) = [finding for finding in json.loads(told) if finding["check"] == "core memory"]
-    assert "nodes of the run before are taken up, 1 is gone" in memory["text"], (code, memory)
+    assert "nodes of the last run are restored, 1 is gone" in memory["text"], (code, memory)
 
     b.agent.kill()
     b.agent.restart()

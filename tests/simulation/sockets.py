@@ -90,7 +90,7 @@ class SimSocket:
         pass
 
     def getsockopt(self, *_: object) -> bytes:
-        raise OSError(errno.ENOPROTOOPT, "this kernel does not tell")
+        raise OSError(errno.ENOPROTOOPT, "this kernel does not say")
 
     def sendmsg(self, parts: Sequence[Buffer]) -> int:
         if self._error is not None:

@@ -133,7 +133,7 @@ class NetworkEndpoint:
         """Accept links, then send beacons."""
         await self.mesh.start()
         await self.discovery.start()
-        _log.info("= %s, domain %d, is on the air", self.identity, self.identity.domain)
+        _log.info("= %s, domain %d: peers can find it", self.identity, self.identity.domain)
 
     async def close(self) -> None:
         """Send the goodbye, and close the links in order."""

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from rmpa.config.read import Loaded
     from rmpa.config.settings import Settings
 
-# Until rmpa web is started anew after it ended; each further time it is twice as long.
+# Until rmpa web is started again after it ended; each further time it is twice as long.
 WEB_RESTART_FIRST: Final = 0.5
 # The longest such time.
 WEB_RESTART_CAP: Final = 30.0

@@ -142,7 +142,7 @@ class ServiceRules:
         if is_own(node):
             return PolicyDecision(False, f"{node} stands for a node of another module, or is the agent itself")
         if matches(OWN_SERVICES, service):
-            return PolicyDecision(False, "built in: the agent's own services stay home")
+            return PolicyDecision(False, "built in: the agent's own services do not cross")
         if not settings.loggers and any(matches(pattern, service) for pattern in LOGGERS):
             return PolicyDecision(
                 False, "built in: a node's log is set at home; services.loggers = true lets it cross"

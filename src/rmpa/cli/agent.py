@@ -158,7 +158,7 @@ def why(name: str, service: bool, module: bool, options: Options) -> int:
     module's own topics every peer says how it arrives there.
 
     ---
-    Exit codes: 0 it flows, on every way if there are several, or no node subscribes and nothing is in its way;
+    Exit codes: 0 it flows, on every way if there are several, or it would flow if a node subscribed;
     1 it does not flow, and the first stage that fails says why.
 
     Examples:
@@ -195,7 +195,7 @@ def stage_lines(diagnosis: Diagnosis) -> Iterator[str]:
         yield Painted(f"  {mark}  {printable(stage.name):<{width}}  {printable(stage.text + advice + code)}")
     failed = diagnosis.failed
     if diagnosis.unasked:
-        yield paint_level("nothing is in its way: it flows as soon as a node subscribes", WARN)
+        yield paint_level("nothing prevents it: it flows as soon as a node subscribes", WARN)
     elif failed is None:
         yield paint_level(_WELL.get(diagnosis.kind, "it flows"), OK)
     else:

@@ -512,7 +512,7 @@ def _peers() -> tuple[list[tuple[str, str]], str]:
     click.option("--root", metavar="DIR", default="", help="The folder of another system, such as an image."),
 )
 def service_uninstall(purge: bool, yes: bool, dry_run: bool, root: str, options: Options) -> int:
-    """Stop rmpa, take it out of the boot, and remove what `rmpa service install` has made.
+    """Stop rmpa, disable it at boot, and remove what `rmpa service install` has made.
 
     /etc/rmpa and /var/lib/rmpa stay, unless --purge says otherwise.
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @json_verb(
     config_option,
-    flag("-q", "--quiet", help="Only what fails, or may."),
+    flag("-q", "--quiet", help="Show only failures and warnings."),
     click.option("--listen", metavar="SECONDS", type=FiniteRange(1.0), help="Wait for multicasts of other machines."),
     flag("--fix", help="Put right what is safe: show the commands, ask, run them, check again."),
     flag("--yes", help="With --fix: do not ask."),

@@ -82,7 +82,7 @@ def gateway(context: click.Context, /, **options: object) -> int:
         given = [name for name, value in options.items() if value not in (None, ())]
         if given:
             option = f"--{given[0].replace('_', '-')}"
-            raise ConfigError(option, f"stands before {context.invoked_subcommand}", "write it behind that")
+            raise ConfigError(option, f"must come after {context.invoked_subcommand}", "write it behind that")
         return 0
     _check_gateway_libraries()
     beside = ""
@@ -186,7 +186,9 @@ def _check_settings(settings: Settings) -> None:
         raise ConfigError("gateway.router", "a router that listens nowhere", "add --listen tls/0.0.0.0:7447")
     if not (it.connect or it.listen):
         example = "tcp/localhost:7447 for rmw_zenohd here" if it.ros2.enabled else "tls/fleet.example:7447"
-        raise ConfigError("rmpa gateway", "there is no way to the others", f"add --connect, such as {example}")
+        raise ConfigError(
+            "rmpa gateway", "there is no connection to other sites", f"add --connect, such as {example}"
+        )
 
 
 def check_gateway(settings: Settings) -> None:

@@ -54,7 +54,7 @@ VERBS: Final = {
     "service call": ("service", "Call a service."),
     "service install": ("boot", "Start the agent at boot, and now: by a unit of systemd."),
     "service status": ("boot", "Show whether rmpa's units of systemd run, and the end of their log."),
-    "service uninstall": ("boot", "Stop rmpa, and take it out of the boot."),
+    "service uninstall": ("boot", "Stop rmpa, and do not start it at boot any more."),
     "node": ("main", "See nodes, here and in other modules; ping and end them."),
     "node list": ("node", "List nodes; those of peers as PEER:/node."),
     "node info": ("node", "Show a node's module, address, process, topics and services."),
@@ -93,7 +93,7 @@ VERBS: Final = {
     "trust init": ("trust", "Make a secured mesh, with this module as its authority."),
     "trust status": ("trust", "Show certificate, keys and deny list; at the authority members and tokens."),
     "trust renew": ("trust", "Renew the certificate now, or the group key of all."),
-    "trust revoke": ("trust", "Throw a module out of the mesh, at the authority."),
+    "trust revoke": ("trust", "Exclude a module from the mesh, at the authority."),
     "trust leave": ("trust", "Remove this module's keys and certificate."),
     "trust invite": ("trust_join", "Invite a module, at the authority: print a token, and wait."),
     "trust join": ("trust_join", "Join a secured mesh with a token, or by files."),
@@ -206,7 +206,7 @@ class LazyGroup(click.Group):
                     path.append(word)
                     found = found.get_command(ctx, word) or found
             if found is not self and any(error.option_name in each.opts for each in found.params):
-                ctx.fail(f"{error.option_name} stands behind the command: {' '.join(path)} {error.option_name}")
+                ctx.fail(f"{error.option_name} belongs after the command: {' '.join(path)} {error.option_name}")
             raise
 
     def invoke(self, ctx: click.Context) -> object:

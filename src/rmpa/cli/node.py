@@ -106,7 +106,7 @@ def _untold(told: Iterable[PeerNodes]) -> Iterator[str]:
     for reason, peers in reasons.items():
         first = ", ".join(peers[:_NAMED])
         who = f"{len(peers):,} modules ({first}, ...)" if len(peers) > _NAMED else first
-        verb = "does not tell its" if len(peers) == 1 else "do not tell their"
+        verb = "does not list its" if len(peers) == 1 else "do not tell their"
         yield f"{who} {verb} nodes, only those that stand here: {reason}"
 
 
@@ -211,10 +211,10 @@ def _ping(master: Master, wanted: GraphName, number: int, options: Options) -> b
     flag("-a", "--all", "everything", help="All of this module but /rosout and the agent's own."),
 )
 def node_kill(nodes: tuple[str, ...], everything: bool, options: Options) -> int:
-    """Ask nodes to end, and wait until they have.
+    """Ask nodes to end, and wait until they have ended.
 
-    The peer's agent ends a node of a peer, if `[nodes] kill` of its rmpa.toml allows it. Exits 1 if a node lives on
-    after 3 s, with the reason.
+    The peer's agent ends a node of a peer, if `[nodes] kill` of its rmpa.toml allows it. Exits 1 if a node still
+    runs after 3 s, with the reason.
 
     ---
     `rosnode kill` of a proxy, /rmpa/PEER/node, ends the peer's node too, and prints "killed" even where that was
@@ -253,7 +253,7 @@ def _kill(master: Master, wanted: GraphName) -> tuple[str, str]:
             gone = asyncio.run(here())
     except RmpaError as error:
         return str(error), error.code
-    still = f"it was asked to end, and is still there after {ros_limits.NODE_KILL_WAIT:g} s"
+    still = f"it was asked to end, and still runs after {ros_limits.NODE_KILL_WAIT:g} s"
     return ("", "") if gone else (still, "node-killed")
 
 

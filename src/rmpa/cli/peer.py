@@ -79,7 +79,7 @@ def peer_list(
             where = ", ".join(snapshot.agent.interfaces) or "no interface"
             yield f"{snapshot.agent.name} knows no peers yet (domain {snapshot.agent.domain}, looking on {where})"
         elif not peers:
-            yield summary(len(known), "peers", (p.state for p in known)) + "; none of them fits"
+            yield summary(len(known), "peers", (p.state for p in known)) + "; none of them matches"
         else:
             if selection.is_long(peers):
                 yield summary(len(peers), "peers", (p.state for p in peers))

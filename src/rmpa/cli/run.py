@@ -313,7 +313,7 @@ class ModuleAgent:
             if self.process is not None and self.process.poll() is not None:
                 text = f"it ended with code {self.process.returncode}"
             if text:
-                raise StartError(f"agent {self.name}", text, "what it said stands above")
+                raise StartError(f"agent {self.name}", text, "see its lines above")
             time.sleep(0.02)
             self._uri = _core_of(self.name)
         return self._uri

@@ -327,7 +327,7 @@ def service_call(service: str, values: tuple[str, ...], wait: bool, timeout: flo
     ---
     The request is one YAML value, or one for each field in order; what is not given is 0, empty or false.
     Its type is the server's; its definition comes with rmpa, or from this machine's ROS packages (PYTHONPATH,
-    ROS_PACKAGE_PATH, CMAKE_PREFIX_PATH). Values that look like options stand behind --.
+    ROS_PACKAGE_PATH, CMAKE_PREFIX_PATH). Put -- before values that look like options.
 
     Examples:
       rmpa service call /add_two_ints 20 22

@@ -404,7 +404,7 @@ def _mesh(shown: TrustStatus) -> Iterator[str | Table]:
             yield Table(titles, rows)
 
 
-@trust_verb(flag("--group-key", help="At the authority: make a new group key; no link falls."))
+@trust_verb(flag("--group-key", help="At the authority: make a new group key; links stay up."))
 def trust_renew(module: Module, options: Options, group_key: bool) -> None:
     """Renew this module's certificate now. Agents do it by themselves after half of its time.
 
@@ -456,7 +456,7 @@ def _renew_files(module: Module) -> int:
     argument("target", metavar="MODULE"), flag("--force", help="Also if no certificate of that name is known here.")
 )
 def trust_revoke(module: Module, options: Options, target: str, force: bool) -> None:
-    """Throw MODULE out of the mesh, at the authority: its certificates are refused everywhere from now on.
+    """Exclude MODULE from the mesh, at the authority: its certificates are refused everywhere from now on.
 
     All linked modules get the deny list and a new group key within a second; others when they are linked again.
     It may come back with a new token.

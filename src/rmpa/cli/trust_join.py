@@ -228,7 +228,7 @@ def trust_join(
     """
     if sum(each is not None for each in (token, request, accept)) != 1:
         raise ConfigError("rmpa trust join", "needs a TOKEN, --request or --accept", "see rmpa trust join --help")
-    module.refuse_member("first, to join anew")
+    module.refuse_member("first, to join again")
     if request is not None:
         _write_request(module, Path(request), options)
         return

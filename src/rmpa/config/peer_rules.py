@@ -37,10 +37,10 @@ class PolicySettings:
         ("/**",), values.list_of(values.TOPIC_GLOB), "Topics that may cross; `[]` lets none cross."
     )
     deny: tuple[str, ...] = setting(
-        (), values.list_of(values.TOPIC_GLOB), "Topics that stay home, besides the built-in ones."
+        (), values.list_of(values.TOPIC_GLOB), "Topics that do not cross, besides the built-in ones."
     )
     allow_types: tuple[str, ...] = setting(("**",), values.list_of(values.TYPE_GLOB), "Message types that may cross.")
-    deny_types: tuple[str, ...] = setting((), values.list_of(values.TYPE_GLOB), "Message types that stay home.")
+    deny_types: tuple[str, ...] = setting((), values.list_of(values.TYPE_GLOB), "Message types that do not cross.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,9 +155,9 @@ class PeerRule:
 
 _POLICY_KEYS: Final = {
     "allow": Setting(_PEER_TOPICS, "Topics that may cross, on top of [bridge], by their names here."),
-    "deny": Setting(_PEER_TOPICS, "Topics that stay home."),
+    "deny": Setting(_PEER_TOPICS, "Topics that do not cross."),
     "allow_types": Setting(values.list_of(values.TYPE_GLOB), "Message types that may cross."),
-    "deny_types": Setting(values.list_of(values.TYPE_GLOB), "Message types that stay home."),
+    "deny_types": Setting(values.list_of(values.TYPE_GLOB), "Message types that do not cross."),
 }
 
 
@@ -251,12 +251,12 @@ class PermissionRule:
     groups: tuple[str, ...] = setting(
         (),
         values.list_of(_GROUP_NAME, if_empty="leave groups out, or name some"),
-        "The groups of [trust.groups] whose modules it is about, too.",
+        "The groups of [trust.groups] to whose modules it applies too.",
     )
     effect: Effect = setting(
         Effect.ALLOW,
         values.member_of(Effect, "an effect"),
-        "allow, which is the default, or deny, which wins where both fit.",
+        "allow, the default, or deny, which wins where both match.",
     )
     names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
@@ -266,14 +266,14 @@ def _globs_over(what: str) -> values.ValueType[tuple[str, ...]]:
 
 
 _NAME_KEYS: Final = {
-    "publish": Setting(_globs_over("topic"), "Its topics that are shown here, by their names here."),
-    "subscribe": Setting(_globs_over("topic"), "This module's topics that it gets."),
-    "call": Setting(_globs_over("service"), "This module's services that it calls."),
-    "serve": Setting(_globs_over("service"), "Its services that are shown here, by their names here."),
-    "param": Setting(_globs_over("parameter"), "This module's parameters that it reads or sets, as [params] lets."),
-    "kill": Setting(_globs_over("node"), "This module's nodes that it ends, as [nodes] kill lets."),
-    ACTION_CLIENT: Setting(_globs_over("topic"), "This module's actions whose client it is."),
-    ACTION_SERVER: Setting(_globs_over("topic"), "Its actions whose clients are here."),
+    "publish": Setting(_globs_over("topic"), "Topics of the module that it may show here, by their names here."),
+    "subscribe": Setting(_globs_over("topic"), "Topics of this module that it may subscribe to."),
+    "call": Setting(_globs_over("service"), "Services of this module that it may call."),
+    "serve": Setting(_globs_over("service"), "Services of the module that it may offer here, by their names here."),
+    "param": Setting(_globs_over("parameter"), "Parameters of this module that it may read or set, within [params]."),
+    "kill": Setting(_globs_over("node"), "Nodes of this module that it may end, within [nodes] kill."),
+    ACTION_CLIENT: Setting(_globs_over("topic"), "Actions of this module that it may use."),
+    ACTION_SERVER: Setting(_globs_over("topic"), "Actions of the module that nodes here may use."),
 }
 # The keys of a rule that have names of topics, services, parameters, nodes or actions.
 NAME_KEYS: Final = tuple(_NAME_KEYS)

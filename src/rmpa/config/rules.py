@@ -58,31 +58,31 @@ _LEASE: Final = "liveliness_lease_duration"
 _CONTRACT_KEYS: Final = {
     "topics": Setting(
         list_of(TOPIC_GLOB, if_empty="leave topics out, or name some"),
-        "Globs over topics, one of which must fit; without it: any topic.",
+        "Globs of topics, one of which must match; without it: any topic.",
     ),
     "types": Setting(
         list_of(TYPE_GLOB, if_empty="leave types out, or name some"),
-        "Globs over message types, one of which must fit; without it: any type.",
+        "Globs of message types, one of which must match; without it: any type.",
     ),
     "reliability": Setting(member_of(Reliability, "a reliability"), "Whether messages survive the loss of a link."),
     "durability": Setting(
-        member_of(Durability, "a durability"), "Whether a late subscriber gets each source's last ones."
+        member_of(Durability, "a durability"), "Whether a late subscriber gets each publisher's last messages."
     ),
     "history": Setting(member_of(History, "a history"), "What a full queue keeps."),
     "depth": Setting(
         whole_number(1, core_limits.CONTRACT_DEPTH_MAX, "a depth"),
-        "Messages that wait for one slow receiver; beyond it the oldest is dropped.",
+        "Messages that wait for one slow receiver; when there are more, the oldest is dropped.",
     ),
     "deadline": Setting(duration_of("a deadline"), "The longest time from one message to the next."),
     "lifespan": Setting(duration_of("a lifespan"), "A message that is older is dropped."),
     "liveliness": Setting(
-        member_of(Liveliness, "a liveliness"), "What shows that a source is alive: its link, or its own messages."
+        member_of(Liveliness, "a liveliness"), "What shows that a publisher is alive: its link, or its own messages."
     ),
     _LEASE: Setting(
-        duration_of("a lease"), "Without a sign of life for so long a source counts as dead; needs liveliness."
+        duration_of("a lease"), "A publisher that shows no life for so long counts as dead; needs liveliness."
     ),
     "priority": Setting(member_of(Priority, "a priority"), "The lane: high is express, low is bulk, normal by size."),
-    "max_rate": Setting(RATE, "Messages a second that cross at most; the newest are kept."),
+    "max_rate": Setting(RATE, "How many messages a second cross at most; the newest are kept."),
     "outage": Setting(OUTAGE, "How long a reliable topic is kept when its link is gone."),
     "transport": Setting(TRANSPORT, "relay: through the agents; direct, auto: from node to node where it can be."),
 }
@@ -355,7 +355,7 @@ def _make_crossing(values: dict[str, Any]) -> CrossingRule:
     rule = CrossingRule(**values)
     if not values.keys() - {"names", "sites", "modules"}:
         example = 'one has names = ["/camera/**"] and rate = 2, or crossing = "none"'
-        raise BadValue("a rule that says nothing of what it selects", example)
+        raise BadValue("a rule that selects nothing", example)
     for key, useful in (("name", Crossing.IN), ("rate", Crossing.OUT), ("size", Crossing.OUT)):
         if key in values and rule.crossing not in (Crossing.BOTH, useful):
             what = "comes in" if useful is Crossing.IN else "goes out"
@@ -443,7 +443,7 @@ class GatewaySettings:
     rules: tuple[CrossingRule, ...] = setting(
         (),
         GATEWAY_RULES,
-        "What may cross to other sites and to ROS 2; the first rule that fits a source holds. "
+        "What may cross to other sites and to ROS 2; the first rule that matches applies. "
         "Without a rule everything crosses that [bridge] and [services] let, on demand.",
         key="gateway.rule",
         live=True,

@@ -63,7 +63,7 @@ class ServiceSettings:
     """
 
     allow: tuple[str, ...] = setting(("/**",), list_of(SERVICE_GLOB), "Services that may cross, by their names here.")
-    deny: tuple[str, ...] = setting((), list_of(SERVICE_GLOB), "Services that stay home.")
+    deny: tuple[str, ...] = setting((), list_of(SERVICE_GLOB), "Services that do not cross.")
     loggers: bool = setting(False, BOOL, "Whether each node's get_loggers and set_logger_level cross too.")
     timeout: float = setting(
         limits.SERVICE_TIMEOUT,
@@ -78,7 +78,7 @@ class ServiceSettings:
     rules: tuple[peer_rules.ServiceRule, ...] = setting(
         (),
         peer_rules.SERVICE_RULES,
-        "Time-outs and transports of single services; of each, the first that fits holds.",
+        "Time-outs and transports of single services; for each, the first rule that matches applies.",
         key="service",
     )
 
@@ -107,7 +107,7 @@ class ParamSettings:
 class TimeSettings:
     """Simulated time (``/use_sim_time`` and ``/clock``) across modules."""
 
-    follow: str = setting("", NAME_OR_EMPTY, "The peer whose simulated time holds here; empty for none.")
+    follow: str = setting("", NAME_OR_EMPTY, "The peer whose simulated time is used here; empty: none.")
     share: bool = setting(False, BOOL, "Whether peers may follow this module's time.")
 
 
@@ -115,7 +115,7 @@ class TimeSettings:
 class LimitSettings:
     """Bounds of what is accepted from one peer and offered to peers; the rest stays hidden and is reported."""
 
-    nodes: int = setting(limits.NODES_PER_PEER_MAX, BOUND, "Nodes of one peer that stand in the local graph.")
+    nodes: int = setting(limits.NODES_PER_PEER_MAX, BOUND, "Nodes of one peer that are shown in the local graph.")
     topics: int = setting(
         limits.TOPICS_PER_PEER_MAX, BOUND, "Pairs of topic and node of one peer, and those that this module offers."
     )
@@ -166,7 +166,7 @@ class WebSettings:
     token_file: str = setting(
         "",
         TEXT,
-        "The file of the token, made if it is not there; with it clients on this machine need the token too.",
+        "The file of the token, made if it is missing; if set, clients on this machine need the token too.",
         shown_default="in the state directory",
     )
     hosts: tuple[str, ...] = setting(
@@ -206,7 +206,7 @@ class TrustSettings:
     default: str = setting(
         "deny",
         peer_rules.PERMISSION_DEFAULT,
-        "What holds where no [[permission]] fits: deny; or allow, and every member of the mesh may do everything.",
+        "What applies where no [[permission]] matches: deny; or allow: each member of the mesh may do everything.",
         live=True,
     )
     groups: tuple[peer_rules.ModuleGroup, ...] = setting(
@@ -232,13 +232,13 @@ class TrustSettings:
     insecure: bool = setting(
         False,
         BOOL,
-        "Start without trust beside keys of other modules; a module with keys of its own is secured all the same.",
+        "Start without trust although other modules here have keys; a module with its own keys is secured anyway.",
         option="--insecure",
     )
     rules: tuple[peer_rules.PermissionRule, ...] = setting(
         (),
         peer_rules.PERMISSION_RULES,
-        "What other modules may do here; a deny that fits wins over an allow.",
+        "What other modules may do here; a deny that matches wins over an allow.",
         key="permission",
         live=True,
     )
@@ -258,7 +258,7 @@ class Settings:
         option="--name",
         shown_default="the name of the first start, else from the host's name",
     )
-    domain: int = setting(0, DOMAIN, "Only agents of one domain join, 0 to 232.", option="--domain")
+    domain: int = setting(0, DOMAIN, "Agents join only those of the same domain, 0 to 232.", option="--domain")
     core_mode: str = setting(
         "embedded",
         CORE_MODE,
@@ -279,7 +279,7 @@ class Settings:
     core_keep: str = setting(
         "auto",
         CORE_KEEP,
-        "Take up nodes and parameters of the run before; auto: if a node of it still runs, or the core died.",
+        "Restore nodes and parameters of the last run; auto: if one of its nodes still runs, or the core crashed.",
         key="core.keep",
         env="RMPA_KEEP",
         option="--keep",
@@ -287,12 +287,14 @@ class Settings:
     core_host: str = setting(
         "127.0.0.1",
         HOST,
-        "The address that the ROS core listens at; 127.0.0.1 is this machine only.",
+        "The address that the ROS core listens at; 127.0.0.1: this machine only.",
         key="core.host",
         option="--core-host",
     )
     core_port: int = setting(11311, PORT, "The ROS core's port.", key="core.port", option="--core-port")
-    port: int = setting(0, PORT_OR_ANY, "The mesh's port, TCP and UDP; 0: any.", key="mesh.port", option="--port")
+    port: int = setting(
+        0, PORT_OR_ANY, "The mesh's port, TCP and UDP; 0: any free one.", key="mesh.port", option="--port"
+    )
     interfaces: tuple[str, ...] = setting(
         (),
         list_of(INTERFACE),
@@ -304,14 +306,14 @@ class Settings:
     seeds: tuple[HostPort, ...] = setting(
         (),
         list_of(HOST_PORT),
-        "Agents to greet by unicast, where multicast does not reach; without a port: the domain's discovery port.",
+        "Addresses of agents that multicast does not reach; without a port: the domain's discovery port.",
         key="discovery.seeds",
         option="--seed",
     )
     multicast: Multicast = setting(
         Multicast(),
         MULTICAST,
-        "Where beacons go, the domain is added to the port; off (false in the file) for none.",
+        "Multicast group and port of beacons; the domain is added to the port; off (false in the file): none.",
         key="discovery.multicast",
         option="--multicast",
     )
@@ -335,14 +337,14 @@ class Settings:
     peers: tuple[peer_rules.PeerRule, ...] = setting(
         (),
         peer_rules.PEER_RULES,
-        "Names and policy for single peers; all that fit apply, in order.",
+        "Names and rules for single peers; all that match apply, in order.",
         key="peer",
         live=True,
     )
     contracts: tuple[ContractRule, ...] = setting(
         (),
         CONTRACT_RULES,
-        "What topics need; every rule that fits a topic applies, in order.",
+        "What topics need; every rule that matches a topic applies, in order.",
         key="contract",
         live=True,
     )
@@ -374,7 +376,7 @@ class Settings:
         "", TEXT, "The directory of the control sockets.", key="", shown_default="this user's runtime directory"
     )
     state_dir: str = setting(
-        "", TEXT, "The directory of what is kept over a restart.", shown_default="this user's state directory"
+        "", TEXT, "The directory of what is kept when rmpa restarts.", shown_default="this user's state directory"
     )
     config_file: Path | None = None
 
@@ -410,7 +412,7 @@ TABLES: Final = {
     "services": "Which services may cross, and how long a call may take.",
     "nodes": "What peers may do with this module's nodes.",
     "params": "What peers may do with this module's parameters.",
-    "time": "Whose simulated time this module has, and whether peers may have its own.",
+    "time": "Which peer's simulated time is used here, and whether peers may use this module's.",
     "limits": "How much is accepted from one peer.",
     "lanes": "How the packets of each lane are marked.",
     "realtime": "What the agent asks the kernel for.",

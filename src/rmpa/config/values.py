@@ -517,7 +517,7 @@ def list_of(item: ValueType[_T], *, if_empty: str = "") -> ValueType[tuple[_T, .
         for index, element in enumerate(raw):
             value = read_at(index, item.read, element)
             if value in found:
-                raise BadValue(f"{element!r} stands there twice", "delete one of them", at=(index,))
+                raise BadValue(f"{element!r} is there twice", "delete one of them", at=(index,))
             found.append(value)
         if if_empty and not found:
             raise BadValue("an empty list fits nothing", if_empty)

@@ -51,7 +51,7 @@ class History(StrEnum):
 
 
 class Liveliness(StrEnum):
-    """What shows that a source is alive: its link, or its own messages."""
+    """What shows that a publisher is alive: its link, or its own messages."""
 
     AUTOMATIC = "automatic"
     MANUAL_BY_TOPIC = "manual_by_topic"

@@ -132,10 +132,10 @@ def _is_unicast(first: int) -> bool:
 _LEGAL: Final = re.compile(r"[~/A-Za-z][\w/]*", re.ASCII)
 # Topics that stay in their module under every policy, and why.
 NEVER_CROSSING: Final = {
-    "/rosout": "log messages stay home: a bridged /rosout would loop",
-    "/rosout_agg": "log messages stay home: a bridged /rosout would loop",
-    "/clock": "time stays home: two clocks in one graph make it jump",
-    "/rmpa/**": "the agent's own topics stay home",
+    "/rosout": "log messages do not cross: a bridged /rosout would loop",
+    "/rosout_agg": "log messages do not cross: a bridged /rosout would loop",
+    "/clock": "time does not cross: with two clocks in one graph it would jump",
+    "/rmpa/**": "the agent's own topics do not cross",
 }
 # The regular expression of a resolved name, ``/like/this``.
 GLOBAL_NAME: Final = r"/([A-Za-z0-9_]+(/[A-Za-z0-9_]+)*)?"

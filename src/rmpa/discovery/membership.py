@@ -54,8 +54,8 @@ _UNICAST_HEARTBEATS_AT_ONCE: Final = 8
 
 SILENCE: Final = "silent for its lease"
 GOODBYE: Final = "said goodbye"
-RESTARTED: Final = "started anew"
-MOVED: Final = "started anew at another port"
+RESTARTED: Final = "started again"
+MOVED: Final = "started again at another port"
 CONFLICT: Final = "another live peer has its GUID address"
 
 

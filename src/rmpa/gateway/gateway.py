@@ -135,7 +135,7 @@ class Gateway:
             self._changed.set()
 
     def _denied(self) -> None:
-        """Have the router refuse what was revoked: its session is opened anew with another table of access."""
+        """Have the router refuse what was revoked: its session is opened again with another table of access."""
         if self._settings.gateway.listen:
             self._reopen = True
             self._changed.set()
@@ -173,7 +173,7 @@ class Gateway:
             return
         self.session = None
         await session.close()
-        _log.info("= the zenoh session is opened anew: certificate, permissions or deny list have changed")
+        _log.info("= the zenoh session is opened again: certificate, permissions or deny list have changed")
 
     def _count(self) -> None:
         """Add what the session has refused to the agent's counters, which `rmpa doctor` and /diagnostics show."""

@@ -206,7 +206,7 @@ def read_reply(path: Path, op: str, line: bytes, type: type[_T]) -> _Result[_T]:
     if len(line) > limits.CONTROL_REPLY_MAX:
         raise RemoteProtocolError(f"{agent} sends more than {limits.CONTROL_REPLY_MAX} bytes")
     if not line.endswith(b"\n"):
-        raise UnreachableError("agent", f"{path}: it hung up", "its log says why")
+        raise UnreachableError("agent", f"{path}: it closed the connection", "its log says why")
     try:
         reply: _Result[_T] = msgspec.json.decode(line, type=_Result[type])  # type: ignore[valid-type]
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
@@ -296,7 +296,7 @@ class ControlClient:
         try:
             return receive()
         except TimeoutError:
-            raise UnreachableError("agent", f"{self.path} in time", "is it stopped? its log may tell") from None
+            raise UnreachableError("agent", f"{self.path} in time", "is it stopped? see its log") from None
         except OSError as error:
             raise UnreachableError("agent", f"{self.path} ({error.strerror})", START_ONE) from None
 

@@ -78,7 +78,7 @@ class ControlStream:
             async with asyncio.timeout(timeout):
                 line = await self._reader.readline()
         except TimeoutError:
-            raise UnreachableError("agent", f"{self.path} in time", "is it stopped? its log may tell") from None
+            raise UnreachableError("agent", f"{self.path} in time", "is it stopped? see its log") from None
         except (OSError, ValueError) as error:  # ValueError: the line is too long
             raise UnreachableError("agent", f"{self.path} ({error})", START_ONE) from None
         return read_reply(self.path, op, line, type).value

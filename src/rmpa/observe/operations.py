@@ -245,7 +245,7 @@ class GraphRevisions:
     def __init__(self, core: Core, *, rows: bool) -> None:
         self._core = core
         self._rows = rows
-        # Begins anywhere, so that a client takes the graph of an agent that was started anew for another one.
+        # Begins anywhere, so that a client takes the graph of an agent that was started again for another one.
         self._history = GraphHistory(secrets.randbits(_REVISION_BITS))
         self._changed = asyncio.Event()
         core.on_change(self._add)

@@ -6,7 +6,7 @@ problem details (RFC 9457).
 Names, units and types of the metrics are as in prometheus.io/docs/practices/naming: base units, ``_total`` for
 counters, times as seconds since the epoch, quantiles as summaries. Labels name peers, topics, nodes and services,
 whose numbers are bounded (``limits.METRIC_…``): ``rmpa_metrics_omitted`` says how many are left out. A counter of a
-link or a route begins at 0 when that is opened anew, which PromQL's ``rate`` understands.
+link or a route begins at 0 when that is opened again, which PromQL's ``rate`` understands.
 """
 
 from __future__ import annotations

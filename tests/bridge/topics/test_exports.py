@@ -112,11 +112,11 @@ def test_one_connection_on_demand_serves_all_subscribers(offering: Exports) -> N
 def test_a_lost_publisher_closes_every_route_and_forgets_them(offering: Exports) -> None:
     offering.opened(1, OpenRoute(7, "/cmd", "/joy"))
     offering.described(CMD, ABOUT)
-    assert offering.lost(CMD, "it hung up") == [
+    assert offering.lost(CMD, "it closed the connection") == [
         RemoveRoute(CMD, 1, 7),
-        Send(1, RouteClosed(7, "it hung up")),
+        Send(1, RouteClosed(7, "it closed the connection")),
     ]
-    assert offering.lost(CMD, "it hung up") == []
+    assert offering.lost(CMD, "it closed the connection") == []
     assert offering.closed(1, CloseRoute(7)) == []
     assert offering.opened(1, OpenRoute(7, "/cmd", "/joy")) == [Connect(CMD, JOY.uri)]
 

@@ -63,7 +63,9 @@ def test_a_closed_route_is_asked_for_again_with_a_growing_delay(imports: Imports
     imports.demand(1, CMD, 0.0, wanted=True)
     now, delays = 0.0, []
     for attempt in range(1, 8):
-        assert imports.closed(1, RouteClosed(attempt, "it hung up"), now) == [Detach(1, CMD, attempt, missed=True)]
+        assert imports.closed(1, RouteClosed(attempt, "it closed the connection"), now) == [
+            Detach(1, CMD, attempt, missed=True)
+        ]
         assert state(imports) == "waiting"
         timer = imports.next_timer()
         assert timer is not None
@@ -72,7 +74,7 @@ def test_a_closed_route_is_asked_for_again_with_a_growing_delay(imports: Imports
         assert imports.handle_timer(now) == [Send(1, OpenRoute(attempt + 1, "/cmd", "/joy"))]
     assert delays == [0.1, 0.2, 0.4, 0.8, 1.6, 2.0, 2.0]
     entry = imports.entry(1, CMD)
-    assert entry.problem == "it hung up"
+    assert entry.problem == "it closed the connection"
     imports.opened(1, RouteOpened(8, ABOUT), now)
     assert entry.problem == ""
 

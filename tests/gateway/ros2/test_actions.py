@@ -417,7 +417,7 @@ def test_a_server_of_ros1_that_is_gone_aborts_its_goals() -> None:
 
 
 def test_a_goal_that_vanishes_from_the_status_of_its_server_is_lost() -> None:
-    """As in actionlib: the server was started anew, or has forgotten the goal without a result."""
+    """As in actionlib: the server was started again, or has forgotten the goal without a result."""
     goals, out = to_ros1()
     name, _ = sent_to_ros1(goals, out)
     waiting = result_of(goals)

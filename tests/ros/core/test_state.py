@@ -84,7 +84,7 @@ async def test_running_nodes_are_restored_and_notified(path: Path) -> None:
             assert core.call("getParam", "/x", "/run_id").value == run_id
             await until(lambda: hearer.updates)
             assert hearer.updates[-1] == ("/chatter", [talker.uri])
-            assert "2 of 2 nodes of the run before are taken up" in core.restored()
+            assert "2 of 2 nodes of the last run are restored" in core.restored()
             assert str(path) in core.restored()
 
 
@@ -97,7 +97,7 @@ async def test_who_is_gone_or_has_another_name_is_not_shown(path: Path, caplog: 
         caplog.set_level("INFO")
         async with running(path) as core:
             assert core.state().publishers == {}
-            assert core.restored().endswith("0 of 2 nodes of the run before are taken up, 2 are gone")
+            assert core.restored().endswith("0 of 2 nodes of the last run are restored, 2 are gone")
             assert "/moved, of the run before, is not there any more" in caplog.text
             await until(lambda: saved(core))
         assert content(path).nodes == {}
@@ -305,7 +305,7 @@ async def test_hanging_node_delays_the_start_by_the_bound_and_is_registered_when
         hearer.calls.clear()
         async with running(path) as core:
             assert names(core) == {"/answers", "/hearer"}
-            assert core.restored().endswith("2 of 3 nodes of the run before are taken up, /hangs did not answer")
+            assert core.restored().endswith("2 of 3 nodes of the last run are restored, /hangs did not answer")
             await until(lambda: hearer.updates)
             assert hearer.updates[-1] == ("/a", [answers.uri])
             hangs.go.set()

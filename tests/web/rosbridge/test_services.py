@@ -184,7 +184,7 @@ def test_a_service_is_offered_anew() -> None:
     client = Client()
     first = _serve(client)
     _serve(client)
-    assert (first.closed, first.reason) == (True, "the service is offered anew")
+    assert (first.closed, first.reason) == (True, "the service is offered again")
 
 
 def test_a_service_that_the_hub_cannot_offer_is_reported() -> None:

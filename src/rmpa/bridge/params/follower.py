@@ -278,7 +278,11 @@ class Params(Part):
                         await self._apply(entry)
                     except RmpaError as error:
                         entry.problem = str(error)
-                        self._refuse("param.failed", str(entry.rule), f"{entry.rule} is not as over there: {error}")
+                        self._refuse(
+                            "param.failed",
+                            str(entry.rule),
+                            f"{entry.rule} cannot be set as its owner has it: {error}",
+                        )
         except Exception:  # noqa: BLE001 - a task's top
             _log.exception("! following parameters failed")
         finally:
@@ -319,7 +323,7 @@ class Params(Part):
             await self._core.delete(key)
         else:
             await self._core.set(key, value)
-        _log.info("= %s: %s", entry.rule, f"{len(text)} characters" if text is not None else "deleted over there")
+        _log.info("= %s: %s", entry.rule, f"{len(text)} characters" if text is not None else "deleted by its owner")
         return True
 
     def _refuse(self, kind: str, who: str, text: str) -> None:

@@ -172,7 +172,7 @@ class ExportedService:
             async with asyncio.timeout(_DESCRIBE_TIMEOUT):
                 self._description = await self._part.context.graph.describe(self._source)
         except TimeoutError:
-            text = f"service {self._source.name} does not tell its type within {_DESCRIBE_TIMEOUT:g} s"
+            text = f"service {self._source.name} does not say its type within {_DESCRIBE_TIMEOUT:g} s"
             raise PeerRefused(self._source.module, text) from None
         return self._description
 

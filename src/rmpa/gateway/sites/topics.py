@@ -213,7 +213,7 @@ class ImportedTopic:
             self.dropped += self._topic.publish(payload)
 
     def renew(self, entry: SiteImport) -> None:
-        """Its module has started anew, or the way to it was interrupted: ask for the header again."""
+        """Its module has started again, or the way to it was interrupted: ask for the header again."""
         if entry.announced.module != self.entry.announced.module:
             self._topic.forget_latched()
             self._last_latched = None

@@ -49,7 +49,7 @@ def judge_agents(agents: Mapping[str, Snapshot | str], version: str) -> Iterator
         yield Check("agent", SKIPPED, text, "start it with `rmpa up`, and ask again")
     for name, shown in agents.items():
         if isinstance(shown, str):
-            yield Check("agent", FAIL, shown, "is it stopped? its log may tell", where=name)
+            yield Check("agent", FAIL, shown, "is it stopped? see its log", where=name)
         else:
             yield from _agent(shown, version)
 
@@ -199,7 +199,7 @@ def judge_exposed_nodes(
     if not trusted:
         return check(SKIPPED, "trust is off: the mesh is open too (rmpa trust init)")
     if exposed is None:
-        return check(SKIPPED, "the core or the kernel does not tell the nodes' ports")
+        return check(SKIPPED, "the nodes' ports cannot be read from the core or the kernel")
     if not exposed:
         return check(OK, "every node listens on loopback alone")
     listed = [f"{node} ({', '.join(map(str, ports))})" for node, ports in sorted(exposed.items())]

@@ -223,12 +223,12 @@ def judge_clock(stepped: float, synchronised: bool | None, error: float, year: i
     else:
         yield clock(OK, "runs evenly", where="step")
     if synchronised is None:
-        yield clock(SKIPPED, "the kernel does not tell", where="synchronised")
+        yield clock(SKIPPED, "the kernel does not say", where="synchronised")
     elif synchronised:
         yield clock(OK, f"within ±{error * 1e3:.1f} ms, says the kernel", where="synchronised")
     else:
         text = "follows no other clock: stamps of this module drift from those of the others (tf: extrapolation)"
-        remedy = "install chrony, and let all modules follow one of them; latencies are right all the same"
+        remedy = "install chrony, and let all modules follow one of them; latencies that RMPA shows are right anyway"
         yield clock(WARN, text, remedy, where="synchronised")
 
 

@@ -85,7 +85,7 @@ def judge_interfaces(
     elif not outer:
         down = ", ".join(one.name for one in interfaces if not one.loopback)
         remedy = f"see `ip address`: {down} need to be up and have an IPv4 address" if down else "plug in a network"
-        yield check(WARN, "none but loopback can be used: agents of other machines are not found", remedy)
+        yield check(WARN, "only loopback can be used: agents of other machines are not found", remedy)
     yield from map(_judge_interface, outer)
     # Of interfaces that share a network the kernel may answer by either.
     networks = Counter(network for one in outer for network in dict.fromkeys(at.network for at in one.networks))
@@ -391,12 +391,12 @@ def judge_rp_filter(values: Mapping[str, int], interfaces: Sequence[NetworkInter
     outer = [one.name for one in interfaces if one.used and not one.loopback]
     strict = [name for name in outer if max(values.get("all", 0), values.get(name, 0)) == _STRICT]
     if not values:
-        return Check("rp_filter", SKIPPED, "this kernel does not tell")
+        return Check("rp_filter", SKIPPED, "this kernel does not say")
     if len(outer) < 2 or not strict:
-        return Check("rp_filter", OK, "nothing is dropped for coming by the wrong interface")
+        return Check("rp_filter", OK, "no packet is dropped because of the interface by which it comes")
     text = (
         f"strict on {', '.join(strict)}, and there are {len(outer)} interfaces: packets of a peer that is routed "
-        "by another one are dropped without a word"
+        "by another one are dropped without a message"
     )
     return Check("rp_filter", WARN, text, "sudo sysctl -w net.ipv4.conf.all.rp_filter=2 (and of each interface)")
 
@@ -480,12 +480,12 @@ def judge_routes(routes: Mapping[str, str]) -> Iterator[Check]:
         if problem:
             yield Check("route", FAIL, f"there is no route: {problem}", remedy, where=target, code="no-route")
         elif len(routes) <= limits.DOCTOR_PEERS_LISTED:
-            yield Check("route", OK, "there is a way", where=target)
+            yield Check("route", OK, "there is a route", where=target)
     reached = sum(not problem for problem in routes.values())
     if reached and len(routes) > limits.DOCTOR_PEERS_LISTED:
-        yield Check("route", OK, f"there is a way to {reached:,} of {len(routes):,} peers and seeds")
+        yield Check("route", OK, f"there is a route to {reached:,} of {len(routes):,} peers and seeds")
     if not routes:
-        yield Check("route", SKIPPED, "no peer and no seed is known whose way could be looked for")
+        yield Check("route", SKIPPED, "no peer and no seed is known to look for a route to")
 
 
 def ports(given: DoctorInput) -> Iterator[Check]:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rmpa.observe.doctor.machine import DoctorInput
 
 _LOCKS: Final = Path("/proc/locks")
-_ANEW: Final = "nothing: the next agent of that name makes them anew"
+_ANEW: Final = "nothing: the next agent of that name makes them again"
 
 
 @dataclass(frozen=True, slots=True)

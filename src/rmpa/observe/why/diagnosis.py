@@ -201,7 +201,7 @@ _REMEDIES: Final = {
     "listening": "start the publisher without ROS_IP and ROS_HOSTNAME, or with an address of that network",
     "subscriber": "start the subscriber without ROS_IP and ROS_HOSTNAME, or with an address of that network",
     "caller_id": "give one of both nodes another name",
-    "reachable": "see that TCP gets through from this machine to the ports of nodes over there (a firewall?)",
+    "reachable": "see that TCP gets through from this machine to the ports of nodes on that machine (a firewall?)",
     "latched": "start the subscriber again",
     "trust": "trust.direct = true in both modules allows it, on a trusted network (docs/guides/trust.md#permissions)",
 }

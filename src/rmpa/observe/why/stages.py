@@ -301,11 +301,11 @@ def _offer(way: Way) -> Check:
     if way.here is not _NOT_OFFERED:
         return Check("offer", OK, f"{way.ends.snapshot.agent.name} knows of it, as {way.before.type}")
     if told is not None and told.type in ("", "*"):
-        text = f"its node has not told {peer}'s core what type it is"
+        text = f"its node has not sent {peer}'s core what type it is"
         return Check("offer", FAIL, text, "a publisher tells its type when it registers; is it an old script?")
     if told is not None and told.beyond:
         text = f"{peer} does not offer it: it has more topics than limits.topics = {told.beyond} of that module"
-        return Check("offer", FAIL, text, "raise it over there and `rmpa reload`, or deny some by bridge.deny there")
+        return Check("offer", FAIL, text, "raise it there and `rmpa reload`, or deny some by bridge.deny there")
     if told is not None and not told.offered:
         text = f"{peer} does not offer it: its name or type is none that can cross, or is too long"
         return Check("offer", FAIL, text, f"names of at most {config_limits.CROSSING_NAME_MAX} characters cross")
@@ -439,7 +439,7 @@ def _route(way: Way) -> Check | None:
 def _sent(way: Way) -> Check:
     told, peer, node = way.told_later, way.peer, way.now.node
     if told is None:
-        return Check("sent", UNKNOWN, f"{peer} did not tell")
+        return Check("sent", UNKNOWN, f"{peer} did not say")
     if told.oversized:
         text = f"{told.oversized} messages of its publisher {node} are too long, the last has "
         text += f"{told.oversized_bytes} bytes, and at most {ros_limits.TCPROS_MESSAGE_MAX} cross"
@@ -453,7 +453,7 @@ def _sent(way: Way) -> Check:
         text += f"; {told.lost} of them given up, while {peer} had no link to this module or a slow one"
         return Check("sent", WARN, text, "a longer outage, or more depth, in [[contract]] keeps more")
     if told.dropped:
-        text += f"; {told.dropped} given up over there"
+        text += f"; {told.dropped} dropped there"
         return Check("sent", WARN, text, "the link is slower than the topic")
     return Check("sent", OK, text)
 
@@ -467,7 +467,7 @@ def _arrived(way: Way) -> Check:
     if not now.messages or (sent >= _SEVERAL and not moved and not rarely):
         text = f"{way.peer} has {f'sent {sent}' if sent else 'sent some'} meanwhile, and none arrived at "
         text += way.ends.snapshot.agent.name
-        text += f" ({told.dropped} were given up over there)" if told is not None and told.dropped else ""
+        text += f" ({told.dropped} were dropped there)" if told is not None and told.dropped else ""
         remedy = "is the link too slow? `rmpa peer info`; a max_rate or priority helps (docs/guides/contracts.md)"
         return Check("arrived", FAIL, text, remedy)
     age, usual = now.age or 0.0, now.period.p99 if now.period is not None else None
@@ -476,7 +476,7 @@ def _arrived(way: Way) -> Check:
     silent = max(2.0, 10.0 * (usual or 0.0))  # ten of its longest usual periods
     if usual is not None and not moved and age > silent:
         text = f"nothing for {age:.1f} s; until then a message came every {usual * 1e3:.0f} ms at the latest"
-        return Check("arrived", FAIL, text, f"its publisher {now.node} on {way.peer} has fallen silent: look at it")
+        return Check("arrived", FAIL, text, f"its publisher {now.node} on {way.peer} stopped publishing: look at it")
     if usual is None and not now.latched and age > silent:
         return Check("arrived", WARN, text, "a topic of few messages? nothing tells how often they should come")
     return Check("arrived", OK, text)

@@ -303,7 +303,7 @@ class WhyService:
             # Its time window, and at most two requests to this agent of ASK_TIMEOUT each.
             found = await self._ask(session, HERE, question, tuple[Diagnosis, ...], 12.0)
             if not found:
-                raise RemoteProtocolError("it walked no way at all")
+                raise RemoteProtocolError("it checked no path")
             return found[: observe_limits.WHY_SOURCES_MAX]
         except RmpaError as error:
             silent = Check("link", FAIL, f"{to} does not tell: {error}", f"run `rmpa why {self._name}:{topic}` there")

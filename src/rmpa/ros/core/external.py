@@ -463,7 +463,7 @@ class ExternalCore(Core):
         again = self._mirror.update(survey, seen)
         self._report_changes()
         if again and self._loop.time() >= self._other_until:
-            _log.info("= %d registrations are made, or ended, anew at %s", len(again), self.uri)
+            _log.info("= %d registrations are made, or ended again at %s", len(again), self.uri)
         if again:  # of any number: the bound would only drop them until the next poll
             self._writes += again
             self._written.clear()

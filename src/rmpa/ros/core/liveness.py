@@ -309,7 +309,7 @@ async def ping_node(node: str, uri: str, caller_id: str) -> NodePing:
     begin = loop.time()
     reply = await _call(node, uri, "getPid", caller_id)
     if reply.code != 1 or not isinstance(reply.value, int):
-        raise PeerRefused(node, reply.status or "it does not tell its process")
+        raise PeerRefused(node, reply.status or "it does not say its process id")
     return NodePing(uri=uri, time=loop.time() - begin, pid=reply.value)
 
 

@@ -284,7 +284,7 @@ class CoreState:
         """What became of the file's content at the start; empty if there was none."""
         parts = [self._dropped]
         if nodes := self._up + self._gone + len(self._asked):
-            parts.append(f"{self._up} of {nodes} nodes of the run before are taken up")
+            parts.append(f"{self._up} of {nodes} nodes of the last run are restored")
             if self._gone:
                 parts[-1] += f", {self._gone} {'is' if self._gone == 1 else 'are'} gone"
             if self._asked:
@@ -307,7 +307,7 @@ class CoreState:
     def notes(self) -> tuple[str, ...]:
         """Problems that the user should know of."""
         problem = self._problem_now()
-        notes = [f"nothing of the core is kept over a restart: {problem}"] if problem else []
+        notes = [f"the core keeps nothing when it restarts: {problem}"] if problem else []
         if not self._asking:
             notes += [
                 f"{node} at {api}, of the run before, does not answer and is not shown: start it again"

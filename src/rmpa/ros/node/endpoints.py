@@ -112,7 +112,7 @@ class MasterClient:
             entry.withdraw()
 
     async def _register_again(self) -> None:
-        """Register everything at a master that has been started anew."""
+        """Register everything at a master that has been started again."""
         for entry in tuple(self._entries.values()):
             await entry.register(again=True)
         for key in tuple(self._followed):

@@ -531,7 +531,7 @@ class Node(MasterClient):
             try:
                 if (await self._call("lookupNode", self.name)).code != 1:
                     _log.info(
-                        "= %s: the master at %s was started anew; registering again", self.name, self.master_uri
+                        "= %s: the master at %s was started again; registering again", self.name, self.master_uri
                     )
                     await self._register_again()
             except RmpaError as error:

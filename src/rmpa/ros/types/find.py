@@ -90,7 +90,7 @@ def _search(
             if not md5 or made.md5sum == md5:
                 return made
             text = f"has the md5 sum {made.md5sum} here ({made.source or 'it comes with rmpa'}), and {md5} there"
-            remedy = "source the workspace that the node over there was built in"
+            remedy = "source the workspace that the node there was built in"
             problem = problem or definitions.DefinitionError(name, text, remedy)
         if problem is not None and (fresh or not isinstance(problem, definitions.UnknownTypeError)):
             raise problem

@@ -268,7 +268,7 @@ class NodeLink:
                         self.node = None
                         self._ready.clear()
                 _log.warning("! the node %s was shut down; it is started again [node-killed]", node.name)
-                self.problem = "the node was shut down, and is started anew"
+                self.problem = "the node was shut down, and is started again"
             except RmpaError as error:
                 if str(error) != self.problem:
                     _log.warning("! %s [%s]", error, error.code)

@@ -370,6 +370,6 @@ class ServiceCalls:
             opened = await probe(uri, service, node.name, ros_limits.SERVICE_OPEN_TIMEOUT)
         type_ = opened.description.type
         if not type_ or type_ == ANY:
-            raise RmpaError(f"the server of {service} does not tell its type")
+            raise RmpaError(f"the server of {service} does not say its type")
         found = self.found[service] = type_, uri
         return found

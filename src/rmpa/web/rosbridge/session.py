@@ -511,13 +511,13 @@ class RosbridgeSession(Session):
     # --- services that the client offers ----------------------------------------------------------------------
 
     def op_advertise_service(self, *, id_: Id = None, service: str, type_: str) -> None:
-        """Offer a service; one that the client offers already is offered anew."""
+        """Offer a service; one that the client offers already is offered again."""
         name = graph_name(service)
         kind = self.hub.types.service(type_name(type_))
         old = self._services.get(name)
         if old is not None:
-            self.status("warning", f"{name} is advertised already: it is offered anew", id_)
-            self._end_service(old, "the service is offered anew")
+            self.status("warning", f"{name} is advertised already: it is offered again", id_)
+            self._end_service(old, "the service is offered again")
         check_count(len(self._services), limits.SERVED_MAX, "advertised services")
         served = _Served(name, service, codec_for(kind.request), codec_for(kind.response))
         asked, failed = partial(self._asked_for, served), partial(self._service_failed, served)

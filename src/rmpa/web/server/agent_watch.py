@@ -144,7 +144,7 @@ class ControlReader:
             except UnreachableError:
                 if time.monotonic() - began >= limits.WEB_AGENT_TIMEOUT:
                     raise  # the agent hangs; another connection would wait as long
-                # It hung up, as it was started anew: look for its new socket.
+                # It hung up, as it was started again: look for its new socket.
         self.close()
         agent = choose_agent(self._environ, self._name)
         self._name = agent.name
@@ -222,7 +222,7 @@ class AgentFollower:
         """
         if not self._fits(snapshot.trust):
             self._loop.call_soon_threadsafe(self.misfit.set)
-            problem = "is secured, and this server begins anew with its certificate and permissions"
+            problem = "is secured, and this server starts again with its certificate and permissions"
             raise PeerRefused(f"agent {snapshot.agent.name}", problem, "ask again")
 
     async def _run(self, graph: GraphWatch) -> None:

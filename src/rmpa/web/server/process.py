@@ -376,7 +376,7 @@ async def serve(
             notify_service_manager("READY=1")
             feed_watchdog(loop)
             await _first_of(stop.wait(), follower.misfit.wait(), _changed(setup, load, reload))
-            _log.info("= ending" if stop.is_set() else "= beginning anew with other settings")
+            _log.info("= ending" if stop.is_set() else "= starting again with other settings")
             await gateways.close()
             await follower.close()
             await monitor.close()
