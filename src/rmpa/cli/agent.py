@@ -55,21 +55,21 @@ _COLOURS: Final = {OK: "green", FAIL: "red", CheckLevel.SKIPPED: "cyan"}
 _WELL: Final = {"service": "it can be called", "module": "it is linked"}
 
 
-@agent_verb(flag("--check", help="Change nothing; only say what would come of it."))
+@agent_verb(flag("--check", help="Change nothing; only say what would change."))
 def reload(check: bool, options: Options) -> int:
-    """Make the agent read its rmpa.toml again; what the changes do not touch is not interrupted.
+    """Make the agent read its rmpa.toml again; what has not changed is not interrupted.
 
     Exit code 2 if the settings cannot be used; then nothing has changed.
 
     ---
     What takes effect at once: [bridge], [[contract]], [[peer]], [services], [[service]], [params], [[param]], [time]
-    and log.level. All else needs a restart, and is named. Variables and flags are those that the agent was started
-    with.
+    and log.level. Everything else needs a restart, and is listed. Variables and options stay those of the agent's
+    start.
 
     Examples:
-      rmpa reload --check       would it be taken?
-      rmpa reload               let it hold
-      kill -HUP PID             the same, answered in the log
+      rmpa reload --check       is the file valid, and what would change?
+      rmpa reload               apply it
+      kill -HUP PID             the same; the answer is in the log
     """
     with options.client() as client:
         reply = client.call("reload", ReloadReply, check=check)
@@ -93,7 +93,7 @@ def reload(check: bool, options: Options) -> int:
 
 @json_verb(config_option)
 def config_show(config: str | None, options: Options) -> None:
-    """Print each setting that `rmpa up` would take here, and where it comes from.
+    """Print each setting that `rmpa up` would use here, and where it comes from.
 
     A running agent may have others: options of its command line, or a file that was changed later (see rmpa reload).
     """
@@ -146,24 +146,23 @@ def explain(code: str | None, options: Options) -> None:
 
 @agent_verb(
     argument("name", "topic", metavar="[PEER:]NAME"),
-    flag("-s", "--service", help="A service is meant, though a topic has that name."),
+    flag("-s", "--service", help="NAME is a service, although a topic has that name."),
     flag("-m", "--module", help="NAME is a module: its link is checked."),
 )
 def why(name: str, service: bool, module: bool, options: Options) -> int:
     """Say why a topic of a peer does not arrive here, a service cannot be called, or a module is not linked.
 
-    Both agents are asked, stage by stage from the publisher to the reader; messages are watched for a second, and
-    a service's server is probed.
-    PEER is a name or a GUID. Without PEER every module that publishes the topic is checked, and for one of this
-    module's own topics every peer says how it arrives there.
+    Both agents are asked, stage by stage from the publisher to the subscriber. Messages are counted for a second; the
+    server of a service is probed. PEER is a name or a GUID. Without PEER every module that publishes the topic is
+    checked; for a topic of this module every peer is asked how it arrives there.
 
     ---
-    Exit codes: 0 it flows, on every way if there are several, or it would flow if a node subscribed;
+    Exit codes: 0 it flows, on every path if there are several, or it would flow if a node subscribed;
     1 it does not flow, and the first stage that fails says why.
 
     Examples:
-      rmpa why joystick:/cmd          why /cmd of joystick does not come here
-      rmpa why /odom                  every way of /odom, in and out
+      rmpa why joystick:/cmd          why /cmd of joystick does not arrive here
+      rmpa why /odom                  every path of /odom, in and out
       rmpa why arm:/move              why the service /move of arm cannot be called here
       rmpa why --module arm           why the module arm is not linked, or slow
       rmpa why joystick:/cmd --json | jq '.[].stages[-1]'
@@ -218,21 +217,21 @@ def up(quiet: bool, **options: object) -> int:
     """Run this machine's agent: ROS core, discovery, mesh and bridge.
 
     ---
-    Settings, each stronger than the last: the ROS environment (ROS_MASTER_URI's port, ROS_DOMAIN_ID,
-    ROS_STATIC_PEERS, ROS_AUTOMATIC_DISCOVERY_RANGE), rmpa.toml, RMPA_* variables, options.
-    `rmpa config show` prints those that hold, each with its source.
-    The name that the first --name gave is kept in the state directory (the file module-name), and holds where no
-    other one is given.
+    Where settings come from, a later one overrides an earlier one: the ROS environment (ROS_MASTER_URI's port,
+    ROS_DOMAIN_ID, ROS_STATIC_PEERS, ROS_AUTOMATIC_DISCOVERY_RANGE), rmpa.toml, RMPA_* variables, options.
+    `rmpa config show` prints the values in effect, and where each comes from.
+    The name of the first --name is kept in the state directory (file module-name), and is used where no other name is
+    given.
 
     Examples:
       rmpa up                                 all defaults; the name is that of the first start, else the host's
       rmpa up --name base --interface wlan0   on one interface only
-      rmpa up --seed 10.8.0.5:40001           greet an agent that multicast does not reach
+      rmpa up --seed 10.8.0.5:40001           also find an agent that multicast does not reach
       rmpa up --name b2 --core-port 11312     a second agent on this machine
-      rmpa up --keep never                    forget what the core kept of the run before
-      rmpa up --prefix-peers                  beside robots of the same kind: their names stay apart
+      rmpa up --keep never                    do not restore what the core kept of the last run
+      rmpa up --prefix-peers                  with robots of the same kind: each gets a prefix
       rmpa up --core external                 join the graph of a roscore that runs already
-      rmpa up --realtime                      punctual on a busy machine; the log says what was not granted
+      rmpa up --realtime                      real-time priority; the log says what was not granted
     """
     if quiet and options["log_level"] is None:
         options["log_level"] = "warning"

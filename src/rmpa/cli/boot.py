@@ -172,10 +172,9 @@ def service_install(
 ) -> int:
     """Start the agent at boot, and now: by a unit of systemd, as a user of its own.
 
-    The name that this machine's module has had, its keys and all that it keeps are taken over from the state
-    directory of the user who calls sudo; /etc/rmpa/rmpa.toml is made if it is missing. Other options of rmpa up
-    are not taken over: write them into that file first. Nothing is overwritten but the units, and a second call
-    changes nothing.
+    The module's name, its keys and its state are copied from the state directory of the user who calls sudo;
+    /etc/rmpa/rmpa.toml is made if it is missing. Other options of rmpa up are not copied: write them into that file
+    first. Only the units are overwritten; a second call changes nothing.
 
     ---
     Where the program is in a home directory that other users cannot read, the units run as its owner.
@@ -505,7 +504,7 @@ def _peers() -> tuple[list[tuple[str, str]], str]:
 
 @json_verb(
     flag(
-        "--purge", help="Remove settings and state too, and the user rmpa: the module's name and keys are gone then."
+        "--purge", help="Remove settings and state too, and the user rmpa: the module's name and keys are then lost."
     ),
     flag("--yes", help="Do not ask."),
     flag("--dry-run", help="Change nothing; say what would be done."),

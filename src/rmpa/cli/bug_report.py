@@ -78,7 +78,7 @@ def bug_report(config: str | None, output: str | None, log: str | None, anonymou
     hosts and addresses stay, unless --anonymous is given. Nothing is sent: look into it, and attach it to the issue.
 
     ---
-    It works without an agent, beside one that hangs (after some 20 s), and as any user; sudo adds the log of the
+    It works as any user, without an agent, and with an agent that hangs (after some 20 s); sudo adds the log of the
     units and the rules of the firewall.
 
     Examples:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     config_option,
     flag("-q", "--quiet", help="Show only failures and warnings."),
     click.option("--listen", metavar="SECONDS", type=FiniteRange(1.0), help="Wait for multicasts of other machines."),
-    flag("--fix", help="Put right what is safe: show the commands, ask, run them, check again."),
+    flag("--fix", help="Repair what is safe: show the commands, ask, run them, check again."),
     flag("--yes", help="With --fix: do not ask."),
 )
 def doctor(config: str | None, quiet: bool, listen: float | None, fix: bool, yes: bool, options: Options) -> int:
@@ -43,9 +43,9 @@ def doctor(config: str | None, quiet: bool, listen: float | None, fix: bool, yes
     with --listen on one machine and meanwhile without on the other, then the other way round.
 
     ---
-    Safe is what stops nothing: to start or enable rmpa's unit, to join the group of its socket, to give a directory
-    back to this user, to remove what a killed agent has left. Without a terminal --fix shows the commands, and exits
-    with 1. Firewalls, clocks, kernel settings and nodes are never touched: the commands for those are printed.
+    Safe repairs stop nothing: start or enable rmpa's unit, join the group of its socket, give a directory back to
+    this user, remove the files of a killed agent. Without a terminal --fix shows the commands, and exits with 1.
+    Firewalls, clocks, kernel settings and nodes are never touched: the commands for those are printed.
 
     Exit codes: 0 nothing fails (there may be warnings); 1 something does.
 
@@ -91,7 +91,7 @@ def checks_summary(found: Sequence[Check]) -> str:
 
 
 def put_right(look: Callable[[], DoctorInput], options: Options, *, yes: bool) -> int:
-    """Put right what can be; return the exit code.
+    """Repair what can be; return the exit code.
 
     Args:
         look: Reads the machine anew.
@@ -122,13 +122,13 @@ def put_right(look: Callable[[], DoctorInput], options: Options, *, yes: bool) -
 
 
 def _plan_lines(plan: Sequence[Repair], by_hand: Sequence[Check]) -> Iterator[str]:
-    yield "What can be put right:" if plan else "Nothing here can be put right by a command that is safe."
+    yield "What can be repaired:" if plan else "Nothing here can be repaired by a safe command."
     for repair in plan:
         yield f"  {repair.check} {repair.where}".rstrip() + f": {repair.text}"
         yield f"    do:   {repair}"
         yield f"    undo: {repair.undo}"
     if advised := [check for check in by_hand if check.remedy]:
-        yield "By hand, for it is yours to decide:"
+        yield "By hand, because you must decide:"
     for check in advised:
         yield f"  {check.name} {check.where}".rstrip() + f": {check.line}"
         yield f"    {check.remedy}"

@@ -73,8 +73,8 @@ def gateway(context: click.Context, /, **options: object) -> int:
 
     Examples:
       rmpa gateway --site warehouse --connect tls/fleet.example:7447     one site of a fleet
-      rmpa gateway --router --listen tls/0.0.0.0:7447                    the router that they meet at
-      rmpa gateway --site b --rank 200 --connect tls/fleet.example:7447  stands by for the one with rank 100
+      rmpa gateway --router --listen tls/0.0.0.0:7447                    the router that the sites connect to
+      rmpa gateway --site b --rank 200 --connect tls/fleet.example:7447  standby for the one with rank 100
       rmpa gateway --ros2 --connect tcp/localhost:7447                   ROS 2 nodes beside rmw_zenohd
       rmpa gateway zenoh-config --listen tls/0.0.0.0:7447 > zenohd.json5 a router with zenohd instead
     """
@@ -249,7 +249,7 @@ def _is_there(name: str) -> bool:
     click.option(
         "--token-file",
         metavar="FILE",
-        help="Ask clients for the token of this file; made if it is not there. [default: in the state directory]",
+        help="Ask clients for the token of this file; made if it is missing. [default: in the state directory]",
     ),
     click.option(
         "--host", "hosts", metavar="NAME", multiple=True, help="A further name of this server in URLs; repeatable."
@@ -273,9 +273,9 @@ def web(config: str | None, with_agent: bool, insecure: bool, options: Options, 
     It is a process of its own: the agent does not depend on it. It starts without an agent too, and finds it later.
 
     ---
-    [web] of rmpa.toml and the variables RMPA_WEB_* give the same; options are stronger.
-    It is as secure as the agent: beside one in a secured mesh it serves HTTPS with the certificate of that module, by
-    its [[permission]], and begins anew where the agent comes back secured.
+    [web] of rmpa.toml and the variables RMPA_WEB_* set the same; options override them.
+    It is as secure as the agent: if the module is in a secured mesh, it serves HTTPS with the module's certificate
+    and by its [[permission]] rules. If the agent restarts as a member, it starts again too.
 
     Examples:
       rmpa web                        for this machine: http://127.0.0.1:8480/, https:// in a secured mesh
@@ -376,14 +376,14 @@ def _default_port() -> int:
         help="Address to listen at; 0.0.0.0 opens it to the network.",
     ),
     click.option(
-        "--advertise", default="", metavar="NAME", help="Host name or address that nodes get, if not --host."
+        "--advertise", default="", metavar="NAME", help="Host name or address that nodes are given, if not --host."
     ),
     click.option(
         "--keep",
         type=click.Choice(["auto", "always", "never"]),
         default="auto",
         show_default=True,
-        help="Take up nodes and parameters of the run before: auto, if a node of it still runs or the core died.",
+        help="Restore nodes and parameters of the last run: auto, if one of its nodes runs or the core crashed.",
     ),
     flag("-v", "--verbose", help="Log every registration."),
     flag("--debug", help="Log every call."),
@@ -426,7 +426,9 @@ async def _run_core(host: str, port: int, advertised: str, keep: str) -> None:
 @verb(
     setting_options("gateway", without=_OF_THE_PROCESS),
     click.option(
-        "--name", metavar="NAME", help="Whose certificate it has. [default: the module's name, then _gateway]"
+        "--name",
+        metavar="NAME",
+        help="The gateway whose certificate it has. [default: the module's name, then _gateway]",
     ),
     config_option,
 )

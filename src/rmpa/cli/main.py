@@ -33,22 +33,22 @@ VERBS: Final = {
     "core": ("gateway", "Run the ROS core alone: a drop-in for roscore."),
     "run": ("run", "Run the Smart Resources of a Python file, with the agent of their module."),
     "peer": ("main", "See the peers that the agent knows."),
-    "peer list": ("peer", "List the peers, and how their links are."),
+    "peer list": ("peer", "List the peers and the state of their links."),
     "peer info": ("peer", "Show all that is known of one peer."),
     "peer ping": ("peer", "Measure the round trip to a peer over the mesh."),
     "topic": ("main", "See topics, listen to them, publish on them."),
     "topic list": ("topic", "List topics; those of peers with the peers' names."),
-    "topic info": ("topic", "Show a topic's type, publishers and subscribers, and what of it crosses."),
+    "topic info": ("topic", "Show a topic's type, publishers and subscribers, and what crosses the mesh."),
     "topic type": ("topic", "Print a topic's type."),
     "topic find": ("topic", "Print the topics of a type."),
     "topic echo": ("messages", "Print messages."),
-    "topic hz": ("topic", "Show how often messages come."),
-    "topic bw": ("topic", "Show how many bytes they need."),
-    "topic delay": ("topic", "Show how old they are when they come; over the mesh by the link's clock too."),
+    "topic hz": ("topic", "Show the rate of messages."),
+    "topic bw": ("topic", "Show the bandwidth of messages."),
+    "topic delay": ("topic", "Show the age of messages when they arrive: by their stamps, and by the link's clock."),
     "topic pub": ("messages", "Publish messages."),
     "service": ("main", "See services, and call them; start rmpa at boot."),
     "service list": ("service", "List services; those of peers with the peers' names."),
-    "service info": ("service", "Show a service's node, address, type and arguments, and what of it crosses."),
+    "service info": ("service", "Show a service's node, address, type and arguments, and what crosses the mesh."),
     "service type": ("service", "Print a service's type."),
     "service find": ("service", "Print the services of a type."),
     "service call": ("service", "Call a service."),
@@ -84,10 +84,10 @@ VERBS: Final = {
     "context get": ("profile", "Print the present context; an empty line for none."),
     "context set": ("profile", "Choose a context by hand, or let the rules decide again."),
     "alarm": ("main", "See the alarms of resources."),
-    "alarm list": ("resource", "List the resources that are not well at present."),
+    "alarm list": ("resource", "List the resources that have a problem."),
     "alarm echo": ("resource", "Print alarms as they are raised and cleared, until Ctrl-C."),
     "site": ("main", "See other sites that gateways join, and values of modules that are off."),
-    "site list": ("peer", "List this site and the others, and how they are."),
+    "site list": ("peer", "List this site and the others, with their state."),
     "site info": ("peer", "Show the modules of a site and what they offer."),
     "trust": ("main", "Secure the mesh: who may join, and what other modules may do here."),
     "trust init": ("trust", "Make a secured mesh, with this module as its authority."),
@@ -106,7 +106,7 @@ VERBS: Final = {
     "gateway": ("gateway", "Join this network's modules with other sites and with ROS 2, over Zenoh."),
     "gateway zenoh-config": ("gateway", "Print a configuration for zenohd, Zenoh's own router."),
     "config": ("main", "Show the settings and where each comes from; print their JSON Schema."),
-    "config show": ("agent", "Print each setting that `rmpa up` would take here, and where it comes from."),
+    "config show": ("agent", "Print each setting that `rmpa up` would use here, and where it comes from."),
     "config schema": ("agent", "Print the JSON Schema of rmpa.toml: editors check and complete the file with it."),
     "reload": ("agent", "Let the agent read its settings again."),
     "completion": ("agent", "Print the script that completes rmpa's commands in a shell."),
@@ -357,7 +357,7 @@ def config() -> None:
     ---
 
     Examples:
-      rmpa config show                        what `rmpa up` would take, and from where
+      rmpa config show                        what `rmpa up` would use, and from where
       rmpa config show --config new.toml      is this file right?
       rmpa config schema > rmpa.schema.json   for editors: see docs/reference/settings.md
     """

@@ -191,7 +191,7 @@ def topic_echo(
 ) -> None:
     """Print messages until Ctrl-C.
 
-    Behind the TOPIC a field may stand: /cmd/axes, /cmd/axes[0].
+    A field may follow the TOPIC: /cmd/axes, /cmd/axes[0].
 
     ---
 
@@ -256,7 +256,7 @@ def topic_pub(
 
     ---
     Without -r one message is published and kept for late subscribers until Ctrl-C; -1 ends after 3 seconds.
-    A header may be written auto, and a stamp now.
+    For a header write auto, for a stamp now.
     The TYPE is one that comes with rmpa, or of this machine's ROS packages (ROS_PACKAGE_PATH, CMAKE_PREFIX_PATH,
     PYTHONPATH); else it is learnt from a node that publishes it, here or at a peer.
 

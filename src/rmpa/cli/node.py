@@ -158,8 +158,8 @@ def _named(master: Master, names: tuple[str, ...], *, everything: bool) -> list[
 def node_ping(node: str, count: int | None, interval: float, everything: bool, options: Options) -> int:
     """Ask whether a node answers, and how fast: a call of its slave API.
 
-    The peer's agent asks a node of a peer: the time is that of the whole way, and in brackets that of the call on the
-    node's own machine. Exits 1 if a node did not answer at all.
+    A node of a peer is asked by the peer's agent: the time is the whole round trip; in brackets is the time of the
+    call on the node's own machine. Exits 1 if a node did not answer at all.
 
     ---
 

@@ -332,7 +332,7 @@ def param_verb(*parameters: Any, **settings: Any) -> Callable[[Callable[..., Non
 
 @param_verb(
     argument("key", "param"),
-    flag("-p", "--pretty", help="A string as it is, without YAML's quotes and folding."),
+    flag("-p", "--pretty", help="Print a string as it is, without YAML's quotes and folding."),
 )
 def param_get(key: str, pretty: bool, peer: str | None, options: Options) -> None:
     """Print the parameter KEY, or all of the namespace KEY, as YAML.

@@ -51,13 +51,13 @@ _BRIEF: Final = "PEER, STATE, >SINCE, ADDRESS, >RTT"
 def peer_list(
     pattern: str, verbose: bool, states: tuple[str, ...], limit: int | None, everything: bool, options: Options
 ) -> None:
-    """List the peers, all or those with names like PATTERN, and how their links are.
+    """List the peers, all or those with names like PATTERN, and the state of their links.
 
-    A link is "at rest" while nothing depends on it: its silence is then noticed after 16 s in place of 1 s, with more
-    than 50 peers later.
+    A link is "at rest" while nothing uses it: a lost peer is then noticed after 16 s instead of 1 s
+    (later with more than 50 peers).
 
-    CLOCK is the peer's wall clock less ours, with the bound of its error. Of very many peers a terminal shows a
-    summary and the first ones: those with a problem, then those with most traffic.
+    CLOCK is the peer's wall clock minus ours, with the largest possible error. With very many peers a terminal shows
+    a summary and the first ones: those with a problem, then those with most traffic.
 
     ---
 
@@ -149,8 +149,9 @@ def _troubles(snapshot: Snapshot, peers: list[PeerInfo]) -> list[tuple[str, str]
 def peer_info(name: str, options: Options) -> None:
     """Show all that is known of the peer NAME (or of one by its GUID).
 
-    Clock is its wall clock less ours, with the bound of what is known of it. Of each topic that comes from it: how
-    often it came in the last minute, and the median and 99th percentile of its one-way latency, true within ±.
+    Clock is its wall clock minus ours, with the largest possible error. For each topic that comes from it: the rate
+    over the last minute, and the median and 99th percentile of the one-way latency, with the largest possible error
+    (±).
 
     ---
 
@@ -294,8 +295,8 @@ def _ask(client: ControlClient, what: str, kind: type[_T], **args: object) -> _T
 def site_list(name: str | None, options: Options) -> int:
     """List this site and the others that its gateways join.
 
-    SOURCES are the topics (one for each publisher) and services that a site offers, SHOWN those that are in the
-    graph here. BY is the gateway that was asked; one that stands by shows nothing.
+    SOURCES counts the topics (one for each publisher) and services that a site offers, SHOWN those in the graph here.
+    BY is the gateway that was asked; a standby gateway shows none.
 
     ---
     Exit codes: 0 each site is joined; 1 one is not, or no gateway answers.

@@ -121,7 +121,7 @@ def _set(what: str, resource: str, name: str | None, *, auto: bool, options: Opt
 def profile_set(resource: str, name: str | None, auto: bool, options: Options) -> None:
     """Choose the PROFILE of a RESOURCE by hand; returns when it runs.
 
-    It runs whatever clients ask, until --auto. If it cannot be applied, what was chosen before stays.
+    It runs until --auto, whatever clients ask for. If it cannot be applied, the earlier choice stays.
 
     ---
 
@@ -232,7 +232,7 @@ async def context_get(graph: ResourceGraph, one: SeenResource, options: Options)
 
 @_set_verb("context", "Let the rules decide again.")
 def context_set(resource: str, name: str | None, auto: bool, options: Options) -> None:
-    """Choose the CONTEXT of a RESOURCE by hand; returns when it is there.
+    """Choose the CONTEXT of a RESOURCE by hand; returns when it is active.
 
     ---
 

@@ -284,9 +284,9 @@ def status_of(status: Any) -> dict[str, Any]:
     }
 
 
-@graph_verb(flag("-a", "--all", "everything", help="Those that are well too."))
+@graph_verb(flag("-a", "--all", "everything", help="Also those without a problem."))
 def alarm_list(everything: bool, options: Options) -> None:
-    """List the resources that are not well at present, here and at peers.
+    """List the resources that have a problem, here and at peers.
 
     WARN: adaptation, or a task that fails; ERROR: non-adaptable; STALE: an input that it needs has no publisher.
 
@@ -321,7 +321,7 @@ def alarm_echo(resource: str | None, count: int | None, options: Options) -> Non
     ---
 
     Examples:
-      rmpa alarm echo                   of all resources, those to come included
+      rmpa alarm echo                   of all resources, also of those that start later
       rmpa alarm echo base:/sonar -n 1  wait for one
       rmpa alarm echo --json | jq -r .message
     """

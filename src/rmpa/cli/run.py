@@ -79,7 +79,7 @@ _ROS_MODULES: Final = {
         "--log-level",
         default="info",
         type=click.Choice(["debug", "info", "warning", "error"]),
-        help="Of the resources; the agent's is behind --. [default: info]",
+        help="Of the resources; that of the agent comes after --. [default: info]",
     ),
     argument("options", nargs=-1, type=click.UNPROCESSED, metavar="[-- OPTIONS OF rmpa up]"),
     context_settings={"ignore_unknown_options": False},
@@ -99,7 +99,7 @@ def run(
     ---
     The file declares one or more rmpa.resource.Resource; see docs/guides/smart-resources.md#tutorial.
     Without --name and --master the module is named as for rmpa up, or else as its first resource. An agent of that
-    name that runs already is used, and stays; else one is started with the options behind --, and ends with the
+    name that runs already is used, and stays; else one is started with the options after --, and ends with the
     resources. An exception in a task, a profile or a hook is logged, and ends neither of them. A second Ctrl-C ends
     at once.
 

@@ -227,7 +227,7 @@ def _find(text: str, options: Options) -> tuple[GraphName, Master, Graph]:
 
 @graph_verb(argument("service", "service"))
 def service_info(service: str, options: Options) -> None:
-    """Show a service's node, address, type and arguments, and what of it crosses.
+    """Show a service's node, address, type and arguments, and what crosses the mesh.
 
     ---
 
@@ -313,7 +313,7 @@ def service_find(kind: str, options: Options) -> None:
 @graph_verb(
     argument("service", "service"),
     argument("values", nargs=-1),
-    flag("-w", "--wait", help="Wait until the service is there, for as long as --timeout says."),
+    flag("-w", "--wait", help="Wait until the service exists, at most --timeout."),
     click.option(
         "-t", "--timeout", type=FiniteRange(0.001), default=60.0, show_default=True, help="Seconds for the answer."
     ),

@@ -227,11 +227,11 @@ def _find(text: str, options: Options) -> tuple[GraphName, Master, Graph]:
 
 @graph_verb(argument("topic", "topic"))
 def topic_info(topic: str, options: Options) -> None:
-    """Show a topic's type, publishers and subscribers, and what of it crosses.
+    """Show a topic's type, publishers and subscribers, and what crosses the mesh.
 
-    Of each remote source the agent measures, over the last minute: rate, period, jitter, bandwidth, losses, and the
-    one-way latency from the publisher's agent to this one. The ± behind a latency bounds its error: the other
-    machine's clock is known only so well. The agent measures only while a node here subscribes.
+    For each remote publisher the agent measures, over the last minute: rate, period, jitter, bandwidth, losses, and
+    the one-way latency from the publisher's agent to this one. The ± is the largest possible error of a latency: the
+    other machine's clock is not known exactly. The agent measures only while a node here subscribes.
 
     ---
 
@@ -485,10 +485,10 @@ def _figures_verb(window: int) -> Callable[[Callable[..., None]], click.Command]
 
 @_figures_verb(50_000)
 def topic_hz(topic: str, window: int, count: int | None, options: Options) -> None:
-    """Show how often messages come, once a second until Ctrl-C.
+    """Show the rate of messages, once a second until Ctrl-C.
 
-    The first figures are measured by this command, as rostopic does. For each remote source the agent's own follow:
-    the arrivals of the last minute over the mesh.
+    The first figures are measured by this command, as rostopic does. Then come the agent's figures for each remote
+    publisher: what arrived over the mesh in the last minute.
 
     ---
 
@@ -501,7 +501,7 @@ def topic_hz(topic: str, window: int, count: int | None, options: Options) -> No
 
 @_figures_verb(100)
 def topic_bw(topic: str, window: int, count: int | None, options: Options) -> None:
-    """Show how many bytes a second messages need, once a second until Ctrl-C.
+    """Show the bandwidth of messages, once a second until Ctrl-C.
 
     The first figures are measured by this command, as rostopic does. For each remote source the agent's own follow:
     the arrivals of the last minute over the mesh.
@@ -517,11 +517,11 @@ def topic_bw(topic: str, window: int, count: int | None, options: Options) -> No
 
 @_figures_verb(50_000)
 def topic_delay(topic: str, window: int, count: int | None, options: Options) -> None:
-    """Show how old messages are when they come, once a second until Ctrl-C.
+    """Show the age of messages when they arrive, once a second until Ctrl-C.
 
-    First by the header's stamp: from the publisher's stamp to here, exact across machines only as far as their clocks
-    agree. Then, for each remote source, by the link's clock: from the publisher's agent to this one. That needs
-    neither a header nor clocks that agree, and the true value lies within the ± that is shown.
+    First by the header's stamp: from the publisher's stamp to here; across machines this is only as exact as their
+    clocks agree. Then, for each remote publisher, by the link's clock: from the publisher's agent to this one. That
+    needs neither a header nor clocks that agree; ± is the largest possible error.
 
     ---
 

@@ -274,9 +274,9 @@ def grouped(digits: str) -> str:
 )
 @click.pass_context
 def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str | None, options: Options) -> None:
-    """Say whether the [[permission]] of this module let PEER do something here, and which of them decides.
+    """Say whether the [[permission]] rules of this module let PEER do something here, and which rule decides.
 
-    The exit code is 0 for yes and 1 for no. What [bridge], [[peer]], [services] and [params] say comes on top.
+    The exit code is 0 for yes and 1 for no. [bridge], [[peer]], [services] and [params] must allow it too.
 
     ---
 
@@ -304,12 +304,12 @@ def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str
 
 
 @trust_verb(
-    click.option("--label", metavar="TEXT", default="", help="What you call the mesh; it stands in its certificates.")
+    click.option("--label", metavar="TEXT", default="", help="A name for the mesh, which its certificates contain.")
 )
 def trust_init(module: Module, options: Options, label: str) -> None:
     """Make a secured mesh. This module becomes its authority: it invites, renews and revokes.
 
-    Its key is needed for that alone: links come up without the authority, for as long as certificates are valid.
+    Only for that its key is needed: while certificates are valid, links come up without the authority.
 
     ---
     Exit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.
@@ -341,7 +341,7 @@ def trust_init(module: Module, options: Options, label: str) -> None:
 def trust_status(module: Module, options: Options) -> None:
     """Show this module's part in its mesh: certificate, keys, deny list; at the authority also members and tokens.
 
-    The exit code is 0 too if trust is off.
+    The exit code is also 0 if trust is off.
 
     ---
     Exit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.
@@ -408,7 +408,7 @@ def _mesh(shown: TrustStatus) -> Iterator[str | Table]:
 def trust_renew(module: Module, options: Options, group_key: bool) -> None:
     """Renew this module's certificate now. Agents do it by themselves after half of its time.
 
-    A module that was off for up to a year is renewed too, with its key alone; it needs the authority for that.
+    A module that was off for up to a year can renew with its key; the authority must be reachable.
 
     ---
     Exit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.
@@ -480,9 +480,9 @@ def trust_revoke(module: Module, options: Options, target: str, force: bool) -> 
 
 @trust_verb(flag("--yes", help="Do not ask."))
 def trust_leave(module: Module, options: Options, yes: bool) -> None:
-    """Remove this module's keys and certificate: its agent starts without trust then.
+    """Remove this module's keys and certificate: after that its agent starts without trust.
 
-    At the authority that ends the whole mesh: nothing can be renewed after a week.
+    At the authority this ends the whole mesh: certificates cannot be renewed, and end after a week.
 
     ---
     Exit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.

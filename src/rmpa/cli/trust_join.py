@@ -40,7 +40,7 @@ _FINGERPRINT: Final = 2 * limits.FINGERPRINT_BYTES
         "--module",
         "invitee",
         metavar="MODULE",
-        help="The only module that may use it, which may be one that joins again. [default: any]",
+        help="Only this module may use it; it may be one that joins again. [default: any]",
     ),
     click.option(
         "--address", metavar="HOST[:PORT]", help="Where the module reaches this one. [default: as other agents do]"
@@ -63,8 +63,8 @@ def trust_invite(
 ) -> None:
     """Invite a module, at the authority: print a token that is valid once, and wait until it has joined.
 
-    On a terminal the token stands in the line to be run on the new module; else it goes to standard output alone. It
-    lets its holder join: pass it on as a secret.
+    On a terminal the line to run on the new module is printed, with the token; else only the token, on standard
+    output. Who has the token can join: keep it secret.
 
     ---
     With --json one object a line is printed: the token, then each step, whose state is refused or joined. A token
@@ -207,7 +207,9 @@ def _address(text: str | None) -> tuple[str, int | None]:
     click.option("--request", metavar="FILE", help="Join by files: write the request."),
     click.option("--accept", metavar="FILE", help="Join by files: read the answer."),
     click.option(
-        "--ca", metavar="FINGERPRINT", help="With --accept: of the CA, as rmpa trust invite --sign shows it."
+        "--ca",
+        metavar="FINGERPRINT",
+        help="With --accept: the fingerprint of the CA, as rmpa trust invite --sign shows it.",
     ),
 )
 def trust_join(
@@ -215,7 +217,7 @@ def trust_join(
 ) -> None:
     """Join a secured mesh with a TOKEN of rmpa trust invite; - reads it from standard input.
 
-    The token proves both sides to each other: nothing between the machines can take part without it.
+    The token proves each side to the other: a third machine between them cannot join or listen without it.
 
     ---
     Exit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.

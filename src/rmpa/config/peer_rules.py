@@ -56,7 +56,7 @@ class ServiceRule:
         None, values.TIMEOUT, "How long a call may take: seconds, or a text such as 5 min."
     )
     transport: Transport | None = setting(
-        None, TRANSPORT, "relay: through the agents; direct, auto: from node to node where it can be."
+        None, TRANSPORT, "relay: through the agents; direct, auto: from node to node where possible."
     )
 
 

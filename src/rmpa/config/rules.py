@@ -84,7 +84,7 @@ _CONTRACT_KEYS: Final = {
     "priority": Setting(member_of(Priority, "a priority"), "The lane: high is express, low is bulk, normal by size."),
     "max_rate": Setting(RATE, "How many messages a second cross at most; the newest are kept."),
     "outage": Setting(OUTAGE, "How long a reliable topic is kept when its link is gone."),
-    "transport": Setting(TRANSPORT, "relay: through the agents; direct, auto: from node to node where it can be."),
+    "transport": Setting(TRANSPORT, "relay: through the agents; direct, auto: from node to node where possible."),
 }
 # The keys of a ``[[contract]]`` besides the topics and types that it is about.
 TERMS: Final = tuple(_CONTRACT_KEYS)[2:]
@@ -444,7 +444,7 @@ class GatewaySettings:
         (),
         GATEWAY_RULES,
         "What may cross to other sites and to ROS 2; the first rule that matches applies. "
-        "Without a rule everything crosses that [bridge] and [services] let, on demand.",
+        "Without a rule, everything that [bridge] and [services] allow crosses, on demand.",
         key="gateway.rule",
         live=True,
     )

@@ -73,7 +73,7 @@ class ServiceSettings:
     transport: Transport = setting(
         DEFAULT_TRANSPORT,
         peer_rules.TRANSPORT,
-        "The path of calls, unless a [[service]] says another; the words are those of bridge.transport.",
+        "How calls travel, unless a [[service]] says otherwise; the values are those of bridge.transport.",
     )
     rules: tuple[peer_rules.ServiceRule, ...] = setting(
         (),
@@ -157,7 +157,7 @@ class WebSettings:
     """Where ``rmpa web`` serves, and whether the agent starts it."""
 
     enabled: bool = setting(
-        False, BOOL, "Start rmpa web with the agent, and again whenever it ends.", option="--web/--no-web"
+        False, BOOL, "Start rmpa web with the agent, and restart it if it ends.", option="--web/--no-web"
     )
     port: int = setting(8480, PORT, "The port of rmpa web.")
     listen: str = setting(
@@ -329,7 +329,7 @@ class Settings:
     prefix_peers: bool = setting(
         False,
         BOOL,
-        "Whether every peer's names are below its own here (/arm/odom of arm): for modules that have the same names.",
+        "Put each peer's name before its names here (/arm/odom of arm): for robots that use the same names.",
         key="bridge.prefix_peers",
         option="--prefix-peers",
         live=True,
