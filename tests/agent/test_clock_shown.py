@@ -23,7 +23,7 @@ async def test_a_followed_clock_does_not_stay_home(settings: Callable[..., Setti
         await until(lambda: "/rmpa/a/simulator" in b.core.publishers("/clock"))
         (here,) = b.snapshots.build(frozenset({"/clock"})).topics
         assert [route.direction for route in here.routes] == ["in"]
-        text = 'time.follow = "a": that module\'s comes here; one of this module stays home'
+        text = 'time.follow = "a": that module\'s comes here; one of this module does not cross'
         assert (here.crosses, here.policy) == (True, text)
         (there,) = a.snapshots.build(frozenset({"/clock"})).topics
         assert (there.crosses, there.policy) == (True, "time.share = true: peers may follow this module's time")
@@ -33,4 +33,4 @@ async def test_a_clock_without_followers_stays_home(settings: Callable[..., Sett
     async with running(settings("a"), settings("b")) as (a, _), node("simulator", a) as simulator:
         await simulator.advertise("/clock", "rosgraph_msgs/Clock")
         (shown,) = a.snapshots.build(frozenset({"/clock"})).topics
-        assert (shown.crosses, shown.policy.startswith("built in: time stays home")) == (False, True)
+        assert (shown.crosses, shown.policy.startswith("built in: time does not cross")) == (False, True)

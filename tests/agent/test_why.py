@@ -70,7 +70,7 @@ async def test_built_in_rules_and_other_types(settings: Callable[..., Settings])
         await one.advertise("/clock", "rosgraph_msgs/Clock")
         stage, text = stopped_at(await ask(b, "/clock", "a"))
         assert stage == "policy there"
-        assert "time stays home" in text
+        assert "time does not cross" in text
         await one.advertise("/x", "std_msgs/String")
         await two.advertise("/x", "std_msgs/Bool")
         await until(lambda: any(entry.cause == CONFLICT for _, _, entry in b.bridge.topics.imports))
@@ -113,4 +113,4 @@ async def test_names_of_a_peer_with_a_prefix(settings: Callable[..., Settings]) 
         command.publish(command.make({"data": "go"}))
         there = await flowing(base, "/robot1/cmd_vel")
         assert (there.name, there.peer, there.to, there.flows) == ("/cmd_vel", "pc", "robot", True)
-        assert there.stages[2].text == "/pilot on pc publishes /cmd_vel (/robot1/cmd_vel over there)"
+        assert there.stages[2].text == "/pilot on pc publishes /cmd_vel (/robot1/cmd_vel there)"

@@ -645,7 +645,7 @@ async def test_values_that_do_not_parse_change_nothing(caplog: pytest.LogCapture
     await base.ask(transfer.VALUE, {"key": "/arm", "text": "<x>"})
     await until(lambda: pad.states() == {"/arm": "refused"})
     assert pad.core.get("/arm") == 1
-    assert "/arm is not as over there" in caplog.text
+    assert "/arm cannot be set as its owner has it" in caplog.text
 
 
 # What the permissions of a secured mesh keep from a peer that asks for a module's parameters.

@@ -31,7 +31,7 @@ case $1 in
     enable) for unit; do [ ! -e {place}/$unit.fails ] || {{ echo "Job for $unit failed." >&2; exit 1; }}; done ;;
 esac
 """,
-    "journalctl": "echo 'info    agent     = base is on the air'",
+    "journalctl": "echo 'info    agent     = base, domain 0: peers can find it'",
     "groupadd": 'echo "$4:x:4243:" >> "$2/etc/group"',
     "useradd": 'for name; do :; done; echo "$name:x:4242:4243::/:/bin/false" >> "$2/etc/passwd"',
     "userdel": 'sed -i "/^$3:/d" "$2/etc/passwd"',
@@ -345,7 +345,9 @@ def test_units_that_have_changed_are_started_again(systemd: Systemd) -> None:
 
 def test_a_unit_that_does_not_start_is_an_error_with_its_log(systemd: Systemd) -> None:
     (systemd.place / "rmpa.service.fails").touch()
-    with pytest.raises(RmpaError, match=r"Job for rmpa.service failed.\n  info    agent     = base is on the air"):
+    with pytest.raises(
+        RmpaError, match=r"Job for rmpa.service failed.\n  info    agent     = base, domain 0: peers can find it"
+    ):
         boot._start(Machine("", dry=False), ["rmpa.service"], [])
 
 
@@ -369,7 +371,7 @@ def test_status(systemd: Systemd, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert main(["service", "status", "--json"]) == 1
     unit = json.loads(capsys.readouterr().out)["units"][0]
     assert unit.pop("since") >= 7500
-    log = ["info    agent     = base is on the air"]
+    log = ["info    agent     = base, domain 0: peers can find it"]
     assert unit == {
         "unit": "rmpa.service",
         "installed": True,

@@ -137,7 +137,7 @@ def test_fix_does_it_and_checks_again(killed: Place) -> None:
     assert (levels["directory"], told["failed"]) == ("ok", [])
     assert code == int("fail" in levels.values())
     assert not (killed.path / "dead.sock").exists()
-    assert "Nothing here can be put right" in killed.run("doctor", "--fix")[1]
+    assert "Nothing here can be repaired" in killed.run("doctor", "--fix")[1]
 
 
 def test_what_is_the_users_is_printed_and_not_done(killed: Place) -> None:

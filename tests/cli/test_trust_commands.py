@@ -152,7 +152,7 @@ def test_from_init_to_a_linked_mesh_and_to_a_revocation(machine: Callable[[str],
     assert (shown["is_authority"], shown["agent"], shown["problems"]) == (True, "secured", [])
     assert [(m["name"], m["linked"]) for m in shown["members"]] == [("arm", True), ("base", True)]  # type: ignore[attr-defined]
     assert arm.status()["authority"] == "base"
-    assert "certificate: until" in base.trust("status")
+    assert "certificate: valid until" in base.trust("status")
     assert "arm has a new certificate until" in arm.trust("renew")
     assert "group key 2 is made" in base.trust("renew", "--group-key")
     assert "is not the authority of its mesh; do it at base" in arm.refused("revoke", "base")
@@ -255,7 +255,7 @@ def test_an_agent_without_trust_warns_and_says_that_it_must_be_started_again(
 ) -> None:
     base = machine("base")
     base.up()
-    until(lambda: "is on the air" in base.log and "trust is off" in base.log)
+    until(lambda: "peers can find it" in base.log and "trust is off" in base.log)
     assert base.log.count("trust is off: every program that reaches port") == 1
     out = base.run("trust", "init")
     assert "the agent base runs without trust until it is started again" in out[2]

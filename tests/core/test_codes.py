@@ -144,6 +144,24 @@ def test_each_code_is_used() -> None:
     assert all(re.fullmatch(r"[a-z]+(-[a-z]+)*", code) for code in codes.CODES)
 
 
+def test_words_that_puzzle_a_reader_do_not_come_back() -> None:
+    """docs/design/style.md; the texts are all that are no docstring, and what a command's help shows."""
+    puzzling = re.compile(
+        r"on the air|stays? home|over there|lives on\b|in its way|stands by\b|told twice|\banew\b|take(s|n)? up"
+        r"|joins nothing|all the same[,.]|\bwhoever\b"
+    )
+    found = []
+    for path, tree in TREES.items():
+        nodes = list(ast.walk(tree))
+        held = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        verbs = (node for node in nodes if isinstance(node, ast.FunctionDef) and node.decorator_list)
+        shown = [ast.get_docstring(verb) or "" for verb in verbs if path.parts[0] == "cli"]
+        constants = (node for node in nodes if isinstance(node, ast.Constant) and id(node) not in held)
+        shown += [node.value for node in constants if isinstance(node.value, str)]
+        found += [f"{path}: {text}" for text in shown if puzzling.search(text)]
+    assert not found
+
+
 def test_an_error_has_the_code_of_its_class_or_that_which_it_is_given() -> None:
     assert ConfigError("--port", "is taken").code == "invalid-value"
     assert ConfigError("--port", "is taken", code="port-in-use").code == "port-in-use"

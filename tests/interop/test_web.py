@@ -125,7 +125,7 @@ async def test_a_resource_of_another_module_is_followed_and_its_profile_chosen(
             await page.wait_text("full runs")
 
             await page.run("location.hash = '#/alarms'")
-            await page.wait_text("No alarm stands")
+            await page.wait_text("There is no alarm")
             driver.tell(json.dumps({"rate": ">= 50 Hz hard"}))
             await page.wait("document.querySelector('[aria-label=Alarms]').innerText.includes('cam:/camera')")
             assert page.errors == []

@@ -97,7 +97,7 @@ def _paragraph(titles: Sequence[str], cells: Sequence[str], colour: str | None, 
     for number, (title, cell) in enumerate(zip(titles, cells, strict=True)):
         if cell in ("", "-"):
             continue
-        fact = f"{title.strip().lower()} {cell}"
+        fact = f"{title.strip().lower()}: {cell}"
         if line and len(_INDENT) + _columns(line) + 2 + _columns(fact) > width:
             yield _INDENT + painted
             line = painted = ""

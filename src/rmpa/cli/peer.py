@@ -346,7 +346,7 @@ def _site_row(report: SitesReport, site: SiteInfo) -> list[str]:
     sources = sum(module.topics + module.services for module in site.modules)
     shown = sum(module.shown for module in site.modules)
     counts = map(str, (site.gateways, modules, sources, shown))
-    by = report.gateway + ("" if report.leads else " (stands by)")
+    by = report.gateway + ("" if report.leads else " (standby)")
     return [site.name, site.state, duration(site.since_ago), *counts, by]
 
 
@@ -376,7 +376,7 @@ def site_info(site: str, name: str | None, options: Options) -> int:
 
 def _site_text(report: SitesReport, site: SiteInfo) -> Iterator[Text]:
     since = f" for {duration(site.since_ago)}" if site.since_ago is not None else ""
-    stands_by = "" if report.leads else ", which stands by"
+    stands_by = "" if report.leads else ", on standby"
     yield f"Site:      {site.name}"
     yield f"State:     {site.state}{since}"
     yield f"Gateways:  {site.gateways}"

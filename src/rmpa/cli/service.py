@@ -127,8 +127,8 @@ def _crossing(infos: Sequence[ServiceInfo]) -> Iterator[str]:
 def _headline(info: ServiceInfo) -> str:
     if info.direction == "out":
         who = f", open at {', '.join(info.callers)}" if info.callers else ""
-        return f"{'may cross' if info.crosses else 'stays home'}: {info.policy}{who}"
-    over_there = f", {info.wire} over there" if info.wire else ""
+        return f"{'may cross' if info.crosses else 'does not cross'}: {info.policy}{who}"
+    over_there = f", {info.wire} there" if info.wire else ""
     state = f"not here: {info.hidden}" if info.hidden else info.state
     return f"from {info.peer}: {info.node}{over_there}, {state}"
 

@@ -257,7 +257,7 @@ def _described(graph: Graph, wanted: GraphName, crossing: TopicInfo | None) -> I
         return
     yield from ("", "Mesh:" + ("" if crossing.routes else " nothing of it crosses"))
     if crossing.policy:
-        yield f" * {'may cross' if crossing.crosses else 'stays home'}: {crossing.policy}"
+        yield f" * {'may cross' if crossing.crosses else 'does not cross'}: {crossing.policy}"
     for route in crossing.routes:
         if wanted.peer not in (None, route.peer):
             continue

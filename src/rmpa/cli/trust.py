@@ -391,14 +391,14 @@ def _mesh(shown: TrustStatus) -> Iterator[str | Table]:
         ", the authority" if shown.is_authority else f"; authority: {shown.authority or 'not known yet'}"
     )
     left = duration(shown.expires - now) if shown.expires > now else "ended"
-    yield f"certificate: until {date_of(shown.expires)} ({left}), renewed from {date_of(shown.renew_at)}"
+    yield f"certificate: valid until {date_of(shown.expires)} ({left}), renewed from {date_of(shown.renew_at)}"
     yield f"CA: {grouped(shown.fingerprint)}"
     yield f"group key {shown.key}; deny list {shown.deny_number}: {', '.join(shown.revoked) or 'none'}"
     yield f"agent: {shown.agent}; files: {shown.folder}"
     words = {True: "linked", False: "not linked", None: "-"}
     members = [(m.name, words[m.linked], date_of(m.issued), date_of(m.expires)) for m in shown.members]
     tokens = [(t.id[:8], t.state, t.used_by or t.name or "any module", date_of(t.expires)) for t in shown.tokens]
-    for titles, rows in (("MODULE, STATE, ISSUED, UNTIL", members), ("TOKEN, STATE, MODULE, UNTIL", tokens)):
+    for titles, rows in (("MODULE, STATE, ISSUED, EXPIRES", members), ("TOKEN, STATE, MODULE, EXPIRES", tokens)):
         if rows:
             yield ""
             yield Table(titles, rows)

@@ -434,8 +434,8 @@ class GatewaySettings:
     uplink: int | None = setting(
         None,
         BYTES_A_SECOND,
-        "What the line to the other sites carries, bytes a second: a command then does not wait behind seconds of "
-        "images in the kernel's buffer.",
+        "The bandwidth to the other sites, bytes a second: commands then do not wait behind images in the kernel's "
+        "buffer.",
         option="--uplink",
         shown_default="unlimited",
     )

@@ -321,8 +321,8 @@ class Settings:
     transport: Transport = setting(
         DEFAULT_TRANSPORT,
         peer_rules.TRANSPORT,
-        "The path of topics' messages, unless a [[contract]] says another. relay: through the agents; "
-        "auto: from node to node where it can be; direct: likewise, with a warning where it cannot.",
+        "How messages travel, unless a [[contract]] says otherwise. relay: through the agents; auto: from node to "
+        "node where possible; direct: the same, with a warning where it is not possible.",
         key="bridge.transport",
         live=True,
     )

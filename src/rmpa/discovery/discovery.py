@@ -507,7 +507,7 @@ class Discovery:
         if not self._settings.multicast.enabled:
             return
         if self.interfaces != before:
-            _log.info("= multicast %s:%d on %s", *self._group, ", ".join(map(str, self.interfaces)) or "nothing")
+            _log.info("= multicast %s:%d on %s", *self._group, ", ".join(map(str, self.interfaces)) or "no interface")
         if any(not i.loopback for i in self.interfaces) or (wanted and self.interfaces):
             self._warned.discard(_ALONE)
         else:

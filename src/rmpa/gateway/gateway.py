@@ -206,7 +206,7 @@ class Gateway:
         self.neighbours = dict(self._make_neighbours(self.graph, session, self._settings))
         for neighbour in self.neighbours.values():
             neighbour.start()
-        _log.info("= joins %s; zenoh session %s", ", ".join(self.neighbours) or "nothing", session.zid)
+        _log.info("= joined: %s; zenoh session %s", ", ".join(self.neighbours) or "none", session.zid)
 
     def _failed(self, error: StartError) -> None:
         if str(error) != self._problem:

@@ -154,7 +154,7 @@ class TopicFacts:
         decision = self._bridge.context.policy.judge(name, type_name, node)
         follow = self._bridge.context.settings.time.follow
         if name == CLOCK and follow and not decision.allowed:
-            text = f'time.follow = "{follow}": that module\'s comes here; one of this module stays home'
+            text = f'time.follow = "{follow}": that module\'s comes here; one of this module does not cross'
             return PolicyDecision(True, text)
         return decision
 

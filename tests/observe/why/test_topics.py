@@ -223,7 +223,7 @@ FAILURES: dict[str, tuple[str, Case]] = {
     ),
     "built in": (
         "policy there",
-        Case(source=source(crosses=False, rule="built in: time stays home"), route=None),
+        Case(source=source(crosses=False, rule="built in: time does not cross"), route=None),
     ),
     "no type": ("offer", Case(source=source(type="*"), route=None)),
     "too many": ("offer", Case(source=source(offered=False, beyond=70), route=None)),

@@ -219,7 +219,7 @@ async def test_simulated_time_survives_only_with_a_node_of_it(
         async with running(path) as core:
             assert core.call("hasParam", "/x", "/use_sim_time").value is left
             assert core.call("hasParam", "/x", "/other").value is True
-            assert ("/use_sim_time of the run before is not taken up" in caplog.text) is not left
+            assert ("/use_sim_time of the run before is not restored" in caplog.text) is not left
         async with running(path) as core:
             assert core.call("hasParam", "/x", "/use_sim_time").value is left
 

@@ -456,7 +456,7 @@ async def test_a_lost_connection_keeps_values_edits_and_rights(site: Site) -> No
     await page.wait_text("Nothing was sent")
     text = await page.run("document.body.innerText")
     assert "wheel" in text
-    assert "may only look" not in text
+    assert "read-only" not in text
     await page.run("window.WebSocket = window.Real; rmpa.retry()")
     await page.wait("!document.querySelector('.banner')")
     assert await page.run(f"{FIELD}.value") == "half"

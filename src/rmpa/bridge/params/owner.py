@@ -363,7 +363,7 @@ class ParamOwner:
             key = str(given).rstrip("/") or "/"
             why = key_problem(given) or self._why_not_follow(asker, key)
             if not why and key not in wanted and len(wanted) >= most:
-                why = f"more parameters than limits.params = {most} over there; raise it, or follow a namespace"
+                why = f"more parameters than limits.params = {most} there; raise it, or follow a namespace"
             if why:
                 refused[str(given)[: config_limits.CROSSING_NAME_MAX]] = why
             else:

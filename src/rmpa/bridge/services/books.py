@@ -147,7 +147,7 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
             raise RemoteProtocolError(f"route {number} is opened twice, for {message.service} now")
         service = self.local(peer, message.service)
         if len(routes) >= self.limit:
-            why = f"more services are open on one link than limits.services = {self.limit} over there"
+            why = f"more services are open on one link than limits.services = {self.limit} there"
         elif service is None:
             self._asked_in_vain(peer, message.service)
             why = f"{message.service} is not provided here, or policy keeps it home"

@@ -232,7 +232,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
         flow = self._flows.get(source) if source is not None else None
         before = flow.routes.get(peer) if flow is not None else None
         if len(routes) >= limit:
-            why = f"more topics are open on one link than limits.topics = {limit} over there"
+            why = f"more topics are open on one link than limits.topics = {limit} there"
         elif source is None:
             self._asked_in_vain(peer, asked.topic)
             why = f"{asked}: not published here, or policy keeps it home"

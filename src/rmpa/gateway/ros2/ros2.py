@@ -142,7 +142,7 @@ class Ros2Neighbour:
         """Show a module's node, or stand by for another gateway that shows it: only one of them may."""
         leader, stands_by = self.context.ros2.led_by(node), node in self._standing_by
         if leader and not stands_by:
-            _log.info("= the gateway with session %s shows %s in ROS 2; this one stands by", leader, node)
+            _log.info("= the gateway with session %s shows %s in ROS 2; this one is on standby", leader, node)
             self._standing_by[node] = leader
         elif not leader:
             self._standing_by.pop(node, None)

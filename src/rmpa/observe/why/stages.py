@@ -257,7 +257,7 @@ def _published(ends: Ends, peer: str) -> Check:
         nodes = ", ".join(source.node for source in there.sources)
         text = f"{nodes} on {peer} publish{'' if len(there.sources) > 1 else 'es'} {wire}"
         others = {source.topic for source in there.sources} - {"", wire}
-        return Check("publisher", OK, f"{text} ({', '.join(sorted(others))} over there)" if others else text)
+        return Check("publisher", OK, f"{text} ({', '.join(sorted(others))} there)" if others else text)
     text = f"no node of {peer} publishes {wire}"
     text += f"; {', '.join(there.subscribers)} there only subscribe to it" if there.subscribers else ""
     remedy = f"start its publisher there, or see `rmpa topic list {peer}:/`"
@@ -301,8 +301,8 @@ def _offer(way: Way) -> Check:
     if way.here is not _NOT_OFFERED:
         return Check("offer", OK, f"{way.ends.snapshot.agent.name} knows of it, as {way.before.type}")
     if told is not None and told.type in ("", "*"):
-        text = f"its node has not sent {peer}'s core what type it is"
-        return Check("offer", FAIL, text, "a publisher tells its type when it registers; is it an old script?")
+        text = f"its node has registered it at {peer} without a type"
+        return Check("offer", FAIL, text, "a publisher must register with its type; is it an old script?")
     if told is not None and told.beyond:
         text = f"{peer} does not offer it: it has more topics than limits.topics = {told.beyond} of that module"
         return Check("offer", FAIL, text, "raise it there and `rmpa reload`, or deny some by bridge.deny there")

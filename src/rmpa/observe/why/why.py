@@ -410,7 +410,7 @@ class WhyService:
         remedy = f"did you mean {similar}?" if similar else remedy
         if own:
             text = f"{own[0]} of this module provides {service}; clients here call it without us"
-            remedy = f"whether another module may call it: `rmpa why {self._name}:{service}` over there"
+            remedy = f"whether another module may call it: `rmpa why {self._name}:{service}` there"
         stage = Check("server", OK if own else FAIL, text, remedy)
         return Diagnosis.of((stage,), kind="service", name=service, peer="", to=self._name)
 

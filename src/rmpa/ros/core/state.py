@@ -291,7 +291,7 @@ class CoreState:
                 parts[-1] += f", {_first(list(self._asked))} did not answer"
         if self._params:
             some = "1 parameter of it was" if self._params == 1 else f"{self._params} parameters of it were"
-            parts.append(f"{some} taken up")
+            parts.append(f"{some} restored")
         return "; ".join(filter(None, parts))
 
     def _problem_now(self) -> str:

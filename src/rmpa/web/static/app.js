@@ -158,7 +158,7 @@ class App extends Component {
     const reach = section(connection.state, "reach");
     const { notice } = connection;
     if (connection.phase === "lost") {
-      const known = connection.state ? "What is shown, and what you have typed, stays; nothing can be sent." : "";
+      const known = connection.state ? "What is shown and typed stays here, but nothing can be sent." : "";
       return html`<${Banner} mark="refused" action="Try now" act=${() => connection.retry()}>
         <strong>No connection to <code>rmpa web</code></strong> for <${Since} moment=${connection.lostAt / 1000} />.
         ${" "}${sentence(connection.reason)} ${known} The page connects again by itself.<//
@@ -167,7 +167,7 @@ class App extends Component {
     if (reach.ok === false)
       return html`<${Banner} mark="refused"
         ><strong>The agent has not answered</strong> for <${Since} moment=${reach.since} />.
-        ${" "}${sentence(reach.error)} ${sentence(reach.remedy)} What is shown is what was last known. This page comes
+        ${" "}${sentence(reach.error)} ${sentence(reach.remedy)} The page shows what was last known. This page comes
         back by itself.<//
       >`;
     if (notice)

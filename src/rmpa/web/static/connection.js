@@ -71,7 +71,7 @@ export class Connection {
     this.phase = "lost";
     this.reason = event.reason;
     if (!opened) this.explain();
-    const failure = { error: "the connection was lost before the answer came", remedy: "Look whether it was done." };
+    const failure = { error: "the connection was lost before the answer came", remedy: "Check whether it was done." };
     for (const question of this.questions.values()) {
       clearTimeout(question.timer);
       question.reject(failure);

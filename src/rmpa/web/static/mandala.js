@@ -393,7 +393,7 @@ export function Concerns({ state, connection }) {
       id: "lost",
       level: "ERROR",
       who: "rmpa web",
-      text: "no connection: what is shown is as it was last known",
+      text: "no connection: the page shows what was last known",
       to: location.hash || "#/",
       since: connection.lostAt / 1000,
     });

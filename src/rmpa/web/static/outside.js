@@ -56,8 +56,8 @@ function Token({ name, made }) {
       () => setCopied("The browser does not allow it: select the line."),
     );
   return html`<p>
-      Run this on ${name} until ${until}. It is a secret, and lets in one module, once. The next one for ${name} makes
-      it void.
+      Run this on ${name} until ${until}. It is a secret; one module can join with it, once. A new one for ${name}
+      replaces it.
     </p>
     <p><code class="token">${made.line}</code></p>
     ${navigator.clipboard && html`<button type="button" onClick=${copy}>Copy</button>`}

@@ -305,7 +305,7 @@ const WORDS = {
 };
 const NO_DEMAND = "demand"; // the last stage where nothing is in the way, and no node wants it
 function verdict({ kind, flows, stages }) {
-  if (flows && stages?.at(-1)?.name === NO_DEMAND) return ["STALE", "Nothing is in its way, and no node subscribes"];
+  if (flows && stages?.at(-1)?.name === NO_DEMAND) return ["STALE", "Nothing prevents it, but no node subscribes"];
   const [well, ill] = WORDS[kind] || WORDS.topic;
   return flows ? ["OK", well] : ["ERROR", ill];
 }

@@ -31,7 +31,7 @@ export function json(text) {
   };
   try {
     const value = JSON.parse(text, keep);
-    return beyond ? { error: "A number in it is beyond what a browser counts exactly." } : { value };
+    return beyond ? { error: "It has a number that is too large for a browser." } : { value };
   } catch (error) {
     return { error: `That is not JSON: ${error.message}` };
   }

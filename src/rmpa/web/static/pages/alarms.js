@@ -16,7 +16,7 @@ export function Alarms({ state, connection }) {
         ><${Table}
           caption="Alarms"
           columns=${["Resource", "Level", "Says", "Stands for"]}
-          empty="No alarm stands."
+          empty="There is no alarm."
           list=${alarms}
         >
           ${([id, alarm]) =>

@@ -10,7 +10,7 @@ const KEYS = { ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [-1, 0], ArrowRig
 
 const HELD =
   "It drives only while the stick is held. " +
-  "Let go, lose the connection or leave the page, and it is stopped within 0.3 s.";
+  "If you let go, lose the connection or leave the page, the robot is stopped within 0.3 s.";
 const DENIED = "This page may not drive. Start rmpa web with --drive, and open the address that it prints.";
 
 export function DrivePage({ state, connection }) {

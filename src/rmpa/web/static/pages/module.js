@@ -101,7 +101,7 @@ const LinkPanel = ({ module, detail }) => {
         ["Waiting to be sent", module.queued ? bytes(module.queued) : undefined],
         ["Dropped, link too slow", module.dropped ? count(module.dropped) : undefined],
         ["Topics that it offers", count(module.topics_in)],
-        ["Topics that it is offered", count(module.topics_out)],
+        ["Topics offered to it", count(module.topics_out)],
         ["Direct subscribers here", module.direct_in || undefined],
         ["Direct subscribers there", module.direct_out || undefined],
         ["Relayed by", module.via],
@@ -146,7 +146,7 @@ function PeerAgent({ name, up, connection, version }) {
             ? "Asking …"
             : !up
               ? "Not known without a link."
-              : `Version and CPU are not told by this peer: ${failure.error}`}
+              : `Version and CPU are not reported by this peer: ${failure.error}`}
         </p>`}<//
   >`;
 }
@@ -154,7 +154,7 @@ function PeerAgent({ name, up, connection, version }) {
 const PURPOSE = { express: "control, small messages", bulk: "large messages" };
 const Lanes = ({ lanes, linked }) =>
   linked && !(lanes || []).length
-    ? html`<p class="empty">The agent does not tell of lanes.</p>`
+    ? html`<p class="empty">The agent does not report lanes.</p>`
     : html`<${Table}
         caption="Lanes"
         columns=${["Lane", "State", "#In", "#Out", "#Waiting", "#Dropped"]}

@@ -56,7 +56,7 @@ export function Nodes({ state }) {
       ><${Table}
         caption="Nodes"
         columns=${["Node", "Module", ...NODE_COLUMNS.slice(1)]}
-        empty="No node is like that."
+        empty="No node matches."
         list=${shown}
       >
         ${([name, one]) => html`<${NodeRow} key=${name} name=${name} node=${one} own=${own} />`}<//
@@ -169,7 +169,7 @@ const Connections = ({ facts, failure, module, own }) =>
       ? html`<p class="empty">
           ${facts.problem
             ? "Not known: the node does not answer."
-            : "Not told by this peer: its agent is of an earlier release."}
+            : "Not reported by this peer: its agent is of an earlier release."}
         </p>`
       : html`<${Table}
           caption="Connections"
@@ -195,7 +195,7 @@ function NodeLog({ node, peer, connection }) {
   const lines = useLog(connection, false).filter((line) => line.node === node);
   return html`<${Panel} title="Log" wide
     >${peer
-      ? html`<p class="empty">Lines of the log stay in their module: ask <code>rmpa web</code> of ${peer}.</p>`
+      ? html`<p class="empty">Log lines do not cross: open <code>rmpa web</code> of ${peer}.</p>`
       : html`<${Lines}
           lines=${lines.slice(0, 100)}
           empty="It has written no line since rmpa web started."

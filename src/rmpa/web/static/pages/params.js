@@ -108,7 +108,7 @@ function Namespace({ tree, path, text, may, ask }) {
     .filter(([key, value]) => holds(value, `${path}/${key}`, text))
     .sort(([a], [b]) => a.localeCompare(b));
   const [first, more] = useFirst(rows);
-  if (!rows.length) return html`<p class="empty">No parameter is like that.</p>`;
+  if (!rows.length) return html`<p class="empty">No parameter matches.</p>`;
   return html`<ul>
       ${first.map(
         ([key, value]) =>
@@ -145,7 +145,7 @@ function Leaf({ name, short, value, may, ask }) {
       begin=${written}
       save=${save}
     >
-      <button type="button" onClick=${remove}>${sure ? "Really delete it" : "Delete"}</button
+      <button type="button" onClick=${remove}>${sure ? "Yes, delete it" : "Delete"}</button
       ><${Failure} failure=${failure}
     /><//>`;
 }

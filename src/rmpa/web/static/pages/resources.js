@@ -304,7 +304,7 @@ function Distances({ scores, profile }) {
         >`;
       })}
     </svg>
-    <p class="muted">Shorter is nearer to what is asked. Red: it cannot be chosen.</p>`;
+    <p class="muted">Shorter is nearer to what is asked for. Red: it cannot be chosen.</p>`;
 }
 
 const cell = (value) =>

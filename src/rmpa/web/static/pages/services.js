@@ -56,7 +56,7 @@ export function Services({ state }) {
       ><${Table}
         caption="Services"
         columns=${["Service", "Module", "Node", "Type", "State", "#Calls", "#Failed"]}
-        empty="No service is like that."
+        empty="No service matches."
         list=${shown}
       >
         ${([key, one]) => html`<${Row} key=${key} name=${key} service=${one} own=${section(state, "agent").name} />`}<//
@@ -144,7 +144,7 @@ function Call({ connection, service, about }) {
       <div class="row">
         <button class="primary" disabled=${!allowed || state.waits}>
           ${state.waits ? "Waiting for the response …" : "Call it"}</button
-        >${!allowed && html`<span class="muted">This page may only look: start rmpa web with --control.</span>`}
+        >${!allowed && html`<span class="muted">This page is read-only: start rmpa web with --control.</span>`}
       </div>
       <div aria-live="polite">
         <${Failure} failure=${state.failure} />${state.answer &&

@@ -42,7 +42,7 @@ export const TopicRow = memo(
         ${" "}→${" "}${(topic.to || []).join(", ") ||
         html`<span class="muted">no subscriber here</span>`}${topic.crosses
           ? ""
-          : html` <span class="muted">stays here</span>`}
+          : html` <span class="muted">does not cross</span>`}
       </td>
     </tr>`,
 );
@@ -92,7 +92,7 @@ export function Topics({ state }) {
       onInput=${(event) => setText(event.target.value)}
     />
     <${Panel}
-      ><${Table} caption="Topics" columns=${TOPIC_COLUMNS} empty="No topic is like that." list=${shown}>
+      ><${Table} caption="Topics" columns=${TOPIC_COLUMNS} empty="No topic matches." list=${shown}>
         ${([name, one]) => html`<${TopicRow} key=${name} name=${name} topic=${one} />`}<//
       >
       ${filter === "data" &&
@@ -311,10 +311,10 @@ function ContractPanel({ connection, topic, type, own, routes }) {
     ><${Failure} failure=${failure} /> ${value &&
     (set.length
       ? table(set)
-      : html`<p class="empty">No rule of <code>[[contract]]</code> names it: the defaults hold.</p>`)}
+      : html`<p class="empty">No rule of <code>[[contract]]</code> matches it: the defaults apply.</p>`)}
     ${value &&
     !routes &&
-    html`<p class="muted">It has no route yet. When a peer subscribes, the stricter terms of both modules hold.</p>`}
+    html`<p class="muted">It has no route yet. When a peer subscribes, the stricter terms of both modules apply.</p>`}
     ${value &&
     html`<details>
       <summary>${set.length ? "The terms that no rule sets" : "The defaults"}</summary>
