@@ -22,6 +22,12 @@ _REFUSED: Final = re.compile(
     re.VERBOSE | re.IGNORECASE,
 )
 
+_ALL_TOGETHER: Final = 35_000
+"""Words that the user pages may have, those aside that are made from code."""
+_MADE: Final = re.compile(
+    r"^<!-- tables: begin.*?^<!-- tables: end -->$|^\| [^\n]* \| `[A-Z]\w+` \|$", re.MULTILINE | re.DOTALL
+)
+
 
 @pytest.mark.parametrize("page", USER_PAGES, ids=name_of)
 def test_a_user_page_tells_what_there_is(page: Path) -> None:
@@ -30,3 +36,8 @@ def test_a_user_page_tells_what_there_is(page: Path) -> None:
         f"{number}: {said[0]}" for number, line in enumerate(text.splitlines(), 1) for said in _REFUSED.finditer(line)
     ]
     assert found == []
+
+
+def test_the_user_pages_are_read_in_an_evening() -> None:
+    words = {name_of(page): len(_MADE.sub("", page.read_text("utf-8")).split()) for page in USER_PAGES}
+    assert sum(words.values()) <= _ALL_TOGETHER, sorted(words.items(), key=lambda each: -each[1])
