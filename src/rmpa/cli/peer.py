@@ -56,6 +56,9 @@ def peer_list(
     A link is "at rest" while nothing uses it: a lost peer is then noticed after 16 s instead of 1 s
     (later with more than 50 peers).
 
+    A module that is "pending" needs an invitation, and the line below the table has the command that makes it. Its
+    name and address are not proved.
+
     CLOCK is the peer's wall clock minus ours, with the largest possible error. With very many peers a terminal shows
     a summary and the first ones: those with a problem, then those with most traffic.
 
