@@ -43,9 +43,9 @@ def steps(settings: Settings = FIT, master: str = CORE, **changes: Any) -> list[
         (Settings(name="base", interfaces=("lo",)), {}, "here: rmpa up --name OTHER --core-port 11312"),
         (FIT, {"agent": {"addresses": ()}}, "no network"),
         (FIT, {"trust": TrustStatus(on=True, module="base")}, "rmpa trust invite here"),
-        (FIT, {"peers": (JOYSTICK, PC)}, "linked with joystick; if a topic does not come: rmpa why NAME"),
+        (FIT, {"peers": (JOYSTICK, PC)}, "linked with joystick; if a topic does not arrive: rmpa why NAME"),
         (FIT, {"peers": (JOYSTICK, JOYSTICK)}, "linked with joystick and 1 more"),
-        (FIT, {"peers": (PC,)}, "pc was found and is not linked: rmpa why --module pc"),
+        (FIT, {"peers": (PC,)}, "pc was found but is not linked: rmpa why --module pc"),
         (FIT, {"strangers": (PC,)}, "pc is not of this mesh"),
     ],
 )

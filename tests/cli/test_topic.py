@@ -155,7 +155,7 @@ def test_over_the_mesh_a_delay_needs_no_header(place: Place, agent: Callable[...
     agent(snapshot=with_core(core.uri))
     code, out, err = place.run("topic", "delay", "joystick:/cmd", "-n", "5")
     assert (code, err) == (0, "")
-    assert "no header, and so no stamp to tell the whole age by\n\tby the link's clock, from joystick" in out
+    assert "no header, so no stamp to measure the whole age by\n\tby the link's clock, from joystick" in out
     (*_, last) = place.json("topic", "delay", "/cmd", "-n", "5", "--json")
     assert (last["source"], last["delay"], last["error"]) == ("link", 0.00044, 0.000216)
 
@@ -165,7 +165,7 @@ def test_without_the_agent_nobody_knows_the_links_clock(place: Place, core: RosC
     code, _, err = place.run("topic", "delay", "/cmd", "--master", core.uri)
     assert (code, err) == (
         1,
-        "rmpa: std_msgs/String has no header, and so no stamp to tell its age by [invalid-value]\n",
+        "rmpa: std_msgs/String has no header, so it has no stamp to measure its age by [invalid-value]\n",
     )
 
 
@@ -208,7 +208,7 @@ def test_delay_needs_a_header(place: Place, core: RosCore) -> None:
         code, _, err = place.run("topic", "delay", "/text")
         assert (code, err) == (
             1,
-            "rmpa: std_msgs/String has no header, and so no stamp to tell its age by [invalid-value]\n",
+            "rmpa: std_msgs/String has no header, so it has no stamp to measure its age by [invalid-value]\n",
         )
         assert place.run("topic", "echo", "/text", "-n", "1")[1] == 'data: "hello"\n---\n'
         process.send_signal(signal.SIGTERM)

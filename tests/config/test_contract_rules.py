@@ -225,7 +225,7 @@ RULE = '[[contract]]\ntopics = ["/a"]\n'
         (RULE + "max_rate = false", "3: contract.max_rate: false is not a rate"),
         (
             RULE + "# a comment\n\nliveliness_lease_duration = 1",
-            '5: contract.liveliness_lease_duration: says nothing without liveliness; add liveliness = "automatic"',
+            '5: contract.liveliness_lease_duration: has no effect without liveliness; add liveliness = "automatic"',
         ),
         (
             "contract = [\n  {topics = ['/a'], depth = 1},\n  {topics = ['/b'], depth = 0},\n]",

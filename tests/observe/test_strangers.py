@@ -27,7 +27,7 @@ PLAIN, OLD_KEY = TrustReason.UNSECURED, TrustReason.REVOKED
         (MEMBER, "arm", PLAIN, "pending", f"not proved; if it is yours, run on base: {INVITE} (", INVITE),
         (LONE, "arm", PLAIN, "pending", f"run on the authority: {INVITE} (", INVITE),
         # A member's name, and this module's own.
-        (AUTHORITY, "pc", PLAIN, "foreign", "it says that it is pc, and does not prove it", ""),
+        (AUTHORITY, "pc", PLAIN, "foreign", "it uses the name pc without a certificate", ""),
         (AUTHORITY, "PC", PLAIN, "foreign", "do not invite it", ""),
         (MEMBER, "pc", TrustReason.KEY, "foreign", "do not invite it", ""),
         # One that has joined and was not started again, or has lost its files.

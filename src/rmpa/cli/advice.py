@@ -74,11 +74,11 @@ def _about_peers(settings: Settings, shown: Snapshot) -> str:
     linked = [peer.name for peer in shown.peers if peer.link]
     if linked:
         others = f" and {len(linked) - 1} more" if len(linked) > 1 else ""
-        hint = "if a topic does not come: rmpa why NAME"
+        hint = "if a topic does not arrive: rmpa why NAME"
         return _fitting(f"linked with {linked[0]}{others}; {hint}", f"linked with {len(linked)}; {hint}")
     if shown.peers:
         hint = f"rmpa why --module {shown.peers[0].name}"
-        return _fitting(f"{shown.peers[0].name} was found and is not linked: {hint}", f"no link: {hint}", hint)
+        return _fitting(f"{shown.peers[0].name} was found but is not linked: {hint}", f"no link: {hint}", hint)
     if shown.strangers:
         one = shown.strangers[0]
         hint = f"{'pending' if one.invite else 'not of this mesh'}: rmpa peer list says what to do"

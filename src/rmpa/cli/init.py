@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rmpa.observe.doctor.machine import NetworkInterface
     from rmpa.observe.snapshot import AgentInfo
 
-_HEAD: Final = "# Written by `rmpa init`: what was found stands above each line that is no comment.\n"
+_HEAD: Final = "# Written by `rmpa init`: the comment above each active line says what was found.\n"
 _COLUMNS: Final = 118
 
 
@@ -106,7 +106,7 @@ def _write(path: Path, text: str, *, force: bool, system: bool) -> None:
     except FileExistsError:
         raise StartError(str(path), "is there already", "--force replaces it, --dry-run prints a new one") from None
     except PermissionError:
-        remedy = "sudo -E rmpa init --system" if system else "call it in a folder of yours"
+        remedy = "sudo -E rmpa init --system" if system else "run it in a folder that you may write"
         raise StartError(str(path), "cannot be written by this user", remedy) from None
     except OSError as error:
         raise StartError(str(path), f"cannot be written: {error.strerror}") from None

@@ -51,7 +51,7 @@ async def _decision(graph: ResourceGraph, one: SeenResource) -> dict[str, Any]:
     try:
         return msgspec.json.decode(said[one], type=dict[str, Any])
     except msgspec.DecodeError as error:
-        raise RmpaError(f"it says something strange about its decision: {error}", code="resource-trouble") from None
+        raise RmpaError(f"its decision cannot be read: {error}", code="resource-trouble") from None
 
 
 @resource_verb()

@@ -256,7 +256,7 @@ def resource_list(options: Options) -> None:
     async def body(graph: ResourceGraph) -> None:
         for path, count in Counter(one.path for one in graph.seen).items():
             if count > 1:
-                text = "what is asked of that name is heard by all of them; docs/guides/names.md tells them apart"
+                text = "a request to that name reaches all of them; docs/guides/names.md shows how to separate them"
                 warn(f"{count} modules have a resource {path}: {text}", "same-names")
         states, profiles, contexts = await graph.texts(graph.seen, "state", "profile", "context")
         found: list[dict[str, Any]] = []

@@ -286,7 +286,7 @@ def topic_type(topic: str, options: Options) -> None:
     wanted, _, graph = _find(topic, options)
     kind = graph.types.get(wanted.name)
     if kind is None:
-        raise RmpaError(f"the type of {wanted.name} is not known yet: its publisher tells it", code="unknown-type")
+        raise RmpaError(f"the type of {wanted.name} is not known yet: its publisher gives it", code="unknown-type")
     options.show({"name": wanted.name, "type": kind}, kind)
 
 
@@ -433,7 +433,7 @@ class _Delay(_Figures):
             self.delays.append((received.stamp_ns - stamp.sec * 1_000_000_000 - stamp.nanosec) / 1e9)
         elif self.master.agent is None or proxied_peer(received.caller_id) is None:
             raise RmpaError(
-                f"{received.kind.name} has no header, and so no stamp to tell its age by", code="invalid-value"
+                f"{received.kind.name} has no header, so it has no stamp to measure its age by", code="invalid-value"
             )
 
     def values(self, routes: tuple[RouteInfo, ...]) -> dict[str, object]:
@@ -451,7 +451,7 @@ class _Delay(_Figures):
     def text(self) -> str:
         """As ``rostopic delay``, with a digit more."""
         if not self.delays:
-            return "no header, and so no stamp to tell the whole age by"
+            return "no header, so no stamp to measure the whole age by"
         v = self.own()
         spread = f"min: {v['min']:.4f}s max: {v['max']:.4f}s std dev: {v['sd']:.5f}s window: {v['window']}"
         return f"average delay: {v['delay']:.4f}\n\t{spread}\n\tby the header's stamp and this machine's clock"

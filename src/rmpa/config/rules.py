@@ -96,8 +96,10 @@ def _make_contract(values: dict[str, Any]) -> ContractRule:
         raise BadValue("a rule without topics and types", 'topics = ["/**"] makes it one for every topic')
     if _LEASE in values:
         if "liveliness" not in values:
-            kinds = '"automatic" (its link says that a source lives) or "manual_by_topic" (its messages)'
-            raise BadValue("says nothing without liveliness", f"add liveliness = {kinds}", at=(_LEASE,))
+            kinds = (
+                '"automatic" (its link shows that a publisher is alive) or "manual_by_topic" (its messages show it)'
+            )
+            raise BadValue("has no effect without liveliness", f"add liveliness = {kinds}", at=(_LEASE,))
         values["liveliness_lease"] = values.pop(_LEASE)
     return ContractRule(topics, types, values)
 
@@ -141,8 +143,8 @@ CLOCK: Final = "/clock"
 UNTOUCHABLE: Final = {
     "/run_id": "it names the run of this module's core",
     "/roslaunch/**": "it is roslaunch's own",
-    "/rosdistro": "it tells which ROS this core is",
-    "/rosversion": "it tells which ROS this core is",
+    "/rosdistro": "it says which ROS this core is",
+    "/rosversion": "it says which ROS this core is",
     SIM_TIME: "time is followed by [time] alone",
 }
 

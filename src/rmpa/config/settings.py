@@ -422,7 +422,7 @@ TABLES: Final = {
     "gateway.ros2": "The ROS 2 graph that rmpa gateway joins (docs/guides/ros2.md).",
     "relay": "Whether this module joins networks that are not routed to each other.",
     "control": "Who on this machine may use the agent's control socket, which the commands ask.",
-    "log": "What the log says, and how.",
+    "log": "Level and format of the log.",
 }
 
 

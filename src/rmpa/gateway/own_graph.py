@@ -122,7 +122,7 @@ class MeshSources:
 
     def _tell(self, source: MeshSource, *, there: bool) -> None:
         for on_change in tuple(self.watchers):
-            with logged_failure(_log, "a neighbour failed at %s; the others are told", source):
+            with logged_failure(_log, "a neighbour failed at %s; the others are informed", source):
                 on_change(source, there)
 
     def _topic(self, topic: str) -> Iterator[MeshSource]:

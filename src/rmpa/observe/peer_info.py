@@ -197,19 +197,21 @@ def judge_stranger(
     if name.casefold() in members:
         if reason is TrustReason.REVOKED:
             return None  # it has joined again
-        text = f"not of this mesh: it says that it is {name}, and does not prove it"
+        text = f"not of this mesh: it uses the name {name} without a certificate"
         return FOREIGN, f"{text}; do not invite it; if it is yours, give it another name: rmpa up --name", ""
     invite = f"rmpa trust invite --module {name}"
     where = "here" if trust.is_authority else f"on {trust.authority or 'the authority'}"
     lets_in = f"run {where}: {invite} (it prints the line to run on {name})"
     certified = name in (member.name for member in trust.members)
     if revoked and not certified:
-        text = f"revoked: it was a member, and knocks again; if it is to come back, rmpa trust leave --yes on {name}"
+        text = (
+            f"revoked: it was a member, and tries to join again; to let it back in, rmpa trust leave --yes on {name}"
+        )
         return REVOKED, f"{text}, then {lets_in}", ""
     if reason is not TrustReason.UNSECURED:
         return FOREIGN, problem, ""
     if certified:
-        text = f"{name} has a certificate, but this module knocks without it; start it again if it has just joined"
+        text = f"{name} has a certificate, but tries to join without it; if it has just joined, start it again"
         return PENDING, f"pending: {text}, or if it has lost its files and is yours, {lets_in}", invite
     text = "pending: it has no keys, so its name and address are not proved"
     return PENDING, f"{text}; if it is yours, {lets_in}", invite

@@ -48,7 +48,7 @@ def test_a_user_is_added_to_the_group_once() -> None:
     (repair,) = of_group("rmpa", "arm", member=False)
     assert repair.command == ("usermod", "-aG", "rmpa", "arm")
     assert repair.undo == "sudo gpasswd -d arm rmpa"
-    assert "a new log-in will have it" in repair.text
+    assert "after the next log-in it may" in repair.text
 
 
 def test_who_needs_sudo_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -453,13 +453,15 @@ class ParamOwner:
                     why = self._why_denied(follower.asker, key, value) or hidden
                     text = None if why else await write_text(key, value)
             except RmpaError as error:  # the core does not answer, or the value is too large to cross
-                _log.warning("! peers are not told of %s: %s [param-trouble]", key, error)
+                _log.warning("! peers do not get the parameter %s: %s [param-trouble]", key, error)
                 why = str(error)
         args = {"key": key, "refused": why} if why else {"key": key, "text": text}
         try:
             await self._shared.rpc.request(follower.session, transfer.VALUE, args, limits.PARAM_ASK_TIMEOUT)
         except RmpaError as error:
-            _log.warning("! %s is not told of %s: %s [param-trouble]", follower.session.link.name, key, error)
+            _log.warning(
+                "! %s does not get the parameter %s: %s [param-trouble]", follower.session.link.name, key, error
+            )
             return False
         if key in follower.told:
             follower.told[key] = _mark(text)

@@ -198,7 +198,9 @@ def _told(site: str, module: str, name: str, there: Diagnosis | None, refusal: s
     if there is None:
         whose = f"{module} at {site}" if module else f"a module at {site}"
         text = f"no node of {whose} has {name}, as the gateway there sees it"
-        remedy = f"start it there; or the [bridge] or [services] of {whose} keeps it at home: `rmpa why {name}` there"
+        remedy = (
+            f"start it there; or the [bridge] or [services] of {whose} does not let it cross: `rmpa why {name}` there"
+        )
         return (Check("source there", FAIL, text, remedy),)
     return there.stages
 
@@ -411,7 +413,7 @@ class SiteAnswers:
             remedy = "in a moment? else routers that do not reach each other, or too many sources: `rmpa site info`"
             stages.append(Check("offer", FAIL, text, remedy))
         elif refusal:
-            text, remedy = f"site {site} announces no {name}", f"`rmpa why {name}` there tells more"
+            text, remedy = f"site {site} announces no {name}", f"`rmpa why {name}` there shows more"
             stages.append(Check("offer", FAIL, text, remedy))
         node = there.node if there is not None else ""
         return self._diagnosis(name, f"{site}/{module}" if module else site, node, kind, stages)

@@ -162,8 +162,8 @@ def _peer(agent: str, peer: PeerInfo) -> Iterator[Check]:
         rest = ", at rest" if link.rests else ""
         yield check(OK, f"linked by {link.remote}{rest}, found by {peer.source or 'its link'}")
         if link.dropped:
-            text = f"{link.dropped} messages were given up, for the link is slower than what it should carry"
-            remedy = "`rmpa peer info` shows of which topics; contracts.md tells what to do (max_rate, priority)"
+            text = f"{link.dropped} messages were dropped, because the link is slower than its topics"
+            remedy = "`rmpa peer info` shows of which topics; docs/guides/contracts.md: max_rate, priority"
             yield check(WARN, text, remedy)
         if link.clock_offset is not None:
             yield machine.judge_peer_clock(agent, peer.name, link.clock_offset, link.clock_error)

@@ -537,7 +537,7 @@ def _own_name(shell: RosShell) -> Iterator[Check]:
 def _host_name(shell: RosShell, remedy: str) -> tuple[Any, ...]:
     """Without those variables nodes are to be reached under the host's name."""
     name, addresses = shell.host_name, shell.resolved.get(shell.host_name, ())
-    told = f"nodes tell others to reach them at {name}"
+    told = f"nodes register with the host name {name}"
     if name == "localhost":
         return OK, "nodes are reached by this machine's address"
     if not addresses:
@@ -549,7 +549,7 @@ def _host_name(shell: RosShell, remedy: str) -> tuple[Any, ...]:
     if not shell.is_here(name):
         return (
             FAIL,
-            f"{told}, which is said to be {addresses[0]}: not this machine",
+            f"{told}, which resolves to {addresses[0]}: not this machine",
             f"correct /etc/hosts, or {remedy}",
         )
     return OK, f"{name} is this machine ({addresses[0]})"

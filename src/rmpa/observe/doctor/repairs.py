@@ -88,10 +88,10 @@ def of_unit(unit: Mapping[str, str], *, agent_runs: bool) -> Iterator[Repair]:
         return
     active, enabled = unit.get("ActiveState", ""), unit.get("UnitFileState") == "enabled"
     if active == "active" and unit.get("UnitFileState") == "disabled":
-        text, command = f"{UNIT} runs, and does not start with the machine", ("systemctl", "enable", UNIT)
+        text, command = f"{UNIT} runs, but does not start at boot", ("systemctl", "enable", UNIT)
         yield Repair("boot", "", text, command, f"sudo systemctl disable {UNIT}", root=True)
     elif active in ("inactive", "failed") and enabled and not agent_runs:
-        text, command = f"{UNIT} is {active}, and is to run", ("systemctl", "start", UNIT)
+        text, command = f"{UNIT} is {active}, but is enabled", ("systemctl", "start", UNIT)
         yield Repair("boot", "", text, command, f"sudo systemctl stop {UNIT}", root=True)
 
 
@@ -104,7 +104,9 @@ def of_group(group: str, user: str, member: bool) -> Iterator[Repair]:
         member: Whether the group has the user; then only a new session is missing.
     """
     if group and not member:
-        text = f"users of the group {group} may ask the agent at boot, and {user} may not (a new log-in will have it)"
+        text = (
+            f"users of the group {group} may ask the agent at boot, and {user} may not (after the next log-in it may)"
+        )
         command, undo = ("usermod", "-aG", group, user), f"sudo gpasswd -d {user} {group}"
         yield Repair("directory", "/run/rmpa", text, command, undo, root=True)
 
@@ -192,7 +194,7 @@ def directories(given: DoctorInput) -> Iterator[Check]:
     for repair in found:
         yield Check("directory", WARN, repair.text, f"rmpa doctor --fix, or: {repair}", where=repair.where)
     if member:
-        text = f"{user} is in the group {group}, and this session is older than that"
+        text = f"{user} is in the group {group}, and this session began before that"
         yield Check("directory", WARN, text, "log in again", where="/run/rmpa")
     elif not found:
         yield Check("directory", OK, "this user may use its directories, and no dead agent has left anything")

@@ -106,7 +106,7 @@ def _at_server(
     yield Check("server", OK, f"{there.node} on {peer} provides it{was}")
     if not there.crosses:
         remedy = f"change [services] or [[peer]] in the rmpa.toml of {peer}, and `rmpa reload` there"
-        yield Check("policy there", FAIL, f"{peer} keeps it at home: {there.rule}", remedy)
+        yield Check("policy there", FAIL, f"{peer} does not let it cross: {there.rule}", remedy)
     yield Check("policy there", OK, f"{peer} lets it cross: {there.rule}")
     if there.permitted:
         yield Check(PERMISSION_THERE, OK, f"{peer} lets {to} call it")
@@ -138,7 +138,7 @@ def _at_client(peer: str, service: str, wire: str, info: ServiceInfo | None, her
     if here.answer:
         yield Check("answer", OK, f"its server answers: {here.answer}")
     else:
-        remedy = f"is the server on {peer} alive? its node's log may tell"
+        remedy = f"is the server on {peer} alive? see the log of its node"
         yield Check("answer", FAIL, here.refusal or "no answer", remedy)
     text = f"{info.calls} from here, {info.failed} of them failed"
     text += "; direct ones are not counted" if info.address else ""

@@ -246,10 +246,10 @@ def _adrift(link: Check, peer: str) -> Check:
 def _published(ends: Ends, peer: str) -> Check:
     there, wire = ends.there, ends.wire
     if there is None and ends.arrivals:
-        text = f"its agent does not tell ({ends.refusal}), but it offered {wire} of {', '.join(ends.arrivals)}"
+        text = f"its agent does not answer ({ends.refusal}), but it offered {wire} of {', '.join(ends.arrivals)}"
         return Check("publisher", UNKNOWN, text)
     if there is None:
-        text = f"{peer} offers no {wire}, and its agent does not tell why ({ends.refusal})"
+        text = f"{peer} offers no {wire}, and its agent gives no reason ({ends.refusal})"
         return Check("publisher", FAIL, text, f"ask on {peer} itself: rostopic info {wire}")
     if there.permitted is False:
         return permission_there(peer, ends.snapshot.agent.name, Access.SUBSCRIBE, wire)
@@ -275,7 +275,7 @@ def _policy_there(way: Way) -> Check:
     remedy = f"change [bridge] in the rmpa.toml of {way.peer}, and `rmpa reload` there"
     if way.told.rule.startswith("built in"):
         remedy = "no rule of yours can let it cross; republish it there under another name (topic_tools relay)"
-    return Check("policy there", FAIL, f"{way.peer} keeps it at home: {way.told.rule}", remedy)
+    return Check("policy there", FAIL, f"{way.peer} does not let it cross: {way.told.rule}", remedy)
 
 
 def _permission_there(way: Way) -> Check | None:
@@ -478,7 +478,7 @@ def _arrived(way: Way) -> Check:
         text = f"nothing for {age:.1f} s; until then a message came every {usual * 1e3:.0f} ms at the latest"
         return Check("arrived", FAIL, text, f"its publisher {now.node} on {way.peer} stopped publishing: look at it")
     if usual is None and not now.latched and age > silent:
-        return Check("arrived", WARN, text, "a topic of few messages? nothing tells how often they should come")
+        return Check("arrived", WARN, text, "a topic of few messages? it is not known how often they should come")
     return Check("arrived", OK, text)
 
 
@@ -491,9 +491,9 @@ def _contract(way: Way) -> Check:
         return Check("contract", OK, f"kept ({said})" if said else "nothing lost, late or expired")
     parts = [f"{count} {key}" for key, count in missing.items()]
     parts += [f"{kind.replace('_', ' ')} {count} times" for kind, count in events.items()]
-    remedy = "`rmpa topic info` tells when; docs/guides/contracts.md what to do"
+    remedy = "`rmpa topic info` shows when; docs/guides/contracts.md what to do"
     if ("lost" in missing or "loss_unknown" in events) and route.contract.get("reliability") == "reliable":
-        remedy = "a longer outage, or more depth, in [[contract]] keeps more; `rmpa topic info` tells when"
+        remedy = "a longer outage, or more depth, in [[contract]] keeps more; `rmpa topic info` shows when"
     return Check("contract", WARN, ", ".join(parts), remedy)
 
 

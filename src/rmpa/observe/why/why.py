@@ -213,7 +213,7 @@ class WhyService:
 
     async def _nowhere(self, topic: str, linked: list[str]) -> Diagnosis:
         if self._own(topic):
-            text, remedy = "no peer is linked that it could go to", "`rmpa peer list` tells of the peers"
+            text, remedy = "no peer is linked that it could go to", "`rmpa peer list` shows the peers"
             return Diagnosis.of((Check("peer", FAIL, text, remedy),), name=topic, peer=self._name, to="")
         state = self._core.state()
         similar = await asyncio.to_thread(did_you_mean, topic, {*state.publishers, *state.subscribers} - {topic})

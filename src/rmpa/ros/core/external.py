@@ -243,7 +243,7 @@ class ExternalCore(Core):
                     await asyncio.shield(self._task)
             if self._writes and not self._problem:
                 _log.warning(
-                    "! the roscore at %s was not told of %d changes [core-slow]", self.uri, len(self._writes)
+                    "! %d changes could not be sent to the roscore at %s [core-slow]", len(self._writes), self.uri
                 )
         tasks = [task for task in (self._task, self._revival) if task is not None]
         for task in tasks:
