@@ -53,6 +53,7 @@ def script() -> None:
             one.spin()
     except rmpa.UnreachableError as error:
         assert_type(error.remedy, str)
+        assert_type(error.code, str)
         raise SystemExit(str(error)) from None
 
 

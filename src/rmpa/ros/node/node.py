@@ -147,8 +147,10 @@ class Node(MasterClient):
             await self.call_master("getPid")
             for key, value in self.environment.parameters.items():
                 await self.set_param(f"~{key}", value)
-        except BaseException:
+        except BaseException as error:
             await self.slave.close()
+            if isinstance(error, UnreachableError):
+                raise error.with_traceback(None) from None  # a short traceback, whose last line says what to do
             raise
         loop = asyncio.get_running_loop()
         for number in self._signals:
