@@ -46,6 +46,7 @@ def test_an_endpoint_that_is_not_secure_is_refused_and_named(
         assert endpoint in str(refused.value)
         assert why in refused.value.problem
         assert remedy in refused.value.remedy
+        assert refused.value.code == ("invalid-value" if certificates else "not-a-member")
 
 
 @pytest.mark.parametrize("endpoint", ["tcp/localhost:7447", "tcp/127.0.0.1:7447", "tcp/[::1]:7447#iface=lo"])

@@ -156,7 +156,7 @@ def gateway_config(settings: GatewaySettings, certificates: MeshCertificates | N
     for endpoint in (*settings.connect, *settings.listen):
         problem = _problem(endpoint, certificates)
         if problem and not settings.insecure:
-            raise StartError(f"zenoh {endpoint}", *problem, code="port-in-use")
+            raise StartError(f"zenoh {endpoint}", *problem, code="invalid-value" if certificates else "not-a-member")
     mode = "router" if settings.router else "peer" if settings.listen else "client"
     return ZenohConfig(mode, settings.connect, settings.listen, certificates, uplink=settings.uplink)
 
