@@ -34,7 +34,7 @@ _PROBES: Final = {
 _TESTS: Final = Path(__file__).parent
 _ROOMS: Final = {"core", "runtime", "discovery", "mesh", "ros", "bridge", "resource"}
 """Rooms whose coroutine tests fail when code of rmpa blocks the event loop."""
-_WAITING: Final = {"interop", "examples", "agent", "lab", "cli"}
+_WAITING: Final = {"docs", "interop", "examples", "agent", "lab", "cli"}
 """Rooms whose tests mostly wait for the processes that they start."""
 _LONG: Final = 10.0
 """Seconds from which on a file is named at the end."""

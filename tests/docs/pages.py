@@ -67,11 +67,11 @@ def links(path: Path) -> frozenset[str]:
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block of a page.
+    """A block of code of a page, fenced or indented.
 
     Attributes:
         page: Where it is.
-        line: The number of its first line, the fence.
+        line: The number of its first line.
         language: What follows the fence.
         mark: The text of the comment on the line before it; empty without.
         text: What it has.
@@ -88,10 +88,10 @@ class Block:
 
 
 def blocks(path: Path) -> Iterator[Block]:
-    """The fenced blocks of a page in their order."""
+    """The blocks of code of a page in their order."""
     text = path.read_text(encoding="utf-8")
     lines = text.splitlines()
     for token in _OPTIONS.parse(text):
-        if token.type == "fence" and token.map:
+        if token.type in {"fence", "code_block"} and token.map:
             before = re.fullmatch(r"\s*<!-- (.*?) -->\s*", lines[token.map[0] - 1]) if token.map[0] else None
             yield Block(path, token.map[0] + 1, token.info.strip(), before[1] if before else "", token.content)
