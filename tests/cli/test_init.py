@@ -107,6 +107,7 @@ def test_a_roscore_that_runs_is_joined(place: Place, core: RosCore) -> None:
     given = found(place, ROS_MASTER_URI=core.uri.replace("127.0.0.1", "localhost"))
     port = urlsplit(core.uri).port
     assert given["core.mode"]["value"] == "external"
+    assert "core.port" not in given, "it is of no use with an external core"
     assert f"is the ROS master at port {port}" in str(given["core.mode"]["found"])
     settings = settings_of(place.path / "rmpa.toml")
     assert (settings.core_mode, settings.core_master) == ("external", f"http://localhost:{port}/")
