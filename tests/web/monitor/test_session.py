@@ -207,7 +207,13 @@ def test_a_connection_that_takes_nothing_gets_no_live_frames() -> None:
 def test_what_cannot_be_shown_ends_the_watch_with_its_reason() -> None:
     page = Page()
     page.send("watch", id=1, topic="/odom", how="image", rate=5)
-    assert page.message(1)[0] == {"op": "failed", "id": 1, "error": page.news[-1]["error"], "remedy": ""}
+    assert page.message(1)[0] == {
+        "op": "failed",
+        "id": 1,
+        "error": page.news[-1]["error"],
+        "remedy": "",
+        "code": page.news[-1]["code"],
+    }
     assert "not an image" in page.news[-1]["error"]
     assert page.last("subscribe").closed
 
@@ -240,7 +246,7 @@ def test_a_question_has_one_answer() -> None:
         assert page.take() == frames
     page.send("ask", id=6, what="why")
     page.last("ask").failed(PeerRefused("arm", "no", "wait"))
-    assert page.take() == [{"op": "failed", "id": 6, "error": "arm refused: no", "remedy": "wait"}]
+    assert page.take() == [{"op": "failed", "id": 6, "error": "arm refused: no", "remedy": "wait", "code": "refused"}]
 
 
 @pytest.mark.parametrize("what", ["call", "set_param", "delete_param", "profile", "context"])

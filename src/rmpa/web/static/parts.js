@@ -164,8 +164,8 @@ export const Gone = ({ kind, name }) =>
 export const Failure = ({ failure }) =>
   failure &&
   html`<p class="failure" role="alert">
-    <${Mark} state="ERROR" word="" /> ${failure.error} ${failure.code && `[${failure.code}]`}${failure.remedy &&
-    html`<br /><span class="muted">${failure.remedy}</span>`}
+    <${Mark} state="ERROR" word="" /> ${failure.error}
+    ${failure.code && `[${failure.code}]`}${failure.remedy && html`<br /><span class="muted">${failure.remedy}</span>`}
   </p>`;
 
 // A time that has passed; it counts by itself, once a second.
