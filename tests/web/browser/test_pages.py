@@ -544,6 +544,7 @@ async def test_a_pending_module_is_invited_by_a_button_that_shows_the_line_once(
     assert await page.run(f"{OUTSIDE}.map((each) => each.querySelectorAll('button').length)") == [1, 0, 0]
     await click(page, "Invite arm")
     await page.wait_text("rmpa trust join rmpa1-forarm")
+    assert "A new one for arm replaces it." in await page.run("document.querySelector('.outside').innerText")
     assert site.server.asked[-1].args == {"name": "arm"}
     assert "rmpa1-" not in await page.run("JSON.stringify(window.rmpa.state) + location + document.cookie")
     assert await page.run("document.documentElement.scrollWidth") == 360

@@ -55,10 +55,8 @@ function Token({ name, made }) {
       () => setCopied("Copied."),
       () => setCopied("The browser does not allow it: select the line."),
     );
-  return html`<p>
-      Run this on ${name} until ${until}. It is a secret; one module can join with it, once. A new one for ${name}
-      replaces it.
-    </p>
+  const about = `It is a secret; one module can join with it, once. A new one for ${name} replaces it.`;
+  return html`<p>Run this on ${name} until ${until}. ${about}</p>
     <p><code class="token">${made.line}</code></p>
     ${navigator.clipboard && html`<button type="button" onClick=${copy}>Copy</button>`}
     <span role="status" class="muted said">${copied}</span>`;
