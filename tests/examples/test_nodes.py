@@ -215,6 +215,9 @@ def test_the_watcher_shows_who_comes_and_goes(machine: Machine, group: str) -> N
             watcher.wait_for(r"^\+ module arm$")
             talker = arm.example("talker.py")
             watcher.wait_for(r"^\+ topic /chatter std_msgs/String$")
+            listener = machine.example("listener.py")
+            listener.wait_for("^heard: hello ")  # as the page says: of another module
+            assert listener.interrupt() == 0
             assert talker.interrupt() == 0
             watcher.wait_for("^- topic /chatter$")
         finally:
