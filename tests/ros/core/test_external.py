@@ -139,7 +139,7 @@ async def test_restarted_master_gets_all_registrations(
         await master.close()
         await until(core.notes)
         await asyncio.sleep(2 * MASTER_RETRY)
-        assert len([r for r in caplog.records if "is waited for" in r.getMessage()]) == 1, "said once"
+        assert len([r for r in caplog.records if "rmpa waits for it" in r.getMessage()]) == 1, "said once"
         assert core.publishers("/u") == {"/n": api}
         master = await a_master(port)
         await until(lambda: master.publishers("/t"))

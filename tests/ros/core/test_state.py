@@ -154,7 +154,7 @@ async def test_parameters_survive_with_their_types_and_never_forgets_all(path: P
             assert core.call("getParam", "/x", "/run_id").value != run_id
             await asyncio.sleep(0)
             assert names(core) == set()
-            assert "the core begins empty: core.keep is never" in core.restored()
+            assert "the core starts empty: core.keep is never" in core.restored()
             await call(core.uri, "setParam", "/x", "/after", 1)
         async with running(path) as core:
             assert (await call_api(core.uri, "hasParam", "/x", "/robot")).value is False
@@ -196,7 +196,7 @@ async def test_what_was_lost_under_running_nodes_is_restored_else_the_core_begin
             async with running(path, keep="auto") as core:
                 assert core.call("hasParam", "/x", "/robot").value is kept
                 assert (core.call("getParam", "/x", "/run_id").value == run_id) is kept
-                assert ("the core begins empty: no node of the run before is left" in core.restored()) is (
+                assert ("the core starts empty: no node of the run before is left" in core.restored()) is (
                     not kept and again == 1
                 )
                 if left == "node":
@@ -255,10 +255,10 @@ async def test_unusable_place_is_reported_and_used_when_usable(
         core.call("setParam", "/x", "/a", 1)
         await until(core.notes)
         (note,) = core.notes()
-        assert "nothing of the core is kept over a restart" in note
+        assert "the core keeps nothing when it restarts" in note
         assert "set RMPA_STATE_DIR" in note
         assert "nothing is kept" in core.restored()
-        assert caplog.text.count("nothing of the core is kept") == 1
+        assert caplog.text.count("the core keeps nothing") == 1
         path.parent.unlink()
         await until(lambda: not core.notes())
     async with running(path) as core:
@@ -400,7 +400,7 @@ async def test_what_cannot_be_written_is_reported_and_nothing_is_lost(
             assert core.restored() == "nothing is kept"
             assert "meanwhile" not in content(path).params
         await until(lambda: not core.notes())
-        assert caplog.text.count("nothing of the core is kept") == 1
+        assert caplog.text.count("the core keeps nothing") == 1
     async with running(path) as core:
         assert [core.call("getParam", "/x", key).value for key in ("/before", "/meanwhile")] == [1, 2]
 
@@ -487,7 +487,7 @@ async def test_a_file_that_cannot_be_read_is_set_aside(
     path.parent.mkdir()
     path.write_bytes(data)
     async with running(path) as core:
-        assert caplog.text.count("the core begins empty") == 1
+        assert caplog.text.count("the core starts empty") == 1
         core.call("setParam", "/x", "/c", 1)
         assert core.call("getParam", "/x", "/").code == 1
     assert path.with_name("core.state.before").read_bytes() == data

@@ -271,7 +271,7 @@ async def test_a_module_tells_its_agents_figures_its_lanes_and_why(site: Site) -
 
 async def test_an_agent_of_an_earlier_release_does_not_tell_its_figures_and_the_page_says_so(site: Site) -> None:
     page = await site.open("module/joystick")
-    await page.wait_text("not told by this peer")
+    await page.wait_text("not reported by this peer")
 
 
 async def test_a_lane_without_a_connection_is_seen(site: Site) -> None:
@@ -286,7 +286,7 @@ async def test_a_node_shows_its_topics_services_connections_and_log(site: Site) 
     text = await page.run("document.querySelector('main').innerText")
     assert "/odom" in text
     assert "set_parameters" in text
-    assert "stay in their module" in text
+    assert "Log lines do not cross" in text
     await page.run("location.hash = '#/topic/%2Fodom'")
     await page.wait("[...document.querySelectorAll('main a')].some((each) => each.hash === '#/node/base%3A%2Fbase')")
     assert (site.server.reports, page.errors) == ([], [])
@@ -330,7 +330,7 @@ async def test_the_contract_of_a_topic_shows_before_it_has_a_route(site: Site) -
     page = await site.open("topic/%2Fvelocity_order")
     await page.wait_text("rule 1: topics /velocity")
     page = await site.open("topic/%2Fodom")
-    await page.wait_text("the defaults hold")
+    await page.wait_text("the defaults apply")
 
 
 async def test_a_parameter_that_another_node_changes_shows_by_itself(site: Site) -> None:

@@ -229,7 +229,7 @@ class CoreState:
     def _drop(self, state: StoredState, why: str) -> None:
         names = [f"/{name}" for name in state.params if f"/{name}" not in _OF_A_CORE]
         if names or state.nodes:
-            self._dropped = f"the core begins empty: {why}"
+            self._dropped = f"the core starts empty: {why}"
         if names and self._keep == "auto":
             self._dropped += f'; its parameters {_first(names)} are dropped (core.keep = "always" keeps them)'
 
