@@ -165,7 +165,7 @@ export const Failure = ({ failure }) =>
   failure &&
   html`<p class="failure" role="alert">
     <${Mark} state="ERROR" word="" /> ${failure.error}
-    ${failure.code && `[${failure.code}]`}${failure.remedy && html`<br /><span class="muted">${failure.remedy}</span>`}
+    ${failure.code && ` [${failure.code}]`}${failure.remedy && html`<br /><span class="muted">${failure.remedy}</span>`}
   </p>`;
 
 // A time that has passed; it counts by itself, once a second.
