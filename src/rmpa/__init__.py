@@ -59,7 +59,7 @@ __all__ = [
 def __getattr__(name):
     """Import a name of the API at its first use."""
     if name not in _LAZY:
-        raise AttributeError(f"module 'rmpa' has no attribute {name!r}")
+        raise AttributeError("module 'rmpa' has no attribute " + repr(name))  # Python 2.7 reads this file too
     import importlib  # noqa: PLC0415 - most programs that import rmpa need no more of it
 
     return getattr(importlib.import_module(_LAZY[name]), name)
