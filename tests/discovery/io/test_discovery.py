@@ -148,7 +148,7 @@ async def test_garbage_is_counted_said_once_and_survived(
     lines = [r.getMessage() for r in caplog.records]
     assert len([line for line in lines if "malformed" in line]) == 1
     told = f"speaks beacon protocol 3, we speak 2 (rmpa {__version__}): install the same release of rmpa on both"
-    assert f"! the peer at 127.0.0.1 {told}" in lines
+    assert f"! the peer at 127.0.0.1 {told} [other-release]" in lines
     assert [(one.identity.name, one.problem) for one in base.discovery.strangers()] == [("new", told)]
     assert len([line for line in lines if "is of domain 7, we are of domain 0" in line]) == 1
     pc = Agent("pc", settings)

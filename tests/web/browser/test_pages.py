@@ -484,7 +484,7 @@ async def test_a_page_that_is_opened_in_the_background_is_whole(site: Site) -> N
         source="Object.defineProperty(document, 'hidden', {get: () => true})",
     )
     page = await site.open("topic/%2Fodom")
-    await page.wait_text("No rule of [[contract]] names it")
+    await page.wait_text("No rule of [[contract]] matches it")
 
 
 async def test_long_lists_are_drawn_in_parts(site: Site) -> None:
