@@ -68,7 +68,7 @@ def test_without_a_name_it_is_the_hosts(tmp_path: Path) -> None:
         (("--ros2",), "add --connect, such as tcp/localhost:7447 for rmw_zenohd here"),
         (("--router",), "a router that listens nowhere; add --listen"),
         (("--site", "ros2", "--connect", "tcp/a:1"), "--site: ros2 is reserved"),
-        (("--site", "a", "zenoh-config"), "--site: stands before zenoh-config"),
+        (("--site", "a", "zenoh-config"), "--site: must come after zenoh-config"),
         (("zenoh-conf",), "Did you mean `rmpa gateway zenoh-config`?"),
         (("--site", "a", "--connect", "fleet:7447"), "did you mean --connect tls/fleet:7447?"),
     ],

@@ -82,7 +82,7 @@ def gateway(context: click.Context, /, **options: object) -> int:
         given = [name for name, value in options.items() if value not in (None, ())]
         if given:
             option = f"--{given[0].replace('_', '-')}"
-            raise ConfigError(option, f"must come after {context.invoked_subcommand}", "write it behind that")
+            raise ConfigError(option, f"must come after {context.invoked_subcommand}", "write it after that")
         return 0
     _check_gateway_libraries()
     beside = ""
