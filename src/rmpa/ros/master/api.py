@@ -151,7 +151,7 @@ class MasterApi:
                     problem = fault
             case _:
                 problem = RosFault(1, f"{brief(call)} is not a struct of methodName and params")
-        return {"faultCode": problem.code, "faultString": problem.text}
+        return {"faultCode": problem.number, "faultString": problem.text}
 
     # --- the node's own API -----------------------------------------------------------------------------------
 
