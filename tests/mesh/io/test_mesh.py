@@ -276,7 +276,7 @@ async def test_another_domain_is_refused_with_what_to_do(caplog: pytest.LogCaptu
         assert one.mesh.counters["link.refused.domain"] == 1
         await until(lambda: not one.mesh.connections(), "the link ended")
         assert [r.message for r in caplog.records if "domain" in r.message and r.levelname == "WARNING"] == [
-            f"! refused a link with stranger at 127.0.0.1: {Refuse.parse(answer.payload).text}"
+            f"! refused a link with stranger at 127.0.0.1: {Refuse.parse(answer.payload).text} [peer-refused]"
         ]
 
 
