@@ -172,7 +172,7 @@ def test_nodes_of_peers(rmpa: Rmpa, talker: str, peer: list[dict[str, Any]]) -> 
     code, out, err = rmpa("list")
     assert (code, out.splitlines()) == (0, ["/rosout", "/talker", "joystick:/joy", "older:/x"])
     assert err.splitlines() == [
-        "! older does not tell its nodes, only those that stand here: it is older [refused]",
+        "! older does not list its nodes, only those with proxies here: it is older [refused]",
         f"! /talker cannot be reached at {talker}: no such name [node-unreachable]",
         f"! joystick:/joy cannot be reached at {JOY}: no answer in 3 s [node-unreachable]",
     ]
@@ -197,7 +197,7 @@ def test_many_modules_that_do_not_tell_their_nodes_take_one_line() -> None:
     silent = [PeerNodes(peer=f"arm{number}", nodes=(), problem="it is stopped") for number in range(1000)]
     told = [*silent, PeerNodes(peer="base", nodes=()), PeerNodes(peer="leg", nodes=(), problem="it is older")]
     assert list(_untold(told)) == [
-        "1,000 modules (arm0, arm1, arm2, ...) do not tell their nodes, only those that stand here: it is stopped",
-        "leg does not tell its nodes, only those that stand here: it is older",
+        "1,000 modules (arm0, arm1, arm2, ...) do not list their nodes, only those with proxies here: it is stopped",
+        "leg does not list its nodes, only those with proxies here: it is older",
     ]
-    assert next(_untold(silent[:2])).startswith("arm0, arm1 do not tell")
+    assert next(_untold(silent[:2])).startswith("arm0, arm1 do not list")

@@ -98,7 +98,7 @@ def _ask_peer(master: Master, wanted: GraphName, what: str, kind: type[_T]) -> _
 
 
 def _untold(told: Iterable[PeerNodes]) -> Iterator[str]:
-    """Which modules do not tell their nodes, one line for all with the same reason."""
+    """Which modules do not list their nodes, one line for all with the same reason."""
     reasons: dict[str, list[str]] = {}
     for one in told:
         if one.problem:
@@ -106,8 +106,8 @@ def _untold(told: Iterable[PeerNodes]) -> Iterator[str]:
     for reason, peers in reasons.items():
         first = ", ".join(peers[:_NAMED])
         who = f"{len(peers):,} modules ({first}, ...)" if len(peers) > _NAMED else first
-        verb = "does not list its" if len(peers) == 1 else "do not tell their"
-        yield f"{who} {verb} nodes, only those that stand here: {reason}"
+        verb = "does not list its" if len(peers) == 1 else "do not list their"
+        yield f"{who} {verb} nodes, only those with proxies here: {reason}"
 
 
 def _of_peers(master: Master, graph: Graph, peer: str | None) -> list[_Line]:
