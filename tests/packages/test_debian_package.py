@@ -99,6 +99,9 @@ def test_there_is_a_manual_for_every_command_and_setting(tree: Path) -> None:
     for setting in SETTINGS:
         name = setting.title if setting.is_list_of_tables or not setting.key else setting.key[-1]
         assert name in pages["rmpa.toml.5.gz"]
+    for page in tree.rglob("*.gz"):
+        head = page.read_bytes()[:10]
+        assert (head[4:8], head[9]) == (bytes(4), 255), f"{page}: other bytes with another Python"
 
 
 @pytest.mark.skipif(not shutil.which("man"), reason="there is no man")
