@@ -120,7 +120,9 @@ def rows(rmpa: Rmpa, *words: str) -> list[list[str]]:
 
 def test_resources_here_and_at_peers(rmpa: Rmpa, running: ResourceNode, remote: object) -> None:
     assert "\x1b" not in rmpa("resource", "list")[1]
-    assert "2 modules have a resource /sonar: what is asked" in rmpa("resource", "list")[2]
+    assert (
+        "2 modules have a resource /sonar: a request to that name reaches all of them" in rmpa("resource", "list")[2]
+    )
     listed = as_json(rmpa, "resource", "list")
     assert [(one["name"], one["peer"], one["profile"], one["context"]) for one in listed] == [
         ("/sonar", None, "slow", ""), ("/lidar", "base", "fast", "away"), ("/sonar", "base", "fast", "away"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -265,16 +266,17 @@ def test_an_agent_without_trust_warns_and_says_that_it_must_be_started_again(
     assert "runs without trust, so no module can join; start it again" in base.refused("invite")
 
 
-def test_ctrl_c_withdraws_the_token(machine: Callable[[str], Machine]) -> None:
-    import signal
-
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_ctrl_c_or_a_closed_terminal_withdraws_the_token(
+    machine: Callable[[str], Machine], number: signal.Signals
+) -> None:
     base, arm = machine("base"), machine("arm")
     base.trust("init")
     base.up()
     inviting = base.start("trust", "invite", "--json")
     assert inviting.stdout is not None
     token = json.loads(inviting.stdout.readline())["token"]
-    inviting.send_signal(signal.SIGINT)
+    inviting.send_signal(number)
     _, err = inviting.communicate(timeout=DEADLINE)
     assert (inviting.returncode, "the token is withdrawn" in err) == (130, True), err
     assert "arm cannot join: the token is unknown here (token)" in arm.refused("join", token)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import signal
 import socket
 import sys
 import time
@@ -93,6 +94,8 @@ def trust_invite(
             problem, remedy = "runs without trust", "start it again"
         raise StartError(f"the agent {module.name}", f"{problem}, so no module can join", remedy, code="not-a-member")
     invited = module.call("invite", InviteReply, name=invitee or "", lifetime=seconds, address=host, port=port)
+    for number in () if no_wait else (signal.SIGHUP, signal.SIGTERM):  # its terminal is closed, too
+        signal.signal(number, signal.default_int_handler)
     try:
         if not options.as_json:
             until = date_of(invited.expires)
@@ -250,7 +253,7 @@ def trust_join(
     if module.socket is not None:
         warn(f"the agent {module.name} runs without trust until it is started again", "needs-restart")
     else:
-        click.echo(f"Next: {start}; rmpa trust check says what other modules may do here.")
+        click.echo(f"Next: {start}; what a module may do here: rmpa trust check PEER publish /TOPIC")
 
 
 def _clock_problem(wall: float, issued: float, *, by_files: bool) -> str:
