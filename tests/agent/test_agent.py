@@ -269,7 +269,9 @@ async def test_a_second_agent_of_one_name_or_port_is_refused(settings: Callable[
     async with running(settings("a")) as (a,):
         with pytest.raises(StartError, match="a"):
             await Agent(settings("a")).start()
-        said = rf"port {core_port(a)} is already in use by the agent a \(pid {os.getpid()}\); .*run FILE --name a"
+        said = (
+            rf"rmpa up: a runs already \(pid {os.getpid()}\); .*ROS_MASTER_URI=http://localhost:{core_port(a)}; a sec"
+        )
         with pytest.raises(StartError, match=said):
             await Agent(settings("b", core_port=core_port(a))).start()
 

@@ -357,6 +357,7 @@ def test_status(systemd: Systemd, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     for agent, web in (
         ("", ""),
         (_RUNS, _RUNS.replace("enabled", "disabled") + "NRestarts=2\n"),
+        ("LoadState=loaded\nActiveState=inactive\nSubState=dead\nUnitFileState=disabled\n", ""),  # the package's
         ("LoadState=loaded\nActiveState=failed\nSubState=failed\nUnitFileState=enabled\nResult=watchdog\n", ""),
     ):
         gateway = agent and _RUNS.replace("enabled", "disabled").replace("=active", "=inactive")  # a package has it
@@ -378,6 +379,7 @@ def test_status(systemd: Systemd, monkeypatch: pytest.MonkeyPatch, capsys: pytes
         "active": "failed",
         "sub": "failed",
         "enabled": True,
+        "set_up": True,
         "result": "watchdog",
         "pid": None,
         "restarts": 0,

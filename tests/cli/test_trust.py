@@ -1,13 +1,17 @@
-"""``rmpa trust check``."""
+"""``rmpa trust check``, and keys that are the service's."""
 
 from __future__ import annotations
 
 import json
+import os
 from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.cli import trust
 from rmpa.cli.main import main
+from rmpa.core.errors import StartError
+from rmpa.trust.store import TrustStore
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -96,3 +100,21 @@ def test_what_cannot_be_asked_exits_2(
     code, _, err = _run(capsys, "check", *arguments, "--config", file)
     assert code == 2
     assert words in err
+
+
+@pytest.mark.parametrize(("uid", "words"), [(1000, "sudo rmpa trust join …"), (0, "choose another state directory")])
+def test_keys_of_the_service_take_sudo(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, uid: int, words: str
+) -> None:
+    def refuse(*_: object) -> bool:
+        raise StartError("/x/trust", "cannot be searched", "choose another state directory", code="keys-unusable")
+
+    monkeypatch.setenv("RMPA_STATE_DIR", str(tmp_path))
+    monkeypatch.setenv("RMPA_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(trust, "STATE", str(tmp_path))
+    monkeypatch.setattr(TrustStore, "exists", property(refuse))
+    monkeypatch.setattr(os, "geteuid", lambda: uid)
+    code, _, error = _run(capsys, "join", "rmpa1-secret", "--name", "arm")
+    assert code == 1
+    assert words in error
+    assert "secret" not in error

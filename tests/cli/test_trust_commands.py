@@ -259,11 +259,11 @@ def test_an_agent_without_trust_warns_and_says_that_it_must_be_started_again(
     until(lambda: "peers can find it" in base.log and "trust is off" in base.log)
     assert base.log.count("trust is off: every program that reaches port") == 1
     out = base.run("trust", "init")
-    assert "the agent base runs without trust until it is started again" in out[2]
+    assert "the agent base runs without its keys; restart it: end it (Ctrl-C), then rmpa up" in out[2]
     shown = base.status()
     assert (shown["on"], shown["agent"]) == (True, "plain")
-    assert "started again" in str(shown["problems"])
-    assert "runs without trust, so no module can join; start it again" in base.refused("invite")
+    assert "restart it: end it" in str(shown["problems"])
+    assert "runs without its keys, so no module can join; restart it: end it" in base.refused("invite")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])

@@ -31,7 +31,14 @@ PLAIN, OLD_KEY = TrustReason.UNSECURED, TrustReason.REVOKED
         (AUTHORITY, "PC", PLAIN, "foreign", "do not invite it", ""),
         (MEMBER, "pc", TrustReason.KEY, "foreign", "do not invite it", ""),
         # One that has joined and was not started again, or has lost its files.
-        (AUTHORITY, "lost", PLAIN, "pending", "has a certificate, but", "rmpa trust invite --module lost"),
+        (
+            AUTHORITY,
+            "lost",
+            PLAIN,
+            "pending",
+            "restart the agent on lost: sudo systemctl restart rmpa if",
+            "rmpa trust invite --module lost",
+        ),
         # Revoked ones, with their former group key or with none any more; and one that has joined again since.
         (MEMBER, "old", OLD_KEY, "revoked", "rmpa trust leave --yes on old, then run on base: rmpa trust invite", ""),
         (AUTHORITY, "old", PLAIN, "revoked", "then run here: rmpa trust invite --module old", ""),
@@ -65,4 +72,7 @@ def test_to_a_module_without_keys_a_secured_mesh_is_pending_and_another_mesh_is_
     state, text, invite = judge_refusal(TrustReason.PLAIN, "arm")
     assert (state, invite) == ("pending", INVITE)
     assert f"to join it, run on its authority: {INVITE} (it prints the line to run here)" in text
+    state, text, invite = judge_refusal(TrustReason.PLAIN, "arm", "sudo systemctl restart rmpa")
+    assert (state, invite) == ("pending", "")
+    assert text.endswith("its agent runs without; restart it: sudo systemctl restart rmpa")
     assert judge_refusal(TrustReason.FOREIGN, "arm")[::2] == ("foreign", "")

@@ -8,14 +8,11 @@ import signal
 import socket
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
-from rmpa.runtime.process import watchdog_period
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from rmpa.runtime.process import restart_text, watchdog_period
 
 # An event loop that hangs at SIGUSR1.
 _PROGRAM = """
@@ -131,3 +128,16 @@ def test_a_sign_of_life_that_failed_is_sent_soon_also_without_a_free_descriptor(
                 process.kill()
             assert process.stderr is not None
             assert process.stderr.read().count(b"cannot be told WATCHDOG=1") == 1
+
+
+@pytest.mark.parametrize(
+    ("line", "text"),
+    [
+        ("0::/system.slice/rmpa.service", "sudo systemctl restart rmpa"),
+        ("5:pids:/system.slice/rmpa-gateway.service\n0::/", "sudo systemctl restart rmpa-gateway"),
+        ("0::/user.slice/user-1000.slice/user@1000.service/app.slice/rmpa.service", "end it (Ctrl-C), then rmpa up"),
+    ],
+)
+def test_an_agent_is_restarted_by_its_unit(monkeypatch: pytest.MonkeyPatch, line: str, text: str) -> None:
+    monkeypatch.setattr(Path, "read_text", lambda *_: f"{line}\n")
+    assert restart_text(7) == text

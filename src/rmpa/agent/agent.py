@@ -16,7 +16,7 @@ import random
 from typing import TYPE_CHECKING, Final
 
 from rmpa.agent.process import Reloader, WebProcess, run_process, serve, web_command, web_environment
-from rmpa.agent.trust import AgentTrust, TrustCommands, open_membership
+from rmpa.agent.trust import AgentTrust, TrustCommands, open_membership, restart_to_join
 from rmpa.bridge.bridge import Bridge, TwinWatch
 from rmpa.bridge.nodes import Nodes
 from rmpa.bridge.params.follower import Params
@@ -50,6 +50,7 @@ from rmpa.runtime import process as garbage_collector
 from rmpa.runtime.accept import open_mesh_port
 from rmpa.runtime.kernel_tcp import may_end_connections
 from rmpa.runtime.loop import SystemClock
+from rmpa.runtime.process import unit_of
 from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
@@ -325,10 +326,11 @@ async def start_core(core: Core, settings: Settings) -> None:
         if not isinstance(cause, OSError) or cause.errno != errno.EADDRINUSE:
             raise
         if (agent := await asyncio.to_thread(_agent_at, port, settings.runtime_dir)) is not None:
-            error.problem = f"port {port} is already in use by the agent {agent.name} (pid {agent.pid})"
+            service = ", as the service: `rmpa service status`" if unit_of(agent.pid) else ""
+            error.what, error.problem = "rmpa up", f"{agent.name} runs already (pid {agent.pid}{service})"
             error.remedy = (
-                f"nodes with ROS_MASTER_URI=http://localhost:{port} are in its module, and so are resources by "
-                f"`rmpa run FILE --name {agent.name}`; a second module here needs another --name and --core-port"
+                f"its nodes need ROS_MASTER_URI=http://localhost:{port}; a second module here needs another --name "
+                "and --core-port"
             )
         elif await is_other_master(port):
             error.remedy = "join its graph with `rmpa up --core external`, or end it, or choose another --core-port"
@@ -446,6 +448,7 @@ class Agent:
             notes=self._notes,
             realtime=realtime,
             trust=self.trust.status if self.trust is not None else lambda: None,
+            restart=lambda: restart_to_join(settings) if self.trust is None else "",
         )
         self.snapshots = SnapshotBuilder(settings, parts)
         needs = Needs((), "figures of the agent, none of the module's graph")

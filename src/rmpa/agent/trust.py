@@ -32,6 +32,7 @@ from rmpa.core.errors import (
     missing_extra,
 )
 from rmpa.discovery.network import list_interfaces
+from rmpa.runtime.process import restart_text
 from rmpa.trust import limits
 from rmpa.trust.permissions import (
     HAVE,
@@ -68,6 +69,14 @@ def trust_store(settings: Settings) -> TrustStore | None:
     """Where the module's files of trust are; ``None``: there is no state directory."""
     place = state_dir(os.environ, settings.state_dir)
     return TrustStore(place, settings.name) if place is not None else None
+
+
+def restart_to_join(settings: Settings) -> str:
+    """How to restart this agent, which runs without trust, if its module has keys; else empty."""
+    with contextlib.suppress(StartError):
+        if (store := trust_store(settings)) is not None and store.exists:
+            return restart_text()
+    return ""
 
 
 def open_membership(settings: Settings, clock: SystemClock) -> Membership | None:
@@ -362,7 +371,6 @@ class AgentTrust(Part):
 Args = dict[str, object]
 
 
-_JOINED: Final = "it has joined since it started: start it again"
 _COMMANDS: Final = ("status", "invite", "step", "withdraw", "renew", "rotate", "revoke", "sign")
 
 
@@ -393,8 +401,9 @@ class TrustCommands:
     @property
     def _trust(self) -> AgentTrust:
         if self._part is None:
-            begin = "rmpa trust init, or rmpa trust join TOKEN; then start it again"
-            remedy = _JOINED if self._plain().problems else begin
+            begin = "rmpa trust init, or rmpa trust join TOKEN; then restart it"
+            restart = restart_to_join(self._settings)
+            remedy = f"it has joined since it started; restart it: {restart}" if restart else begin
             raise PeerRefused(f"agent {self._settings.name}", "it runs without trust", remedy, code="not-a-member")
         return self._part
 
@@ -405,7 +414,7 @@ class TrustCommands:
     def _plain(self) -> TrustStatus:
         name, store = self._settings.name, trust_store(self._settings)
         joined, folder = store is not None and store.exists, str(store.folder) if store is not None else ""
-        problems = (f"the agent {name} still runs without trust: {_JOINED}",) if joined else ()
+        problems = (f"the agent {name} runs without its keys; restart it: {restart_text()}",) if joined else ()
         return TrustStatus(on=False, module=name, folder=folder, agent="plain", problems=problems)
 
     def invite(self, args: Args) -> InviteReply:

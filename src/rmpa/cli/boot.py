@@ -57,6 +57,7 @@ _BY_HAND: Final = ".by-hand"
 _PROPERTIES: Final = (
     *("LoadState", "ActiveState", "SubState", "UnitFileState", "Result", "MainPID", "NRestarts"),
     "StateChangeTimestampMonotonic",
+    "FragmentPath",
 )
 # The states of a unit that does nothing, or is not there.
 _AWAY: Final = ("inactive", "unknown")
@@ -422,7 +423,7 @@ def service_status(options: Options) -> int:
     states = [_state(name) for name in UNITS.values()]
     # A package has all units, of which web server and gateway may be of no use here.
     units = [states[0], *(state for state in states[1:] if state["enabled"] or state["active"] not in _AWAY)]
-    peers, problem = _peers() if units[0]["active"] == "active" else ([], "")
+    peers, waiting, problem = _peers() if units[0]["active"] == "active" else ([], "", "")
 
     def text() -> Iterator[Text]:
         for unit in units:
@@ -431,7 +432,7 @@ def service_status(options: Options) -> int:
             linked = sum(state == "linked" for _, state in peers)
             yield f"{len(peers)} peer{'' if len(peers) == 1 else 's'}, {linked} linked: `rmpa peer list`"
         elif units[0]["active"] == "active":
-            yield f"peers: {problem or 'none yet'}"
+            yield f"peers: {problem or waiting or 'none yet'}"
 
     found = [{"name": name, "state": state} for name, state in peers]
     options.show({"units": units, "peers": found, "problem": problem}, text())
@@ -439,6 +440,8 @@ def service_status(options: Options) -> int:
 
 
 def _state(unit: str) -> dict[str, object]:
+    from rmpa.observe.doctor.machine import is_set_up
+
     shown = _shown(unit)
     since = int(shown.get("StateChangeTimestampMonotonic") or 0) / 1e6
     installed = shown.get("LoadState") == "loaded"
@@ -449,6 +452,7 @@ def _state(unit: str) -> dict[str, object]:
         "sub": shown.get("SubState", ""),
         "since": time.clock_gettime(time.CLOCK_MONOTONIC) - since if since else None,
         "enabled": shown.get("UnitFileState", "") == "enabled",
+        "set_up": is_set_up(shown),
         "result": shown.get("Result", ""),
         "pid": int(shown.get("MainPID") or 0) or None,
         "restarts": int(shown.get("NRestarts") or 0),
@@ -458,6 +462,7 @@ def _state(unit: str) -> dict[str, object]:
 
 def _unit_lines(unit: dict[str, object]) -> Iterator[str]:
     from rmpa.cli.output import duration
+    from rmpa.observe.doctor.machine import INSTALL
 
     name, active = unit["unit"], unit["active"]
     if not unit["installed"]:
@@ -476,16 +481,17 @@ def _unit_lines(unit: dict[str, object]) -> Iterator[str]:
         words.append(f"failed by {unit['result']}")
     yield f"{name}: {', '.join(words)}"
     if not unit["enabled"]:
-        yield f"    to start it at boot: sudo systemctl enable {name}"
+        start = f"sudo systemctl enable {name}" if unit["set_up"] else INSTALL
+        yield f"    to start it at boot: {start}"
     log = unit["log"]
     if isinstance(log, list):
         yield from (f"    {line}" for line in log)
         if not log:
-            yield "    no log that this user may read: sudo journalctl -u rmpa"
+            yield f"    its log: sudo journalctl -u {str(name).removesuffix('.service')}"
 
 
-def _peers() -> tuple[list[tuple[str, str]], str]:
-    """The peers of the unit's agent, and why they are not known."""
+def _peers() -> tuple[list[tuple[str, str]], str, str]:
+    """The peers of the unit's agent, what is said of modules that are none, and why nothing is known."""
     from rmpa.observe.control_client import ControlClient, find_agents
 
     try:
@@ -493,10 +499,12 @@ def _peers() -> tuple[list[tuple[str, str]], str]:
             with ControlClient(agent.path) as client:
                 snapshot = client.snapshot(topics=())
             if not snapshot.agent.name.endswith(GATEWAY_SUFFIX):
-                return [(peer.name, peer.state) for peer in snapshot.peers], ""
+                others = ", ".join(f"{one.name} is {one.state}" for one in snapshot.strangers[:3])
+                waiting = f"{others}: `rmpa peer list`" if others else ""
+                return [(peer.name, peer.state) for peer in snapshot.peers], waiting, ""
     except RmpaError as error:
-        return [], str(error)
-    return [], f"this user may not ask: use sudo, or join the group {GROUP}"
+        return [], "", str(error)
+    return [], "", f"this user may not ask: use sudo, or join the group {GROUP}"
 
 
 # --- uninstall ------------------------------------------------------------------------------------------------------

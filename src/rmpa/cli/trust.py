@@ -15,12 +15,14 @@ import click
 
 from rmpa.cli.options import Options, argument, config_option, flag, json_verb
 from rmpa.cli.output import Table, duration, warn
+from rmpa.cli.units import STATE
 from rmpa.config import module_name
 from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, Access
 from rmpa.config.read import load_settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError, missing_extra
 from rmpa.core.identity import is_global_name, peer_name_problem
 from rmpa.observe.control_client import ControlClient, find_agents, running_agents
+from rmpa.runtime.process import restart_text
 from rmpa.trust.permissions import Permissions, TrustReply, TrustStatus, action_topics
 from rmpa.trust.store import TrustStore, modules_with_keys
 
@@ -33,8 +35,9 @@ if TYPE_CHECKING:
     from rmpa.trust.membership import Membership, MeshAuthority
 
 _T = TypeVar("_T")
+# The codes of files that this user cannot use.
+_CLOSED: Final = ("keys-unusable", "directory-unusable")
 _WORDS: Final = (*(access.value for access in Access), ACTION_CLIENT, ACTION_SERVER)
-_RESTART: Final = "the agent {} runs without trust until it is started again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +51,7 @@ class Module:
         socket: The control socket of its agent; ``None``: none runs.
         trust: What its agent says of trust; ``None``: none runs.
         config_file: The settings of its agent; empty: it has none, or none runs.
+        pid: The process of its agent; 0: none runs.
     """
 
     chosen: ModuleName
@@ -56,6 +60,7 @@ class Module:
     socket: Path | None = None
     trust: TrustStatus | None = None
     config_file: str = ""
+    pid: int = 0
 
     @property
     def name(self) -> str:
@@ -66,6 +71,10 @@ class Module:
     def agent(self) -> str:
         """How its agent runs: ``secured``, ``plain`` or ``off``."""
         return "off" if self.trust is None else self.trust.agent
+
+    def restart(self, start: str = "rmpa up") -> str:
+        """What is said of its agent, which does not have its keys yet."""
+        return f"the agent {self.name} runs without its keys; restart it: {restart_text(self.pid, start)}"
 
     @property
     def place(self) -> Path:
@@ -183,10 +192,10 @@ def find_module(
     if path is None:
         return Module(chosen, loaded, module_name.state_dir(environ, loaded.settings.state_dir))
     with ControlClient(path) as client:
-        trust, config_file = client.call("trust", TrustStatus, what="status"), client.agent().config_file
+        trust, agent = client.call("trust", TrustStatus, what="status"), client.agent()
     # The agent may have been started with another state directory than this shell has.
     state = Path(trust.folder).parent.parent if trust.folder else None
-    return Module(chosen, loaded, state, path, trust, config_file)
+    return Module(chosen, loaded, state, path, trust, agent.config_file, agent.pid)
 
 
 def trust_verb(*parameters: Any) -> Callable[[Callable[..., None]], click.Command]:
@@ -200,7 +209,15 @@ def trust_verb(*parameters: Any) -> Callable[[Callable[..., None]], click.Comman
     def decorate(function: Callable[..., None]) -> click.Command:
         @functools.wraps(function)
         def command(name: str | None, config: str | None, options: Options, **given: Any) -> None:
-            function(find_module(name, {"config": config}, os.environ), options, **given)
+            module = find_module(name, {"config": config}, os.environ)
+            try:
+                function(module, options, **given)
+            except StartError as error:
+                if not (os.geteuid() and module.state == Path(STATE) and error.code in _CLOSED):
+                    raise
+                words = click.get_current_context().command_path
+                problem, remedy = f"the keys of {module.name} are the service's", f"sudo {words} …"
+                raise StartError(words, problem, remedy, code="root-needed") from None
 
         return json_verb(*parameters, name_option, config_option)(command)
 
@@ -329,9 +346,9 @@ def trust_init(module: Module, options: Options, label: str) -> None:
         yield f"fingerprint of the CA: {grouped(status.fingerprint)}"
         yield "Keep a copy of that folder in a safe place: without ca.key no module can join or be renewed."
         if module.socket is not None:
-            warn(_RESTART.format(module.name), "needs-restart")
-        again = " again" if module.socket is not None else ""
-        yield f"Next: {start} here{again}, and rmpa trust invite for each module."
+            warn(module.restart(start), "needs-restart")
+        first = "" if module.socket is not None else f"{start} here, and "
+        yield f"Next: {first}rmpa trust invite for each module."
         yield "Modules may do here only what [[permission]] in rmpa.toml allows: docs/guides/trust.md#permissions"
 
     options.show(status, text())
@@ -381,7 +398,7 @@ def _status(module: Module) -> TrustStatus:
     authority = module.authority() if module.store.is_authority else None
     membership = authority.membership if authority is not None else module.membership()
     shown = status_of(membership, authority, agent=module.agent)
-    restart = (_RESTART.format(module.name),) if module.agent == "plain" else ()
+    restart = (module.restart(),) if module.agent == "plain" else ()
     return replace(shown, problems=(*shown.problems, *restart))
 
 
@@ -507,4 +524,5 @@ def trust_leave(module: Module, options: Options, yes: bool) -> None:
     done = f"{module.name} has left its mesh: {len(removed)} files are removed"
     options.show(TrustReply(module=module.name, done=True, text=", ".join(removed)), done)
     if module.socket is not None and not options.as_json:
-        warn(f"the agent {module.name} keeps its membership until it is started again", "needs-restart")
+        how = restart_text(module.pid)
+        warn(f"the agent {module.name} keeps its membership until you restart it: {how}", "needs-restart")

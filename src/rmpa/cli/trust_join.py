@@ -21,6 +21,7 @@ from rmpa.cli.output import print_json, warn
 from rmpa.cli.trust import check_library, confirm, date_of, grouped, keep_member_name, trust_verb
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
 from rmpa.core.identity import peer_name_problem
+from rmpa.runtime.process import restart_text
 from rmpa.trust import limits
 from rmpa.trust.permissions import InviteReply, JoinStep, TrustError, TrustReply
 
@@ -91,7 +92,7 @@ def trust_invite(
         module.authority()  # the better error, if this module is none
         problem, remedy = "does not run", "start it: rmpa up"
         if module.socket is not None:
-            problem, remedy = "runs without trust", "start it again"
+            problem, remedy = "runs without its keys", f"restart it: {restart_text(module.pid)}"
         raise StartError(f"the agent {module.name}", f"{problem}, so no module can join", remedy, code="not-a-member")
     invited = module.call("invite", InviteReply, name=invitee or "", lifetime=seconds, address=host, port=port)
     for number in () if no_wait else (signal.SIGHUP, signal.SIGTERM):  # its terminal is closed, too
@@ -251,7 +252,7 @@ def trust_join(
     if text := _clock_problem(time.time(), found.issued, by_files=accept is not None):
         warn(text, "clock-skew")
     if module.socket is not None:
-        warn(f"the agent {module.name} runs without trust until it is started again", "needs-restart")
+        warn(module.restart(start), "needs-restart")
     else:
         click.echo(f"Next: {start}; what a module may do here: rmpa trust check PEER publish /TOPIC")
 

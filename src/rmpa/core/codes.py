@@ -546,6 +546,7 @@ _COUNTERS: Final = {
     "beacon.clock": "clock-skew",
     "beacon.other_domain": "peer-refused",
     "beacon.flood": "too-many-connections",
+    "beacon.forged": "other-mesh",
     "beacon.unknown_key": "other-mesh",
     "beacon.untagged": "other-mesh",
     "beacon.version": "other-release",

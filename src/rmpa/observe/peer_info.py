@@ -170,6 +170,8 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
 #
 # What is shown of a module that is heard and is not of this mesh. Nothing that it says is proved.
 
+_RESTART: Final = "sudo systemctl restart rmpa if the service runs it, else end it, then rmpa up"
+
 
 def judge_stranger(
     name: str,
@@ -211,21 +213,24 @@ def judge_stranger(
     if reason is not TrustReason.UNSECURED:
         return FOREIGN, problem, ""
     if certified:
-        text = f"{name} has a certificate, but tries to join without it; if it has just joined, start it again"
-        return PENDING, f"pending: {text}, or if it has lost its files and is yours, {lets_in}", invite
+        text = f"{name} has a certificate, but its agent runs without it; restart the agent on {name}: {_RESTART}"
+        return PENDING, f"pending: {text}; if {name} has lost its keys and is yours, {lets_in}", invite
     text = "pending: it has no keys, so its name and address are not proved"
     return PENDING, f"{text}; if it is yours, {lets_in}", invite
 
 
-def judge_refusal(reason: TrustReason, own: str) -> tuple[str, str, str]:
+def judge_refusal(reason: TrustReason, own: str, restart: str = "") -> tuple[str, str, str]:
     """What is shown of a peer that refuses this module, or is refused, as not of its mesh; as ``judge_stranger``.
 
     Args:
         reason: The word of the refusal.
         own: The name of this module.
+        restart: How to restart this module's agent, if it has joined since that started; else empty.
     """
     if reason is not TrustReason.PLAIN:
         return FOREIGN, not_of_this_mesh(reason), ""
+    if restart:
+        return PENDING, f"pending: this module has its keys, but its agent runs without; restart it: {restart}", ""
     invite = f"rmpa trust invite --module {own}"
     text = "pending: this module has no keys of that secured mesh; to join it, run on its authority"
     return PENDING, f"{text}: {invite} (it prints the line to run here)", invite

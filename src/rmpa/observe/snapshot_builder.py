@@ -77,6 +77,7 @@ class AgentParts:
         notes: What else the user should know, each ready to read.
         realtime: The outcomes of ``--realtime``, ready to read; those that were refused begin with ``no``.
         trust: The state of trust; ``None``: it is off.
+        restart: How to restart the agent, if its module has joined a secured mesh since it started; else empty.
     """
 
     core: Core
@@ -88,6 +89,7 @@ class AgentParts:
     notes: Callable[[], Iterable[str]]
     realtime: tuple[str, ...]
     trust: Callable[[], TrustStatus | None]
+    restart: Callable[[], str]
 
 
 class SnapshotBuilder:
@@ -275,7 +277,7 @@ class SnapshotBuilder:
             state, since = "linked", session.link.since or now
         elif status is not None and status.foreign is not None:
             next_attempt = None
-            state, last_error, invite = judge_refusal(status.foreign, self._settings.name)
+            state, last_error, invite = judge_refusal(status.foreign, self._settings.name, self._parts.restart())
         elif run is not None and view is not None and not view.present:
             state, since = "conflict", run.since
         elif status is not None and status.refused is not None and status.state == "refused":

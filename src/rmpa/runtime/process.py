@@ -13,6 +13,7 @@ import faulthandler
 import gc
 import logging
 import os
+import re
 import resource
 import socket
 import threading
@@ -20,6 +21,7 @@ import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from rmpa.runtime import limits
@@ -124,6 +126,25 @@ def in_journal(environ: Mapping[str, str], fd: int) -> bool:
     except OSError:
         return False
     return environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
+
+
+# The line of proc(5)'s cgroup of a process that a unit of the system runs.
+_OF_UNIT: Final = re.compile(r":/system\.slice/(rmpa[\w-]*)\.service", re.MULTILINE)
+
+
+def unit_of(pid: int | str = "self") -> str:
+    """The system's unit that an agent runs in, ``rmpa``; empty: it was started by hand."""
+    try:
+        found = _OF_UNIT.search(Path(f"/proc/{pid}/cgroup").read_text("utf-8", "replace"))
+    except OSError:
+        return ""
+    return found[1] if found else ""
+
+
+def restart_text(pid: int | str = "self", start: str = "rmpa up") -> str:
+    """How an agent is restarted, behind "restart …: "; ``start`` starts one that no unit runs."""
+    unit = unit_of(pid)
+    return f"sudo systemctl restart {unit}" if unit else f"end it (Ctrl-C), then {start}"
 
 
 # --- ``--realtime`` -------------------------------------------------------------------------------------------------

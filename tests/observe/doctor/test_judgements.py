@@ -160,6 +160,14 @@ CASES: dict[str, tuple[Callable[[], Iterable[Check]], str]] = {
     "a unit": (one(judge_unit, UNIT), "ok"),
     "no unit": (one(judge_unit, {"LoadState": "not-found"}), "skipped"),
     "a unit that is not enabled": (one(judge_unit, UNIT | {"UnitFileState": "disabled"}), "warn"),
+    "a unit of the package that was never set up": (
+        one(judge_unit, UNIT | {"UnitFileState": "disabled", "ActiveState": "inactive"}),
+        "warn",
+    ),
+    "a unit that was switched off": (
+        one(judge_unit, UNIT | {"UnitFileState": "disabled", "ActiveState": "inactive", "FragmentPath": "/etc/x"}),
+        "warn",
+    ),
     "a unit that was stopped": (one(judge_unit, UNIT | {"ActiveState": "inactive"}), "warn"),
     "a unit that has failed": (one(judge_unit, UNIT | {"ActiveState": "failed", "Result": "watchdog"}), "fail"),
     "nodes of an open mesh": (one(judge_exposed_nodes, "base", None, trusted=False), "skipped"),

@@ -10,6 +10,7 @@ from itertools import count
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config.settings import LaneSettings
+from rmpa.core import codes
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FULL, Lane, Refusal, Refuse
@@ -39,6 +40,12 @@ _log = logging.getLogger(__name__)
 _ORDINARY: Final = frozenset({Refusal.ALREADY_LINKED, Refusal.MYSELF, Refusal.NO_EXPRESS})
 
 _TRUST: Final = frozenset(TrustReason)
+
+
+def _log_refusal(peer: object, refuse: Refuse) -> None:
+    """One line of a peer that refuses a link, with the code of the reason."""
+    kind = f"link.refused.{refuse.label}"
+    _log.warning("! %s refuses a link: %s [%s]", peer, refuse.text, codes.of_counter(kind))
 
 
 class Mesh(LinkOwner):
@@ -227,7 +234,7 @@ class Mesh(LinkOwner):
     def _distrusted(self, connection: Connection, refuse: Refuse, *, by_us: bool) -> None:
         """Show a refusal for trust that concerns a connection which the peer dialled, or which was up."""
         if not by_us:
-            _log.warning("! %s refuses a link: %s [peer-refused]", connection.name, refuse.text)
+            _log_refusal(connection.name, refuse)
         link = self._links.get(connection.id)
         if link is not None and link.used:
             # Not when its socket is closed: a revoked peer need not answer the refusal.
@@ -311,7 +318,7 @@ class Mesh(LinkOwner):
                 link.use(used=False)
                 self.handlers.down(link, reason)
             case ("refused", identity, refuse):
-                _log.warning("! %s refuses a link: %s [peer-refused]", identity, refuse.text)
+                _log_refusal(identity, refuse)
 
     def _due(self, now: float) -> None:
         self._peering.handle_timer(now)

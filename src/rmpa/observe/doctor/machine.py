@@ -282,6 +282,9 @@ def judge_peer_clock(agent: str, peer: str, offset: float, error: float | None) 
 
 # The agent's unit, as ``rmpa service install`` and the Debian package name it.
 UNIT: Final = "rmpa.service"
+# How one is started that does not start with the machine; and one that has no name and keys.
+START: Final = "sudo systemctl enable --now rmpa"
+INSTALL: Final = "sudo rmpa service install"
 
 
 def at_boot(_: DoctorInput) -> Iterable[Check]:
@@ -291,9 +294,17 @@ def at_boot(_: DoctorInput) -> Iterable[Check]:
 
 def read_unit() -> dict[str, str]:
     """What ``systemctl show`` says of the agent's unit; empty where there is no systemd."""
-    properties = "--property=LoadState,ActiveState,UnitFileState,Result"
+    properties = "--property=LoadState,ActiveState,UnitFileState,Result,FragmentPath"
     told = ask_program("systemctl", "show", UNIT, properties) or ""
     return dict(line.partition("=")[::2] for line in told.splitlines())
+
+
+def is_set_up(unit: Mapping[str, str]) -> bool:
+    """Whether a unit has the user's name and keys: it runs, or ``rmpa service install`` or the user made its file.
+
+    The Debian package's may never have had them. ``rmpa service install`` changes nothing where it has.
+    """
+    return unit.get("ActiveState") != "inactive" or unit.get("FragmentPath", "").startswith("/etc/")
 
 
 def judge_unit(unit: Mapping[str, str]) -> Check:
@@ -305,7 +316,7 @@ def judge_unit(unit: Mapping[str, str]) -> Check:
         return Check("boot", FAIL, f"rmpa.service has failed ({unit['Result']})", "journalctl -u rmpa says why")
     if unit["UnitFileState"] != "enabled":
         text = f"rmpa.service is {unit['ActiveState']}, and does not start with the machine"
-        return Check("boot", WARN, text, "sudo systemctl enable --now rmpa")
+        return Check("boot", WARN, text, START if is_set_up(unit) else INSTALL)
     if unit["ActiveState"] == "inactive":
         return Check(
             "boot", WARN, "rmpa.service starts with the machine, and was stopped", "sudo systemctl start rmpa"
