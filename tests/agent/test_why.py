@@ -88,8 +88,12 @@ async def test_unknown_peers_and_names(settings: Callable[..., Settings]) -> Non
         assert found.failed.remedy.startswith("did you mean a?")
         with pytest.raises(ConfigError, match="not a topic"):
             await ask(b, "x y")
-    async with running(settings("lonely")) as (lonely,):
-        assert stopped_at(await ask(lonely, "/x"))[0] == "publisher"
+    async with running(settings("lonely")) as (lonely,), node("talker", lonely) as talker:
+        await talker.advertise("/robot1/x", "std_msgs/String")
+        (found,) = await ask(lonely, "/x")
+        assert stopped_at((found,))[0] == "publisher"
+        assert found.failed is not None
+        assert found.failed.remedy == "did you mean /robot1/x?"
 
 
 async def test_names_of_a_peer_with_a_prefix(settings: Callable[..., Settings]) -> None:

@@ -167,6 +167,11 @@ def test_heavy_packages_wait_until_they_are_needed(module: str) -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).stderr == b""
 
 
+def test_help_without_arguments_is_no_error_with_a_code(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 2
+    assert capsys.readouterr().err.endswith("why they do not come\n")
+
+
 def test_help_imports_no_command() -> None:
     code = (
         "import sys; from rmpa.cli.main import main; main(['--help']);"

@@ -15,6 +15,7 @@ import pytest
 from rmpa.cli.advice import advises, next_steps
 from rmpa.config.settings import Settings, WebSettings
 from rmpa.config.values import Multicast
+from rmpa.ros.environment import DEFAULT_MASTER_URI
 from rmpa.trust.permissions import TrustStatus
 from tests.cli.conftest import DEADLINE, free_port
 from tests.observe.samples import SNAPSHOT
@@ -58,8 +59,11 @@ def test_the_first_line_says_what_the_facts_ask_for(settings: Settings, changes:
 
 def test_a_wrong_master_of_this_shell_is_named_with_the_right_one() -> None:
     assert "ROS_MASTER_URI" not in steps()[2]
-    assert steps(master="http://10.9.9.9:11311")[2] == f"ROS_MASTER_URI is wrong: export ROS_MASTER_URI={CORE}"
-    second = {"core_uri": "http://localhost:11312/"}
+    wrong = "http://10.9.9.9:11311"
+    assert steps(master=wrong)[2] == f"wrong: export ROS_MASTER_URI={DEFAULT_MASTER_URI}, also in ~/.bashrc"
+    second = {"core_uri": "http://127.0.0.1:11312/"}
+    there = "export ROS_MASTER_URI=http://localhost:11312"
+    assert steps(master=wrong, agent=second)[2] == f"ROS_MASTER_URI is wrong: {there}"
     assert steps(master="", agent=second)[2].endswith("needs: export ROS_MASTER_URI=http://localhost:11312")
     assert "in a browser: http://localhost:9000/" in steps(Settings(web=WebSettings(enabled=True, port=9000)))[1]
 

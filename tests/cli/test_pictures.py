@@ -171,6 +171,7 @@ def _outside(name: str) -> PeerInfo:
 
 
 RELAYED: Final = peer("pad", "relayed", via="base2", topics_in=3, last_error="no route to host")
+SLOW: Final = replace(peer("slow", "linking"), since_ago=9.0)
 CROWD: Final = (
     *(peer(f"arm{n}", "relayed") for n in range(999)),
     peer("arm999", "refused", last_error="another domain"),
@@ -196,6 +197,10 @@ KINDS: Final[dict[str, tuple[dict[str, Any], tuple[str, ...]]]] = {
     "relayed": (
         {"snapshot": replace(SNAPSHOT, peers=(RELAYED,), notes=()), "ping": refuse(RmpaError("no link to pad"))},
         ("peer list", "peer info pad", "peer ping pad -c 1"),
+    ),
+    "linking": (
+        {"snapshot": replace(SNAPSHOT, peers=(replace(SLOW, name="new", since_ago=1.0), SLOW), notes=())},
+        ("peer list",),
     ),
     "crowd": (
         {"snapshot": replace(SNAPSHOT, peers=CROWD, notes=())},

@@ -104,7 +104,7 @@ def test_both_ends_say_which_subscriber_is_direct_and_why_another_is_not(modules
 @pytest.mark.parametrize(
     ("config", "condition", "text"),
     [
-        ("", "transport", 'transport  relayed: transport is "relay" in this module'),
+        ("", "transport", 'transport  relayed: the setting transport = "relay" of this module asks for it'),
         (
             f'{AUTO}[[contract]]\ntopics = ["{TOPIC}"]\ndeadline = 0.2\n',
             "contract",

@@ -35,11 +35,11 @@ def words() -> list[str]:
 
 
 def test_a_topic_that_is_relayed_by_rule_says_so() -> None:
-    text = 'transport is "relay" in this module'
+    text = 'the setting transport = "relay" of this module asks for it'
     route = msgspec.structs.replace(
         DIRECT, transport="relay", condition="transport", condition_text=text, subscribers=()
     )
-    assert route_texts(route) == [f"relayed: {text} (condition transport)"]
+    assert route_texts(route) == [f"relayed: {text}"]
     assert route_texts(msgspec.structs.replace(route, transport="", condition="", condition_text="")) == []
 
 

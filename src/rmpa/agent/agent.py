@@ -42,7 +42,7 @@ from rmpa.observe.snapshot_builder import AgentParts, SnapshotBuilder
 from rmpa.observe.why.why import WhyService
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.external import ExternalCore
-from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback
+from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback, shown_uri
 from rmpa.ros.http.rpc import call_api, is_own_name
 from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.node.slave_node import LoggerServices
@@ -208,6 +208,9 @@ class Network:
             StartError: The mesh's port is taken.
         """
         await self._join(self.settings.port)
+
+    def warn_if_open(self) -> None:
+        """Say that trust is off."""
         if self.trust is None and self.endpoint is not None:
             text = (
                 "! trust is off: every program that reaches port %d may join; secure it: rmpa trust init [trust-off]"
@@ -502,7 +505,8 @@ class Agent:
             garbage_collector.take_over()
             undo.callback(garbage_collector.give_back)
             self._undo = undo.pop_all()
-        _log.info("= ROS_MASTER_URI=%s", self.core.uri)
+        _log.info("= ROS_MASTER_URI=%s", shown_uri(self.core.uri))
+        self.network.warn_if_open()
 
     async def close(self) -> None:
         """Close every part: the goodbye comes first, then the proxies leave the local graph, the core is last."""

@@ -12,7 +12,7 @@ import click
 from rmpa.cli.output import printable
 from rmpa.core.errors import RmpaError
 from rmpa.observe.control_client import ControlClient, runtime_dir, same_core
-from rmpa.ros.environment import DEFAULT_MASTER_URI
+from rmpa.ros.environment import DEFAULT_MASTER_URI, shown_uri
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -55,11 +55,14 @@ def next_steps(settings: Settings, shown: Snapshot, master: str) -> list[str]:
         shown: What it knows.
         master: The ROS_MASTER_URI of its shell; empty: not set.
     """
-    core = shown.agent.core_uri.rstrip("/")
+    core = shown_uri(shown.agent.core_uri)
     nodes = "nodes of this machine join as soon as they start"
     if not same_core(core, master or DEFAULT_MASTER_URI):
         wrong = "ROS_MASTER_URI is wrong" if master else "each shell of nodes needs"
         nodes = _fitting(f"{wrong}: export ROS_MASTER_URI={core}", f"export ROS_MASTER_URI={core}")
+        if same_core(core, DEFAULT_MASTER_URI):
+            # Not unset: nodes of roscpp end without it.
+            nodes = _fitting(f"wrong: export ROS_MASTER_URI={core}, also in ~/.bashrc", nodes)
     page = f"http://localhost:{settings.web.port}/" if settings.web.enabled else "rmpa web"
     return [_about_peers(settings, shown), f"to look: rmpa peer list; in a browser: {page}", nodes]
 

@@ -402,6 +402,7 @@ async def _run_core(host: str, port: int, advertised: str, keep: str) -> None:
     from rmpa import __version__
     from rmpa.config.module_name import core_file
     from rmpa.ros.core.embedded import ROS_VERSION, RosCore
+    from rmpa.ros.environment import shown_uri
 
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -412,7 +413,7 @@ async def _run_core(host: str, port: int, advertised: str, keep: str) -> None:
     await core.start()
     print_text(
         f"rmpa core {__version__}, in place of ros_comm {ROS_VERSION.strip()}",
-        f"ROS_MASTER_URI={core.uri}",
+        f"ROS_MASTER_URI={shown_uri(core.uri)}",
         f"setting /run_id to {core.call('getParam', '/rmpa_core', '/run_id').value}",
         "started core service [/rosout]",
         [text] if core.stored is not None and (text := core.stored.restored()) else [],

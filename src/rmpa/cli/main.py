@@ -437,6 +437,9 @@ def _run(arguments: Sequence[str] | None) -> int:
             if remedy := REMOVED.get(error.option_name):
                 error = click.UsageError(f"No such option: {error.option_name}; {remedy}", error.ctx)
         text = error.format_message()
+        if isinstance(error, click.exceptions.NoArgsIsHelpError):
+            click.echo(text, err=True)
+            return _failed(arguments, text, "usage", error.exit_code)
         error.format_message = lambda: f"{text} [usage]"  # type: ignore[method-assign]
         error.show()
         return _failed(arguments, text, "usage", error.exit_code)

@@ -38,8 +38,10 @@ _COLOURS: Final = {
 }
 # States that are no problem.
 _USUAL: Final = frozenset({"linked", "relayed"})
+# Seconds after which it is said what a link waits for: most are up after 0.3 s.
+_YOUNG: Final = 5.0
 # Columns that are shown without ``-v``: they fit 80 characters.
-_BRIEF: Final = "PEER, STATE, >SINCE, ADDRESS, >RTT"
+_BRIEF: Final = "PEER, STATE, >SINCE, ADDRESS, RTT"
 
 
 @agent_verb(
@@ -145,6 +147,9 @@ def _troubles(snapshot: Snapshot, peers: list[PeerInfo]) -> list[tuple[str, str]
         if info.last_error and info.state not in _USUAL:
             again = "" if info.next_attempt is None else f"; next attempt in {duration(info.next_attempt)}"
             found.append((f"{info.name}: {info.last_error}{again}", info.code))
+        elif info.state == "linking" and not info.conflicts and info.since_ago >= _YOUNG:
+            text = f"waits for a TCP connection with {info.guid.partition('#')[0]}; rmpa why --module {info.name}"
+            found.append((f"{info.name}: {text}", "peer-unlinked"))
     return found
 
 

@@ -139,6 +139,12 @@ def host_of(uri: str) -> str:
     return match["host"] if match else ""
 
 
+def shown_uri(uri: str) -> str:
+    """A master's URI as users see and type it: ``http://localhost:11311``."""
+    uri = uri.rstrip("/")
+    return uri.replace("//127.0.0.1:", "//localhost:")
+
+
 def parse_value(text: str) -> XmlRpcValue:
     """Parse a parameter's value from the command line: a number, boolean, JSON list, object or string, else the text.
 

@@ -114,7 +114,7 @@ def unmet_by_contract(contract: Contract, where: str) -> Unmet | None:
         where: Whose it is, as text.
     """
     if contract.transport is Transport.RELAY:
-        return Unmet(Condition.TRANSPORT, f'transport is "relay" in {where}')
+        return Unmet(Condition.TRANSPORT, f'the setting transport = "relay" of {where} asks for it')
     terms = needs_agents(contract)
     return Unmet(Condition.CONTRACT, f"the contract asks for what only agents do: {terms}") if terms else None
 

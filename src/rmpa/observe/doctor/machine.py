@@ -31,7 +31,7 @@ from rmpa.observe import limits
 from rmpa.observe.control_client import ControlClient, find_agents
 from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check, CheckLevel
 from rmpa.observe.snapshot import Snapshot
-from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback
+from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback, shown_uri
 from rmpa.ros.http.rpc import call_api
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.process import REMEDY
@@ -109,7 +109,7 @@ def look_at(environ: Mapping[str, str], config: str | None = None, listen: float
         settings = loaded.settings
         where = f"read from {settings.config_file}" if settings.config_file else "no file; defaults and variables"
         checks = [Check("settings", OK, f"{where}: name {settings.name}, domain {settings.domain}")]
-        checks += [Check("settings", WARN, note) for note in loaded.notes]
+        checks += [Check("settings", WARN, note, code="doubtful-setting") for note in loaded.notes]
     agents: dict[str, Snapshot | str] = {}
     for found in find_agents(environ):
         try:
@@ -496,7 +496,10 @@ def _master(shell: RosShell) -> tuple[Any, ...]:
     said = given or f"{DEFAULT_MASTER_URI} (it is not set)"
     cores = {name: core.rstrip("/") for name, core in shell.cores.items()}
     ours = [name for name, core in cores.items() if core.rpartition(":")[2] == port]
-    export = next((f"export ROS_MASTER_URI={core}" for core in shell.cores.values()), "unset ROS_MASTER_URI")
+    core = next(map(shown_uri, shell.cores.values()), DEFAULT_MASTER_URI)
+    export = f"export ROS_MASTER_URI={core}"
+    if core == DEFAULT_MASTER_URI:
+        export += ", also in ~/.bashrc"
     if uri not in cores.values():
         if shell.external.rstrip("/") == uri and shell.answers:
             return OK, f"{said} is the roscore that `rmpa up` will use"
@@ -506,12 +509,12 @@ def _master(shell: RosShell) -> tuple[Any, ...]:
             text = f"{said}: the name {host} cannot be resolved, so nodes of this shell find no master"
             return FAIL, text, export
         if host != "localhost" and not shell.is_here(host):
-            text = f"{said} is another machine ({shell.addresses_of(host)[0]}): nodes of this shell join its graph, "
-            return FAIL, text + "and this module's not", export
+            text = f"{said} is another machine ({shell.addresses_of(host)[0]}): "
+            return FAIL, text + "nodes of this shell use the ROS master there, and not that of this module", export
     if ours:
         return OK, f"{said} is the core of {ours[0]}"
     if shell.cores:
-        listed = ", ".join(f"{name}'s is {core}" for name, core in shell.cores.items())
+        listed = ", ".join(f"{name}'s is {shown_uri(core)}" for name, core in shell.cores.items())
         return WARN, f"{said} is not the core of an agent here ({listed})", export
     if shell.answers:
         remedy = "end that roscore before `rmpa up`, or let it be the agent's"

@@ -225,7 +225,7 @@ def subscriber_text(one: SubscriberTransport, since: str = "") -> str:
         since: For how long, as text.
     """
     node = f"{one.node} ({since})" if since else one.node
-    reason = f"{one.text} (condition {one.condition})" if one.condition else one.text
+    reason = _reason(one.condition, one.text)
     if one.state == "granted":
         return f"direct for {node}, to port {one.endpoint} of this machine"
     if one.transport == "direct":
@@ -243,8 +243,13 @@ def route_texts(route: RouteInfo) -> list[str]:
     if route.subscribers:
         return [subscriber_text(one) for one in route.subscribers]
     if route.transport == "relay" and route.condition:
-        return [f"relayed: {route.condition_text} (condition {route.condition})"]
+        return [f"relayed: {_reason(route.condition, route.condition_text)}"]
     return []
+
+
+def _reason(condition: str, text: str) -> str:
+    """Why something is relayed, with the word of the condition; a setting's text says all."""
+    return f"{text} (condition {condition})" if condition not in ("", "transport") else text
 
 
 def remedy_for(one: SubscriberTransport) -> str:

@@ -154,7 +154,7 @@ def _transport(peer: str, info: ServiceInfo) -> Check:
     if info.address:
         return Check("transport", OK, f"direct: clients call the server itself, at {info.address}")
     if info.wanted == "relay":
-        return Check("transport", OK, 'relayed by both agents: transport is "relay" here')
+        return Check("transport", OK, 'relayed by both agents: the setting transport = "relay" here asks for it')
     if not info.condition:
         return Check("transport", OK, f"relayed by both agents; {peer} is being asked for direct calls")
     if info.wanted == "direct" and info.condition != "transport":

@@ -173,6 +173,10 @@ def _conflict(peer: PeerInfo, level: CheckLevel) -> Check:
     return Check("peer", level, "; ".join(texts), remedy)
 
 
+# Seconds without a beacon after which a machine may be off.
+_SILENT: Final = 5.0
+
+
 def _link(peer: PeerInfo) -> Check:
     if (link := peer.link) is not None and peer.state == "linked":
         text = f"linked by {link.remote} for {link.up_ago:.0f} s"
@@ -189,6 +193,11 @@ def _link(peer: PeerInfo) -> Check:
     if peer.state == "refused":
         return Check("link", FAIL, text, "do what the text says; both sides are asked again by themselves")
     remedy = (
+        "its beacons have stopped too: is the machine on, and its cable or Wi-Fi connected? If so, "
+        if peer.beacon_ago is None or peer.beacon_ago > _SILENT
+        else ""
+    )
+    remedy += (
         f"see that TCP to {peer.guid.partition('#')[0]} is open on both machines (a firewall? give it a fixed port "
         "with --port), and that the machines reach each other: `rmpa doctor`"
     )

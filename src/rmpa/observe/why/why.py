@@ -216,7 +216,9 @@ class WhyService:
             text, remedy = "no peer is linked that it could go to", "`rmpa peer list` shows the peers"
             return Diagnosis.of((Check("peer", FAIL, text, remedy),), name=topic, peer=self._name, to="")
         state = self._core.state()
-        similar = await asyncio.to_thread(did_you_mean, topic, {*state.publishers, *state.subscribers} - {topic})
+        names = {*state.publishers, *state.subscribers} - {topic}
+        longer = sorted(name for name in names if name.endswith(topic))[:3]  # those of a namespace, or with a prefix
+        similar = " or ".join(longer) if longer else await asyncio.to_thread(did_you_mean, topic, names)
         text = f"neither {self._name} nor a linked peer ({', '.join(linked) or 'there is none'}) publishes {topic}"
         remedy = "`rmpa topic list` shows the topics, `rmpa peer list` the modules"
         remedy = f"did you mean {similar}?" if similar else remedy
