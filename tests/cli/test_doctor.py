@@ -12,7 +12,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.cli.doctor import _run
+from rmpa.observe import limits
 from rmpa.observe.doctor.checks import CHECKS
+from rmpa.observe.doctor.repairs import Repair
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -138,6 +141,29 @@ def test_fix_does_it_and_checks_again(killed: Place) -> None:
     assert code == int("fail" in levels.values())
     assert not (killed.path / "dead.sock").exists()
     assert "Nothing here can be repaired" in killed.run("doctor", "--fix")[1]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a file to another user")
+def test_root_changes_nothing_in_a_directory_of_another_user(loopback: Place) -> None:
+    place, made = loopback.path / "rmpa", loopback.path / "made"
+    place.mkdir()
+    (place / "x.lock").symlink_to(made)
+    with socket.socket(socket.AF_UNIX) as sock:
+        sock.bind(str(place / "x.sock"))
+    os.chown(place, 12345, -1)
+    del loopback.environ["RMPA_RUNTIME_DIR"]
+    loopback.environ["XDG_RUNTIME_DIR"] = str(loopback.path)
+    code, out, _ = loopback.run("doctor", "--fix", "--yes", "--json")
+    told = json.loads(out)
+    assert [each["command"] for each in told["plan"] if str(loopback.path) in each["command"]] == []
+    assert not made.exists()
+    assert (place / "x.sock").exists()
+    assert code == int(bool(told["failed"]) or any(each["level"] == "fail" for each in told["checks"]))
+
+
+def test_a_command_that_does_not_end_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "DOCTOR_REPAIR", 0.1)
+    assert not _run(Repair("boot", "", "text", ("sleep", "60"), "undo"))
 
 
 def test_what_is_the_users_is_printed_and_not_done(killed: Place) -> None:

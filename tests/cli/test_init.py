@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 import re
 import socket
+import subprocess
+import sys
+import time
 from ipaddress import IPv4Interface
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
@@ -16,6 +19,7 @@ from rmpa.cli.init import _interfaces as of_interfaces
 from rmpa.cli.units import config_text
 from rmpa.config.read import load_settings
 from rmpa.core.identity import peer_name_from
+from rmpa.observe import limits
 from rmpa.observe.doctor.machine import NetworkInterface
 from tests.cli.conftest import end, free_port, until, with_core
 
@@ -167,6 +171,42 @@ def test_what_is_there_is_not_replaced_and_a_print_writes_nothing(place: Place) 
     assert (code, err.startswith("rmpa: rmpa.toml: is there already; --force")) == (1, True)
     assert place.run("init", "--force")[0] == 0
     assert settings_of(place.path / "rmpa.toml").domain == 0
+
+
+@pytest.mark.parametrize("before", ["", "domain = 3\n"])
+def test_on_a_full_disk_what_was_there_stays(place: Place, before: str) -> None:
+    path = place.path / "rmpa.toml"
+    if before:
+        path.write_text(before)
+        path.chmod(0o640)
+    command = ["sh", "-c", 'ulimit -f 1; exec "$@"', "-", sys.executable, "-m", "rmpa.cli.main", "init", "--force"]
+    environ = {**place.environ, "PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run(command, env=environ, cwd=place.path, capture_output=True, text=True, check=False)
+    assert (done.returncode, "rmpa.toml: cannot be written: " in done.stderr) == (1, True)
+    assert [each.read_text() for each in place.path.iterdir()] == [before] * bool(before)
+    assert place.run("init", "--force")[0] == 0
+    assert [each.name for each in place.path.iterdir()] == ["rmpa.toml"]
+    assert not before or path.stat().st_mode & 0o777 == 0o640
+
+
+@pytest.mark.parametrize("words", [(), ("--force",)])
+def test_a_link_is_not_replaced(place: Place, words: tuple[str, ...]) -> None:
+    (place.path / "rmpa.toml").symlink_to("other.toml")
+    code, _, err = place.run("init", *words)
+    assert (code, err.startswith("rmpa: rmpa.toml: is ")) == (1, True)
+    assert (place.path / "rmpa.toml").is_symlink()
+    assert not (place.path / "other.toml").exists()
+
+
+def test_an_agent_that_does_not_answer_is_told_of_in_time(place: Place) -> None:
+    start = time.monotonic()
+    with socket.socket(socket.AF_UNIX) as stopped:
+        stopped.bind(str(place.path / "base.sock"))
+        stopped.listen()
+        code, out, err = place.run("init", "-")
+    assert (code, "\n[core]\n" in out) == (0, True)
+    assert "the port of the agent base is not known: " in err
+    assert time.monotonic() - start < limits.CONTROL_CALL_TIMEOUT
 
 
 def test_no_password_of_a_variable_is_told(place: Place) -> None:

@@ -15,6 +15,7 @@ from rmpa.cli.agent import paint_level
 from rmpa.cli.options import FiniteRange, Options, config_option, flag, json_verb
 from rmpa.cli.output import Painted, print_text, printable, warn
 from rmpa.cli.trust import confirm
+from rmpa.observe import limits
 from rmpa.observe.doctor.checks import examine
 from rmpa.observe.doctor.machine import look_at
 from rmpa.observe.doctor.repairs import find_repairs
@@ -146,10 +147,22 @@ def _agreed(plan: Sequence[Repair], options: Options, *, yes: bool) -> bool:
 
 def _run(repair: Repair) -> bool:
     """Run one command; what it prints goes to standard error. Return whether it succeeded."""
+    try:
+        if repair.do:
+            repair.do()
+            return True
+    except OSError as error:
+        warn(f"{repair}: {error.strerror}", "failed")
+        return False
     if shutil.which(repair.words[0]) is None:
         warn(f"{repair}: there is no {repair.words[0]} here; run it as root without it", "failed")
         return False
-    code = subprocess.run(repair.words, stdout=sys.stderr.fileno(), check=False).returncode  # noqa: S603 - as shown
+    out, limit = sys.stderr.fileno(), limits.DOCTOR_REPAIR
+    try:
+        code = subprocess.run(repair.words, stdout=out, check=False, timeout=limit).returncode  # noqa: S603 - as shown
+    except subprocess.TimeoutExpired:
+        warn(f"{repair}: it did not end within {limit:.0f} s", "failed")
+        return False
     if code:
         warn(f"{repair}: exit code {code}", "failed")
     return not code

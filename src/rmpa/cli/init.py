@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import socket
+import stat
 import textwrap
 from contextlib import suppress
 from itertools import count
@@ -101,8 +102,23 @@ def _write(path: Path, text: str, *, force: bool, system: bool) -> None:
     try:
         if system:
             path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
-        with path.open("w" if force else "x", encoding="utf-8") as file:
-            file.write(text)
+        before = path.lstat() if force and os.path.lexists(path) else None
+        if before and not stat.S_ISREG(before.st_mode):
+            raise StartError(str(path), "is not a regular file", "name another one")
+        new = path.with_name(f".{path.name}.{os.getpid()}") if before else path
+        with new.open("x", encoding="utf-8") as file:
+            try:
+                if before:
+                    with suppress(PermissionError):
+                        os.fchown(file.fileno(), before.st_uid, before.st_gid)
+                    os.fchmod(file.fileno(), stat.S_IMODE(before.st_mode))
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+                new.replace(path)
+            except BaseException:
+                new.unlink()
+                raise
     except FileExistsError:
         raise StartError(str(path), "is there already", "--force replaces it, --dry-run prints a new one") from None
     except PermissionError:
@@ -134,7 +150,7 @@ def findings(environ: Mapping[str, str], notes: list[str]) -> list[Finding]:
     """
     from rmpa.observe.doctor.machine import read_interfaces
 
-    host, agents = socket.gethostname(), list(_agents(environ))
+    host, agents = socket.gethostname(), list(_agents(environ, notes))
     directory = state_dir(of_unit(environ))
     kept = kept_name(directory)
     name = Finding(("name",), f"this host is called {host}", peer_name_from(host))
@@ -153,12 +169,16 @@ def findings(environ: Mapping[str, str], notes: list[str]) -> list[Finding]:
     return sorted(found.values(), key=lambda each: order.index(each.key[0]))
 
 
-def _agents(environ: Mapping[str, str]) -> Iterator[AgentInfo]:
+def _agents(environ: Mapping[str, str], notes: list[str]) -> Iterator[AgentInfo]:
+    from rmpa.observe import limits
     from rmpa.observe.control_client import ControlClient, find_agents
 
     for agent in find_agents(environ):
-        with suppress(RmpaError), ControlClient(agent.path) as client:
-            yield client.agent()
+        try:
+            with ControlClient(agent.path, limits.CONTROL_LOOK_TIMEOUT) as client:
+                yield client.agent()
+        except RmpaError as error:
+            notes.append(f"the port of the agent {agent.name} is not known: {error}")
 
 
 def _core(agents: Sequence[AgentInfo], name: str, port: int) -> Iterator[Finding]:

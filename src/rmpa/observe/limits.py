@@ -46,6 +46,8 @@ DIAGNOSTICS_TOPICS: Final = 2000
 DOCTOR_HEAR: Final = 1.0
 # Time-out of a program of the system (nft, iptables).
 DOCTOR_PROGRAM: Final = 5.0
+# Time-out of a command of ``--fix``: sudo waits for the password, and systemd 90 s for a unit.
+DOCTOR_REPAIR: Final = 300.0
 # Time-out of a name look-up: the resolver itself waits 5 s for a dead name server.
 DOCTOR_NAME: Final = 5.0
 # Peers of an agent that are listed one by one; of more, those with a problem are, and the others are counted.

@@ -2,31 +2,36 @@
 
 It does what a user would do without a thought, and what stops nothing: it starts a unit that is to run, or enables
 one that runs; adds the user to the group of the control sockets; gives a directory of ours back to the user; removes
-what a dead agent has left. Firewalls, clocks, kernel settings, nodes, programs that have a port, and variables of the
-shell are the user's: of these the remedy of the check is shown.
+what a dead agent has left. Of directories and files it changes only those that this user owns, and shares with no
+other user; what is doubtful is a ``Check``: its remedy is shown, and the user decides. Firewalls, clocks, kernel
+settings, nodes, programs that have a port, and variables of the shell are the user's too.
 """
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import grp
 import os
 import pwd
 import shlex
 import socket
 import stat
-from contextlib import suppress
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config.module_name import state_dir
+from rmpa.core.identity import peer_name_problem
 from rmpa.observe import limits
 from rmpa.observe.control_client import closed_to_us, runtime_dir, runtime_dirs
 from rmpa.observe.doctor.machine import UNIT, read_unit
 from rmpa.observe.peer_info import OK, WARN, Check
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from rmpa.observe.doctor.machine import DoctorInput
 
@@ -45,6 +50,7 @@ class Repair:
         command: What puts it right, as the arguments of a program.
         undo: What undoes that, ready to read.
         root: Whether it takes the rights of root.
+        do: Does the same as the command, in this process: it follows no link that was put there since.
     """
 
     check: str
@@ -53,6 +59,7 @@ class Repair:
     command: tuple[str, ...]
     undo: str
     root: bool = False
+    do: Callable[[], None] | None = field(default=None, compare=False)
 
     @property
     def words(self) -> tuple[str, ...]:
@@ -66,7 +73,8 @@ class Repair:
 
 def find_repairs(given: DoctorInput) -> list[Repair]:
     """All that can be put right now."""
-    return [*of_unit(read_unit(), agent_runs=bool(given.agents)), *of_group(*_access()), *of_directories(given)]
+    of_places = [each for each in of_directories(given) if isinstance(each, Repair)]
+    return [*of_unit(read_unit(), agent_runs=bool(given.agents)), *of_group(*_access()), *of_places]
 
 
 def _access() -> tuple[str, str, bool]:
@@ -111,60 +119,130 @@ def of_group(group: str, user: str, member: bool) -> Iterator[Repair]:
         yield Repair("directory", "/run/rmpa", text, command, undo, root=True)
 
 
-def of_directories(given: DoctorInput) -> Iterator[Repair]:
+def of_directories(given: DoctorInput) -> Iterator[Repair | Check]:
     """Give this user's directories back to it, and remove what dead agents have left in them."""
     environ, settings = given.environ, given.settings
-    home = Path(environ["HOME"]) if environ.get("HOME") else None
     own = runtime_dir(environ, settings.runtime_dir)
     state = state_dir(environ, settings.state_dir or None)
     yield from of_mode(own, 0o027, "g-w,o-rwx")
     if state is not None:
-        yield from of_owner(state, home)
+        if environ.get("HOME"):
+            yield from of_owner(state, Path(environ["HOME"]))
         yield from of_mode(state, 0o022, "go-w")
     for place in dict.fromkeys((own, *runtime_dirs(environ))):
         yield from of_leavings(place)
 
 
-def of_owner(directory: Path, home: Path | None) -> Iterator[Repair]:
-    """A directory in this user's home that belongs to another one, as after a ``sudo rmpa up``; or the one above."""
-    there = next(place for place in (directory, *directory.absolute().parents) if place.exists())
-    owner, user = there.stat().st_uid, os.geteuid()
-    if owner != user and user and home is not None and there.absolute().is_relative_to(home):
-        change = ("chown", *(("-R",) if there == directory else ()))
-        text, undo = (
-            "belongs to another user, so this user's agent can keep nothing there",
-            (*change, str(owner), str(there)),
-        )
-        command = (*change, f"{user}:", str(there))
-        yield Repair("directory", str(there), text, command, f"sudo {shlex.join(undo)}", root=True)
+@contextmanager
+def _opened(directory: Path) -> Iterator[int]:
+    """A directory that this user owns and that is shared with no other user.
+
+    Raises:
+        OSError: It is another user's, sticky, a link, not there, or cannot be read.
+    """
+    opened = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        info = os.fstat(opened)
+        if info.st_uid != os.geteuid():
+            raise PermissionError(errno.EPERM, f"belongs to user {info.st_uid}")
+        if info.st_mode & stat.S_ISVTX:
+            raise PermissionError(errno.EPERM, "is shared with other users (sticky)")
+        yield opened
+    finally:
+        os.close(opened)
 
 
-def of_mode(directory: Path, forbidden: int, mode: str) -> Iterator[Repair]:
+def of_owner(directory: Path, home: Path) -> Iterator[Repair | Check]:
+    """The state directory in this user's home that belongs to root, as after a ``sudo rmpa up``; or the one above."""
+    user = os.geteuid()
+    try:
+        directory, home = directory.resolve(), home.resolve()
+        there = next(place for place in (directory, *directory.parents) if place.exists())
+        above = [place.stat().st_uid for place in there.parents if place.is_relative_to(home)]  # the last: home
+        if there.stat().st_uid != 0 or not above or above[-1] != user or {*above} - {0, user} or not user:
+            return
+    except (OSError, RuntimeError):  # a loop of links
+        return
+    ours = there == directory and directory.name == "rmpa"
+    change = ("chown", "-h", *(("-R",) if ours else ()))
+    text, command = "belongs to root, so this user's agent can keep nothing there", (*change, f"{user}:", str(there))
+    undo = f"sudo {shlex.join((*change, '0', str(there)))}"
+    if ours:
+        yield Repair("directory", str(there), text, command, undo, root=True)
+    else:
+        yield Check("directory", WARN, text, f"sudo {shlex.join(command)}", where=str(there))
+
+
+def of_mode(directory: Path, forbidden: int, mode: str) -> Iterator[Repair | Check]:
     """A directory of this user that it cannot use, or that is open to others."""
     try:
         info = directory.lstat()
     except OSError:
         return
     bits = stat.S_IMODE(info.st_mode)
-    if info.st_uid == os.geteuid() and stat.S_ISDIR(info.st_mode) and (bits & forbidden or bits & 0o700 != 0o700):
-        text, undo = f"has the mode {bits:04o}", shlex.join(("chmod", f"{bits:04o}", str(directory)))
-        yield Repair("directory", str(directory), text, ("chmod", f"u+rwx,{mode}", str(directory)), undo)
+    if (
+        info.st_uid != os.geteuid()
+        or not stat.S_ISDIR(info.st_mode)
+        or not (bits & forbidden or bits & 0o700 != 0o700)
+    ):
+        return
+    text, command = f"has the mode {bits:04o}", ("chmod", f"u+rwx,{mode}", str(directory))
+    if bits & stat.S_ISVTX:
+        advice = "set RMPA_RUNTIME_DIR or RMPA_STATE_DIR to a directory of your own"
+        yield Check("directory", WARN, f"{text}: other users share it", advice, where=str(directory))
+    elif directory.name in ("rmpa", f"rmpa-{os.geteuid()}") and bits & stat.S_IRUSR:
+        undo = shlex.join(("chmod", f"{bits:04o}", str(directory)))
+        do = partial(_set_mode, directory, bits & ~forbidden | 0o700)
+        yield Repair("directory", str(directory), text, command, undo, do=do)
+    else:  # it may be the home directory
+        yield Check("directory", WARN, text, f"if nothing else uses it: {shlex.join(command)}", where=str(directory))
+
+
+def _set_mode(directory: Path, bits: int) -> None:
+    with _opened(directory) as place:
+        os.fchmod(place, bits)
 
 
 def of_leavings(place: Path) -> Iterator[Repair]:
     """Sockets and locks of agents that were killed. They are removed under the lock, which a live agent holds."""
     try:
-        names = sorted({path.stem for pattern in ("*.sock", "*.lock") for path in place.glob(pattern)})
+        with _opened(place) as opened:
+            names = [name[:-5] for name in sorted(os.listdir(opened)) if name.endswith(".lock")]  # noqa: PTH208
+            names = [name for name in names if not peer_name_problem(name) and _are_ours(opened, name)]
         locks = _LOCKS.read_text("ascii", "replace")
     except OSError:
         return
     for name in names:
         sock, lock = place / f"{name}.sock", place / f"{name}.lock"
-        there = [str(path) for path in (sock, lock) if path.exists()]
         if not (_is_held(lock, locks) or _is_alive(sock)):
             command = ("flock", "--nonblock", str(lock), "rm", "-f", str(sock), str(lock))
-            text = f"the agent {name} was killed, and has left {' and '.join(map(os.path.basename, there))}"
-            yield Repair("directory", str(place), text, command, _ANEW, root=not os.access(place, os.W_OK))
+            text = f"the agent {name} was killed, and has left {sock.name} and {lock.name}"
+            yield Repair("directory", str(place), text, command, _ANEW, do=partial(_remove, place, name))
+
+
+def _are_ours(place: int, name: str) -> bool:
+    """Whether both files of an agent are there, and are this user's; one alone harms nothing, and may not be ours."""
+    try:
+        sock, lock = (os.stat(f"{name}.{end}", dir_fd=place, follow_symlinks=False) for end in ("sock", "lock"))
+    except OSError:
+        return False
+    kinds = stat.S_ISSOCK(sock.st_mode) and stat.S_ISREG(lock.st_mode)
+    return kinds and sock.st_uid == lock.st_uid == os.geteuid()
+
+
+def _remove(directory: Path, name: str) -> None:
+    with _opened(directory) as place:
+        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        lock = os.open(f"{name}.lock", flags, dir_fd=place)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            there = os.stat(f"{name}.lock", dir_fd=place, follow_symlinks=False)
+            if not (os.path.samestat(os.fstat(lock), there) and _are_ours(place, name)):
+                raise OSError(errno.ESTALE, "it has changed meanwhile")
+            os.unlink(f"{name}.sock", dir_fd=place)
+            os.unlink(f"{name}.lock", dir_fd=place)
+        finally:
+            os.close(lock)
 
 
 def _is_held(lock: Path, locks: str) -> bool:
@@ -191,8 +269,11 @@ def directories(given: DoctorInput) -> Iterator[Check]:
     """The check of the directories: what can be put right there."""
     group, user, member = _access()
     found = [*of_group(group, user, member), *of_directories(given)]
-    for repair in found:
-        yield Check("directory", WARN, repair.text, f"rmpa doctor --fix, or: {repair}", where=repair.where)
+    for each in found:
+        if isinstance(each, Check):
+            yield each
+        else:
+            yield Check("directory", WARN, each.text, f"rmpa doctor --fix, or: {each}", where=each.where)
     if member:
         text = f"{user} is in the group {group}, and this session began before that"
         yield Check("directory", WARN, text, "log in again", where="/run/rmpa")
