@@ -175,6 +175,9 @@ _LISTED: Final = 5
 _AGENTS_OWN: Final = ("/rmpa", "/rosout")
 
 
+_WEB: Final = "/rmpa_web"
+
+
 def _exposed_nodes(given: DoctorInput) -> Iterable[Check]:
     for name, shown in given.snapshots.items():
         trusted = shown.trust is not None
@@ -241,6 +244,8 @@ def exposed_nodes(core_uri: str, agent_pid: int) -> dict[str, tuple[int, ...]] |
     found = {}
     for node, port in nodes.items():
         processes = {pid for _, at, pid in sockets if at == port and pid is not None}
+        if node.startswith(_WEB):  # its other ports are those of HTTP, which ask for the token
+            processes &= {agent_pid}
         its = [(address, at) for address, at, pid in sockets if at == port or pid in processes]
         ports = {at for address, at in its if is_beyond_loopback(address)}
         if ports and agent_pid not in processes:

@@ -41,9 +41,13 @@ def node(*addresses: str) -> subprocess.Popen[str]:
 
 
 async def test_the_other_ports_of_a_nodes_process_are_found_too(core: RosCore) -> None:
-    with node("127.0.0.1", "0.0.0.0") as half_open, node("127.0.0.1") as closed:
+    with (
+        node("127.0.0.1", "0.0.0.0") as half_open,
+        node("127.0.0.1") as closed,
+        node("127.0.0.1", "0.0.0.0") as web,  # its other port asks for a token
+    ):
         ports = {}
-        for name, process in (("/half", half_open), ("/closed", closed)):
+        for name, process in (("/half", half_open), ("/closed", closed), ("/rmpa_web", web)):
             assert process.stdout is not None
             ports[name] = json.loads(await asyncio.to_thread(process.stdout.readline))
             uri = f"http://127.0.0.1:{ports[name][0]}/"
@@ -51,7 +55,7 @@ async def test_the_other_ports_of_a_nodes_process_are_found_too(core: RosCore) -
         found = await asyncio.to_thread(exposed_nodes, core.uri, os.getpid())
         assert found == {"/half": (ports["/half"][1],)}
         assert await asyncio.to_thread(exposed_nodes, core.uri, half_open.pid) == {}
-        for process in (half_open, closed):
+        for process in (half_open, closed, web):
             process.communicate()
 
 
