@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
 import tarfile
+import time
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -41,8 +43,9 @@ def files_of(archive: Path) -> dict[str, str]:
 
 
 def report(place: Place, *words: str) -> dict[str, str]:
-    code, out, err = place.run("bug-report", "-o", "report.tar.gz", *words)
-    assert (code, err) == (0, "")
+    with place.start("bug-report", "-o", "report.tar.gz", *words) as process:
+        out, err = process.communicate(timeout=4 * bug_report.DEADLINE)
+    assert (process.returncode, err) == (0, "")
     assert "report.tar.gz is written" in out
     assert (place.path / "report.tar.gz").stat().st_mode & 0o777 == 0o600
     return files_of(place.path / "report.tar.gz")
@@ -81,7 +84,10 @@ def test_secrets_of_every_place_are_taken_out(place: Place, agent: Callable[...,
     )
     place.environ |= {
         "RMPA_WEB_PASSWORD": "env-secret",
-        "ROS_MASTER_URI": "http://me:uri-pass@10.0.0.9:11311",
+        "ROS_MASTER_URI": "http://me:uri-pa/s@s@10.0.0.9:11311",
+        "ROS_PWD": "hunter2a",
+        "ROS_OTHER": "hunter2b",
+        "RMPA_GATEWAY_X": "hunter3",
         "ROS_TOKEN": "env-token-value",
         "USER": "susanne",
     }
@@ -95,17 +101,31 @@ def test_secrets_of_every_place_are_taken_out(place: Place, agent: Callable[...,
         "rmpa web --token option-token --token-file /home/susanne/t",
         "the web server has plain-web-token and kept-elsewhere, and said env-token-value",
         "joystick is at 10.0.0.2",
-        "/home/susanne/catkin_ws/src and /root/x and /home/other/y",
+        "/home/susanne/catkin_ws/src and /root/x and /home/other/y, of other",
+        "tcp/u:hunter4@host:7447 u:hunter5@host http://a:p@hunter6@h rmpa@base.service",
+        "the password hunter7 is wrong; pw=hunter9 auth=hunter10 ",
+        "pwd: hunter11",
+        'seeds = ["carol:hunter8@5.6.7.8:1"]',
+        "PGPASS=hunter12 api-key: hunter13 private-key=hunter14 x_token=ab;hunter18&hunter19",
+        "wifi_psk_value=hunter15",
+        f"keys {'0123abcd' * 5}01234567 {'0123abcd' * 4}0 of /Users/hunter16/x",
+        "passphrase: my hunter17 words",
+        "password=ab&hunter20;hunter21",
+        f"{'many words ' * 1000}the end",
     ]
     (place.path / "up.log").write_text("\n".join(lines))
     agent("base", msgspec.structs.replace(SNAPSHOT, notes=("cannot reach ftp://bob:note-pass@10.0.0.3/", JOIN)))
     files = report(place, "--log", "up.log")
     every = "\n".join([*files, *files.values()])
-    secrets = (JOIN, "MIIEvQIBADANBgkq", "hkiG9w0BAQEFAASC", RANDOM, "origin-pass", "env-secret", "uri-pass")
+    secrets = (JOIN, "MIIEvQIBADANBgkq", "hkiG9w0BAQEFAASC", RANDOM, "origin-pass", "env-secret", "uri-pa", "s@s")
     more = ("env-token-value", "query-token-1", "bearer.value-77", "two words", "json-key-value", "option-token")
     for planted in (
         *secrets,
         *more,
+        "hunter",
+        "carol",
+        "0123abcd",
+        "of other",
         "plain-web-token",
         "kept-elsewhere",
         "note-pass",
@@ -117,9 +137,57 @@ def test_secrets_of_every_place_are_taken_out(place: Place, agent: Callable[...,
     assert str(place.path) not in every, "it is the home here"
     assert "rmpa web --token [redacted] --token-file ~/t" in files["up.log"]
     assert "joystick is at 10.0.0.2" in files["up.log"], "names and addresses stay"
-    assert "~/catkin_ws/src and ~/x and ~/y" in files["up.log"]
+    assert "~/catkin_ws/src and ~/x and ~/y, of [user]" in files["up.log"]
     assert "http://[redacted]@10.0.0.9:11311" in files["system.json"]
+    assert {"ROS_PWD", "ROS_OTHER", "RMPA_GATEWAY_X"} < set(json.loads(files["system.json"])["variables"])
+    assert 'seeds = ["[redacted]@5.6.7.8:1"]' in files["up.log"]
+    assert "rmpa@base.service" in files["up.log"], "a unit's name is no address"
+    assert "many words [6915 characters cut]" in files["up.log"]
     assert "module.key" in files["state.txt"], "names and sizes alone"
+
+
+def test_names_that_are_not_utf8_are_written(place: Place) -> None:
+    (place.path / ".local/state/rmpa").mkdir(parents=True)
+    (place.path / ".local/state/rmpa" / os.fsdecode(b"caf\xe9")).touch()
+    place.environ["ROS_PACKAGE_PATH"] = os.fsdecode(b"/caf\xe9")
+    files = report(place)
+    assert "caf\\udce9" in files["state.txt"]
+    assert json.loads(files["system.json"])["variables"]["ROS_PACKAGE_PATH"] == "/caf\udce9"
+    name = os.fsdecode(b"\xe9")
+    assert place.json("bug-report", "-o", name, "--json")[0]["file"] == "\\udce9"
+    assert "caf\\udce9" in (place.path / name / "state.txt").read_text()
+
+
+@pytest.mark.parametrize("name", ["report.tar.gz", "report"])
+def test_a_full_disk_leaves_nothing(tmp_path: Path, name: str) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            bug_report._write(tmp_path / name, {"a/b.txt": os.urandom(90_000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_log_that_only_root_may_read_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(bug_report, "run_programs", lambda programs, _: dict.fromkeys(programs, ""))
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    assert main(["bug-report", "-o", str(tmp_path / "folder")]) == 0
+    assert "only root may read its log: sudo rmpa bug-report" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("part", ["a-", "http://a:", "password ", 'token=\\" ', "_key", "aA1+", "a@", ":"])
+@pytest.mark.parametrize("end", ["", "\n"])
+def test_the_time_is_linear_in_the_text(part: str, end: str) -> None:
+    lines = 131 if end else 1
+    text = (part * (512 * 1024 // lines // len(part)) + end) * lines
+    begun, redactor = time.monotonic(), Redactor(["the-secret"], ["/home/a"], ["susanne"])
+    redactor.anonymise([text], ["depot"], ["joystick"])
+    redactor.text(text)
+    assert time.monotonic() - begun < 10
 
 
 def test_anonymous_replaces_each_name_by_one_word(place: Place, agent: Callable[..., None]) -> None:
@@ -127,12 +195,15 @@ def test_anonymous_replaces_each_name_by_one_word(place: Place, agent: Callable[
     place.environ |= {"ROS_MASTER_URI": "http://robot-7.example.org:11311", "ROS_STATIC_PEERS": "depot.example.org"}
     (place.path / "up.log").write_text(
         "joystick is at 10.0.0.2 and fe80::1:2%eth0, mac 02:42:ac:11:00:02, 127.0.0.1\n"
+        "peer wagon-3: no answer\nrmpa up --name wagon-4\nwagon-3, wagon-4 and wagon-5\n"
     )
+    (place.path / "rmpa.toml").write_text('name = "wagon-5"\nit cannot be read')
     files = report(place, "--log", "up.log", "--anonymous")
     every = "\n".join([*files, *files.values()])
     names = (
         os.uname().nodename,
         "joystick",
+        "wagon",
         "robot-7.example.org",
         "depot.example.org",
         "10.0.0.2",
@@ -186,6 +257,8 @@ def test_an_agent_that_does_not_answer_holds_nothing_up(
     place: Place, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     port = f"239.255.82.77:{20000 + os.getpid() % 20000}"
+    said = " ".join(str(bug_report.bug_report.callback.__doc__).split())
+    assert f"within {bug_report.DEADLINE:g} s, and {bug_report._SNAPSHOT:g} s for each" in said
     words = ["--name", "base", "--interface", "lo", "--multicast", port, "--core-port", str(free_port())]
     process = subprocess.Popen(
         [sys.executable, "-m", "rmpa", "up", *words], env=place.environ, cwd=place.path, text=True

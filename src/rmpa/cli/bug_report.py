@@ -7,6 +7,8 @@ import json
 import os
 import platform
 import pwd
+import re
+import shutil
 import socket
 import sys
 import tarfile
@@ -25,6 +27,7 @@ from rmpa.cli.output import Table, print_text, size
 from rmpa.cli.redact import Redactor, is_secret
 from rmpa.cli.units import UNITS
 from rmpa.config.module_name import of_unit, state_dir
+from rmpa.config.read import VARIABLES, find_config_file
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.core.limits import KIB
 from rmpa.discovery.network import list_interfaces
@@ -32,7 +35,7 @@ from rmpa.observe.control_client import ControlClient, find_agents
 from rmpa.runtime.interpreter import own_command
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
 
 # By its file: the command of rmpa that fills it. Those of an agent are asked of each.
@@ -56,11 +59,26 @@ DEADLINE: Final = 30.0
 _SNAPSHOT: Final = 5.0
 _LOG: Final = "journalctl --no-pager --quiet --output=short-iso-precise --lines=1000"
 _LOG_BYTES: Final = 512 * KIB
-_VARIABLES: Final = ("ROS_", "RMPA_", "XDG_", "ZENOH_", "RMW_", "CMAKE_PREFIX_PATH", "PYTHONPATH", "LANG", "PATH")
+# Variables whose values are shown; of others that begin so only the names.
+_SHOWN: Final = re.compile(
+    r"ROS_(?:MASTER_URI|IP|HOSTNAME|DOMAIN_ID|STATIC_PEERS|AUTOMATIC_DISCOVERY_RANGE|LOCALHOST_ONLY|PACKAGE_PATH|DISTRO"
+    r"|VERSION|PYTHON_VERSION|ROOT|ETC_DIR|HOME|LOG_DIR)|RMW_IMPLEMENTATION|XDG_(?:CONFIG_HOME|RUNTIME_DIR|STATE_HOME)"
+    rf"|RMPA_(?:RUNTIME|STATE)_DIR|(?:CMAKE_PREFIX_|LD_LIBRARY_|PYTHON)?PATH|LANG|LANGUAGE|{'|'.join(VARIABLES)}"
+)
+_NAMED_ONLY: Final = ("ROS_", "RMPA_", "XDG_", "ZENOH_", "RMW_")
+_NO_LOG: Final = "nothing: no unit of rmpa has a log here, or only root may read it; see --log\n"
+# Where texts name a module or a user: `peer NAME: …`, "peer":"NAME", --name NAME, name = "NAME"; /home/NAME.
+_MODULE: Final = re.compile(
+    r"""(?m)(?:\b(?:peer|module)(?:["']\s?:\s?["']|=["']?|[ ](?=[\w.-]{1,99}:[ ]))|--(?:name|peer|agent)[ =]"""
+    r"""|^[ \t]{0,9}name\s{0,9}=\s{0,9}["'])([A-Za-z][\w.-]*)"""
+)
+_USER: Final = re.compile(r"/(?:home|Users)/([\w.-]{3,})")
 _FILES_SHOWN: Final = 300
 _README: Final = """\
 A report of `rmpa bug-report`. It has no contents of messages and no parameters' values.
 Taken out: keys, tokens, passwords, user names and home directories{more}.
+What no pattern knows may stay: secrets within a sentence, names of users and modules that stand only in a log,
+names of topics, nodes and files. Look through it before you send it.
 Files that could not be filled say why.
 """
 
@@ -78,8 +96,8 @@ def bug_report(config: str | None, output: str | None, log: str | None, anonymou
     hosts and addresses stay, unless --anonymous is given. Nothing is sent: look into it, and attach it to the issue.
 
     ---
-    It works as any user, without an agent, and with an agent that hangs (after some 20 s); sudo adds the log of the
-    units and the rules of the firewall.
+    It works as any user, without an agent, and with an agent that hangs (within 30 s, and 5 s for each such agent);
+    sudo adds the log of the units and the rules of the firewall.
 
     Examples:
       rmpa bug-report
@@ -94,23 +112,31 @@ def bug_report(config: str | None, output: str | None, log: str | None, anonymou
     settings: dict[str, Any] = {}
     with suppress(ValueError, KeyError):  # they cannot be read: the file says why
         settings = {each["name"]: each["value"] for each in json.loads(found["settings.json"])["settings"]}
-    redactor = _redactor(environ, settings.get("web.token_file", ""))
+    redactor = _redactor(environ, settings.get("web.token_file", ""), found.values())
     if anonymous:
+        modules += [settings.get("name", ""), *_named(config, environ, found.values())]
         redactor.anonymise(found.values(), _hosts(environ, settings), modules)
     found["README.txt"] = _README.format(more=", names of hosts and modules, addresses" if anonymous else "")
-    clean = {redactor.text(name): _redacted(name, text, redactor) for name, text in sorted(found.items())}
+    clean = {
+        redactor.text(name): _redacted(name, text, redactor).encode(errors="backslashreplace")
+        for name, text in sorted(found.items())
+    }
     try:
         _write(path, clean)
     except OSError as error:
         raise StartError(str(path), f"cannot be written: {error.strerror}", "name another by --output") from None
     counts = {what: count for what, count in redactor.counts.items() if count}
-    sizes = {name: len(text.encode()) for name, text in clean.items()}
+    sizes = {name: len(data) for name, data in clean.items()}
     if options.as_json:
-        options.show({"file": str(path), "files": sizes, "redacted": counts})
+        options.show(
+            {"file": str(path).encode(errors="backslashreplace").decode(), "files": sizes, "redacted": counts}
+        )
         return
     print_text(Table("FILE, >SIZE", [(name, size(count)) for name, count in sizes.items()]), "")
     print_text(f"redacted: {', '.join(f'{count} {what}' for what, count in counts.items()) or 'nothing'}")
-    print_text(f"{path} is written. Look into it before you attach it to an issue: it was not sent anywhere.")
+    if found["log.txt"] == _NO_LOG and os.geteuid():
+        print_text("log.txt is empty: if a unit of rmpa runs here, only root may read its log: sudo rmpa bug-report")
+    print_text(f"{path} is written, and was not sent anywhere. Names may stay: look through it before you send it.")
 
 
 def collect(environ: Mapping[str, str], log: str | None) -> tuple[dict[str, str], list[str]]:
@@ -142,7 +168,7 @@ def collect(environ: Mapping[str, str], log: str | None) -> tuple[dict[str, str]
             found[f"{agent.name}/snapshot.json"] = msgspec.json.encode(shown).decode()
             modules += [peer.name for peer in (*shown.peers, *shown.strangers)]
     if not found["log.txt"]:
-        found["log.txt"] = "nothing: no unit of rmpa has a log here, or only root may read it; see --log\n"
+        found["log.txt"] = _NO_LOG
     if log is not None:
         found["up.log"] = Path(log).read_bytes()[-_LOG_BYTES:].decode("utf-8", "replace")
     return found, modules
@@ -183,7 +209,11 @@ def _system(environ: Mapping[str, str]) -> dict[str, object]:
         "cpus": os.cpu_count(),
         "root": os.geteuid() == 0,
         "ros": sorted(map(str, Path("/opt/ros").glob("*"))),
-        "variables": {name: value for name, value in sorted(environ.items()) if name.startswith(_VARIABLES)},
+        "variables": {
+            name: value if _SHOWN.fullmatch(name) else "(not shown)"
+            for name, value in sorted(environ.items())
+            if _SHOWN.fullmatch(name) or name.startswith(_NAMED_ONLY)
+        },
         "interfaces": [asdict(one) for one in list_interfaces()],
     }
 
@@ -199,11 +229,11 @@ def _state(environ: Mapping[str, str]) -> Iterator[str]:
             yield f"{info.st_mode:06o} {info.st_uid:>6} {info.st_size:>10} {path.relative_to(directory or path)}"
 
 
-def _redactor(environ: Mapping[str, str], token_file: str) -> Redactor:
+def _redactor(environ: Mapping[str, str], token_file: str, texts: Iterable[str]) -> Redactor:
     """One that knows this machine's secrets, users and homes."""
     directory = state_dir(of_unit(environ))
     files = [*directory.rglob("*token*")] if directory is not None else []
-    secrets = [value for name, value in environ.items() if is_secret(name)]
+    secrets = [value for name, value in environ.items() if is_secret(name) and name not in ("PWD", "OLDPWD")]
     for file in (*files, Path(token_file)):
         with suppress(OSError):
             secrets.append(file.read_bytes()[:KIB].decode("utf-8", "replace").strip())
@@ -214,13 +244,23 @@ def _redactor(environ: Mapping[str, str], token_file: str) -> Redactor:
             entry = pwd.getpwuid(user)
             users.append(entry.pw_name)
             homes.append(entry.pw_dir)
-    return Redactor(secrets, homes, users)
+    return Redactor(secrets, homes, [*users, *(user for text in texts for user in _USER.findall(text))])
+
+
+def _named(config: str | None, environ: Mapping[str, str], texts: Iterable[str]) -> Iterator[str]:
+    """The names of modules in texts, and in settings that cannot be read."""
+    for text in texts:
+        yield from _MODULE.findall(text)
+    with suppress(RmpaError, OSError):
+        file = find_config_file(config, environ, Path.cwd(), [])
+        yield from _MODULE.findall(file.read_text("utf-8", "replace") if file else "")
 
 
 def _hosts(environ: Mapping[str, str], settings: Mapping[str, list[str]]) -> Iterator[str]:
     yield from (socket.gethostname(), socket.gethostname().partition(".")[0], environ.get("ROS_HOSTNAME", ""))
+    yield from environ.get("ROS_STATIC_PEERS", "").split(";")
     for name in ("discovery.seeds", "web.hosts", "gateway.connect", "gateway.listen"):
-        yield from (each.rpartition("/")[2].partition(":")[0] for each in settings.get(name, ()))
+        yield from (each.rpartition("@")[2].rpartition("/")[2].partition(":")[0] for each in settings.get(name, ()))
 
 
 def _redacted(name: str, text: str, redactor: Redactor) -> str:
@@ -230,17 +270,27 @@ def _redacted(name: str, text: str, redactor: Redactor) -> str:
     return redactor.text(text)
 
 
-def _write(path: Path, files: Mapping[str, str]) -> None:
-    if not path.name.endswith((".tar.gz", ".tgz")):
-        path.mkdir(mode=0o700)
-        for name, text in files.items():
-            (path / name).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            (path / name).write_text(text, "utf-8")
-        return
+def _write(path: Path, files: Mapping[str, bytes]) -> None:
+    """Write it beside its place, and move it there when it is whole."""
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        if path.name.endswith((".tar.gz", ".tgz")):
+            _write_archive(part, path.name.partition(".tar")[0], files)
+        else:
+            part.mkdir(mode=0o700)
+            for name, data in files.items():
+                (part / name).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                (part / name).write_bytes(data)
+        part.rename(path)
+    finally:  # nothing is there after the move
+        shutil.rmtree(part, ignore_errors=True)
+        part.unlink(missing_ok=True)
+
+
+def _write_archive(path: Path, folder: str, files: Mapping[str, bytes]) -> None:
     opened = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(opened, "wb") as file, tarfile.open(fileobj=file, mode="w:gz") as archive:
-        for name, text in files.items():
-            data = text.encode()
-            info = tarfile.TarInfo(f"{path.name.partition('.tar')[0]}/{name}")  # it has no user's name
+        for name, data in files.items():
+            info = tarfile.TarInfo(f"{folder}/{name}")  # it has no user's name
             info.size, info.mtime = len(data), int(time.time())
             archive.addfile(info, io.BytesIO(data))

@@ -14,25 +14,46 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
 _GONE: Final = "[redacted]"
-_WORDS: Final = r"passw|passphrase|secret|token|credential|(?:api|private|access)_?key|psk\b|authorization|cookie"
+# Every pattern takes a time linear in the text: it starts where no word goes on, or its repeats are bounded.
+_LINE: Final = 4096
+_LONG: Final = re.compile(rf"(?m)^(?=.{{{_LINE + 1}}})(.{{0,{_LINE - 1}}}\s|)(.*)$")  # cut between words
+_TO_THE_END: Final = r"passw|passphrase|pwd|psk|authorization|cookie"  # their values may have blanks
+_OTHERS: Final = (
+    r"secret|token|credential|(?:api|private|access|shared)key|[-_]key(?![a-z])|auth(?![a-z])"
+    r"|(?<!com)(?<!by)pass(?![a-z])|(?<![a-z])pw(?![a-z])"
+)
+_WORDS: Final = f"{_TO_THE_END}|{_OTHERS}"
 _IS_SECRET: Final = re.compile(_WORDS, re.IGNORECASE)
 # Names of files and the like: that they hold a secret does not make them one.
 _IS_PLACE: Final = re.compile(r"(file|path|dir|folder)s?$", re.IGNORECASE)
-_USER_INFO: Final = re.compile(r"(\b[a-zA-Z][\w+.-]*://)[^/\s@\"'<>]+@")
+# All up to the last @ of a word, as passwords may have any character; units of systemd have one too.
+_USER_INFO: Final = re.compile(
+    r"(?<!\S)((?:[\w.-]+=)?[\"'(<\[]{0,4}(?:[a-zA-Z][\w+.-]*://|(?:tcp|udp|tls|quic|wss?)/)?)"
+    r"\S+@(?![\w.-]*\.(?:service|socket|target)\b)"
+)
 # By what is counted: the pattern, and what takes its place.
-_RULES: Final = (
-    ("private keys", re.compile(r"(?s)-----BEGIN ([A-Z0-9 ]+)-----.*?(?:-----END \1-----|\Z)")),
-    ("tokens", re.compile(r"(?i)\brmpa1-[a-z2-7]{8,}|(?<=bearer )[\w.~+/=-]{6,}|(?<=basic )[\w.~+/=-]{6,}")),
-    # As base64 has it, and the hexadecimal digits of a key.
-    ("random texts", re.compile(r"\b(?=[\w+-]*\d)(?=[\w+-]*[a-z])(?=[\w+-]*[A-Z])[\w+-]{40,}={0,2}")),
-    ("random texts", re.compile(r"\b[0-9a-fA-F]{64,}\b")),
+_RULES: Final[tuple[tuple[str, re.Pattern[str], str | Callable[[re.Match[str]], str]], ...]] = (
+    ("private keys", re.compile(r"(?s)-----BEGIN ([A-Z0-9 ]{1,40})-----.*?(?:-----END \1-----|\Z)"), _GONE),
+    ("ends of long lines", _LONG, lambda m: f"{m[1]}[{len(m[2])} characters cut]"),
+    ("users and passwords of addresses", _USER_INFO, rf"\1{_GONE}@"),
+    ("tokens", re.compile(r"(?i)\brmpa1-[a-z2-7]{8,}|(?<=bearer )[\w.~+/=-]{6,}|(?<=basic )[\w.~+/=-]{6,}"), _GONE),
+    # As base64 has it, and the hexadecimal digits of a key. Those of md5 (a type's) and of a commit stay.
+    ("random texts", re.compile(r"(?<![\w+-])(?=[\w+-]*\d)(?=[\w+-]*[a-z])(?=[\w+-]*[A-Z])[\w+-]{40,}={0,2}"), _GONE),
+    ("random texts", re.compile(r"(?<![0-9a-fA-F])(?!(?:\w{32}|\w{40})\b)[0-9a-fA-F]{32,}"), _GONE),
 )
-_VALUE: Final = r"(\\?\"(?:[^\"\\]|\\.)*\"|'[^']*'|[^\s\"',;&}\])]+)"
+_QUOTED: Final = r"\\?\"(?:[^\"\\\n]|\\.){0,200}\"|'[^'\n]{0,200}'"
+_NAME: Final = r"[\w.-]{0,60}(?<!file)(?<!path)(?<!dir)(?<!folder)"
+_IS: Final = r"\\?[\"']?[ \t]{0,9}[:=][ \t]{0,9}"
 _NAMED: Final = tuple(
-    re.compile(rf"(?i)({begin}[\w.-]*(?:{_WORDS})[\w.-]*)({between}){_VALUE}")
-    for begin, between in (("", r"\\?[\"']?\s*[:=]\s*"), ("--", r"\s+"))  # token = "…", and --token …
+    re.compile(rf"(?i)({begin}(?:{words}){_NAME})({between})({_QUOTED}|{value})")
+    for begin, words, between, value in (
+        ("", _TO_THE_END, _IS, ".+"),
+        ("", _OTHERS, _IS, r"\S+"),
+        (r"(?<![\w-])--[\w-]{0,60}", _WORDS, r"\s{1,9}", r"\S+"),  # --token …
+        (r"\b", "password|passphrase", r"[ \t]{1,9}(?:(?:is|was)[ \t]{1,9})?", r"\S+"),  # the password …
+    )
 )
-_HOME: Final = re.compile(r"/home/[^/\s\"':;,\])}]+|/root(?![\w-])")
+_HOME: Final = re.compile(r"/(?:home|Users)/[^/\s\"':;,\])}]+|/root(?![\w-])")
 _HOST: Final = re.compile(r"(?<=://)[A-Za-z][\w.-]*")
 _ADDRESS: Final = re.compile(
     r"(?<![\w.])(?:\d{1,3}\.){3}\d{1,3}(?![\w.])|(?<![\w:])[0-9a-fA-F]{0,4}(?::[0-9a-fA-F]{0,4}){2,7}(?![\w:])"
@@ -82,9 +103,8 @@ class Redactor:
     def text(self, text: str) -> str:
         """A text without what is not to be seen."""
         text = self._swap("secrets of this machine", self._secrets, _GONE, text)
-        text = self._swap("users and passwords of addresses", _USER_INFO, rf"\1{_GONE}@", text)
-        for what, pattern in _RULES:
-            text = self._swap(what, pattern, _GONE, text)
+        for what, pattern, by in _RULES:
+            text = self._swap(what, pattern, by, text)
         for pattern in _NAMED:
             text = self._swap("values of secret names", pattern, _value_of, text)
         for home in (self._homes, _HOME):
@@ -127,8 +147,8 @@ class Redactor:
 
 
 def _value_of(match: re.Match[str]) -> str:
-    key, between, value = match.groups()
-    return match[0] if value.startswith(_GONE[:5]) or not is_secret(key) else f"{key}{between}{_GONE}"
+    key, between, _ = match.groups()
+    return f"{key}{between}{_GONE}" if is_secret(key) else match[0]
 
 
 def is_secret(key: str) -> bool:
