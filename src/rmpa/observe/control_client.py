@@ -110,6 +110,8 @@ def make_runtime_dir(place: Path, group: int | None = None) -> None:
             raise StartError(
                 str(place), f"belongs to user {info.st_uid}, not to us", _REMEDY, code="directory-unusable"
             )
+        if info.st_mode & stat.S_ISVTX:  # such as /tmp, which would be closed to all others
+            raise StartError(str(place), "is shared by all users", _REMEDY, code="directory-unusable")
         if group is not None:
             os.chown(place, -1, group)
             place.chmod(0o750)

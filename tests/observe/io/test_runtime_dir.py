@@ -57,6 +57,15 @@ def test_a_link_or_file_in_its_place_is_refused(place: Path) -> None:
     assert runtime_dirs({"RMPA_RUNTIME_DIR": str(place / "link")}) == []
 
 
+def test_a_directory_that_all_users_share_stays_as_it_is(place: Path) -> None:
+    shared = place / "tmp"
+    shared.mkdir()
+    shared.chmod(0o1777)
+    with pytest.raises(StartError, match="is shared by all users; set RMPA_RUNTIME_DIR"):
+        make_runtime_dir(shared)
+    assert shared.stat().st_mode & 0o7777 == 0o1777
+
+
 def test_somebody_elses_directory_is_refused(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 4321)
     with pytest.raises(StartError, match=r"belongs to user \d+"):
