@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import hashlib
 from ipaddress import IPv4Address
 
@@ -148,6 +149,15 @@ def test_a_token_can_be_withdrawn() -> None:
     assert book.withdraw(TOKEN.token_id)
     assert not book.withdraw(TOKEN.token_id)
     assert book.use(TOKEN.token_id, "arm", WALL) == "token"
+
+
+def test_a_new_token_for_a_name_replaces_the_open_one() -> None:
+    other, third = (dataclasses.replace(TOKEN, secret=bytes([n]) * 16) for n in (8, 9))
+    book = TokenBook()
+    for token in (TOKEN, other):
+        book.invite(token, "arm")
+    book.invite(third)
+    assert [book.judge(token.token_id, "arm", WALL) for token in (TOKEN, other, third)] == ["token", "", ""]
 
 
 def test_names_are_checked() -> None:

@@ -255,8 +255,11 @@ class SnapshotBuilder:
         infos.sort(key=lambda info: (info.name, info.guid))
         # A module that has joined was heard without keys before its link came up.
         joined = {session.link.name: session.link.since or now for session in links.values()}
+        members = {
+            name.casefold() for name in (self._settings.name, *joined, *(each.name for each in relayed.values()))
+        }
         knocking = (
-            _stranger(one, now, trust, {name.casefold() for name in (self._settings.name, *joined)})
+            _stranger(one, now, trust, members)
             for one in discovery.strangers()
             if one.heard > joined.get(one.identity.name, 0.0)
             and not any(one.identity.guid in known for known in (roster, statuses, links))

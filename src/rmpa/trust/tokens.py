@@ -210,13 +210,17 @@ class TokenBook:
 
         Args:
             token: The token.
-            name: The module that it is for; empty for any.
+            name: The module that it is for, whose open tokens it replaces; empty for any.
 
         Raises:
             ValueError: No module can have that name.
         """
         if name and (problem := peer_name_problem(name)):
             raise ValueError(problem)
+        if name:
+            open_ones = [key for key, each in self._all.items() if each.name == name and not each.used_by]
+            for key in open_ones:
+                del self._all[key]
         while len(self._all) >= limits.TOKENS_MAX:
             del self._all[min(self._all, key=lambda each: (not self._all[each].used_by, self._all[each].expires))]
         self._all[token.token_id] = Invitation(token.token_id, token.key, token.expires, name)

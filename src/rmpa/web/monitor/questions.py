@@ -86,7 +86,6 @@ class Answers:
         self._environ = environ
         self._agent_name = agent
         self._threads = ThreadPoolExecutor(limits.ANSWERS_AT_ONCE, "rmpa-answers")
-        self._invited: dict[str, str] = {}  # the id of the last token for each module
 
     async def answer(self, what: str, args: Args) -> Any:
         """The answer to one of ``QUESTIONS`` that the page may ask, as values for JSON.
@@ -226,12 +225,9 @@ class Answers:
         def invite(client: ControlClient) -> InviteReply:
             if not any(one.invite and one.name == name for one in client.snapshot(topics=()).strangers):
                 raise RmpaError(f"no module {name[:80]!r} is pending")
-            if before := self._invited.pop(name, ""):  # one open token for each module that is pending
-                client.call("trust", object, what="withdraw", id=before)
             return client.call("trust", InviteReply, what="invite", name=name)
 
         made: InviteReply = await self._in_thread(invite)
-        self._invited[name] = made.id
         _log.info("= a page has made an invitation for %s", name)
         return {"line": f"rmpa trust join {made.token}", "until": made.expires}
 
