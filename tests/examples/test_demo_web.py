@@ -117,7 +117,9 @@ def test_without_the_extra_it_says_how_to_get_it(
     env = {**tidy, "PYTHONPATH": str(place)}
     with Process([sys.executable, DEMO, "--seconds", "0.1", *flags], env=env, name="demo") as demo:
         assert demo.wait(60) == 0, demo.output
-    problem = re.compile(r"rmpa web: aiohttp not installed; run \S+/python3? -m pip install 'rmpa\[web\]'")
+    problem = re.compile(
+        r"rmpa web: aiohttp not installed; run \S+/python3? -m pip install 'rmpa\[web\]' \[extra-missing\]"
+    )
     first = demo.output.splitlines()[0]
     if flags:
         assert json.loads(first)["web"] is None

@@ -159,7 +159,7 @@ def told_what_to_do(made: Agent) -> None:
     assert fifo.startswith("! realtime: no SCHED_FIFO, priority 50: ")
     assert memory.startswith("! realtime: no memory lock: ")
     for text in (fifo, memory):
-        assert "To have it: systemd: sudo rmpa service install --realtime, or LimitRTPRIO=50" in text
+        assert "to get it: systemd: sudo rmpa service install --realtime, or LimitRTPRIO=50" in text
     assert os.sched_getscheduler(made.pid) == os.SCHED_OTHER
     assert status(made.pid)["VmLck"] == 0
     assert "Traceback" not in made.process.output

@@ -79,7 +79,7 @@ def test_a_reload_loses_no_message_of_a_stream(
     code, said = b.agent.rmpa("reload", "--check")
     assert code == 0, said
     assert "b.toml: bridge.deny, [[peer]], [[contract]] would take effect" in said
-    assert "mesh.port (40123 instead of 0) needs a restart" in said
+    assert "mesh.port (40123 instead of 0) would take effect after a restart" in said
     assert "/later" not in b.topics()
 
     # SIGHUP does it.
