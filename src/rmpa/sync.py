@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import signal
 import sys
 import threading
@@ -24,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, Self, TypeVar
 
 from rmpa.config.limits import SERVICE_TIMEOUT
 from rmpa.core.errors import RmpaError
+from rmpa.core.schedule import positive
 from rmpa.ros import limits
 from rmpa.ros.node.node import Node
 
@@ -40,6 +42,8 @@ _log = logging.getLogger(__name__)
 
 # Messages that wait for a callback; above it the oldest is dropped.
 _QUEUE: Final = 100
+# Seconds for a node to unregister, and then for its loop to end; after them the end of the program ends them.
+_CLOSE_WITHIN: Final = 10.0
 _NO_DEFAULT: Final = object()
 
 
@@ -86,7 +90,7 @@ class SyncPublisher:
             The number of older messages dropped for slow subscribers.
 
         Raises:
-            MessageError: The message does not fit the type.
+            MessageError: The message does not fit the type, whether there is a subscriber or not.
             RmpaError: The node is closed.
         """
 
@@ -117,8 +121,9 @@ class SyncNode:
     """A node for scripts; made by ``connect``.
 
     A ``with`` registers it, and unregisters it at its end. In the main thread Ctrl-C and SIGTERM end the ``with``:
-    KeyboardInterrupt interrupts what runs in it, and the program goes on behind it. When the master shuts the node
-    down (``rosnode kill``), ``rate`` and ``spin`` end.
+    KeyboardInterrupt interrupts what runs in it, and the program goes on behind it. A second signal, while it ends,
+    does what it did before the ``with``: it ends the program. When the master shuts the node down (``rosnode kill``),
+    ``rate`` and ``spin`` end. A process that is forked in a ``with`` makes a node of its own.
 
     Args:
         name: The node's name, resolved in the namespace.
@@ -138,7 +143,9 @@ class SyncNode:
         self._thread = threading.Thread(target=self._run, name=f"rmpa {name}", daemon=True)
         self._node: Node | None = None
         self._stopped = threading.Event()
+        self._pid = 0
         self._closing = False
+        self._close_lock = threading.Lock()
         self._restore: list[tuple[signal.Signals, Any]] = []
 
     def __enter__(self) -> Self:
@@ -147,7 +154,11 @@ class SyncNode:
         Raises:
             UnreachableError: The master does not answer.
             ConfigError: A ROS variable cannot be used.
+            RmpaError: The node was opened before.
         """
+        if self._pid:
+            raise RmpaError(f"{self._arguments['name']} was opened before: make another with rmpa.connect(...)")
+        self._pid = os.getpid()
         self._loop = asyncio.new_event_loop()
         self._thread.start()
         try:
@@ -169,13 +180,15 @@ class SyncNode:
 
     def close(self) -> None:
         """Unregister everything and close; may be called twice."""
-        self._closing = True  # which takes seconds at the most, so further signals are ignored
-        if self._loop is not None and self._node is not None:
-            self._wait_for(self._node.close())
-            self._end()
-        for number, handler in self._restore:
-            signal.signal(number, handler)
-        self._restore.clear()
+        self._closing = True
+        with self._close_lock:
+            if self._loop is not None and self._node is not None and self._pid == os.getpid():
+                try:
+                    self._wait_for(self._node.close(), _CLOSE_WITHIN)
+                except TimeoutError:
+                    _log.warning("! %s has not unregistered in %g s", self._node.name, _CLOSE_WITHIN)
+                self._end()
+        self._restore_signals()
 
     @property
     def name(self) -> str:
@@ -270,8 +283,9 @@ class SyncNode:
                 future.set_running_or_notify_cancel()
                 try:
                     future.set_result(handler(request))
-                except Exception as error:  # noqa: BLE001 - it is the client's answer
-                    future.set_exception(error)
+                except BaseException as error:  # noqa: BLE001 - it is the client's answer; the loop takes no sys.exit()
+                    passes = isinstance(error, Exception) and not isinstance(error, StopIteration)
+                    future.set_exception(error if passes else RuntimeError(repr(error)))
 
             threading.Thread(target=run, name=f"call of {name}", daemon=True).start()
             return await asyncio.wrap_future(future)
@@ -309,15 +323,23 @@ class SyncNode:
         self._wait_for(self._open_node.delete_param(key))
 
     def follow_param(self, key: str, callback: ParamCallback) -> XmlRpcValue:
-        """Call ``callback(key, value)`` in a thread with each change; return the present value, ``{}`` for none."""
-        changes: asyncio.Queue[tuple[str, XmlRpcValue]] = asyncio.Queue()
+        """Call ``callback(key, value)`` in a thread with each change; return the present value, ``{}`` for none.
+
+        While the callback is slow, the last 100 changes wait for it.
+        """
+        changes: asyncio.Queue[tuple[str, XmlRpcValue]] = asyncio.Queue(_QUEUE)
+
+        def change(key: str, value: XmlRpcValue) -> None:
+            if changes.full():
+                changes.get_nowait()
+            changes.put_nowait((key, value))
 
         async def each() -> AsyncIterator[tuple[str, XmlRpcValue]]:
             while True:
                 yield await changes.get()
 
         node = self._open_node
-        value = self._wait_for(node.follow_param(key, lambda key, value: changes.put_nowait((key, value))))
+        value = self._wait_for(node.follow_param(key, change))
         self._for_each(each(), lambda change: callback(*change), f"callback for parameter {key}")
         return value
 
@@ -326,8 +348,7 @@ class SyncNode:
     def rate(self, hz: float) -> Iterator[int]:
         """The numbers 0, 1, 2 … at a rate, until the node is closed; see ``rmpa.Node.rate``."""
         ticks = self._open_node.rate(hz)
-        while (count := self._wait_for(_next(ticks))) is not None:
-            yield count
+        return iter(lambda: self._wait_for(_next(ticks)), None)
 
     def timer(self, period: float, callback: Callable[[], object]) -> Callable[[], None]:
         """Call a function every ``period`` seconds, in a thread, one call at a time; see ``rmpa.Node.timer``.
@@ -341,15 +362,18 @@ class SyncNode:
             if count and not ended.is_set():
                 callback()
 
-        self._for_each(self._open_node.rate(1 / period), tick, f"timer of {period:g} s", ended)
+        ticks = self._open_node.rate(1 / positive(period, "a timer's period"))
+        self._for_each(ticks, tick, f"timer of {period:g} s", ended)
         return ended.set
 
     def sleep(self, seconds: float) -> bool:
         """Sleep; false if the node is closed meanwhile."""
+        self._check_process()
         return not self._stopped.wait(seconds)
 
     def spin(self) -> None:
         """Wait until the node is closed: by Ctrl-C, SIGTERM or the master."""
+        self._check_process()
         self._stopped.wait()
 
     @property
@@ -375,19 +399,31 @@ class SyncNode:
         if self._loop is not None:
             self._loop.run_forever()
 
-    def _wait_for(self, coroutine: Coroutine[Any, Any, _T], /) -> _T:
+    def _check_process(self) -> None:
+        if self._pid and self._pid != os.getpid():  # the loop's thread is not in a forked process
+            name = self._arguments["name"]
+            raise RmpaError(f"{name} belongs to process {self._pid}: a forked process makes a node of its own")
+
+    def _running(self) -> asyncio.AbstractEventLoop:
+        self._check_process()
+        if self._loop is None:
+            raise RmpaError(f"{self._arguments['name']} is closed")
+        return self._loop
+
+    def _wait_for(self, coroutine: Coroutine[Any, Any, _T], /, within: float | None = None) -> _T:
         """Run a coroutine in the event loop, and wait for its result.
 
         Raises:
-            RmpaError: The node is closed.
+            RmpaError: The node is closed, or is another process's.
+            TimeoutError: It is not there in time.
         """
-        loop = self._loop
-        if loop is None:
-            coroutine.close()
-            raise RmpaError(f"{self._arguments['name']} is closed")
-        future: Future[_T] = asyncio.run_coroutine_threadsafe(coroutine, loop)
         try:
-            return future.result()
+            future: Future[_T] = asyncio.run_coroutine_threadsafe(coroutine, self._running())
+        except BaseException:
+            coroutine.close()
+            raise
+        try:
+            return future.result(within)
         except CancelledError:
             raise RmpaError(f"{self._arguments['name']} is closed") from None
         except RmpaError as error:  # what happened in the loop is no help to a script's author
@@ -410,7 +446,7 @@ class SyncNode:
                 while not (ended and ended.is_set()) and (item := self._wait_for(_next(items))) is not None:
                     try:
                         callback(item)
-                    except Exception:  # noqa: BLE001 - the top of the user's code
+                    except BaseException:  # noqa: BLE001 - the top of the user's code; sys.exit() ends no other thread
                         _log.exception("! the %s failed", what)
 
         threading.Thread(target=run, name=what, daemon=True).start()
@@ -430,13 +466,24 @@ class SyncNode:
             await loop.shutdown_asyncgens()
             await loop.shutdown_default_executor()
 
-        asyncio.run_coroutine_threadsafe(cancel(), loop).result()
+        with suppress(TimeoutError):
+            asyncio.run_coroutine_threadsafe(cancel(), loop).result(_CLOSE_WITHIN)
         loop.call_soon_threadsafe(loop.stop)
-        self._thread.join()
-        loop.close()
+        self._thread.join(_CLOSE_WITHIN)
+        if not self._thread.is_alive():
+            loop.close()
 
-    def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
-        if not self._closing:
+    def _restore_signals(self) -> None:
+        if threading.current_thread() is threading.main_thread():  # else the end of the ``with`` does it
+            for number, handler in self._restore:
+                signal.signal(number, handler)
+            self._restore.clear()
+
+    def _interrupt(self, number: int, _frame: FrameType | None) -> None:
+        if self._closing:
+            self._restore_signals()
+            signal.raise_signal(number)
+        else:
             self._stopped.set()
             raise KeyboardInterrupt
 

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import os
+import queue
 import signal
+import subprocess
+import sys
+import textwrap
 import threading
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 import rmpa
+from rmpa import sync
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.http.rpc import call_api
 
@@ -214,3 +219,155 @@ def test_without_a_master_it_says_what_to_do_in_a_short_traceback(monkeypatch: p
         rmpa.connect("n").__enter__()
     assert caught.value.__cause__ is None
     assert len(caught.traceback) <= 3
+
+
+def test_a_node_is_opened_once(core: RosCore) -> None:
+    with rmpa.connect("n") as node:
+        with pytest.raises(rmpa.RmpaError, match="n was opened before: make another"):
+            node.__enter__()
+        assert node.get_param("/none", 7) == 7
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_ends_a_program_whose_node_does_not_close(core: RosCore, number: signal.Signals) -> None:
+    text = """
+    import asyncio, rmpa
+    with rmpa.connect("n") as node:
+        async def hang():
+            print("closing", flush=True)
+            await asyncio.Event().wait()
+        node._node.close = hang
+        print("open", flush=True)
+        node.spin()
+    """
+    program = [sys.executable, "-c", textwrap.dedent(text)]
+    with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as started:
+        assert started.stdout is not None
+        try:
+            for line in ("open\n", "closing\n"):
+                assert started.stdout.readline() == line
+                started.send_signal(number)
+            assert started.wait(sync._CLOSE_WITHIN / 2) in (-number, 1)
+        finally:
+            started.kill()
+
+
+def test_a_node_that_does_not_close_is_left_after_a_while(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(sync, "_CLOSE_WITHIN", 0.2)
+    with rmpa.connect("n") as node:
+        close = node._open_node.close
+
+        async def hang() -> None:
+            await close()
+            await asyncio.Event().wait()
+
+        monkeypatch.setattr(node._open_node, "close", hang)
+    assert "n has not unregistered in 0.2 s" in caplog.text
+    assert node.stopped
+
+
+def test_a_forked_process_is_told_that_the_node_is_not_its_own(core: RosCore) -> None:
+    with rmpa.connect("n") as node:
+        publisher = node.advertise("/t", "std_msgs/String")
+        child = os.fork()
+        if not child:
+            signal.alarm(int(DEADLINE))
+            told = 0
+            for call in (lambda: publisher.publish("x"), lambda: node.get_param("/a"), node.spin):
+                try:
+                    call()
+                except rmpa.RmpaError as error:
+                    told += "belongs to process" in str(error)
+            node.close()
+            os._exit(told)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 3
+        assert publisher.publish("x") == 0
+        assert "/t" in core.state().publishers
+
+
+def test_a_callback_may_close_the_node(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
+    with rmpa.connect("n") as node:
+        node.subscribe("/t", "std_msgs/String", lambda _: node.close())
+        node.advertise("/t", "std_msgs/String", latch=True).publish("x")
+        node.spin()
+    assert "failed" not in caplog.text
+    assert "/t" not in core.state().subscribers
+
+
+def test_a_topic_can_be_subscribed_to_more_than_once(core: RosCore) -> None:
+    first: queue.Queue[str] = queue.Queue()
+    second: queue.Queue[str] = queue.Queue()
+    with rmpa.connect("n") as node, rmpa.connect("other") as other, ThreadPoolExecutor() as threads:
+        ends = [
+            node.subscribe("/t", "std_msgs/String", lambda m: first.put(m.data)),
+            node.subscribe("/t", "std_msgs/String", lambda m: second.put(m.data)),
+        ]
+        other.advertise("/t", "std_msgs/String", latch=True).publish("x")
+        assert [q.get(timeout=DEADLINE) for q in (first, second)] == ["x", "x"]
+        for _ in range(5):
+            waiting = [threads.submit(node.wait_for_message, "/t", timeout=DEADLINE) for _ in range(4)]
+            assert [each.result(DEADLINE).data for each in waiting] == ["x"] * 4
+        ends[0]()
+        assert list(core.state().subscribers["/t"]) == ["/n"]
+        ends[1]()
+        assert "/t" not in core.state().subscribers
+
+
+@pytest.mark.parametrize("value", [0, -1, float("inf"), float("nan")])
+def test_a_rate_is_above_0_and_finite(core: RosCore, value: float) -> None:
+    with rmpa.connect("n") as node:
+        with pytest.raises(ValueError, match=f"a rate is above 0 and finite, not {value}"):
+            node.rate(value)
+        with pytest.raises(ValueError, match=f"a timer's period is above 0 and finite, not {value}"):
+            node.timer(value, print)
+
+
+@pytest.mark.parametrize("error", [SystemExit(3), StopIteration()])
+def test_whatever_a_handler_raises_is_the_clients_answer(
+    core: RosCore, caplog: pytest.LogCaptureFixture, error: BaseException
+) -> None:
+    def fail(_: object) -> None:
+        raise error
+
+    with rmpa.connect("n") as node:
+        node.advertise_service("/s", "std_srvs/Trigger", fail)
+        with pytest.raises(rmpa.PeerRefused, match=type(error).__name__):
+            node.call_service("/s", "std_srvs/Trigger", timeout=DEADLINE)
+    assert "a call of /n failed" in caplog.text
+
+
+def test_values_are_checked_without_a_subscriber(core: RosCore) -> None:
+    with rmpa.connect("n") as node:
+        publisher = node.advertise("/t", "std_msgs/String")
+        wrongs: tuple[object, ...] = (b"x", [1, 2], {"data": {}})
+        for wrong in wrongs:
+            with pytest.raises(rmpa.MessageError):
+                publisher.publish(wrong)
+        publisher.publish(data=5)
+
+
+def test_what_a_slow_callback_for_a_parameter_misses_is_the_oldest(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sync, "_QUEUE", 2)
+    seen: queue.Queue[object] = queue.Queue()
+    go_on = threading.Event()
+
+    def slow(_: str, value: object) -> None:
+        seen.put(value)
+        go_on.wait(DEADLINE)
+
+    with rmpa.connect("n") as node:
+        node.follow_param("/gain", slow)
+        told = node._open_node._followed["/gain"]
+        assert told is not None
+        assert node._loop is not None
+        node._loop.call_soon_threadsafe(told, "/gain", 0)
+        assert seen.get(timeout=DEADLINE) == 0
+        for value in range(1, 6):
+            node._loop.call_soon_threadsafe(told, "/gain", value)
+        node.has_param("/gain")  # which the loop does after them
+        go_on.set()
+        assert [seen.get(timeout=DEADLINE) for _ in range(2)] == [4, 5]

@@ -9,6 +9,13 @@ from typing import Final
 _EARLY: Final = 1e-9
 
 
+def positive(value: float, what: str) -> float:
+    """The value, if it is above 0 and finite; else ValueError."""
+    if not 0 < value < math.inf:
+        raise ValueError(f"{what} is above 0 and finite, not {value:g}")
+    return value
+
+
 class Schedule:
     """The due times of a periodic task: start, start + period, start + 2 periods and so on.
 

@@ -86,7 +86,8 @@ async def test_updates_reach_subscriptions_and_owner() -> None:
     publication = Publication("/t", "/p", STRING)
     source.add_publication(publication)
     got: list[bytes] = []
-    node.add_subscription(Subscription("/t", "/s", on_message=lambda _, framed: got.append(bytes(framed))))
+    subscription = Subscription("/t", "/s", on_message=lambda _, framed: got.append(bytes(framed)))
+    node.add_subscription(subscription)
     await call(node.uri, "publisherUpdate", "/master", "/t", [source.uri])
     await until(lambda: publication.subscribers)
     publication.publish_framed(frame_message(b"hello"))
@@ -96,7 +97,7 @@ async def test_updates_reach_subscriptions_and_owner() -> None:
     assert await call(node.uri, "paramUpdate", "/master", "/a/", 1) == [1, "", 0]
     assert await call(node.uri, "shutdown", "/master", "replaced") == [1, "shutdown", 0]
     assert told == [("/a", 1), "replaced"]
-    node.remove_subscription("/t")
+    node.remove_subscription(subscription)
     await until(lambda: not publication.subscribers)
     await node.close()
     await source.close()

@@ -59,8 +59,9 @@ class MasterClient:
         self.slave = slave
         self.name = slave.name
         self.master_uri = master_uri
-        # By ``Publisher``, ``Subscriber`` or ``Service``, and name.
-        self._entries: dict[tuple[str, str], Publisher | Subscriber | Service] = {}
+        self._entries: list[Publisher | Subscriber | Service] = []
+        # So that the end of one subscriber does not unregister the next one of its topic.
+        self._registering = asyncio.Lock()
         # The parameters that are subscribed to, with what is told of their changes.
         self._followed: dict[str, ParamCallback | None] = {}
 
@@ -93,27 +94,32 @@ class MasterClient:
         """Serve and register.
 
         Raises:
-            ValueError: The node has one of that name already.
+            ValueError: The node has a publisher or service of that name already.
         """
         entry.serve()
-        self._entries[entry.kind_name, entry.key] = entry
+        self._entries.append(entry)
         try:
-            await entry.register()
+            async with self._registering:
+                await entry.register()
         except BaseException:
-            self._entries.pop((entry.kind_name, entry.key), None)
+            if entry in self._entries:
+                self._entries.remove(entry)
             entry.withdraw()
             raise
 
     async def remove(self, entry: Publisher | Subscriber | Service) -> None:
         """Unregister and close a publisher, subscriber or service; nothing happens if it is not registered."""
-        if self._entries.pop((entry.kind_name, entry.key), None) is not None:
-            with contextlib.suppress(RmpaError):
-                await self.call_master(f"unregister{entry.kind_name}", entry.key, entry.uri)
+        if entry in self._entries:
+            self._entries.remove(entry)
+            async with self._registering:
+                if not any((other.kind_name, other.key) == (entry.kind_name, entry.key) for other in self._entries):
+                    with contextlib.suppress(RmpaError):
+                        await self.call_master(f"unregister{entry.kind_name}", entry.key, entry.uri)
             entry.withdraw()
 
     async def _register_again(self) -> None:
         """Register everything at a master that has been started again."""
-        for entry in tuple(self._entries.values()):
+        for entry in tuple(self._entries):
             await entry.register(again=True)
         for key in tuple(self._followed):
             await self.call_master("subscribeParam", self.uri, key)
@@ -131,8 +137,9 @@ class MasterClient:
 
         try:
             async with asyncio.timeout(NODE_UNREGISTER_TIMEOUT), asyncio.TaskGroup() as group:
-                for (kind, key), entry in self._entries.items():
-                    group.create_task(unregister(f"unregister{kind}", key, entry.uri), name=f"unregister {self.name}")
+                for entry in self._entries:
+                    call = unregister(f"unregister{entry.kind_name}", entry.key, entry.uri)
+                    group.create_task(call, name=f"unregister {self.name}")
                 for key in self._followed:
                     group.create_task(unregister("unsubscribeParam", self.uri, key), name=f"unregister {self.name}")
         except TimeoutError:
@@ -374,10 +381,11 @@ class Publisher(PublicationEvents):
                 fields, or the value itself where the type has one field.
             fields: In place of ``message``: fields by name; the others are 0, empty or false.
 
-        ``header.seq`` counts the messages, 1, 2, 3 …, as rospy has it.
+        ``header.seq`` counts the messages, 1, 2, 3 …, as rospy has it. A number in place of a string becomes its
+        text: ``data=5`` is "5".
 
         Raises:
-            MessageError: The message does not fit the type.
+            MessageError: The message does not fit the type, whether there is a subscriber or not.
         """
         kind = self._known()
         payload: Buffer = kind.serialize(kind.given(message, fields))
@@ -527,7 +535,7 @@ class Subscriber:
 
     def withdraw(self) -> None:
         """Disconnect from the publishers."""
-        self._node.slave.remove_subscription(self.topic)
+        self._node.slave.remove_subscription(self.subscription)
 
     def _message(self, connection: PublisherConnection, framed: memoryview) -> None:
         try:

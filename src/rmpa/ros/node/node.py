@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from rmpa.config import limits as config_limits
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
-from rmpa.core.schedule import Schedule
+from rmpa.core.schedule import Schedule, positive
 from rmpa.ros import limits
 from rmpa.ros.environment import RosEnvironment, host_of, is_loopback
 from rmpa.ros.node import rosout
@@ -211,7 +211,7 @@ class Node(MasterClient):
         nodelay: bool = True,
         queue_messages: int = _RECEIVED_QUEUE,
     ) -> Subscriber:
-        """Subscribe to a topic, of this node's own publisher too, as rospy and roscpp do.
+        """Subscribe to a topic, of this node's own publisher too, as rospy does; each subscriber connects for itself.
 
         Args:
             topic: Resolved in the namespace.
@@ -228,14 +228,11 @@ class Node(MasterClient):
             DefinitionError: The type is not known.
             UnreachableError: The master does not answer.
             PeerRefused: The master refuses the registration.
-            ValueError: The node subscribes to that topic already.
         """
         resolved = self._resolve(topic)
         type_name = kind if isinstance(kind, str) else ANY
         if isinstance(kind, str):
             kind = await find_here(kind) if kind != ANY else None
-        if ("Subscriber", resolved) in self._entries:
-            raise ValueError(f"{self.name} subscribes to {resolved} already")
         subscriber = Subscriber(
             self,
             resolved,
@@ -448,17 +445,20 @@ class Node(MasterClient):
 
     # --- time and log -----------------------------------------------------------------------------------------
 
-    async def rate(self, hz: float) -> AsyncIterator[int]:
+    def rate(self, hz: float) -> AsyncIterator[int]:
         """The numbers 0, 1, 2 … at a rate, the first one at once, until the node closes.
 
         Due times are absolute, so that lateness does not add up. A time that is a whole period past is left out, and
         so is its number.
 
         Args:
-            hz: How many a second.
+            hz: How many a second, above 0.
         """
+        return self._ticks(positive(1 / positive(hz, "a rate"), "1 / a rate"))
+
+    async def _ticks(self, period: float) -> AsyncIterator[int]:
         loop = asyncio.get_running_loop()
-        schedule, count = Schedule(1 / hz, loop.time()), 0
+        schedule, count = Schedule(period, loop.time()), 0
         while True:
             due, missed = schedule.next_due(loop.time())
             if await self._stopped_before(due):
@@ -471,15 +471,16 @@ class Node(MasterClient):
         """Call a function again and again, the first time after one period, until the node closes.
 
         Args:
-            period: Seconds from one call to the next, by absolute times as in ``rate``.
+            period: Seconds from one call to the next, above 0, by absolute times as in ``rate``.
             callback: A function or a coroutine function; its exceptions are logged.
 
         Returns:
             Its task: ``cancel()`` ends it.
         """
+        ticks = self.rate(1 / positive(period, "a timer's period"))
 
         async def run() -> None:
-            async for count in self.rate(1 / period):
+            async for count in ticks:
                 if not count:
                     continue
                 try:
@@ -500,7 +501,7 @@ class Node(MasterClient):
         """
 
         def topics() -> list[str]:
-            return sorted(key for kind, key in self._entries if kind == Publisher.kind_name)
+            return sorted(entry.key for entry in self._entries if isinstance(entry, Publisher))
 
         logger = logging.getLogger("rosout" + self.name.replace("/", "."))
         if logger.level == logging.NOTSET:
@@ -589,11 +590,10 @@ class Node(MasterClient):
                 task.cancel()
             await asyncio.wait(self._tasks)
         await self._unregister_all()
-        for entry in self._entries.values():
-            if isinstance(entry, Publisher):
-                await entry.drained()
-            elif isinstance(entry, Subscriber):
+        for entry in self._entries:
+            if isinstance(entry, Subscriber):
                 entry.ended()
+        await asyncio.gather(*(entry.drained() for entry in self._entries if isinstance(entry, Publisher)))
         await self.slave.close()
         for number in self._signals:
             asyncio.get_running_loop().remove_signal_handler(number)

@@ -98,7 +98,7 @@ class SlaveNode:
         self._listener = listener
         self._advertised = advertised_host or host
         self._publications: dict[str, Publication] = {}
-        self._subscriptions: dict[str, Subscription] = {}
+        self._subscriptions: list[Subscription] = []
         self._services: dict[str, ServiceEndpoint] = {}
         self._numbers = itertools.count(1)
         self._on_shutdown = on_shutdown
@@ -134,8 +134,8 @@ class SlaveNode:
         services = tuple(self._services.values())
         for topic in tuple(self._publications):
             self.remove_publication(topic)
-        for topic in tuple(self._subscriptions):
-            self.remove_subscription(topic)
+        for subscription in tuple(self._subscriptions):
+            self.remove_subscription(subscription)
         for service in tuple(self._services):
             self.remove_service(service)
         if self._listener is not None and self.uri:
@@ -173,12 +173,12 @@ class SlaveNode:
 
     def add_subscription(self, subscription: Subscription) -> None:
         """Pass ``publisherUpdate`` of its topic on to a subscription."""
-        self._subscriptions[subscription.topic] = subscription
+        self._subscriptions.append(subscription)
 
-    def remove_subscription(self, topic: str) -> None:
-        """Disconnect from a topic's publishers."""
-        subscription = self._subscriptions.pop(topic, None)
-        if subscription is not None:
+    def remove_subscription(self, subscription: Subscription) -> None:
+        """Disconnect from its topic's publishers."""
+        if subscription in self._subscriptions:
+            self._subscriptions.remove(subscription)
             subscription.close()
 
     @property
@@ -213,13 +213,13 @@ class SlaveNode:
 
     def subscriptions(self) -> dict[str, str]:
         """Subscribed topics and types."""
-        found = {s.topic: s.type_name for s in self._subscriptions.values()}
+        found = {s.topic: s.type_name for s in self._subscriptions}
         return found | {tap.topic: tap.fields.get("type", ANY) for tap in self._taps()}
 
     def connections(self) -> list[BusConnection]:
         """All topic connections."""
         found = [c for publication in self._publications.values() for c in publication.connections()]
-        found += [c for subscription in self._subscriptions.values() for c in subscription.connections()]
+        found += [c for subscription in self._subscriptions for c in subscription.connections()]
         return found + [tap.connection() for tap in self._taps()]
 
     def address_of(self, topic: str) -> tuple[str, int] | None:
@@ -240,8 +240,9 @@ class SlaveNode:
             case "requestTopic", [str(caller), str(topic), list(protocols)]:
                 return self._request_topic(caller, topic, protocols)
             case "publisherUpdate", [_, str(topic), list(publishers)]:
-                if topic in self._subscriptions:
-                    self._subscriptions[topic].update(map(str, publishers))
+                for subscription in self._subscriptions:
+                    if subscription.topic == topic:
+                        subscription.update(map(str, publishers))
                 return [1, "", 0]
             case "paramUpdate", [_, str(key), value]:
                 # rosmaster appends a slash to the key, and roscpp removes it.
