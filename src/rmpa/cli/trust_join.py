@@ -66,7 +66,7 @@ def trust_invite(
     """Invite a module, at the authority: print a token that is valid once, and wait until it has joined.
 
     On a terminal the line to run on the new module is printed, with the token; else only the token, on standard
-    output. Who has the token can join: keep it secret.
+    output. The holder of the token can join: keep it secret.
 
     ---
     With --json one object a line is printed: the token, then each step, whose state is refused or joined. A token
