@@ -186,7 +186,7 @@ class SyncNode:
                 try:
                     self._wait_for(self._node.close(), _CLOSE_WITHIN)
                 except TimeoutError:
-                    _log.warning("! %s has not unregistered in %g s", self._node.name, _CLOSE_WITHIN)
+                    _log.warning("! %s has not unregistered in %g s [ending-slowly]", self._node.name, _CLOSE_WITHIN)
                 self._end()
         self._restore_signals()
 
