@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tomllib
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from click.testing import CliRunner
 
+import rmpa
 from rmpa.cli.agent import up
 from rmpa.cli.gateway import gateway
 from rmpa.cli.main import cli
@@ -26,6 +28,13 @@ if TYPE_CHECKING:
 NOT_OF_A_GATEWAY = {"--core", "--master", "--keep", "--web", "--no-web"}
 """Options of ``rmpa up`` about what a gateway has not: a core of its nodes, a page."""
 DOCS = Path(__file__).parents[2] / "docs"
+SRC = Path(rmpa.__path__[0])
+BETWEEN_AGENTS = re.compile(
+    r"""SOCK_DIAG_|DATA_PAYLOAD_|CONTROL_|KEY_|BEACON_|RECONCILE_|TCPROS_MESSAGE_|CLOCK_|DOCUMENT_|ADVERTISEMENT_
+    |ASK_BYTES_|DIRECT_BREAKS_|INSTANCE_ID_""",
+    re.VERBOSE,
+)
+"""Limits of messages between agents of this release, and of what the command line asks: errors of broken programs."""
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +55,28 @@ def test_documentation_has_every_setting_and_every_list_of_tables() -> None:
             setting.title if setting.is_list_of_tables else f"| `{(setting.key or (setting.env,))[-1]}` |"
         ) in page
     assert {".".join(setting.key[:-1]) for setting in SETTINGS if len(setting.key) > 1} == set(TABLES)
+
+
+def test_a_limit_that_an_error_names_is_on_the_page() -> None:
+    """In the ``limits.py`` of its room: such a comment is a row, as ``test_documentation_is_up_to_date`` sees."""
+    text = "".join(path.read_text() for path in SRC.rglob("limits.py"))
+    on_the_page = set(re.findall(r"^# At it: .*\n(?:#.*\n)*(\w+): Final", text, re.MULTILINE))
+    known = set(re.findall(r"^(\w+): Final", text, re.MULTILINE))
+    code = "".join(path.read_text() for path in SRC.rglob("*.py"))
+    named = set(re.findall(r"\{(?:\w*limits\.)?([A-Z][A-Z\d_]+)|LimitExceeded\(.*limits\.(\w+)", code))
+    assert len(on_the_page) > 200
+    beside_it = ({name for pair in named for name in pair} & known) - on_the_page
+    assert [name for name in beside_it if not BETWEEN_AGENTS.match(name)] == []
+
+
+def test_a_row_of_a_limit_names_what_there_is() -> None:
+    """Each dotted name is a setting, or a counter that the code counts."""
+    page = (DOCS / "reference" / "limits.md").read_text()
+    code = "".join(path.read_text() for path in SRC.rglob("*.py") if path.name != "limits.py")
+    settings = {".".join(setting.key) for setting in SETTINGS}
+    named = set(re.findall(r"`([a-z_]+(?:\.[a-z_]+)+)`", page))
+    assert {name for name in settings if name.startswith("limits.")} <= named
+    assert [name for name in named - settings if not re.search(rf'[".]{name.rpartition(".")[2]}"', code)] == []
 
 
 def test_no_two_settings_share_a_name() -> None:

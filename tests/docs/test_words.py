@@ -24,10 +24,7 @@ _REFUSED: Final = re.compile(
 
 _ALL_TOGETHER: Final = 35_000
 """Words that the user pages may have, those aside that are made from code."""
-_MADE: Final = re.compile(
-    r"^<!-- tables: begin.*?^<!-- tables: end -->$|^\| [^\n]* \| `[A-Z]\w+` \|$", re.MULTILINE | re.DOTALL
-)
-
+_MADE: Final = re.compile(r"^<!-- tables: begin.*?^<!-- tables: end -->$", re.MULTILINE | re.DOTALL)
 
 _UNSEEN: Final = re.compile(r"<!--.*?-->", re.DOTALL)
 

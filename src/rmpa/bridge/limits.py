@@ -41,7 +41,10 @@ REFUSED_MAX: Final = 32_768
 ADVERTISED_MAX: Final = 16_384
 # Refused subscribers of one source that are remembered, to show them to the user.
 MISMATCHES_MAX: Final = 16
-# Relays between two modules: five networks in a row. Each adds a hop's delay, and longer rows are a mistake.
+# [Graph] Relays in a row
+# At it: what has passed them is not passed on
+# Told in: `why`
+# Why: Five networks in a row. Each adds a hop's delay, and longer rows are a mistake.
 RELAY_HOPS_MAX: Final = 4
 # The lowest route number of a service; topics' routes are counted from 1.
 SERVICE_ROUTES: Final = 1 << 31
@@ -50,13 +53,19 @@ SERVICE_ROUTES: Final = 1 << 31
 SERVICE_GRACE: Final = 1.0
 # Seconds without a call after which a service's route, and a connection to its server, is closed.
 SERVICE_IDLE: Final = 30.0
-# Connections to the server of one service, and so the calls that it gets at once: each connection carries one call at
-# a time, and rospy runs a thread for each.
+# [Services] Calls of one service that its server gets at once
+# At it: further ones wait
+# Told in: `service info`
+# Why: Each connection carries one call at a time, and rospy runs a thread for each.
 SERVICE_POOL: Final = 32
-# Calls of one service that may wait for such a connection; further ones are refused at once.
+# [Services] Calls that wait for one of these
+# At it: further ones fail at once
+# Told in: the caller's error
 SERVICE_QUEUE: Final = 1024
-# Bytes of requests and responses on one link that are in transfer or being reassembled, each way: four of the largest
-# messages.
+# [Services] Bytes of requests and responses of one peer under way, each way
+# At it: further calls fail
+# Told in: the caller's error
+# Why: In transfer or being reassembled: four of the largest messages.
 SERVICE_BYTES: Final = 256 * MIB
 # Seconds between two checks that the servers of offered services still listen; a killed one is noticed within 1 s.
 SERVER_LOOK: Final = 0.5
@@ -64,8 +73,10 @@ SERVER_LOOK: Final = 0.5
 SERVICE_LATENCIES: Final = 512
 # Nodes subscribed to one topic that are named to the agent of its publisher.
 AUDIENCE_MAX: Final = 64
-# Connections that represent the subscribers of one peer (``bridge.topics.local``): enough for 512 action
-# servers of one module.
+# [Graph] Connections to action servers here for one peer's clients
+# At it: further clients are not seen by the server
+# Told in: log
+# Why: They represent its subscribers (``bridge.topics.local``): enough for 512 action servers of one module.
 AUDIENCES_MAX: Final = 1024
 # Characters in the name of a request between agents.
 ASK_NAME_MAX: Final = 64
@@ -78,16 +89,25 @@ ASK_TIMEOUT: Final = 5.0
 ASK_EXPRESS_MAX: Final = 16 * KIB
 # Bytes of one request or response: the text of a parameter, and what is around it.
 ASK_BYTES_MAX: Final = 17 * MIB
-# Bytes of large requests and responses on one link that wait, are reassembled or are answered, each way: four of the
-# largest parameters.
+# [Core] Bytes of large questions and answers between two modules, such as parameters, each way
+# At it: further ones fail
+# Told in: the command's error; of a followed parameter `peer list`, diagnostics, log
+# Why: That wait, are reassembled or are answered: four of the largest parameters.
 ASK_BYTES: Final = 64 * MIB
-# Characters of a parameter, as XML-RPC text, that may cross between modules; within one module ``HTTP_BODY_MAX``
-# holds.
+# [Core] Bytes of a parameter that crosses between modules
+# At it: it is not read, set or followed
+# Told in: the command's error; of a followed parameter `peer list`, diagnostics, log
+# Why: Characters of its XML-RPC text; within one module ``HTTP_BODY_MAX`` holds.
 PARAM_TEXT_MAX: Final = 16 * MIB
-# Parameters in one value that a peer sets: each takes the core some 0.25 ms, between data; a large robot has some
-# thousand in all.
+# [Core] Parameters in one value that a peer sets
+# At it: none is set
+# Told in: the command's error
+# Why: Each takes the core some 0.25 ms, between data; a large robot has some thousand in all.
 PARAMS_SET_MAX: Final = 10_000
-# Modules of another site for which a gateway asks at once: as many as one mesh has.
+# [Core] Modules of another site for which a gateway asks for parameters at once
+# At it: the question is refused
+# Told in: the command's error
+# Why: As many as one mesh has.
 PARAM_ASKERS_MAX: Final = 256
 # Seconds that a peer has to answer a request about a parameter: as data goes first, its core may need seconds for
 # megabytes of numbers. Less than CONTROL_HANDLER_TIMEOUT, so that the error names the agent that did not answer.
@@ -100,16 +120,23 @@ PARAM_GATHER: Final = 0.05
 # Characters up to which a followed parameter is compared each RECONCILE_INTERVAL. For larger ones the core's own
 # notifications are relied on; they are compared when one has come, or the core was restarted.
 PARAM_SMALL: Final = 64 * KIB
-# Characters of all followed parameters together, which are kept here so that they can be put back.
+# [Core] Bytes of all followed parameters
+# At it: further ones are not followed
+# Told in: `peer list`, diagnostics, log
+# Why: Characters, which are kept here so that they can be put back.
 FOLLOWED_BYTES_MAX: Final = 64 * MIB
 # Characters of a human-readable text in a control message.
 CONTROL_TEXT_MAX: Final = 16 * KIB
 # Seconds that a peer's agent has to end a node: the node's answer to the call, and the wait for its end.
 NODE_KILL_TIMEOUT: Final = 10.0
-# Nodes of peers that are being ended on request at one time; further requests are refused.
+# [Core] Nodes of peers that one agent is ending at a time
+# At it: further ones are refused
+# Told in: `node kill`, log
 NODE_KILLS_AT_ONCE: Final = 16
-# Seconds in which a caller that asked the agent's own node to end can end no node of another module. Each further
-# call of it starts the time anew: `rosnode kill -a` asks all nodes of the graph, one after the other.
+# [Core] Time after `rosnode kill -a` asked the agent's own node
+# At it: until then it ends no node of a peer
+# Told in: log
+# Why: Each further call of it starts the time anew: it asks all nodes of the graph, one after the other.
 NODE_KILL_ALL: Final = 2.0
 # Seconds after which a proxy whose subscribers were disconnected is registered again: at once, and once more for slow
 # subscribers.
@@ -146,9 +173,11 @@ QUALITY_CLOCKS: Final = 128
 # Seconds in which at most two of these estimates are remembered. An estimate comes once a second, and at each request
 # for it.
 QUALITY_CLOCK_STEP: Final = 0.9
-# Seconds that a subscriber's `requestTopic` waits at most for the decision about direct transport; then it is
-# answered with the proxy's address, and moved when the decision is there. The decision takes one round trip between
-# the agents, one call of the publisher and one connection to it: a few milliseconds.
+# [Direct] Time for which a subscriber's `requestTopic` waits for the decision
+# At it: it is relayed at first, and moved later
+# Told in: `direct.undecided`
+# Why: The decision takes one round trip between the agents, one call of the publisher and one connection to it: a few
+#   milliseconds.
 DIRECT_HOLD: Final = 0.25
 # Seconds that a peer has to answer a request for a direct connection; its publisher may be slow.
 DIRECT_ASK_TIMEOUT: Final = 5.0
@@ -161,8 +190,10 @@ DIRECT_NODE_TIMEOUT: Final = 2.0
 DIRECT_PORT_KNOWN: Final = 10.0
 # Seconds that a peer's node has to answer a probe. A firewall that drops packets costs this once for each node.
 DIRECT_PROBE_TIMEOUT: Final = 1.0
-# Seconds after which a subscriber that was refused for a passing reason (the node does not answer, the port cannot be
-# reached) is considered again.
+# [Direct] Time after a refusal that may pass by itself
+# At it: the connection is tried again; it is relayed until then
+# Told in: `why`
+# Why: The node does not answer, or the port cannot be reached.
 DIRECT_RETRY: Final = 30.0
 # Seconds between two requests for one subscriber that a peer's notifications cause.
 DIRECT_RETRY_PAUSE: Final = 1.0
@@ -170,15 +201,22 @@ DIRECT_RETRY_PAUSE: Final = 1.0
 DIRECT_CHECK: Final = 1.0
 # Seconds that a subscriber has to connect after it was answered the publisher's address.
 DIRECT_SETTLE: Final = 2.0
-# Direct connections that one peer may have to publishers of this module, and as many to its services.
+# [Direct] Connections of one peer to publishers of this module, and as many to its services
+# At it: further ones are relayed
+# Told in: `topic info`, `service info`, `why` (*limit*)
 DIRECT_MAX: Final = 1024
 # Seconds after the start of an agent within which each subscriber that asks for a topic is looked at: it may have a
 # direct connection from an earlier run of the agent.
 DIRECT_ADOPT: Final = 10.0
-# Seconds that services which are called directly stay in the graph after their agent has crashed, as topics do
-# (``core.limits.RESUME_WINDOW``).
+# [Direct] Time for which directly called services stay after their agent crashed
+# At it: they leave the graph
+# Told in: `service info`
+# Why: As topics do (``core.limits.RESUME_WINDOW``).
 DIRECT_KEEP: Final = 30.0
-# A direct connection that broke so many times within `DIRECT_BREAKS_SPAN` seconds is relayed for `DIRECT_RETRY`.
+# [Direct] Breaks of a connection within 10 s
+# At it: its subscriber is relayed for 30 s
+# Told in: `topic info`, `why` (*stable*)
+# Why: Within ``DIRECT_BREAKS_SPAN``, for ``DIRECT_RETRY``.
 DIRECT_BREAKS: Final = 3
 # Seconds; see `DIRECT_BREAKS`.
 DIRECT_BREAKS_SPAN: Final = 10.0

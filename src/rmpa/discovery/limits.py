@@ -15,8 +15,11 @@ BEACON_MAX_BYTES: Final = 1200
 BEACON_ADDRESSES_MAX: Final = 8
 # Peers that one beacon gossips about; if there are more, successive beacons carry them in turn.
 BEACON_GOSSIP_MAX: Final = 64
-# Members above which answers and early heartbeats are delayed or gathered, lest a start of many agents be a storm of
-# packets. Up to here each announcement is answered at once, as in the paper.
+# [Links] Modules of a mesh above which answers to beacons become rarer
+# At it: they are delayed, and gathered
+# Told in: `beacon.answer_spared`
+# Why: Lest a start of many agents be a storm of packets. Up to here each announcement is answered at once, as in the
+#   paper.
 MANY_MEMBERS: Final = 64
 # Seconds without a link, although its beacons arrive, after which a peer with another's address is shown as in
 # conflict.
@@ -32,16 +35,27 @@ MULTICAST_SILENCE: Final = 11.0
 # peers stays below this. In a large mesh it is also the number of answers a second that one newcomer gets: 1,000
 # members answer within 2 s, each at a random time.
 ANSWERS_PER_SECOND: Final = 500
-# Peers that were never linked and may be known at one time: they may be forged, and each of them costs a few
-# microseconds wherever all peers are looked at. Peers of a large mesh are linked once, and then count no more.
+# [Graph] Peers that are known and were never linked
+# At it: further ones are ignored until some are linked or silent
+# Told in: `roster.full`
+# Why: They may be forged, and each of them costs a few microseconds wherever all peers are looked at. Peers of a
+#   large mesh are linked once, and then count no more.
 STRANGERS_MAX: Final = 1024
 BEACONS_UNPROVED_BURST: Final = 1000
-# Modules that are not of this mesh and are shown to users; what they say of themselves may be invented.
+# [Graph] Modules of no mesh, or another one, that are shown
+# At it: the list is full: further ones are not shown until one was silent for 30 s
+# Told in: `peer list`, `doctor`
+# Why: What they say of themselves may be invented.
 STRANGERS_SHOWN: Final = 32
-# Packets a second from one address; a host with twenty agents that all start at once stays below.
+# [Links] Beacons a second from one address
+# At it: further ones are not read
+# Told in: log, `beacon.flood`
+# Why: A host with twenty agents that all start at once stays below.
 BEACONS_PER_SOURCE: Final = 200
-# Beacons a second that are accepted from peers that never had a link, over all addresses (they can be forged): 5 % of
-# a core.
+# [Links] Beacons a second from peers that were never linked
+# At it: further ones are not read; they come again
+# Told in: `beacon.unlinked_limited`
+# Why: Over all addresses, which can be forged: 5 % of a core.
 BEACONS_UNLINKED_PER_SECOND: Final = 200.0
 # Beacons of peers without a link accepted at once, which take 0.4 s: a thousand agents that start together announce
 # themselves four times each. Data is handled between them.

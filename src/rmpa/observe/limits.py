@@ -14,9 +14,14 @@ from rmpa.core.limits import MIB
 CONTROL_REQUEST_MAX: Final = 1 * MIB
 # Bytes of a text that follows a request: a parameter.
 CONTROL_TEXT_BYTES_MAX: Final = 17 * MIB
-# Bytes of one reply: the snapshot of a very large graph.
+# [Agent] Bytes of an answer of the agent to a command
+# At it: the command fails
+# Told in: its error
+# Why: The snapshot of a very large graph.
 CONTROL_REPLY_MAX: Final = 64 * MIB
-# Simultaneous clients of the control socket.
+# [Agent] Commands that ask one agent at a time
+# At it: further ones are refused
+# Told in: their error
 CONTROL_CLIENTS_MAX: Final = 32
 # A connection without a request for this long is closed.
 CONTROL_IDLE_TIMEOUT: Final = 60.0
@@ -26,19 +31,26 @@ CONTROL_CALL_TIMEOUT: Final = 10.0
 CONTROL_LOOK_TIMEOUT: Final = 1.0
 # Pings of one call, which must end within its time-out. The command line asks for one at a time.
 CONTROL_PINGS_MAX: Final = 100
-# Time-out of an operation in the agent; ``rmpa why`` waits for peers.
+# [Agent] Time for the agent's answer to a command
+# At it: the command fails
+# Told in: its error
+# Why: ``rmpa why`` waits for peers.
 CONTROL_HANDLER_TIMEOUT: Final = 30.0
 # The longest wait for a change of the graph in one request: it must end within ``CONTROL_HANDLER_TIMEOUT``.
 CONTROL_WAIT_MAX: Final = 25.0
 # Changes of the graph that are kept for clients of ``graph``: the start of a large graph makes fewer while a slow
 # client does not ask. A client that is further behind gets the whole graph. Some 0.5 MB.
 GRAPH_HISTORY: Final = 4096
-# Bytes in a UNIX socket's path: Linux's sun_path less its final zero.
+# [Agent] Bytes of the control socket's path
+# At it: the agent does not start
+# Told in: error at start
+# Why: Linux's sun_path less its final zero.
 CONTROL_PATH_MAX: Final = 107
 # How long a peer that is gone, with its topics, is shown as stale on /diagnostics.
 DIAGNOSTICS_STALE: Final = 60.0
-# Topics and services beyond which /diagnostics leaves out those that nothing here uses: each second it would take
-# 0.03 ms for each of them, two thirds of a core with 20,000.
+# [Agent] Topics, and services, in `/diagnostics`
+# At it: further ones that nothing here uses are left out
+# Why: Each second it would take 0.03 ms for each of them, two thirds of a core with 20,000.
 DIAGNOSTICS_TOPICS: Final = 2000
 
 # --- doctor -----------------------------------------------------------------------------------------------------
@@ -58,9 +70,12 @@ DOCTOR_CLOCK_LOOK: Final = 0.3
 # --- why --------------------------------------------------------------------------------------------------------
 # Time between the two counts that ``rmpa why`` compares: a topic of some messages a second has moved by then.
 WHY_WINDOW: Final = 1.0
-# Publishers of one topic in one module that ``rmpa why`` reports.
+# [Agent] Publishers of one topic that `rmpa why` reports
+# At it: others are left out
 WHY_SOURCES_MAX: Final = 64
 # Seconds in which a core tells the addresses of its nodes; each takes a millisecond.
 DOCTOR_NODES_TIMEOUT: Final = 2.0
-# Nodes of one core whose ports are looked at, so that the check ends in time.
+# [Agent] Nodes of a core whose ports `rmpa doctor` checks
+# At it: others are left out
+# Why: So that the check ends in time.
 DOCTOR_NODES_MAX: Final = 500

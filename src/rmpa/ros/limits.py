@@ -6,80 +6,152 @@ from typing import Final
 
 from rmpa.core.limits import KIB, MIB
 
-# One ROS message with its length; the largest point clouds and images stay below this.
+# [Messages] Bytes of one message, its length included
+# At it: it is left out, the topic's others cross
+# Told in: at both ends: log, `topic info` (*too long*), `why` (*sent*), diagnostics, counters
+# Why: The largest point clouds and images stay below this.
 MESSAGE_MAX: Final = 256 * MIB
 
 # --- TCPROS and services ------------------------------------------------------------------------------------------
-# A connection header: the longest message definitions are some 100 KB; roscpp would accept 1 GB.
+# [Messages] Bytes of a connection header (TCPROS)
+# At it: the connection is refused
+# Told in: log, counters
+# Why: The longest message definitions are some 100 KB; roscpp would accept 1 GB.
 TCPROS_HEADER_MAX: Final = 4 * MIB
 # One message without its 4-byte length.
 TCPROS_MESSAGE_MAX: Final = MESSAGE_MAX - 4
-# Above it, as in roscpp, the stream is out of step and closed; a message between both limits is read and dropped.
+# [Messages] The length that a local publisher gives for a message
+# At it: the stream is corrupt: the connection is made anew
+# Told in: log, counters, `why` (*route*)
+# Why: As in roscpp; a message between both limits is read and dropped.
 TCPROS_LENGTH_MAX: Final = 1_000_000_000
-# Time within which the other side's header must arrive; rospy and roscpp wait without a limit.
+# [Messages] Time for the other side's header
+# At it: the connection is closed
+# Told in: log, `why` (*route*)
+# Why: rospy and roscpp wait without a limit.
 TCPROS_HANDSHAKE_TIMEOUT: Final = 10.0
-# Time-out of a TCP connect to a node.
+# [Messages] Time for a connection to a node
+# At it: it is tried again
+# Told in: `topic info`, `why` (*route*), log
 TCPROS_CONNECT_TIMEOUT: Final = 3.0
-# Accepted connections of one node: its subscribers, with room for those that reconnect.
+# [Messages] Subscribers connected to one proxy
+# At it: further ones are refused, and try again
+# Told in: log, counters
+# Why: With room for those that reconnect.
 TCPROS_CONNECTIONS_MAX: Final = 1024
-# Accepted connections without a header yet (port scanners, stuck nodes).
+# [Messages] Of these, without a header yet
+# At it: further ones are refused, and try again
+# Told in: log, counters
+# Why: Port scanners, stuck nodes.
 TCPROS_HANDSHAKES_MAX: Final = 128
 # Freed addresses that are held back: room for all nodes of some large modules that start and end in that minute.
 LOOPBACK_RESTING_MAX: Final = 16_384
-# One request or response of a service, which is held in memory: maps and point clouds reach some 10 MB.
+# [Services] Bytes of one request or response
+# At it: the call fails
+# Told in: the caller's error, log
+# Why: It is held in memory: maps and point clouds reach some 10 MB.
 SERVICE_MESSAGE_MAX: Final = 64 * MIB
 # Time-out of the connection to a service's server and the exchange of headers together.
 SERVICE_OPEN_TIMEOUT: Final = 5.0
-# Messages queued for one slow local subscriber; above it the oldest is dropped.
+# [Messages] Messages that wait for one slow local subscriber (`depth` of `[[contract]]`)
+# At it: the oldest is dropped
+# Told in: `topic info`, `why` (*reader*)
 SUBSCRIBER_QUEUE_MESSAGES: Final = 1000
-# Messages of one source kept for late subscribers (durability transient_local), whatever the contract's depth.
-LATCHED_MAX: Final = 100
-# Bytes queued for one slow local subscriber; one message always fits.
+# [Messages] Bytes that wait for it
+# At it: the oldest is dropped
+# Told in: `topic info`, `why` (*reader*)
 SUBSCRIBER_QUEUE_BYTES: Final = 32 * MIB
+# [Messages] Latched messages of one source that are kept
+# At it: the newest are kept
+# Why: For late subscribers (durability transient_local), whatever the contract's depth.
+LATCHED_MAX: Final = 100
 
 # --- message types ------------------------------------------------------------------------------------------------
-# Characters of a message definition with all that it embeds; the longest known are some 100 KB.
+# [Messages] Characters of a message definition
+# At it: its type is not learnt; its bytes cross all the same
+# Told in: the command's error
+# Why: With all that it embeds; the longest known are some 100 KB.
 DEFINITION_MAX: Final = 1 * MIB
-# Fields and constants of one message type.
+# [Messages] Fields and constants of a message type
+# At it: it is not learnt
+# Told in: the command's error
 DEFINITION_FIELDS_MAX: Final = 4096
-# Types within types; ROS's own go five deep.
+# [Messages] Types within types
+# At it: it is not learnt
+# Told in: the command's error
+# Why: ROS's own go five deep.
 DEFINITION_DEPTH_MAX: Final = 32
-# Folders within folders below an entry of ROS_PACKAGE_PATH that are searched for packages; usual are four.
+# [Agent] Folders within folders below an entry of ROS_PACKAGE_PATH that are searched for types
+# At it: deeper ones are not searched
+# Told in: the command's error
+# Why: Usual are four.
 PACKAGE_DEPTH_MAX: Final = 32
-# Folders searched below one entry, nearer ones first, in up to 3 s; a workspace has a thousand, which take 40 ms.
+# [Agent] Folders that are searched there
+# At it: the nearest ones are searched
+# Told in: the command's error
+# Why: In up to 3 s; a workspace has a thousand, which take 40 ms.
 PACKAGE_FOLDERS_MAX: Final = 20_000
-# Directory entries of all searched folders together: a folder of recordings must not take minutes.
+# [Agent] Files and folders in these
+# At it: the rest is not searched
+# Told in: the command's error
+# Why: A folder of recordings must not take minutes.
 PACKAGE_ENTRIES_MAX: Final = 200_000
 # Types found on this machine in the cache of a process; the least recently used is dropped.
 TYPES_FOUND_MAX: Final = 256
 # Unknown types in the cache of a process; the oldest is dropped.
 TYPES_MISSING_MAX: Final = 64
-# Publishers of a type that are asked for its definition, one after the other.
+# [Agent] Publishers that are asked for a type
+# At it: others are not asked
+# Told in: the command's error
+# Why: One after the other.
 FETCH_TYPE_PUBLISHERS: Final = 8
 # --- values of messages (`ros.types.codec`) ---
 # Characters of a wrong value in an error.
 SHOWN: Final = 60
 
 # --- XML-RPC over HTTP --------------------------------------------------------------------------------------------
-# One XML-RPC call or response: maps reach 10 MB; roslaunch sets all parameters of a file in one call.
+# [Core] Bytes of one call to the core as XML: a parameter, or all those of a launch file
+# At it: a fault that names the call, its size and what to do
+# Told in: the caller's error (not roscpp's), log, counters
+# Why: Maps reach 10 MB; roslaunch sets all parameters of a file in one call.
 HTTP_BODY_MAX: Final = 64 * MIB
-# All large calls of one server together: four of the largest.
+# [Core] Bytes of large calls under way together
+# At it: the slowest one, or the new one, gets a fault
+# Told in: the caller's error (not roscpp's), log, counters
+# Why: Four of the largest.
 HTTP_BODIES_MAX: Final = 256 * MIB
-# A call that is too large is read to its end, for its client sends all before it reads; above this it is cut.
+# [Core] Bytes of a refused call that are read
+# At it: it is cut off with HTTP 413
+# Told in: log, counters
+# Why: Its client sends all before it reads.
 HTTP_DISCARDED_MAX: Final = 1024 * MIB
 # Longer bodies are read and written over several turns of the event loop: 8 MiB of numbers take seconds.
 HTTP_BODY_INLINE: Final = 64 * KIB
-# Open connections to one XML-RPC server; beyond it ``ros.http.server`` chooses one to close for a new one.
+# [Core] Connections to the core, and to each proxy
+# At it: a new one replaces a slow one, else the one idle for longest
+# Told in: log, `http.evicted`
+# Why: ``ros.http.server`` chooses it.
 HTTP_CONNECTIONS_MAX: Final = 512
 # Time after which a kept-alive connection without a call is closed; rospy and roscpp reconnect by themselves.
 HTTP_IDLE_TIMEOUT: Final = 60.0
-# Time from a request's first byte to its last.
+# [Core] Time for a call to arrive
+# At it: its connection is closed
+# Told in: log, counters
 HTTP_REQUEST_TIMEOUT: Final = 10.0
-# Nested XML elements: some eighty arrays in arrays, more than any real parameter.
+# [Core] XML elements within each other in one call
+# At it: a fault
+# Told in: the caller's error, log
+# Why: Some eighty arrays in arrays, more than any real parameter.
 XMLRPC_DEPTH_MAX: Final = 256
-# XML elements in one body, two for each number; each takes some hundred bytes of memory.
+# [Core] XML elements in one call; a number is two
+# At it: a fault
+# Told in: the caller's error, log
+# Why: Each takes some hundred bytes of memory.
 XMLRPC_ELEMENTS_MAX: Final = 4_000_000
-# Nested namespaces in one parameter's name; more is an attack on the recursion.
+# [Core] Namespaces within each other in a parameter
+# At it: it is refused
+# Told in: the caller's error
+# Why: More is an attack on the recursion.
 PARAM_DEPTH_MAX: Final = 64
 # Time-out of one XML-RPC call to a node; a stopped node must not hold the others up.
 SLAVE_CALL_TIMEOUT: Final = 3.0
@@ -87,13 +159,25 @@ SLAVE_CALL_TIMEOUT: Final = 3.0
 # --- cores --------------------------------------------------------------------------------------------------------
 # Period in which each registered node is checked: whether it still listens.
 NODE_CHECK_INTERVAL: Final = 5.0
-# Seconds for which connects to a node fail until peers are no longer offered it: a cable is put back sooner.
+# [Core] Time for which a registered node may be unreachable
+# At it: it is not offered to peers
+# Told in: `why` (*reachable*), `topic info`, `node list`, `doctor`, diagnostics, log
+# Why: A cable is put back sooner.
 NODE_UNREACHABLE_AFTER: Final = 15.0
-# Updates of topics and parameters queued for one slow node; for each topic only the latest is queued.
+# [Core] Notifications (`publisherUpdate`, `paramUpdate`) that wait for one slow node
+# At it: the oldest is dropped
+# Told in: `notify.dropped`
+# Why: For each topic only the latest is queued.
 NOTIFY_QUEUE_MAX: Final = 4096
-# Seconds from the end of /rosout (`rosnode kill`) to its next start; roscore takes about as long.
+# [Core] Time before a `/rosout` that was ended is started anew
+# At it: the core waits while another node has the name
+# Told in: log
+# Why: roscore takes about as long.
 ROSOUT_RESPAWN: Final = 0.5
-# A core's state file: a robot's parameters with its description are some MB.
+# [Core] Bytes of registrations and parameters that the core keeps over a restart
+# At it: nothing newer is kept
+# Told in: `peer list`, diagnostics, log
+# Why: A robot's parameters with its description are some MB.
 CORE_STATE_BYTES: Final = 64 * MIB
 # Namespaces, structs and arrays within each other in a state file: as many as ``setParam`` can make.
 CORE_STATE_DEPTH_MAX: Final = PARAM_DEPTH_MAX + XMLRPC_DEPTH_MAX // 3
@@ -103,7 +187,12 @@ CORE_STATE_OPEN: Final = 3.0
 CORE_STATE_WRITE: Final = 10.0
 # Time-out of the last write of an ending core, whose disk may hang.
 CORE_STATE_CLOSE: Final = 3.0
-# The nodes of the run before are asked for this long before the core listens.
+# [Core] Time in which nodes of the last run are asked before the core listens
+# At it: the core listens; a node that does not answer within some seconds must be restarted
+# Told in: `doctor` (*core memory*), `peer list`, diagnostics, log
 CORE_STATE_ASK: Final = 1.0
-# Seconds for a node to end after it was asked to; one with much to save takes a second or two.
+# [Core] Time for a peer's node to end
+# At it: "is still there" is answered
+# Told in: `node kill`, log
+# Why: One with much to save takes a second or two.
 NODE_KILL_WAIT: Final = 3.0

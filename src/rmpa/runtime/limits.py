@@ -10,11 +10,17 @@ from typing import Final
 from rmpa.core.limits import KIB
 
 # --- process ----------------------------------------------------------------------------------------------------
-# File descriptors that an agent asks for: the hard limit, but no more than the kernel's own default (fs.nr_open).
-# Containers have hard limits of 10^9, and some old programs close every number at their start.
+# [Agent] Open files that the agent asks for
+# At it: it gets as many as the hard limit allows (`LimitNOFILE=` of systemd, `ulimit -Hn`); if none is left, new
+#   connections wait
+# Told in: `doctor`, `why`, diagnostics, log
+# Why: The kernel's own default (fs.nr_open). Containers have hard limits of 10^9, and some old programs close every
+#   number at their start.
 OPEN_FILES: Final = 1_048_576
-# Descriptors that data connections must leave free: half for the core, half for the links and the control socket.
-# 16 peers that reconnect at once take 32.
+# [Agent] Of these, reserved for the core, links and the control socket; a quarter of a limit below 256
+# At it: data connections wait; listening sockets of proxies leave twice as many free
+# Told in: `doctor`, `why`, diagnostics, log
+# Why: Half for the core, half for the links and the control socket. 16 peers that reconnect at once take 32.
 DESCRIPTORS_RESERVED: Final = 64
 # The reserve is at most the descriptor limit divided by this: 16 of 64.
 DESCRIPTORS_RESERVED_PART: Final = 4

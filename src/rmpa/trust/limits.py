@@ -58,7 +58,10 @@ TOKEN_SECRET_BYTES: Final = 16
 FINGERPRINT_BYTES: Final = 16
 # Validity of a token, unless a user says otherwise: the way from one machine to the other.
 TOKEN_LIFETIME: Final = 900.0
-# The longest validity of a token, for the delivery of a robot.
+# [Agent] Time for which a token of `rmpa trust invite` is valid
+# At it: the command fails
+# Told in: its error
+# Why: For the delivery of a robot.
 TOKEN_LIFETIME_MAX: Final = 30 * 86_400.0
 # Tokens of one authority that are remembered, used ones too; the one that ended first is forgotten first.
 TOKENS_MAX: Final = 256
@@ -102,13 +105,17 @@ EXPIRY_NEAR: Final = 2 * 86_400
 EARLIEST_TIME: Final = 1_735_689_600
 # Bytes of a request for a certificate (DER); one has some 250.
 CSR_MAX: Final = 4 * KIB
-# Names and addresses that a module's certificate has for its page, besides those that follow from its name.
+# [Graph] Names and addresses in a module's certificate for its page, besides its own
+# At it: the browser warns at further ones
 PAGE_HOSTS_MAX: Final = 16
 # Bytes of a certificate (DER or PEM) that are parsed; one has some 600.
 CERTIFICATE_MAX: Final = 8 * KIB
 
 # --- documents --------------------------------------------------------------------------------------------------
-# Names on a deny list, two for each member of a full roster.
+# [Agent] Names of revoked modules
+# At it: `rmpa trust revoke` fails; make a new mesh
+# Told in: its error
+# Why: Two for each member of a full roster.
 DENY_MAX: Final = 1024
 # Bytes of a signed document: a full deny list has some 100 KB.
 DOCUMENT_MAX: Final = 256 * KIB
