@@ -42,6 +42,6 @@ def fuzz(data: bytes) -> None:
         path.unlink()
     for ros1 in ("a_msgs/Foo", "a/Do", "std_msgs/String"):
         pair = mapping.message(ros1, frozenset(("std_msgs/msg/String", "b/msg/Do")))
-        for each in (mapping.service(ros1), *((pair,) if pair is not None else ())):
+        for each in (mapping.counterpart(ros1, "srv"), *((pair,) if pair is not None else ())):
             if each.name.count("/") != 2 or "/" not in mapping.ros1_type(each.name):
                 raise AssertionError(f"{ros1} has the pair {each}")

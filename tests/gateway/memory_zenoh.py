@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +12,7 @@ from rmpa.gateway.zenoh.threads import ZenohReply, ZenohSample
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rmpa.gateway.zenoh.queries import ArrivedQuery
-    from rmpa.gateway.zenoh.threads import ZenohPriority, ZenohQos
+    from rmpa.gateway.zenoh.threads import ZenohQos
     from rmpa.ros.wire.tcpros import Buffer
 
 
@@ -76,6 +76,11 @@ class MemoryQuery:
     def reply(self, key: str, payload: Buffer, attachment: bytes = b"") -> None:
         self.replies.append(ZenohReply(key, bytes(payload), attachment, True))
 
+    def answer(self, payload: Buffer) -> None:
+        """Give the only answer, with the attachment of the query."""
+        self.reply(self.key, payload, self.attachment)
+        self.finish()
+
     def reply_error(self, text: str) -> None:
         self.replies.append(ZenohReply("", text.encode(), b"", False))
         self.finish()
@@ -117,12 +122,11 @@ class MemoryZenoh:
         self.queryables: list[Entry] = []
         self.tokens: list[Entry] = []
         self.watches: list[Entry] = []
-        self._sessions = 0
+        self._numbers = itertools.count(1)
 
     def session(self) -> MemorySession:
         """Open one more session."""
-        self._sessions += 1
-        return MemorySession(self, f"{self._sessions:032x}")
+        return MemorySession(self, f"{next(self._numbers):032x}")
 
     @property
     def token_keys(self) -> list[str]:
@@ -163,11 +167,7 @@ class MemorySession:
         return made
 
     def subscribe(
-        self,
-        key: str,
-        on_sample: Callable[[ZenohSample], None],
-        *,
-        history: bool = False,
+        self, key: str, on_sample: Callable[[ZenohSample], None], *, history: bool = False
     ) -> MemoryDeclared:
         network, entry = self.network, Entry(self, key, on_sample)
         declared = MemoryDeclared(network.subscribers, entry, network.match)
@@ -192,10 +192,7 @@ class MemorySession:
                 self.network.soon(self.network.watches, entry, token.key, True)
         return declared
 
-    def queryable(
-        self, key: str, on_query: Callable[[ArrivedQuery], None], _needs: object = None, *, complete: bool = True
-    ) -> MemoryDeclared:
-        del complete
+    def queryable(self, key: str, on_query: Callable[[Any], None], _needs: object = None) -> MemoryDeclared:
         return MemoryDeclared(self.network.queryables, Entry(self, key, on_query))
 
     async def get(
@@ -205,22 +202,19 @@ class MemorySession:
         attachment: bytes = b"",
         *,
         timeout: float = 5.0,
-        all_complete: bool = False,
-        priority: ZenohPriority | None = None,
+        **_terms: object,
     ) -> list[ZenohReply]:
-        del all_complete, priority
-        loop = asyncio.get_running_loop()
         queries = []
         key, _, parameters = selector.partition("?")
         for entry in [entry for entry in self.network.queryables if fits(key, entry.key)]:
-            query = MemoryQuery(key, bytes(payload), attachment, loop.create_future(), parameters)
+            query = MemoryQuery(key, bytes(payload), attachment, asyncio.Future(), parameters)
             queries.append(query)
             self.network.soon(self.network.queryables, entry, query)
         if queries:
             await asyncio.wait([query.done for query in queries], timeout=timeout)
         return [reply for query in queries for reply in query.replies]
 
-    def close(self) -> None:
+    async def close(self) -> None:
         """Take back all that it declared."""
         network = self.network
         for table in (network.publishers, network.subscribers, network.queryables, network.watches):

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["pytest_asyncio_loop_factories", "settings"]
 CONNECT = GatewaySettings(site="here", connect=("tcp/127.0.0.1:7447",))
+LISTEN = GatewaySettings(router=True, listen=("tcp/127.0.0.1:7447",))
 
 
 class OpenedSession(MemorySession):
@@ -38,7 +39,6 @@ class OpenedSession(MemorySession):
     def __init__(self, events: list[str]) -> None:
         super().__init__(MemoryZenoh(), "1")
         self.events = events
-        self.endpoints: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
         self.stale = False
         self.refused: dict[str, int] = {}
 
@@ -46,7 +46,7 @@ class OpenedSession(MemorySession):
         refused, self.refused = self.refused, {}
         return refused
 
-    async def close(self) -> None:  # type: ignore[override] # a real one ends threads
+    async def close(self) -> None:
         self.events.append("session closed")
 
 
@@ -70,7 +70,7 @@ class RecordedNeighbour:
 class Bed:
     """A gateway whose session fails to open so many times."""
 
-    def __init__(self, settings: Settings, gateway: GatewaySettings, failures: int = 0) -> None:
+    def __init__(self, settings: Settings, gateway: GatewaySettings = CONNECT, failures: int = 0) -> None:
         self.events: list[str] = []
         self.failures = failures
         self.sessions: list[Any] = []
@@ -100,17 +100,24 @@ async def started(bed: Bed) -> AsyncIterator[Gateway]:
         await bed.gateway.close()
 
 
-async def test_neighbours_start_with_the_session_and_close_before_it(settings: Callable[..., Settings]) -> None:
-    bed = Bed(settings("g"), CONNECT)
+@pytest.fixture(autouse=True)
+def _short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("CERTIFICATE_LOOK_PERIOD", "OPEN_RETRY_FIRST"):
+        monkeypatch.setattr(limits, name, 0.05)
+
+
+@pytest.fixture
+async def bed(settings: Callable[..., Settings]) -> Bed:
+    return Bed(settings("g"))
+
+
+async def test_neighbours_start_with_the_session_end_before_it_are_reported_and_made_anew_by_other_rules(
+    bed: Bed,
+) -> None:
     async with started(bed) as gateway:
         assert gateway.agent.bridge.relay.enabled
         assert bed.events == ["started in g"]
-    assert bed.events == ["started in g", "closed", "session closed"]
-
-
-async def test_the_control_socket_reports_what_is_joined(settings: Callable[..., Settings]) -> None:
-    bed = Bed(settings("g"), CONNECT)
-    async with started(bed):
+        bed.sessions[0].refused = {"zenoh.key.long": 2}
 
         def ask() -> dict[str, object]:
             with ControlClient(Path(bed.settings.runtime_dir) / "g.sock") as client:
@@ -119,27 +126,17 @@ async def test_the_control_socket_reports_what_is_joined(settings: Callable[...,
         report = await asyncio.to_thread(ask)
         assert (report["name"], report["site"], report["problem"]) == ("g", "here", "")
         assert report["neighbours"] == {"sites": {"sites": ["warehouse"]}}
-
-
-async def test_other_rules_make_the_neighbours_anew(settings: Callable[..., Settings]) -> None:
-    bed = Bed(settings("g"), CONNECT)
-    async with started(bed) as gateway:
+        assert gateway.agent.bridge.counters["zenoh.key.long"] == 2
         other = replace(bed.settings, log_level="warning")
         gateway.agent.apply_settings(other)  # nothing that neighbours are made with
         rules = (CrossingRule(crossing=Crossing.NONE),)
         gateway.agent.apply_settings(replace(other, gateway=replace(CONNECT, rules=rules)))
-        await until(lambda: len(bed.events) == 3)
-        assert bed.events == ["started in g", "closed", "started in g"]
+        await until(lambda: bed.events == ["started in g", "closed", "started in g"])
         assert bed.rules == [(), rules]
     assert bed.events[3:] == ["closed", "session closed"]
 
 
-async def test_a_session_whose_certificate_was_renewed_is_opened_anew_with_its_neighbours(
-    settings: Callable[..., Settings], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(limits, "CERTIFICATE_LOOK_PERIOD", 0.05)
-    monkeypatch.setattr(limits, "OPEN_RETRY_FIRST", 0.05)
-    bed = Bed(settings("g"), CONNECT)
+async def test_a_session_whose_certificate_was_renewed_is_opened_anew_with_its_neighbours(bed: Bed) -> None:
     async with started(bed) as gateway:
         bed.sessions[0].stale = True
         assert gateway.report()["stale"]
@@ -150,42 +147,33 @@ async def test_a_session_whose_certificate_was_renewed_is_opened_anew_with_its_n
     assert bed.events[4:] == ["closed", "session closed"]
 
 
-async def test_other_permissions_open_a_session_that_listens_anew(
-    settings: Callable[..., Settings], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(limits, "OPEN_RETRY_FIRST", 0.05)
-    listens = GatewaySettings(router=True, listen=("tcp/127.0.0.1:7447",))
-    bed = Bed(settings("g"), listens)
+async def test_other_permissions_open_a_session_that_listens_anew(settings: Callable[..., Settings]) -> None:
+    bed = Bed(settings("g"), LISTEN)
     async with started(bed) as gateway:
         gateway.agent.apply_settings(replace(bed.settings, trust=TrustSettings(default="allow")))
         await until(lambda: len(bed.sessions) == 2 and gateway.session is bed.sessions[1])
         assert bed.events == ["started in g", "closed", "session closed", "started in g"]
 
 
-async def test_a_router_that_comes_later_is_joined_then(settings: Callable[..., Settings]) -> None:
-    bed = Bed(settings("g"), CONNECT, failures=2)
+async def test_a_router_that_comes_later_is_joined_then(bed: Bed) -> None:
+    bed.failures = 2
     async with started(bed) as gateway:
         assert bed.events == []
         assert "no router answers" in str(gateway.report()["problem"])
-        notes = gateway.agent.operations.snapshot({}).notes
-        assert any("no router answers" in note for note in notes)
+        assert any("no router answers" in note for note in gateway.agent.operations.snapshot({}).notes)
         await until(lambda: bed.events)
         assert gateway.report()["problem"] == ""
     assert bed.events == ["started in g", "closed", "session closed"]
 
 
-async def test_a_gateway_that_cannot_listen_does_not_start(settings: Callable[..., Settings]) -> None:
-    bed = Bed(settings("g"), GatewaySettings(router=True, listen=("tcp/127.0.0.1:7447",)), failures=1)
+async def test_a_gateway_that_cannot_listen_does_not_start_and_a_session_is_closed_if_the_agent_cannot(
+    settings: Callable[..., Settings],
+) -> None:
+    deaf, bed, second = Bed(settings("g"), LISTEN, failures=1), Bed(settings("g")), Bed(settings("g"))
     with pytest.raises(StartError):
-        await bed.gateway.start()
-    again = Bed(settings("g"), CONNECT)
-    async with started(again):  # its name and ports are free
-        assert again.events == ["started in g"]
-
-
-async def test_a_session_is_closed_if_the_agent_cannot_start(settings: Callable[..., Settings]) -> None:
-    first, second = Bed(settings("g"), CONNECT), Bed(settings("g"), CONNECT)
-    async with started(first):
+        await deaf.gateway.start()
+    async with started(bed):  # its name and ports are free
+        assert bed.events == ["started in g"]
         with pytest.raises(StartError):
             await second.gateway.start()
         assert second.events == ["session closed"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import socket
 from typing import TYPE_CHECKING
@@ -13,7 +12,7 @@ from rmpa.gateway.zenoh.config import ZenohConfig
 from rmpa.gateway.zenoh.session import OpenSession, open_session
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator
 
 pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 
@@ -24,13 +23,6 @@ def free_port() -> int:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
         return port
-
-
-async def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
-    """Wait until ``condition()`` is true; raises ``TimeoutError`` after ``seconds``."""
-    async with asyncio.timeout(seconds):
-        while not condition():
-            await asyncio.sleep(0.005)
 
 
 class ZenohBed:

@@ -65,10 +65,8 @@ def scalar(kind: MessageType, name: str, rng: random.Random, depth: int) -> Any:
     if name == "string":
         return "".join(rng.choice("aZ/ _é世🤖") for _ in range(rng.randint(0, 9)))
     if name in ("time", "duration"):
-        return {
-            "secs": rng.randint(*((0, 2**32 - 1) if name == "time" else (-(2**31), 2**31 - 1))),
-            "nsecs": rng.randint(0, 10**9 - 1),
-        }
+        low, high = INTEGERS["uint32" if name == "time" else "int32"]
+        return {"secs": rng.randint(low, high), "nsecs": rng.randint(0, 10**9 - 1)}
     return values(kind, name, rng, depth + 1)
 
 
@@ -139,12 +137,10 @@ def test_a_log_keeps_its_stamp_and_text() -> None:
     conversion = convert("rosgraph_msgs/Log")
     kind = conversion.ros1
     value = {"header": {"stamp": {"secs": 3, "nsecs": 4}}, "level": 8, "name": "/talker", "msg": "hot", "line": 12}
-    read: Any = JAZZY.store.deserialize_cdr(
-        conversion.to_ros2(kind.serialize(kind.make(value))), "rcl_interfaces/msg/Log"
-    )
-    assert (read.stamp.sec, read.stamp.nanosec, read.level, read.name, read.msg, read.line) == (
-        3, 4, 8, "/talker", "hot", 12,
-    )  # fmt: skip
+    cdr = conversion.to_ros2(kind.serialize(kind.make(value)))
+    read: Any = JAZZY.store.deserialize_cdr(cdr, "rcl_interfaces/msg/Log")
+    assert (read.stamp.sec, read.stamp.nanosec, read.level, read.name) == (3, 4, 8, "/talker")
+    assert (read.msg, read.line) == ("hot", 12)
 
 
 def test_fields_on_both_sides_that_the_other_lacks_need_a_rule() -> None:
@@ -216,6 +212,8 @@ def header_definition() -> str:
 
 
 HEADER = {"stamp": {"secs": 5, "nsecs": 6}, "frame_id": "odom"}
+STAMP = {"secs": 1, "nsecs": 7}
+VALUES = [{"key": "t", "value": "90"}, {"key": "", "value": ""}]
 CDR_OF_CYCLONEDDS: dict[str, tuple[dict[str, Any], str]] = {
     "sensor_msgs/Range": (
         {
@@ -243,11 +241,7 @@ CDR_OF_CYCLONEDDS: dict[str, tuple[dict[str, Any], str]] = {
                     "child_frame_id": "base",
                     "transform": {"translation": {"x": 1, "y": 2, "z": 3}, "rotation": {"w": 1}},
                 },
-                {
-                    "header": {"stamp": {"secs": 1, "nsecs": 7}},
-                    "child_frame_id": "arm1",
-                    "transform": {"rotation": {"w": 1}},
-                },
+                {"header": {"stamp": STAMP}, "child_frame_id": "arm1", "transform": {"rotation": {"w": 1}}},
             ]
         },
         (
@@ -258,17 +252,7 @@ CDR_OF_CYCLONEDDS: dict[str, tuple[dict[str, Any], str]] = {
         ),
     ),
     "diagnostic_msgs/DiagnosticArray": (
-        {
-            "header": HEADER,
-            "status": [
-                {
-                    "level": 2,
-                    "name": "lidar",
-                    "message": "hot",
-                    "values": [{"key": "t", "value": "90"}, {"key": "", "value": ""}],
-                }
-            ],
-        },
+        {"header": HEADER, "status": [{"level": 2, "name": "lidar", "message": "hot", "values": VALUES}]},
         (
             "000100000500000006000000050000006f646f6d000000000100000002000000060000006c6964617200000004000000686f7400"
             "0100000000000000020000000200000074000000030000003930000001000000000000000100000000"

@@ -30,12 +30,8 @@ RULES = """
   request_fields_1_to_2: {fast: quick}
 """
 PAIR = "ros1_package_name: a, ros2_package_name: b, ros1_message_name: C, ros2_message_name: D"
-KNOWN = {
-    "arm_interfaces/msg/Grip",
-    "std_msgs/msg/String",
-    "other_interfaces/msg/Thing",
-    "control_msgs/msg/JointState",
-}
+NAMES = "arm_interfaces/msg/Grip std_msgs/msg/String other_interfaces/msg/Thing control_msgs/msg/JointState"
+KNOWN = set(NAMES.split())
 
 
 @pytest.fixture
@@ -46,12 +42,9 @@ def mapping(tmp_path: Path) -> TypeMapping:
     return made
 
 
-def test_types_of_one_name_are_a_pair() -> None:
+def test_types_of_one_name_are_a_pair_and_packages_that_end_in_msgs_also_fit_interfaces() -> None:
     assert TypeMapping().message("std_msgs/String", KNOWN) == TypePair("std_msgs/msg/String")
     assert TypeMapping().message("std_msgs/Nothing", KNOWN) is None
-
-
-def test_packages_that_end_in_msgs_also_fit_interfaces() -> None:
     assert TypeMapping().message("other_msgs/Thing", KNOWN) == TypePair("other_interfaces/msg/Thing")
 
 
@@ -62,9 +55,12 @@ def test_rules_for_packages_messages_and_fields(mapping: TypeMapping) -> None:
 
 
 def test_rules_for_services(mapping: TypeMapping) -> None:
-    assert mapping.service("arm_msgs/Home") == TypePair("arm_interfaces/srv/GoHome", {"request": {"fast": "quick"}})
-    assert mapping.service("arm_msgs/Stop") == TypePair("arm_interfaces/srv/Stop")
-    assert mapping.service("std_srvs/Trigger") == TypePair("std_srvs/srv/Trigger")
+    for name, ros2, *paths in (
+        ("arm_msgs/Home", "arm_interfaces/srv/GoHome", {"request": {"fast": "quick"}}),
+        ("arm_msgs/Stop", "arm_interfaces/srv/Stop"),
+        ("std_srvs/Trigger", "std_srvs/srv/Trigger"),
+    ):
+        assert mapping.counterpart(name, "srv") == TypePair(ros2, *paths)
 
 
 def test_the_way_back(mapping: TypeMapping) -> None:
@@ -86,10 +82,7 @@ def test_the_way_back(mapping: TypeMapping) -> None:
         ("- {ros1_package_name: a, ros2_package_name: b, ros1_message_name: C}", "needs both"),
         ("- {ros1_package_name: a, ros2_package_name: b, field: C}", "unknown key 'field'"),
         ("- {ros1_package_name: a, ros2_package_name: b, fields_1_to_2: {a: b}}", "names no message"),
-        (
-            f"- {{{PAIR}, fields_1_to_2: 3}}",
-            "no mapping of fields",
-        ),
+        (f"- {{{PAIR}, fields_1_to_2: 3}}", "no mapping of fields"),
         ("- {ros1_package_name: '', ros2_package_name: b, ros1_message_name: C, ros2_message_name: D}", "not a name"),
         ("- [", "cannot be read"),
     ],
@@ -100,8 +93,5 @@ def test_a_wrong_file_is_refused_with_the_rule(tmp_path: Path, text: str, proble
     with pytest.raises(ConfigError, match=problem) as caught:
         TypeMapping().read(path)
     assert str(path) in str(caught.value)
-
-
-def test_a_file_that_is_missing_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         TypeMapping().read(tmp_path / "none.yaml")

@@ -35,29 +35,23 @@ CHATTER_TOKEN = (
 )
 
 
-def test_a_node_and_an_endpoint_have_the_tokens_of_rmw_zenoh() -> None:
-    assert NODE.token() == NODE_TOKEN
-    assert CHATTER.token() == CHATTER_TOKEN
+@pytest.mark.parametrize(
+    ("entity", "token"),
+    [
+        (NODE, NODE_TOKEN),
+        (CHATTER, CHATTER_TOKEN),
+        (Ros2Node(0, "ff", 3, "/talker"), "@ros2_lv/0/ff/3/3/NN/%/%/talker"),
+        (Ros2Node(0, "ff", 3, "/talker", "/secure/enclave"), "@ros2_lv/0/ff/3/3/NN/%secure%enclave/%/talker"),
+    ],
+)
+def test_nodes_and_endpoints_have_the_tokens_of_rmw_zenoh(entity: Ros2Node | Ros2Endpoint, token: str) -> None:
+    assert (entity.token(), parse_token(token)) == (token, entity)
 
 
-def test_a_node_without_a_namespace_has_a_mark_in_its_place() -> None:
-    assert Ros2Node(0, "ff", 3, "/talker").token() == "@ros2_lv/0/ff/3/3/NN/%/%/talker"
-
-
-def test_tokens_are_read_back() -> None:
-    assert parse_token(NODE_TOKEN) == NODE
-    assert parse_token(CHATTER_TOKEN) == CHATTER
-    root = Ros2Node(0, "ff", 3, "/talker", "/secure/enclave")
-    assert parse_token(root.token()) == root
-
-
-def test_data_of_a_topic_goes_by_its_name_type_and_hash() -> None:
+def test_data_of_a_topic_goes_by_its_name_type_and_hash_and_types_have_two_names() -> None:
     assert CHATTER.key() == f"2/robot/chatter/std_msgs::msg::dds_::String_/{HASH}"
     assert data_key(0, "/chatter", "std_msgs/msg/String", "*") == "0/chatter/std_msgs::msg::dds_::String_/*"
     assert graph_key(7) == "@ros2_lv/7/**"
-
-
-def test_types_have_two_names() -> None:
     assert dds_type("example_interfaces/srv/AddTwoInts") == "example_interfaces::srv::dds_::AddTwoInts_"
     assert ros_type("example_interfaces::srv::dds_::AddTwoInts_") == "example_interfaces/srv/AddTwoInts"
 
@@ -113,14 +107,9 @@ def test_a_qos_and_its_text(qos: Ros2Qos, text: str) -> None:
     assert Ros2Qos.parse(text) == qos
 
 
-def test_kinds_that_are_not_known_count_as_the_default() -> None:
-    assert Ros2Qos.parse("0:9:7,10:,:,:4,,") == Ros2Qos()
-    assert Ros2Qos.parse("1:2:1,10:,:,:1,,") == Ros2Qos()
-
-
-def test_a_latched_publisher_is_transient_local() -> None:
-    assert Ros2Qos.parse(":1:,1:,:,:,,").latched
-    assert not Ros2Qos().latched
+def test_kinds_that_are_not_known_count_as_the_default_and_transient_local_is_latched() -> None:
+    assert Ros2Qos.parse("0:9:7,10:,:,:4,,") == Ros2Qos.parse("1:2:1,10:,:,:1,,") == Ros2Qos()
+    assert [Ros2Qos.parse(text).latched for text in (":1:,1:,:,:,,", "::,10:,:,:,,")] == [True, False]
 
 
 @given(

@@ -1,11 +1,12 @@
-"""Sites in one process: gateways with a graph in memory, joined by a real Zenoh router."""
+"""Sites in one process: gateways with a graph in memory, joined by Zenoh in memory, or by a real router."""
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+
+import pytest
 
 from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.policy import OPEN_GATE
@@ -13,40 +14,34 @@ from rmpa.config.peer_rules import ServiceRule
 from rmpa.config.settings import ServiceSettings, Settings
 from rmpa.core.contract import Contracts
 from rmpa.core.counters import Counters
-from rmpa.gateway.rules import CrossingRules, MeshSource, SourceKind
+from rmpa.gateway import limits
+from rmpa.gateway.rules import CrossingRules
+from rmpa.gateway.sites import topics
 from rmpa.gateway.sites.keys import SiteGateway
 from rmpa.gateway.sites.site import SiteNeighbour
 from rmpa.gateway.sites.topics import SiteContext
 from rmpa.ros.wire.tcpros import TopicDescription
-from tests.gateway.memory_graph import MemoryGraph, MemoryTap, MemoryTopic
-from tests.gateway.zenoh_bed import ZenohBed, bed, until
+from tests.gateway.memory_graph import MemoryGraph, MemoryTopic
+from tests.gateway.memory_zenoh import MemoryZenoh, eventually
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator
 
     from rmpa.bridge.policy import PermissionGate
     from rmpa.config.rules import CrossingRule
-    from rmpa.core.contract import ContractRule
     from rmpa.gateway.sites.topics import ImportedTopic
     from rmpa.gateway.topics import Export
-    from rmpa.gateway.zenoh.session import OpenSession
 
 MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
 
 
 def site_context(
-    name: str,
-    graph: object,
-    session: object,
-    rules: CrossingRules | None = None,
-    contracts: tuple[ContractRule, ...] = (),
-    timeout: float = 30.0,
+    name: str, graph: Any, session: Any, rules: CrossingRules | None = None, timeout: float = 30.0
 ) -> SiteContext:
     """What the parts of a site share; calls take ``timeout`` seconds at most."""
     services = ServiceSettings(rules=(ServiceRule(("/**",), timeout),))
     bridge = BridgeContext.of(Settings(services=services))
-    made: tuple[Any, Any] = graph, session
-    return SiteContext(name, *made, rules or CrossingRules(), bridge, Contracts(contracts), Counters())
+    return SiteContext(name, graph, session, rules or CrossingRules(), bridge, Contracts(()), Counters())
 
 
 def described(latching: bool = False, md5sum: str = MD5, type_name: str = "odd_msgs/Odd") -> TopicDescription:
@@ -54,78 +49,13 @@ def described(latching: bool = False, md5sum: str = MD5, type_name: str = "odd_m
     return TopicDescription(type_name, md5sum, "string data\n", latching)
 
 
-class SiteGraph(MemoryGraph):
-    """A graph whose publishers answer later, and give their latched message to each new connection."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.latched: dict[MeshSource, bytes] = {}
-
-    def add(
-        self, name: str, description: TopicDescription, *, module: str = "arm", node: str = "/talker", run: str = "0"
-    ) -> MeshSource:
-        """A node of a module publishes."""
-        proxy = f"/rmpa/{module}{node}"
-        source = MeshSource(SourceKind.TOPIC, module, run * 32, node, name, description.type, name, proxy)
-        self._publishers[source.kind, name, proxy] = description
-        return self._add(source)
-
-    def describe_anew(self, source: MeshSource, description: TopicDescription) -> None:
-        """The publisher starts again with another definition."""
-        self._publishers[source.kind, source.here, source.proxy] = description
-        for tap in self.taps:
-            if tap.source == source:
-                asyncio.get_running_loop().call_soon(self._describe, tap, tap.on_described)  # type: ignore[attr-defined]
-
-    def send(self, source: MeshSource, body: bytes) -> int:
-        if self._publishers[source.kind, source.here, source.proxy].latching:
-            self.latched[source] = body
-        return super().send(source, body)
-
-    def tap(
-        self,
-        source: MeshSource,
-        on_message: Callable[[memoryview], None],
-        on_described: Callable[[TopicDescription], None],
-        on_lost: Callable[[str], None],
-        *,
-        listener: str = "",
-    ) -> MemoryTap:
-        tap = LateTap(self, source, on_message, None, on_described)
-        asyncio.get_running_loop().call_soon(self._describe, tap, on_described)
-        return tap
-
-    def _describe(self, tap: MemoryTap, on_described: Callable[[TopicDescription], None]) -> None:
-        source = tap.source
-        if isinstance(tap, LateTap) and tap.closed:
-            return
-        tap.description = self._publishers[source.kind, source.here, source.proxy]
-        if tap not in self.taps:
-            self.taps.append(tap)
-        on_described(tap.description)
-        if source in self.latched:
-            tap.on_message(memoryview(self.latched[source]))
-
-
-@dataclass(eq=False)
-class LateTap(MemoryTap):
-    """A tap that is connected after a turn of the loop."""
-
-    on_described: Callable[[TopicDescription], None]
-    closed: bool = False
-
-    def close(self) -> None:
-        self.closed = True
-        super().close()
-
-
 @dataclass(eq=False)
 class Site:
     """One gateway of a site."""
 
     neighbour: SiteNeighbour
-    graph: SiteGraph
-    session: OpenSession
+    graph: MemoryGraph
+    session: Any
 
     def topic(self, name: str, node: str = "/talker") -> MemoryTopic:
         """A topic that is shown here."""
@@ -151,35 +81,37 @@ class Site:
 
     async def subscribed(self, name: str, node: str = "/talker") -> MemoryTopic:
         """Subscribe to a topic of the other site, and wait until its messages come."""
-        await until(lambda: self.shows(name, node))
+        await eventually(lambda: self.shows(name, node))
         topic = self.topic(name, node)
         topic.on_demand(True)
-        await until(lambda: topic.description)
+        await eventually(lambda: topic.description)
         return topic
 
 
 @dataclass(eq=False)
 class SiteBed:
-    """Gateways at one router."""
+    """Gateways of one network, which makes their sessions."""
 
-    zenoh: ZenohBed
+    network: Any
     opened: list[Site] = field(default_factory=list)
+
+    async def session(self) -> Any:
+        made = self.network.session()
+        return made if isinstance(self.network, MemoryZenoh) else await made
 
     async def site(
         self,
         name: str,
         rank: int = 100,
         *,
-        graph: SiteGraph | None = None,
+        graph: MemoryGraph | None = None,
         rules: tuple[CrossingRule, ...] = (),
-        contracts: tuple[ContractRule, ...] = (),
         gate: PermissionGate = OPEN_GATE,
     ) -> Site:
         """Open one more gateway, and start it."""
-        session = await self.zenoh.session()
-        graph = graph if graph is not None else SiteGraph()
+        session, graph = await self.session(), graph or MemoryGraph()
         own = SiteGateway(name, rank, f"{len(self.opened) + 1:032x}")
-        context = site_context(name, graph, session, CrossingRules(rules, gate=gate), contracts)
+        context = site_context(name, graph, session, CrossingRules(rules, gate=gate))
         site = Site(SiteNeighbour(context, own), graph, session)
         self.opened.append(site)
         site.neighbour.start()
@@ -188,15 +120,18 @@ class SiteBed:
     async def pair(self) -> tuple[Site, Site]:
         """The sites ``yard`` and ``hall``, which lead."""
         sites = await self.site("yard"), await self.site("hall")
-        await until(lambda: all(site.neighbour.leads for site in sites))
+        await eventually(lambda: all(site.neighbour.leads for site in sites))
         return sites
 
 
 @contextlib.asynccontextmanager
-async def site_bed() -> AsyncIterator[SiteBed]:
-    """A router without gateways; everything is closed at the end."""
-    async with bed() as zenoh:
-        made = SiteBed(zenoh)
+async def site_bed(network: Any = None) -> AsyncIterator[SiteBed]:
+    """A network without gateways, in memory by default; what they wait for is short, and all is closed at the end."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(limits, "LEADER_PATIENCE", 0.02)
+        for name in ("_TAP_LINGER", "_DEMAND_LINGER", "_IDLE_CHECK"):
+            patch.setattr(topics, name, 0.05)
+        made = SiteBed(network or MemoryZenoh())
         try:
             yield made
         finally:

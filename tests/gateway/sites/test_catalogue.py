@@ -28,6 +28,10 @@ class Followed(SiteCatalogue):
         self.told: list[tuple[CatalogueChange, SiteModule | SiteSource]] = []
         super().__init__(own, lambda change, item: self.told.append((change, item)))
 
+    def all_tokens(self, now: float, *, alive: bool) -> None:
+        for item in EVERYTHING:
+            self.token(item.token(), now, alive=alive)
+
 
 def told(catalogue: Followed) -> list[tuple[CatalogueChange, SiteModule | SiteSource]]:
     events, catalogue.told[:] = list(catalogue.told), []
@@ -36,29 +40,23 @@ def told(catalogue: Followed) -> list[tuple[CatalogueChange, SiteModule | SiteSo
 
 def with_everything() -> Followed:
     catalogue = Followed()
-    for item in EVERYTHING:
-        catalogue.token(item.token(), 0.0, alive=True)
+    catalogue.all_tokens(0.0, alive=True)
     told(catalogue)
     return catalogue
 
 
-def test_a_module_that_is_killed_is_gone_within_a_fifth_of_a_second_with_its_sources() -> None:
+@pytest.mark.parametrize(("gone", "also", "left"), [(ARM, [SCAN], [BASE]), (SCAN, [], [ARM, BASE])])
+def test_a_module_that_is_killed_is_gone_within_a_fifth_of_a_second_with_its_sources_and_a_source_alone(
+    gone: SiteModule | SiteSource, also: list[SiteSource], left: list[SiteModule]
+) -> None:
     catalogue = with_everything()
-    catalogue.token(ARM.token(), 10.0, alive=False)
+    catalogue.token(gone.token(), 10.0, alive=False)
     due = catalogue.next_timer()
     assert due is not None
     assert due <= 10.2
     catalogue.handle_timer(due)
-    assert told(catalogue) == [(GONE, SCAN), (GONE, ARM)]
-    assert catalogue.modules("cloud") == [BASE]
-
-
-def test_a_source_that_is_withdrawn_goes_alone() -> None:
-    catalogue = with_everything()
-    catalogue.token(SCAN.token(), 10.0, alive=False)
-    catalogue.handle_timer(10.2)
-    assert told(catalogue) == [(GONE, SCAN)]
-    assert catalogue.modules("cloud") == [ARM, BASE]
+    assert told(catalogue) == [(GONE, each) for each in (*also, gone)]
+    assert catalogue.modules("cloud") == left
 
 
 @pytest.mark.parametrize("order", [EVERYTHING, EVERYTHING[::-1]])
@@ -74,47 +72,35 @@ def test_another_gateway_that_takes_over_takes_nothing_down(
     for back in (ARM, BASE, SCAN, STOP):
         catalogue.token(back.token(), 10.0 + limits.LEADER_PATIENCE + 0.1, alive=True)
     catalogue.handle_timer(20.0)
-    changes = told(catalogue)
-    assert {change for change, _ in changes} == {RENEWED}
-    assert {item for _, item in changes} == {ARM, BASE, SCAN, STOP}
+    assert set(told(catalogue)) == {(RENEWED, item) for item in (ARM, BASE, SCAN, STOP)}
 
 
 def test_a_site_that_does_not_come_back_is_gone_after_the_grace() -> None:
     catalogue = with_everything()
-    for item in EVERYTHING:
-        catalogue.token(item.token(), 10.0, alive=False)
+    catalogue.all_tokens(10.0, alive=False)
     catalogue.handle_timer(10.0 + limits.SITE_GRACE)
     changes = told(catalogue)
     assert {item for change, item in changes if change is GONE} == {ARM, BASE, SCAN, STOP}
     assert changes.index((GONE, SCAN)) < changes.index((GONE, ARM))
-    assert catalogue.sites == ()
-    assert catalogue.next_timer() is None
+    assert (catalogue.sites, catalogue.next_timer()) == ((), None)
 
 
 def test_a_short_break_of_the_link_takes_nothing_down() -> None:
     catalogue = with_everything()
-    for item in EVERYTHING:
-        catalogue.token(item.token(), 10.0, alive=False)
-    for item in EVERYTHING:
-        catalogue.token(item.token(), 10.4, alive=True)
+    catalogue.all_tokens(10.0, alive=False)
+    catalogue.all_tokens(10.4, alive=True)
     catalogue.handle_timer(100.0)
     assert GONE not in {change for change, _ in told(catalogue)}
     assert catalogue.sources(ARM) == [SCAN]
 
 
-def test_tokens_of_this_site_are_not_another_sites() -> None:
+def test_tokens_of_this_site_are_not_another_sites_and_those_that_are_none_are_counted() -> None:
     catalogue = Followed("cloud")
-    for item in EVERYTHING:
-        catalogue.token(item.token(), 0.0, alive=True)
-    assert catalogue.sites == ()
-
-
-def test_tokens_that_are_none_are_counted() -> None:
-    catalogue = Followed()
+    catalogue.all_tokens(0.0, alive=True)
+    assert (catalogue.sites, catalogue.counters.as_dict()) == ((), {})
     for key in ("", "rmpa/1/cloud", ARM.token() + "x", f"rmpa/2{ARM.token()[6:]}", SCAN.token() + "/later"):
         catalogue.token(key, 0.0, alive=True)
-    assert catalogue.sites == ()
-    assert catalogue.counters["site.token.malformed"] == 4
+    assert (catalogue.sites, catalogue.counters["site.token.malformed"]) == ((), 4)
     assert catalogue.counters["site.token.later_version"] == 1
 
 
@@ -127,10 +113,9 @@ def test_sites_modules_and_sources_have_bounds_that_are_told(monkeypatch: pytest
     for module in modules:
         catalogue.token(module.token(), 0.0, alive=True)
     for number in range(5):
-        source = SiteSource(modules[0], SourceKind.TOPIC, "std_msgs/String", "/n", f"/t{number}")
-        catalogue.token(source.token(), 0.0, alive=True)
-        orphan = SiteSource(modules[3], SourceKind.TOPIC, "std_msgs/String", "/n", f"/t{number}")
-        catalogue.token(orphan.token(), 0.0, alive=True)
+        for module in (modules[0], modules[3]):  # the last one was refused
+            source = SiteSource(module, SourceKind.TOPIC, "std_msgs/String", "/n", f"/t{number}")
+            catalogue.token(source.token(), 0.0, alive=True)
     for number in range(4):
         catalogue.token(SiteModule(f"site{number}", "arm", "0" * 32).token(), 0.0, alive=True)
     assert len(catalogue.modules("cloud")) == 2

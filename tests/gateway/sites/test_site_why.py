@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,6 @@ from rmpa.gateway import limits
 from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.gateway.sites.answers import SiteAnswers, WhyQuestion, here_stages, parse_ways, sent_stages
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
-from rmpa.gateway.sites.params import SiteParams
 from rmpa.gateway.sites.plans import SiteImport
 from rmpa.observe.operations import INFO, PARAM, REPORT, WHY
 from rmpa.observe.peer_info import FAIL, OK, WARN, Check
@@ -29,10 +28,10 @@ from tests.gateway.memory_zenoh import eventually as until
 from tests.gateway.sites.site_bed import site_bed
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
     from rmpa.observe.peer_info import SitesReport
     from tests.gateway.sites.site_bed import Site, SiteBed
-
-pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 
 TEXT = TopicDescription("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n")
 SCAN = SiteImport(
@@ -47,7 +46,13 @@ class Asked:
 
     site: Site
     answers: SiteAnswers
-    params: list[tuple[str, str, str]]
+    params: list[tuple[str, str, str]] = field(default_factory=list)
+
+    async def ask(self, asker: str, at: str, module: str, args: dict[str, Any]) -> object:
+        """As ``SiteParams``."""
+        del asker
+        self.params.append((at, module, args["what"]))
+        return args
 
     async def why(self, name: str, site: str = "", module: str = "", asker: str = "") -> list[Diagnosis]:
         args = {"name": name, "site": site, "module": module}
@@ -59,27 +64,35 @@ class Asked:
         return found
 
 
-async def asked(
-    bed: SiteBed,
-    name: str,
-    rules: tuple[CrossingRule, ...] = (),
-    permissions: tuple[PermissionRule, ...] | None = None,
-) -> Asked:
-    gate = PermissionGate(None if permissions is None else Permissions(TrustSettings(rules=permissions)))
+class AskedBed:
+    """Sites that are asked."""
 
-    site = await bed.site(name, rules=rules, gate=gate)
-    params: list[tuple[str, str, str]] = []
+    def __init__(self, bed: SiteBed) -> None:
+        self._bed = bed
 
-    class Params(SiteParams):
-        async def ask(self, asker: str, at: str, module: str, args: dict[str, Any]) -> object:
-            del asker
-            params.append((at, module, args["what"]))
-            return args
+    async def site(
+        self, name: str, rules: tuple[CrossingRule, ...] = (), permissions: tuple[PermissionRule, ...] | None = None
+    ) -> Asked:
+        gate = PermissionGate(None if permissions is None else Permissions(TrustSettings(rules=permissions)))
+        site = await self._bed.site(name, rules=rules, gate=gate)
+        params: Any = SimpleNamespace()
+        asked = Asked(site, SiteAnswers(site.neighbour, params))
+        params.ask = asked.ask
+        await until(lambda: site.neighbour.leads)
+        return asked
 
-    unused: Any = None
-    answers = SiteAnswers(site.neighbour, Params(site.neighbour.context, unused))
-    await until(lambda: site.neighbour.leads)
-    return Asked(site, answers, params)
+    async def pair(self, name: str = "/chatter") -> tuple[Asked, Asked]:
+        """The sites ``yard``, which has a topic, and ``hall``, which shows it."""
+        yard, hall = await self.site("yard"), await self.site("hall")
+        yard.site.graph.add(name, TEXT)
+        await until(lambda: hall.site.shows(name))
+        return yard, hall
+
+
+@pytest.fixture
+async def bed() -> AsyncIterator[AskedBed]:
+    async with site_bed() as made:
+        yield AskedBed(made)
 
 
 def levels(diagnosis: Diagnosis) -> dict[str, str]:
@@ -91,105 +104,99 @@ def failed(way: Diagnosis) -> Check:
     return way.failed
 
 
-async def test_rules_of_both_sites_are_named() -> None:
+async def test_rules_of_both_sites_are_named(bed: AskedBed) -> None:
     out = CrossingRule(names=("/home/**",), crossing=Crossing.NONE)
     into = CrossingRule(names=("/noise",), crossing=Crossing.OUT)
-    async with site_bed() as bed:
-        yard, hall = await asked(bed, "yard", (out,)), await asked(bed, "hall", (into,))
-        for name in ("/home/diary", "/noise", "/told"):
-            yard.site.graph.add(name, TEXT)
-        await until(lambda: hall.site.shows("/told"))
-        (kept,) = await hall.why("/home/diary", "yard")
-        assert (failed(kept).name, "gateway.rule 1 (none: /home/**)" in failed(kept).text) == ("rule there", True)
-        (noise,) = await hall.why("/noise")
-        assert (failed(noise).name, "gateway.rule 1 (out: /noise)" in failed(noise).text) == ("rule here", True)
-        (own,) = await yard.why("/home/diary", asker="arm")
-        assert failed(own).name == "rule here"
-        (none,) = await hall.why("/none", "yard", "arm")
-        assert failed(none).text == "no node of arm at yard has /none, as the gateway there sees it"
-        info = await hall.report(INFO, site="yard")
-        (site,) = info.sites
-        problems = {source.name: source.problem for source in site.sources}
-        assert problems["/told"] == ""
-        assert "lets it not come in" in problems["/noise"]
-        assert site.not_shown == 1
+    yard, hall = await bed.site("yard", (out,)), await bed.site("hall", (into,))
+    for name in ("/home/diary", "/noise", "/told"):
+        yard.site.graph.add(name, TEXT)
+    await until(lambda: hall.site.shows("/told"))
+    (kept,) = await hall.why("/home/diary", "yard")
+    assert (failed(kept).name, "gateway.rule 1 (none: /home/**)" in failed(kept).text) == ("rule there", True)
+    (noise,) = await hall.why("/noise")
+    assert (failed(noise).name, "gateway.rule 1 (out: /noise)" in failed(noise).text) == ("rule here", True)
+    (own,) = await yard.why("/home/diary", asker="arm")
+    assert failed(own).name == "rule here"
+    (none,) = await hall.why("/none", "yard", "arm")
+    assert failed(none).text == "no node of arm at yard has /none, as the gateway there sees it"
+    info = await hall.report(INFO, site="yard")
+    (site,) = info.sites
+    problems = {source.name: source.problem for source in site.sources}
+    assert problems["/told"] == ""
+    assert "lets it not come in" in problems["/noise"]
+    assert site.not_shown == 1
 
 
-async def test_a_module_and_a_site_are_told_only_of_what_they_may_have() -> None:
+async def test_a_module_and_a_site_are_told_only_of_what_they_may_have(bed: AskedBed) -> None:
     """The answers about what is denied are equal to those about what is not there."""
     to_desk = PermissionRule(("desk",), names={"subscribe": ("/open",), "call": ("/open",)})
     to_hall = PermissionRule(("hall",), names={"subscribe": ("/open", "/hidden")})
-    async with site_bed() as bed:
-        yard = await asked(bed, "yard", permissions=(to_hall,))
-        to_yard = PermissionRule(("yard",), names={"publish": ("/**",)})
-        hall = await asked(bed, "hall", permissions=(to_desk, to_yard))
-        for name in ("/open", "/hidden", "/secret"):
-            yard.site.graph.add(name, TEXT)
-            hall.site.graph.add(f"/home{name}", TEXT, module="press")
-        hall.site.graph.add("/home/mine", TEXT, module="desk")
-        await until(lambda: hall.site.shows("/hidden") and hall.site.shows("/open"))
-        for site, names in (("yard", {"/open"}), ("hall", {"/home/mine"})):
-            (told,) = (await hall.report(INFO, "desk", site=site)).sites
-            assert {source.name for source in told.sources} == names
-            assert sum(module.topics for module in told.modules) == 1
-            assert len((await hall.report(INFO, site=site)).sites[0].sources) > 1, "this machine's user"
-        for name, real in (("/hidden", True), ("/none", False)):
-            assert await hall.why(name, asker="desk") == []
-            (denied,) = await hall.why(name, "yard", asker="desk")
-            assert str(denied.failed).replace(name, "NAME").count("do not let desk subscribe to NAME") == 1, real
-        (way,) = await hall.why("/open", asker="desk")
-        assert way.node == "/talker"
-        said = []
-        for name in ("/secret", "/none"):
-            (refused,) = await hall.why(name, "yard", "arm")
-            said.append(str(refused.failed).replace(name, "NAME"))
-        assert said[0] == said[1]
-        assert "the permissions there do not let hall subscribe to NAME" in said[0]
+    yard = await bed.site("yard", permissions=(to_hall,))
+    to_yard = PermissionRule(("yard",), names={"publish": ("/**",)})
+    hall = await bed.site("hall", permissions=(to_desk, to_yard))
+    for name in ("/open", "/hidden", "/secret"):
+        yard.site.graph.add(name, TEXT)
+        hall.site.graph.add(f"/home{name}", TEXT, module="press")
+    hall.site.graph.add("/home/mine", TEXT, module="desk")
+    await until(lambda: hall.site.shows("/hidden") and hall.site.shows("/open"))
+    for site, names in (("yard", {"/open"}), ("hall", {"/home/mine"})):
+        (told,) = (await hall.report(INFO, "desk", site=site)).sites
+        assert {source.name for source in told.sources} == names
+        assert sum(module.topics for module in told.modules) == 1
+        assert len((await hall.report(INFO, site=site)).sites[0].sources) > 1, "this machine's user"
+    for name, real in (("/hidden", True), ("/none", False)):
+        assert await hall.why(name, asker="desk") == []
+        (denied,) = await hall.why(name, "yard", asker="desk")
+        assert str(denied.failed).replace(name, "NAME").count("do not let desk subscribe to NAME") == 1, real
+    (way,) = await hall.why("/open", asker="desk")
+    assert way.node == "/talker"
+    said = []
+    for name in ("/secret", "/none"):
+        (refused,) = await hall.why(name, "yard", "arm")
+        said.append(str(refused.failed).replace(name, "NAME"))
+    assert said[0] == said[1]
+    assert "the permissions there do not let hall subscribe to NAME" in said[0]
 
 
-async def test_a_site_that_left_is_unreachable_since_then_and_one_that_never_was_is_no_site() -> None:
-    async with site_bed() as bed:
-        yard, hall = await asked(bed, "yard"), await asked(bed, "hall")
-        yard.site.graph.add("/chatter", TEXT)
-        await until(lambda: hall.site.shows("/chatter"))
-        report = await hall.report()
-        assert [(site.name, site.state) for site in report.sites] == [("hall", "this site"), ("yard", "joined")]
-        assert report.leads
-        (module,) = report.sites[1].modules
-        assert (module.name, module.topics, module.services, module.shown) == ("arm", 1, 0, 1)
-        await yard.site.neighbour.close()
-        await until(lambda: hall.site.neighbour.history.away == ("yard",))
-        report = await hall.report()
-        assert report.sites[1].state == "unreachable"
-        assert report.sites[1].since_ago is not None
-        (way,) = await hall.why("/chatter", "yard")
-        assert failed(way).text.startswith("site yard is unreachable since")
-        (unnamed,) = await hall.why("/chatter")  # the question of a user who does not know whose it was
-        assert failed(unnamed).text.startswith("site yard is unreachable since")
-        assert await hall.why("/other") == []
-        assert await hall.why("/chatter", "joystick") == []  # a peer's name
-        (moon,) = await hall.why("/chatter", "moon", "arm")
-        assert "no gateway of a site moon" in failed(moon).text
-        with pytest.raises(RmpaError, match="site yard is unreachable since"):
-            await hall.answers.answer(PARAM, {"site": "yard", "module": "arm"})
-        with pytest.raises(UnreachableError, match="known are: none"):
-            await hall.answers.answer(PARAM, {"site": "moon", "module": "arm"})
+async def test_a_site_that_left_is_unreachable_since_then_and_one_that_never_was_is_no_site(bed: AskedBed) -> None:
+    yard, hall = await bed.pair()
+    report = await hall.report()
+    assert [(site.name, site.state) for site in report.sites] == [("hall", "this site"), ("yard", "joined")]
+    assert report.leads
+    (module,) = report.sites[1].modules
+    assert (module.name, module.topics, module.services, module.shown) == ("arm", 1, 0, 1)
+    await yard.site.neighbour.close()
+    await until(lambda: hall.site.neighbour.history.away == ("yard",))
+    report = await hall.report()
+    assert report.sites[1].state == "unreachable"
+    assert report.sites[1].since_ago is not None
+    (way,) = await hall.why("/chatter", "yard")
+    assert failed(way).text.startswith("site yard is unreachable since")
+    (unnamed,) = await hall.why("/chatter")  # the question of a user who does not know whose it was
+    assert failed(unnamed).text.startswith("site yard is unreachable since")
+    assert await hall.why("/other") == []
+    assert await hall.why("/chatter", "joystick") == []  # a peer's name
+    (moon,) = await hall.why("/chatter", "moon", "arm")
+    assert "no gateway of a site moon" in failed(moon).text
+    with pytest.raises(RmpaError, match="site yard is unreachable since"):
+        await hall.answers.answer(PARAM, {"site": "yard", "module": "arm"})
+    with pytest.raises(UnreachableError, match="known are: none"):
+        await hall.answers.answer(PARAM, {"site": "moon", "module": "arm"})
 
 
-async def test_questions_are_checked_before_they_are_passed_on() -> None:
-    async with site_bed() as bed:
-        hall = await asked(bed, "hall")
-        for what, args in (
-            ("site.shout", {"site": "hall", "module": "arm"}),
-            (PARAM, {"site": "ha ll", "module": "arm", "what": "param.get"}),
-            (PARAM, {"site": "hall", "module": "*", "what": "param.get"}),
-        ):
-            with pytest.raises(RmpaError):
-                await hall.answers.answer(what, args)
-        assert hall.params == []
-        question = {"site": "hall", "module": "arm", "what": "param.get", "key": "/x"}
-        assert await hall.answers.answer(PARAM, question) == question
-        assert hall.params == [("hall", "arm", "param.get")]
+async def test_questions_are_checked_before_they_are_passed_on(bed: AskedBed) -> None:
+    hall = await bed.site("hall")
+    for what, args in (
+        ("site.shout", {"site": "hall", "module": "arm"}),
+        (PARAM, {"site": "ha ll", "module": "arm", "what": "param.get"}),
+        (PARAM, {"site": "hall", "module": "*", "what": "param.get"}),
+    ):
+        with pytest.raises(RmpaError):
+            await hall.answers.answer(what, args)
+    assert hall.params == []
+    question = {"site": "hall", "module": "arm", "what": "param.get", "key": "/x"}
+    assert await hall.answers.answer(PARAM, question) == question
+    assert hall.params == [("hall", "arm", "param.get")]
 
 
 def test_losses_are_told_with_the_hop_where_they_happen() -> None:
@@ -206,79 +213,66 @@ def test_losses_are_told_with_the_hop_where_they_happen() -> None:
     assert arrived.text == (
         "80 messages have come, 9.5 Hz; 10 were lost between the gateways; 2 have another md5 sum than their header"
     )
+    other: Any = SimpleNamespace(problem="its messages have the md5 sum aa, its header bb")
+    assert [(stage.name, stage.level) for stage in here_stages(SCAN, other)[-1:]] == [("md5", FAIL)]
 
 
-def test_another_definition_is_the_stage_md5() -> None:
-    found: Any = SimpleNamespace(problem="its messages have the md5 sum aa, its header bb")
-    stages = here_stages(SCAN, found)
-    assert (stages[-1].name, stages[-1].level) == ("md5", FAIL)
+async def test_a_gateway_that_does_not_tell_leaves_its_half_open(bed: AskedBed) -> None:
+    _, hall = await bed.pair()
+    hall.site.session.network.queryables.clear()
+    (way,) = await hall.why("/chatter")
+    assert (levels(way)["source there"], levels(way)["demand here"]) == ("unknown", "fail")
 
 
-async def test_a_gateway_that_does_not_tell_leaves_its_half_open() -> None:
-    async with site_bed() as bed:
-        yard, hall = await asked(bed, "yard"), await asked(bed, "hall")
-        yard.site.graph.add("/chatter", TEXT)
-        await until(lambda: hall.site.shows("/chatter"))
-        await yard.answers.close()
-        (way,) = await hall.why("/chatter")
-        assert levels(way)["source there"] == "unknown"
-        assert levels(way)["demand here"] == "fail"
-
-
-async def test_a_router_that_keeps_a_subscription_back_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_router_that_keeps_a_subscription_back_is_named(
+    bed: AskedBed, monkeypatch: pytest.MonkeyPatch
+) -> None:
     said = Check("demand there", WARN, "no other site subscribes")
     way = Diagnosis.of((said,), name="/chatter", peer="arm", to="site hall", node="/talker")
 
     async def ask(*_args: object, **_kwargs: object) -> object:
         return (way,), ""
 
-    async with site_bed() as bed:
-        yard, hall = await asked(bed, "yard"), await asked(bed, "hall")
-        yard.site.graph.add("/chatter", TEXT)
-        await until(lambda: hall.site.shows("/chatter"))
-        monkeypatch.setattr(SiteAnswers, "_ask", ask)
-        (told,) = await hall.why("/chatter")
-        assert levels(told)["demand there"] == "warn"
-        await hall.site.subscribed("/chatter")
-        (told,) = await hall.why("/chatter")
-        assert failed(told).name == "router"
+    _, hall = await bed.pair()
+    monkeypatch.setattr(SiteAnswers, "_ask", ask)
+    (told,) = await hall.why("/chatter")
+    assert levels(told)["demand there"] == "warn"
+    await hall.site.subscribed("/chatter")
+    (told,) = await hall.why("/chatter")
+    assert failed(told).name == "router"
 
 
-async def test_a_topic_for_some_sites_is_told_of_to_each_as_the_rules_are_for_it() -> None:
-    async with site_bed() as bed:
-        rules = (CrossingRule(sites=("hall",), crossing=Crossing.NONE),)
-        yard = await asked(bed, "yard", rules)
-        hall, cellar, attic = await asked(bed, "hall"), await asked(bed, "cellar"), await asked(bed, "attic")
-        yard.site.graph.add("/chatter", TEXT)
-        await cellar.site.subscribed("/chatter")
-        await until(lambda: attic.site.shows("/chatter"))
-        await until(lambda: yard.site.exported("/chatter", "cellar").wanted)
-        (way,) = await cellar.why("/chatter")
-        assert levels(way)["demand there"] == "ok"
-        (way,) = await attic.why("/chatter")
-        assert levels(way)["demand there"] == "warn", "the subscriber is at another site"
-        (way,) = await hall.why("/chatter", "yard", "arm")
-        assert levels(way)["rule there"] == "fail"
-        assert "gateway.rule 1" in way.stages[-1].text
-        assert {way.to for way in await yard.why("/chatter", asker="arm")} == {"site attic", "site cellar"}
-        report = await yard.report(INFO, site="yard")
-        assert [(module.name, module.topics) for module in report.sites[0].modules] == [("arm", 1)]
+async def test_a_topic_for_some_sites_is_told_of_to_each_as_the_rules_are_for_it(bed: AskedBed) -> None:
+    rules = (CrossingRule(sites=("hall",), crossing=Crossing.NONE),)
+    yard = await bed.site("yard", rules)
+    hall, cellar, attic = await bed.site("hall"), await bed.site("cellar"), await bed.site("attic")
+    yard.site.graph.add("/chatter", TEXT)
+    await cellar.site.subscribed("/chatter")
+    await until(lambda: attic.site.shows("/chatter"))
+    await until(lambda: yard.site.exported("/chatter", "cellar").wanted)
+    (way,) = await cellar.why("/chatter")
+    assert levels(way)["demand there"] == "ok"
+    (way,) = await attic.why("/chatter")
+    assert levels(way)["demand there"] == "warn", "the subscriber is at another site"
+    (way,) = await hall.why("/chatter", "yard", "arm")
+    assert levels(way)["rule there"] == "fail"
+    assert "gateway.rule 1" in way.stages[-1].text
+    assert {way.to for way in await yard.why("/chatter", asker="arm")} == {"site attic", "site cellar"}
+    report = await yard.report(INFO, site="yard")
+    assert [(module.name, module.topics) for module in report.sites[0].modules] == [("arm", 1)]
 
 
 def test_a_question_that_is_none_is_refused() -> None:
-    for data in (b"", b"{}", b'{"site": "a", "name": "x y"}', b"[" * 5000):
-        with pytest.raises(RemoteProtocolError):
-            WhyQuestion.parse(data)
-    with pytest.raises(RemoteProtocolError):
-        parse_ways(b"{")
-    with pytest.raises(RemoteProtocolError):
-        parse_ways(b" " * limits.SITE_WHY_MAX + b"[]")
+    questions = (b"", b"{}", b'{"site": "a", "name": "x y"}', b"[" * 5000)
+    answers = (b"{", b" " * limits.SITE_WHY_MAX + b"[]")
+    for parse, texts in ((WhyQuestion.parse, questions), (parse_ways, answers)):
+        for data in texts:
+            with pytest.raises(RemoteProtocolError):
+                parse(data)
 
 
 def test_the_words_of_another_site_are_bounded_and_safe_to_show() -> None:
     stage = Check("sent\x1b[2J", OK, "a" * 1000, "\nroot@pc:~# ")
     way = Diagnosis.of((stage,), name="/t", peer="arm", to="site hall")
-    (told,) = parse_ways(msgspec.json.encode([way]))
-    assert told.stages[0].name == "sent\ufffd[2J"
-    assert told.stages[0].remedy == "\ufffdroot@pc:~# "
-    assert len(told.stages[0].text) < 300
+    ((told,),) = (each.stages for each in parse_ways(msgspec.json.encode([way])))
+    assert (told.name, told.remedy, len(told.text) < 300) == ("sent\ufffd[2J", "\ufffdroot@pc:~# ", True)

@@ -10,13 +10,14 @@ import pytest
 
 from rmpa.gateway import limits
 from rmpa.gateway.zenoh.threads import ZenohQos
-from tests.gateway.zenoh_bed import ZenohBed, bed, until
+from tests.gateway.memory_zenoh import eventually
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
+    from collections.abc import Awaitable, Callable, Iterator
 
     from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import OpenSession
+    from tests.gateway.zenoh_bed import ZenohBed
 
 zenoh = pytest.importorskip("zenoh")
 
@@ -24,9 +25,8 @@ KEY = "rmpa/1/hall/arm/t/std_msgs%String/chatter"
 
 
 @pytest.fixture
-async def net() -> AsyncIterator[ZenohBed]:
-    async with bed() as made:
-        yield made
+async def victim(net: ZenohBed) -> OpenSession:
+    return await net.session()
 
 
 @pytest.fixture
@@ -40,59 +40,57 @@ def eve(net: ZenohBed) -> Iterator[Any]:
     session.close()
 
 
+async def repeated(ask: Callable[[], Awaitable[Any]], done: Callable[[Any], object]) -> Any:
+    """Ask until it is done: a declaration needs a moment to be known."""
+    async with asyncio.timeout(20):
+        while not done(answer := await ask()):
+            await asyncio.sleep(0.02)
+    return answer
+
+
 async def counted(session: OpenSession, reason: str) -> int:
     """Wait until something was refused for this reason; return how often."""
-    total = 0
-    async with asyncio.timeout(20):
-        while not total:
-            total += session.take_refused().get(reason, 0)
-            await asyncio.sleep(0.01)
-    return total
+
+    async def taken() -> int:
+        return session.take_refused().get(reason, 0)
+
+    return int(await repeated(taken, bool))
 
 
+@pytest.mark.parametrize(
+    ("bound", "most", "size", "sizes"),
+    [("REPLIES_MAX", 100, 100, [100] * 100), ("REPLY_BYTES_MAX", 100_000, 150_000, [150_000])],
+    ids=["answers", "bytes of answers, of which one always comes"],
+)
 async def test_answers_that_never_end_are_bounded_and_the_query_ends_with_the_first(
-    net: ZenohBed, eve: Any, monkeypatch: pytest.MonkeyPatch
+    victim: OpenSession,
+    eve: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    bound: str,
+    most: int,
+    size: int,
+    sizes: list[int],
 ) -> None:
-    monkeypatch.setattr(limits, "REPLIES_MAX", 100)
-    victim = await net.session()
+    monkeypatch.setattr(limits, bound, most)
     stop = asyncio.Event()
 
     def answer(query: Any) -> None:
         for _ in range(20_000):
             if stop.is_set():
                 break
-            query.reply(query.key_expr, b"x" * 100)
+            query.reply(query.key_expr, b"x" * size)
 
     queryable = eve.declare_queryable("a/b", answer, complete=True)
-    async with asyncio.timeout(20):
-        while not (replies := await victim.get("a/b", timeout=10.0)):
-            await asyncio.sleep(0.02)
+    replies = await repeated(lambda: victim.get("a/b", timeout=10.0), len)
     stop.set()
-    assert len(replies) == 100
+    assert [len(reply.payload) for reply in replies] == sizes
     assert await counted(victim, "zenoh.reply.limit")
     await asyncio.to_thread(queryable.undeclare)
 
 
-async def test_one_large_answer_comes_and_the_bytes_of_more_are_bounded(
-    net: ZenohBed, eve: Any, monkeypatch: pytest.MonkeyPatch
+async def test_messages_and_queries_with_giant_attachments_are_dropped_and_counted(
+    victim: OpenSession, eve: Any
 ) -> None:
-    monkeypatch.setattr(limits, "REPLY_BYTES_MAX", 100_000)
-    victim = await net.session()
-
-    def answer(query: Any) -> None:
-        for _ in range(3):
-            query.reply(query.key_expr, b"x" * 150_000)
-
-    queryable = eve.declare_queryable("a/b", answer, complete=True)
-    async with asyncio.timeout(20):
-        while not (replies := await victim.get("a/b", timeout=5.0)):
-            await asyncio.sleep(0.02)
-    assert [len(reply.payload) for reply in replies] == [150_000]
-    await asyncio.to_thread(queryable.undeclare)
-
-
-async def test_messages_and_queries_with_giant_attachments_are_dropped_and_counted(net: ZenohBed, eve: Any) -> None:
-    victim = await net.session()
     got: list[bytes] = []
     asked: list[bytes] = []
 
@@ -103,43 +101,37 @@ async def test_messages_and_queries_with_giant_attachments_are_dropped_and_count
     victim.subscribe(KEY, lambda sample: got.append(sample.payload))
     victim.queryable("q/q", answer)
     publisher = eve.declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
-    await until(lambda: publisher.matching_status.matching)
+    await eventually(lambda: publisher.matching_status.matching)
     publisher.put(b"giant", attachment=b"a" * 1_000_000)
     publisher.put(b"fits", attachment=b"a" * limits.ATTACHMENT_MAX)
-    await until(lambda: got)
-    assert got == [b"fits"]
+    await eventually(lambda: got == [b"fits"])
     assert await counted(victim, "zenoh.attachment.long") == 1
 
-    def ask(size: int) -> None:
-        list(eve.get("q/q", attachment=b"a" * size, timeout=1.0))
+    async def ask(size: int) -> None:
+        await asyncio.to_thread(lambda: list(eve.get("q/q", attachment=b"a" * size, timeout=1.0)))
 
-    async with asyncio.timeout(20):
-        while b"a" not in asked:
-            await asyncio.to_thread(ask, 1)
-    await asyncio.to_thread(ask, 1_000_000)
+    await repeated(lambda: ask(1), lambda _: asked)
+    await ask(1_000_000)
     assert await counted(victim, "zenoh.attachment.long") == 1
     assert set(asked) == {b"a"}
 
 
-async def test_giant_keys_are_dropped_and_counted(net: ZenohBed, eve: Any) -> None:
-    victim = await net.session()
+async def test_giant_keys_are_dropped_and_counted(victim: OpenSession, eve: Any) -> None:
     tokens: list[str] = []
     victim.watch_tokens("rmpa/1/**", lambda key, _: tokens.append(key))
     long = "rmpa/1/" + "a" * 2 * limits.ZENOH_KEY_MAX
     held = [eve.liveliness().declare_token(key) for key in (long, "rmpa/1/hall/arm/up/00")]
-    await until(lambda: tokens)
-    assert tokens == ["rmpa/1/hall/arm/up/00"]
+    await eventually(lambda: tokens == ["rmpa/1/hall/arm/up/00"])
     assert await counted(victim, "zenoh.key.long")
     for token in held:
         await asyncio.to_thread(token.undeclare)
 
 
 async def test_a_client_that_asks_and_does_not_read_fills_no_memory(
-    net: ZenohBed, eve: Any, monkeypatch: pytest.MonkeyPatch
+    victim: OpenSession, eve: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Answers wait in order for Zenoh; what is beyond the bound ends its query."""
     monkeypatch.setattr(limits, "ANSWERS_WAITING_MAX", 3)
-    victim = await net.session()
     taken: list[int] = []
 
     def answer(query: ArrivedQuery) -> None:
@@ -149,10 +141,8 @@ async def test_a_client_that_asks_and_does_not_read_fills_no_memory(
         query.finish()
 
     victim.queryable("q/q", answer)
-    async with asyncio.timeout(20):
-        while not taken:
-            await asyncio.to_thread(lambda: list(eve.get("q/q", timeout=2.0)))
+    await repeated(lambda: asyncio.to_thread(lambda: list(eve.get("q/q", timeout=2.0))), lambda _: taken)
     assert await counted(victim, "zenoh.answer.limit")
     publisher = victim.publisher(KEY, ZenohQos(), lambda _: None)
     publisher.put(b"it lives")
-    await until(lambda: publisher.sent)
+    await eventually(lambda: publisher.sent)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.gateway.zenoh.threads import ArrivalQueue, Arrivals, QueuedPublisher, SendingLane, ZenohQos
-from tests.gateway.zenoh_bed import until
+from tests.gateway.memory_zenoh import eventually
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -52,7 +52,7 @@ async def test_behind_a_full_transport_the_oldest_are_dropped_and_all_are_counte
     dropped = sum(made.put(b"%d" % number) for number in range(1000))
     assert made.waiting <= 100
     handle.free.set()
-    await until(lambda: not made.waiting)
+    await eventually(lambda: not made.waiting)
     assert handle.got[-1] == b"999"
     assert (made.sent, made.dropped, made.sent + made.dropped) == (len(handle.got), dropped, 1000)
 
@@ -62,11 +62,11 @@ async def test_a_message_larger_than_the_bound_still_goes_alone(lane: SendingLan
     handle.free.clear()
     made = publisher(lane, handle, ZenohQos(bytes=10))
     assert made.put(bytes(100)) == 0
-    await until(lambda: lane_took(made))
+    await eventually(lambda: lane_took(made))
     assert made.put(bytes(100)) == 0
     assert made.put(bytes(200)) == 1
     handle.free.set()
-    await until(lambda: not made.waiting)
+    await eventually(lambda: not made.waiting)
     assert [len(each) for each in handle.got] == [100, 200]
 
 
@@ -82,7 +82,7 @@ async def test_a_flood_does_not_starve_another_publisher_of_its_priority(lane: S
         flood.put(bytes(1000))
     other.put(b"other")
     handle.free.set()
-    await until(lambda: not flood.waiting and not other.waiting)
+    await eventually(lambda: not flood.waiting and not other.waiting)
     assert handle.got.index(b"other") <= 130
 
 
@@ -95,10 +95,10 @@ async def test_a_publisher_that_cannot_send_is_undeclared_after_a_second_and_cou
     for _ in range(200):
         made.put(b"x")
     made.close()
-    await until(lambda: ended)
+    await eventually(lambda: ended)
     assert made.dropped >= 200 - 64
     handle.free.set()
-    await until(lambda: not made.waiting)
+    await eventually(lambda: not made.waiting)
     assert made.sent + made.dropped == 200
     assert ended == ["undeclared"]
 
@@ -110,7 +110,7 @@ async def test_what_zenoh_refuses_counts_as_dropped(lane: SendingLane) -> None:
 
     made = publisher(lane, Closed(), ZenohQos())
     made.put(b"x")
-    await until(lambda: made.dropped == 1)
+    await eventually(lambda: made.dropped == 1)
     assert made.sent == 0
 
 
@@ -127,7 +127,7 @@ async def test_while_the_loop_is_away_the_oldest_arrivals_are_dropped_and_counte
     thread = threading.Thread(target=flood)
     thread.start()
     thread.join()
-    await until(lambda: len(got) == 10)
+    await eventually(lambda: len(got) == 10)
     assert got == list(range(90, 100))
     assert queue.dropped == 90
     assert discarded == list(range(90))
@@ -139,7 +139,7 @@ async def test_large_arrivals_are_bounded_by_their_bytes() -> None:
     for number in range(10):
         queue.add(number, 400)
     queue.add(99, 5000)
-    await until(lambda: got)
+    await eventually(lambda: got)
     assert got == [99]
     assert queue.dropped == 10
 
@@ -160,7 +160,7 @@ async def test_a_flood_on_one_subscriber_leaves_the_loop_and_the_others_their_tu
         flood.add(0)
     other.add(0)
     loop.call_soon(turn)
-    await until(lambda: order.count("flood") == 5000)
+    await eventually(lambda: order.count("flood") == 5000)
     assert order.index("other") <= 64
     assert order.count("loop") >= 10
 
@@ -175,7 +175,7 @@ async def test_an_error_of_one_subscriber_keeps_nothing_from_the_others(caplog: 
     broken, whole = ArrivalQueue(arrivals, fails, 10, 10), ArrivalQueue(arrivals, got.append, 10, 10)
     broken.add(1)
     whole.add(2)
-    await until(lambda: got)
+    await eventually(lambda: got)
     assert "could not be handled" in caplog.text
 
 
@@ -192,6 +192,6 @@ async def test_each_of_a_steady_stream_arrives_soon_at_any_rate() -> None:
 
     thread = threading.Thread(target=produce)
     thread.start()
-    await until(lambda: len(got) == 3000)
+    await eventually(lambda: len(got) == 3000)
     thread.join()
     assert (got, queue.dropped) == (list(range(3000)), 0)

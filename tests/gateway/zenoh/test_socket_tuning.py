@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.gateway.zenoh.config import SocketTuning
-from tests.gateway.zenoh_bed import bed, until
+from tests.gateway.memory_zenoh import eventually
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from tests.gateway.zenoh_bed import ZenohBed
 
 UNSENT = 20_000
 
@@ -45,8 +47,7 @@ def test_other_endpoints_leave_it_alone(ends: tuple[socket.socket, socket.socket
     assert unsent(ours) == before
 
 
-async def test_each_connection_of_a_session_is_found() -> None:
-    async with bed() as net:
-        session = await net.session()
-        await until(lambda: session.endpoints)
-        assert SocketTuning(UNSENT).look(session.endpoints) == 1
+async def test_each_connection_of_a_session_is_found(net: ZenohBed) -> None:
+    session = await net.session()
+    await eventually(lambda: session.endpoints)
+    assert SocketTuning(UNSENT).look(session.endpoints) == 1

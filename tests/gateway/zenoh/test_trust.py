@@ -18,7 +18,7 @@ from rmpa.gateway.zenoh import config as trust
 from rmpa.gateway.zenoh.config import revoked_modules, zenohd_config
 from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.trust.certificates import DenyList
-from tests.gateway.zenoh_bed import until
+from tests.gateway.memory_zenoh import eventually
 from tests.gateway.zenoh_fleet import Fleet
 from tests.trust.io.member_files import SecuredMesh
 
@@ -30,44 +30,53 @@ if TYPE_CHECKING:
 
 zenoh = pytest.importorskip("zenoh")
 
-SCAN = "rmpa/1/home/arm/t/sensor_msgs%LaserScan/scan"
-
 
 @pytest.fixture
 async def fleet(tmp_path: Path) -> AsyncIterator[Fleet]:
     made = Fleet(tmp_path)
-    try:
-        yield made
-    finally:
-        await made.close()
+    yield made
+    await made.close()
 
 
-@pytest.mark.parametrize("default", ["deny", "allow"])
-async def test_a_member_may_use_the_keys_of_sites_whatever_the_rules_of_names_say(fleet: Fleet, default: str) -> None:
+@pytest.fixture
+async def fleet_router(fleet: Fleet, tmp_path: Path, request: pytest.FixtureRequest) -> AsyncIterator[bool]:
+    """A router, by its rules or as zenohd by the file for it; whether it passes on the keys of other programs too."""
+    if request.param != "zenohd":
+        rule = PermissionRule(("a",), effect=Effect.DENY, names={"publish": ("/**",)})
+        await fleet.router(rule, default=request.param)
+        yield request.param == "allow"
+        return
+    file = tmp_path / "zenohd.json5"
+    file.write_text(zenohd_config(fleet.settings("fleet", GatewaySettings(listen=(fleet.endpoint,)))))
+    router = await asyncio.to_thread(lambda: zenoh.open(zenoh.Config.from_file(str(file))))
+    yield False
+    await asyncio.to_thread(router.close)
+
+
+@pytest.mark.parametrize("fleet_router", ["deny", "allow", "zenohd"], indirect=True)
+@pytest.mark.parametrize("key", ["t/sensor_msgs%LaserScan/scan", "to/hall/t/sensor_msgs%LaserScan/scan"])
+async def test_a_member_may_use_the_keys_of_sites_whatever_the_rules_of_names_say(
+    fleet: Fleet, fleet_router: bool, key: str
+) -> None:
     """Gateways judge names; a router with rules for modules only lets members in."""
-    rule = PermissionRule(("a",), effect=Effect.DENY, names={"publish": ("/**",)})
-    await fleet.router(rule, default=default)
-    a, b = await fleet.gateway("a"), await fleet.gateway("b")
-    tokens: list[str] = []
-    got: list[bytes] = []
-    late: list[bytes] = []
-    b.watch_tokens("rmpa/1/**", lambda key, _: tokens.append(key))
+    a, b, key = await fleet.gateway("a"), await fleet.gateway("b"), f"rmpa/1/home/arm/{key}"
+    heard: dict[str, list[object]] = {what: [] for what in ("token", "scan", "late", "valve", "matching")}
+    b.watch_tokens("rmpa/1/**", lambda key, _: heard["token"].append(key))
     a.token("rmpa/1/home/arm/up/00")
-    await until(lambda: tokens)
-    b.subscribe(SCAN, lambda sample: got.append(sample.payload))
-    other: list[bool] = []
-    b.subscribe("plant/valve", lambda sample: other.append(True))
-    matching: list[bool] = []
-    scan = a.publisher(SCAN, ZenohQos(cache=1), matching.append)
+    await eventually(lambda: heard["token"])
+    b.subscribe(key, lambda sample: heard["scan"].append(sample.payload))
+    b.subscribe("plant/valve", lambda sample: heard["valve"].append(sample.payload))
+    scan = a.publisher(key, ZenohQos(cache=1), heard["matching"].append)
     valve = a.publisher("plant/valve", ZenohQos(), lambda _: None)
-    await until(lambda: matching and matching[-1])
+    await eventually(lambda: True in heard["matching"])
     valve.put(b"open")
-    await until(lambda: valve.sent)
+    await eventually(lambda: valve.sent)
     scan.put(b"scan")
-    await until(lambda: got)
-    b.subscribe(SCAN, lambda sample: late.append(sample.payload), history=True)
-    await until(lambda: late)
-    assert (got, late) == ([b"scan"], [b"scan"])
+    await eventually(lambda: heard["scan"])
+    b.subscribe(key, lambda sample: heard["late"].append(sample.payload), history=True)
+    await eventually(lambda: heard["late"])
+    assert (heard["scan"], heard["late"]) == ([b"scan"], [b"scan"])
+    assert bool(heard["valve"]) == fleet_router, "with deny, other programs' keys do not pass"
 
     def stop(query: ArrivedQuery) -> None:
         query.reply(query.key, b"stopped")
@@ -78,7 +87,6 @@ async def test_a_member_may_use_the_keys_of_sites_whatever_the_rules_of_names_sa
         while not (replies := await b.get("rmpa/1/home/arm/s/std_srvs%Trigger/stop", timeout=1.0)):
             await asyncio.sleep(0.02)
     assert [reply.payload for reply in replies] == [b"stopped"]
-    assert bool(other) == (default == "allow"), "with deny, other programs' keys do not pass"
 
 
 async def test_a_renewed_certificate_makes_a_listening_session_stale_and_a_connecting_one_not(fleet: Fleet) -> None:
@@ -87,30 +95,6 @@ async def test_a_renewed_certificate_makes_a_listening_session_stale_and_a_conne
     fleet.mesh.save("fleet", time.time())
     fleet.mesh.save("a", time.time())
     assert (before, (router.stale, a.stale)) == ((False, False), (True, False))
-
-
-async def test_the_file_for_zenohd_opens_a_router_that_enforces_the_same(fleet: Fleet, tmp_path: Path) -> None:
-    gateway = GatewaySettings(listen=(fleet.endpoint,))
-    text = zenohd_config(fleet.settings("fleet", gateway))
-    file = tmp_path / "zenohd.json5"
-    file.write_text(text)
-    router = await asyncio.to_thread(lambda: zenoh.open(zenoh.Config.from_file(str(file))))
-    try:
-        a, b = await fleet.gateway("a"), await fleet.gateway("b")
-        got: list[str] = []
-        matching: list[bool] = []
-        b.subscribe("rmpa/1/**", lambda sample: got.append(sample.key))
-        b.subscribe("plant/**", lambda sample: got.append(sample.key))
-        valve = a.publisher("plant/valve", ZenohQos(), lambda _: None)
-        scan = a.publisher(SCAN, ZenohQos(), matching.append)
-        await until(lambda: matching and matching[-1])
-        valve.put(b"x")
-        await until(lambda: valve.sent)
-        scan.put(b"x")
-        await until(lambda: SCAN in got)
-        assert got == [SCAN]
-    finally:
-        await asyncio.to_thread(router.close)
 
 
 def test_the_file_for_zenohd_needs_certificates_or_says_that_it_is_insecure(tmp_path: Path) -> None:

@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
-from rmpa.gateway.ros2.conversion import PART, ActionPair, NoConversion, action_name
+from rmpa.gateway.ros2.conversion import PART, ActionPair, action_name
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Durability, Ros2Qos, data_key
 from rmpa.gateway.ros2.goals import Goals, GoalsToRos1, GoalsToRos2
 from rmpa.gateway.ros2.graph import SITE, valid_name
 from rmpa.gateway.ros2.pairs import derive_ros1
 from rmpa.gateway.ros2.services import SERVICE_NEEDS
-from rmpa.gateway.ros2.types import TypePair
 from rmpa.gateway.rules import ForeignSource, SourceKind
-from rmpa.gateway.zenoh.threads import ZenohQos
+from rmpa.gateway.zenoh.threads import ZenohQos, first_answer
 from rmpa.ros.types.definitions import Specification, known_specifications
 from rmpa.ros.types.find import find_message_type
 from rmpa.ros.types.messages import MessageType
@@ -24,6 +23,8 @@ from rmpa.runtime.loop import MachineTimer, SystemClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+
+    from rosbags.typesys.store import Typestore
 
     from rmpa.gateway.foreign import ProxiedTopic, TopicTap
     from rmpa.gateway.ros2.format import Ros2Endpoint
@@ -151,6 +152,11 @@ async def find_types(*names: str) -> list[MessageType]:
     return [await asyncio.to_thread(find_message_type, name) for name in names]
 
 
+async def _parts_of(ros1: str) -> list[MessageType]:
+    """Goal, result and feedback of an action of ROS 1; errors as for ``find_types``."""
+    return await find_types(*(f"{ros1}{kind}" for kind in KINDS))
+
+
 # --- A server of ROS 1 for clients of ROS 2 -------------------------------------------------------------------------
 
 
@@ -201,8 +207,8 @@ class OfferedAction(JoinedAction, GoalsToRos1):
             context.say(self.here, "ROS 2 does not allow the name of this action")
             return
         try:
-            kinds = await find_types(*(f"{self.ros1}{kind}" for kind in KINDS))
-            pair = ActionPair(kinds, context.mapping.action(self.ros1), context.types)
+            rule = context.mapping.counterpart(self.ros1, "action")
+            pair = ActionPair(await _parts_of(self.ros1), rule, context.types)
             topics = await find_types(f"{self.ros1}ActionGoal", "actionlib_msgs/GoalID")
         except RmpaError as error:
             context.say(self.here, f"ROS 2 does not see this action: {error}")
@@ -319,12 +325,25 @@ class ShownAction(JoinedAction, GoalsToRos2):
     # --- inside ----------------------------------------------------------------------------------------------------
 
     async def _join(self) -> None:
+        context, server = self._context, self.server
+        ros2 = server.type.removesuffix("_SendGoal")
+
+        def derive(store: Typestore, ros1: str) -> list[MessageType]:
+            own = {f"{ros2}_{kind}": f"{ros1}{kind}" for kind in KINDS}
+            return [derive_ros1(store, each, lambda it: own.get(it) or context.ros1_name(it)) for each in own]
+
+        asked = (
+            ("send_goal", EntityKind.SERVICE),
+            ("get_result", EntityKind.SERVICE),
+            ("feedback", EntityKind.PUBLISHER),
+        )
+        endpoints = [(f"{self._name}{PART}{part}", kind) for part, kind in asked]
         try:
-            pair = await self._find_pair()
+            pair = await context.find_pair(server, ros2, _parts_of, ActionPair, derive, *endpoints)
             headers = [kind.describe() for kind in await find_types("actionlib_msgs/GoalStatusArray")]
             headers += await self._outcome_headers(pair)
         except RmpaError as error:
-            self._context.say(self.here, f"the action of ROS 2's node {self._server} is not shown: {error}")
+            context.say(self.here, f"the action of ROS 2's node {self._server} is not shown: {error}")
             return
         if self._closed:
             return
@@ -349,45 +368,6 @@ class ShownAction(JoinedAction, GoalsToRos2):
         except RmpaError:
             return [_wrapped(pair.ros1, "Feedback", pair.feedback.ros1), _wrapped(pair.ros1, "Result", pair.result)]
 
-    async def _find_pair(self) -> ActionPair:
-        """The types; the server's node is asked for what is not known here.
-
-        Raises:
-            RmpaError: The types are no pair, or ROS 2's are not known.
-        """
-        context, server = self._context, self.server
-        ros2 = server.type.removesuffix("_SendGoal")
-        ros1 = context.mapping.ros1_type(ros2)
-        rule = context.mapping.action(ros1)
-        if rule.name != ros2:
-            rule = TypePair(ros2)
-        known: list[MessageType] = []
-        try:
-            known = await find_types(*(f"{ros1}{kind}" for kind in KINDS))
-            pair = ActionPair(known, rule, context.types)
-            if pair.types["send_goal"][1] == server.type_hash:
-                return pair
-            problem = f"{ros2} has another definition there than {ros1} here: its type hash differs"
-        except RmpaError as error:
-            problem = str(error)
-        own = {f"{ros2}_{kind}": f"{ros1}{kind}" for kind in KINDS}
-        try:
-            fields = await context.asker.learn(
-                (server.name, EntityKind.SERVICE),
-                (f"{self._name}{PART}get_result", EntityKind.SERVICE),
-                (f"{self._name}{PART}feedback", EntityKind.PUBLISHER),
-                of=server,
-            )
-            types = context.types.variant(fields)
-            kinds = known or [
-                derive_ros1(types.store, each, lambda it: own.get(it) or context.ros1_name(it)) for each in own
-            ]
-            return ActionPair(kinds, rule, types)
-        except RmpaError as error:
-            raise NoConversion(f"{problem}; {error}") from error
-        except KeyError as error:
-            raise NoConversion(f"{problem}; {ros2} has no form in ROS 1: {error}") from error
-
     async def _ask(self, service: str, uuid: bytes, request: bytes) -> None:
         if service not in self._callers:
             self._callers[service] = self._declare(self._context.nodes.own_name, EntityKind.CLIENT, service)
@@ -400,9 +380,9 @@ class ShownAction(JoinedAction, GoalsToRos2):
                 timeout=_ROS2_GOAL_TIMEOUT if service == "get_result" else limits.ROS2_CALL_TIMEOUT,
                 all_complete=True,
             )
-            answer = next((answer for answer in answers if answer.ok), None)
-            if answer is None:
-                text = answers[0].payload.decode(errors="replace") if answers else "it is gone"
+            answer = first_answer(answers)
+            if answer is None or not answer.ok:
+                text = answer.text if answer is not None else "it is gone"
                 raise RemoteProtocolError(f"the action server of ROS 2 gave no answer to {service}: {text}")
             self.answered(service, uuid, answer.payload)
         except RmpaError as error:

@@ -385,6 +385,7 @@ class ActionPair:
         name: ``package/action/Name`` of ROS 2.
         ros1: ``package/Name`` of ROS 1.
         types: The type of each service and topic in ROS 2, and its hash.
+        type_hash: That of *send_goal*.
         goal: Converts goals, without the id.
         feedback: Converts feedback, without the id.
         result: ROS 1's result.
@@ -406,6 +407,7 @@ class ActionPair:
             types.learn({name: each for name, each in kind.specifications.items() if name != kind.name})
             types.define_as(f"{rule.name}_{part}", kind.specifications[kind.name])
         self.types: Final = _define(rule.name, types)
+        self.type_hash: Final = self.types["send_goal"][1]
         self.goal: Final = Conversion(goal, f"{rule.name}_Goal", types, rule.paths.get("goal"))
         self.feedback: Final = Conversion(feedback, f"{rule.name}_Feedback", types, rule.paths.get("feedback"))
         self.result: Final = result

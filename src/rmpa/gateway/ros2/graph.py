@@ -16,6 +16,7 @@ from rmpa.gateway.ros2.conversion import NoConversion
 from rmpa.gateway.ros2.format import NO_HASH, EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, parse_token
 from rmpa.gateway.ros2.pairs import described_types
 from rmpa.gateway.ros2.types import SERVICE, parse_type_response, type_request
+from rmpa.gateway.zenoh.threads import first_answer
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -377,8 +378,8 @@ class Ros2TypeAsker:
             timeout=limits.ROS2_SERVICE_WAIT,
             all_complete=True,
         )
-        answer = next((reply for reply in replies if reply.ok), None)
-        if answer is None:
+        answer = first_answer(replies)
+        if answer is None or not answer.ok:
             raise NoConversion(f"{server.name} does not answer; {self._unknown(endpoint)}")
         return parse_type_response(answer.payload)
 

@@ -104,13 +104,9 @@ class TypeMapping:
             return TypePair(_USUAL[name], {"": _LOG_FIELDS} if name == _LOG else {})
         return next((TypePair(each) for each in self._candidates(name, "msg") if each in known), None)
 
-    def service(self, name: str) -> TypePair:
-        """The ROS 2 type of a service type; without a rule the one of the same name."""
-        return self._types["srv"].get(name) or TypePair(_USUAL.get(name) or self._candidates(name, "srv")[0])
-
-    def action(self, name: str) -> TypePair:
-        """The ROS 2 type of an action type, ``package/Name`` of ROS 1; without a rule the one of the same name."""
-        return self._types["action"].get(name) or TypePair(_USUAL.get(name) or self._candidates(name, "action")[0])
+    def counterpart(self, name: str, kind: str) -> TypePair:
+        """The ROS 2 type of a service (``srv``) or ``action`` of ROS 1; without a rule the one of the same name."""
+        return self._types[kind].get(name) or TypePair(_USUAL.get(name) or self._candidates(name, kind)[0])
 
     def has_service_rule(self, name: str) -> bool:
         """Whether a mapping file has a rule for a service type of ROS 1 or its package."""

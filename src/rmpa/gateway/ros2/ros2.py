@@ -297,7 +297,7 @@ def _in_stages(imported: Ros2Import, publisher: Ros2Publisher) -> Iterator[Check
         yield Check("demand", WARN, "no node of a module subscribes: it crosses once one does")
         return
     yield Check("demand", OK, "a node of a module subscribes")
-    losses = imported.sequences.lost, publisher.dropped, imported.unconverted, imported.unheard
+    losses = imported.sequences.lost, publisher.dropped, imported.unconverted, imported.early.dropped
     messages = publisher.received
     yield _flow("arrived", f"{messages} messages have come", messages, losses, _ARRIVED_LOSSES)
 

@@ -7,22 +7,27 @@ import itertools
 import logging
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from rmpa.bridge.policy import Needs
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.foreign import Answering, OwnedTasks
-from rmpa.gateway.ros2.conversion import Conversion, NoConversion
+from rmpa.gateway.ros2.conversion import ActionPair, Conversion, NoConversion
 from rmpa.gateway.ros2.format import GID_BYTES, EntityKind, Ros2Attachment, Ros2Qos, data_key
 from rmpa.gateway.ros2.graph import SITE, OwnRos2Nodes, Ros2Graph, Ros2TypeAsker, valid_name
 from rmpa.gateway.ros2.pairs import TypeMapping, derive_service
 from rmpa.gateway.ros2.types import WITHOUT_HASH, Ros2Types, TypePair
 from rmpa.gateway.rules import CrossingRules, ForeignSource, SourceKind
+from rmpa.gateway.zenoh.threads import first_answer
 from rmpa.ros.types.definitions import known_types
 from rmpa.ros.types.find import find_service_type
 
 if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from rosbags.typesys.store import Typestore
+
     from rmpa.config.rules import GatewaySettings
     from rmpa.core.contract import Contracts
     from rmpa.gateway.foreign import ProxiedService
@@ -137,6 +142,10 @@ class ServicePair:
         self.response = Conversion(ros1.response, f"{pair.name}_Response", types, pair.paths.get("response"))
 
 
+_Kinds = TypeVar("_Kinds")
+_Pair = TypeVar("_Pair", ServicePair, ActionPair)
+
+
 class Ros2Context(OwnedTasks):
     """What the parts of the neighbour ROS 2 share, with its tasks; each part joins topics, services or actions.
 
@@ -180,6 +189,52 @@ class Ros2Context(OwnedTasks):
     def ros1_name(self, name: str) -> str:
         """The name of ROS 1 for a message type of ROS 2, ``package/msg/Name``."""
         return self.mapping.ros1_type(name, known_types())
+
+    async def find_pair(
+        self,
+        server: Ros2Endpoint,
+        ros2: str,
+        find: Callable[[str], Awaitable[_Kinds]],
+        make: Callable[[_Kinds, TypePair, Ros2Types], _Pair],
+        derive: Callable[[Typestore, str], _Kinds],
+        *endpoints: tuple[str, EntityKind],
+    ) -> _Pair:
+        """Pair the type of a server of ROS 2; what is not known here its node is asked for.
+
+        Args:
+            server: The endpoint whose hash tells whether the types are those that are known here.
+            ros2: ``package/srv/Name`` or ``package/action/Name``.
+            find: Finds ROS 1's types by the name of the pair in ROS 1.
+            make: Makes the pair.
+            derive: Makes ROS 1's types of that name from those of ROS 2.
+            endpoints: The names and kinds of those whose types the node is asked for; none: that of ``server``.
+
+        Raises:
+            RmpaError: The types are no pair, or ROS 2's are not known.
+        """
+        ros1 = self.mapping.ros1_type(ros2)
+        rule = self.mapping.counterpart(ros1, ros2.split("/")[1])
+        if rule.name != ros2:
+            rule = TypePair(ros2)
+        kinds = None
+        try:
+            kinds = await find(ros1)
+            pair = make(kinds, rule, self.types)
+            if pair.type_hash == server.type_hash:
+                return pair
+            problem = (
+                f"{server.type} has the hash {server.type_hash} there, and {pair.type_hash} is that of {ros1} here: "
+                "the definitions differ"
+            )
+        except RmpaError as error:
+            problem = str(error)
+        try:
+            types = self.types.variant(await self.asker.learn(*endpoints, of=server))
+            return make(kinds or derive(types.store, ros1), rule, types)
+        except RmpaError as error:
+            raise NoConversion(f"{problem}; {error}") from error
+        except KeyError as error:
+            raise NoConversion(f"{problem}; {ros2} has no form in ROS 1: {error}") from error
 
     def say(self, subject: str, text: str) -> None:
         """Log a problem once, and keep it: what it is about, and the text. An empty text: it is solved."""
@@ -255,7 +310,7 @@ class OfferedService:
             return
         try:
             kind = await asyncio.to_thread(find_service_type, description.type, description.md5sum)
-            pair = self._pair = ServicePair(kind, context.mapping.service(kind.name), context.types)
+            pair = self._pair = ServicePair(kind, context.mapping.counterpart(kind.name, "srv"), context.types)
         except RmpaError as error:
             self._say(f"ROS 2 does not see this service: {error}")
             return
@@ -326,9 +381,15 @@ class ShownRos2Service:
     async def _show(self) -> None:
         """Find the types, and show it if they are a pair."""
         context, server = self._context, self.server
-        name = context.mapping.ros1_type(server.type)
+
+        async def find(name: str) -> ServiceType:
+            return await asyncio.to_thread(find_service_type, name)
+
+        def derive(store: Typestore, name: str) -> ServiceType:
+            return derive_service(store, server.type, name, context.ros1_name)
+
         try:
-            pair = self._pair = await self._find_pair(name)
+            pair = self._pair = await context.find_pair(server, server.type, find, ServicePair, derive)
         except RmpaError as error:
             context.say(self.here, f"the service of ROS 2's node {server.node.name} is not shown: {error}")
             return
@@ -337,40 +398,8 @@ class ShownRos2Service:
             return pair.ros1.describe()
 
         if not self._closed:
-            source = ForeignSource(SourceKind.SERVICE, SITE, "", server.node.name, self.here, name)
+            source = ForeignSource(SourceKind.SERVICE, SITE, "", server.node.name, self.here, pair.ros1.name)
             self._service = context.graph.show_service(source, self._serve, describe)
-
-    async def _find_pair(self, name: str) -> ServicePair:
-        """Pair the service's type with ROS 1's ``name``; what is not known here its node is asked for.
-
-        Raises:
-            RmpaError: The types are no pair, or ROS 2's is not known.
-        """
-        context, server = self._context, self.server
-        rule = context.mapping.service(name)
-        if rule.name != server.type:
-            rule = TypePair(server.type)
-        kind = None
-        try:
-            kind = await asyncio.to_thread(find_service_type, name)
-            pair = ServicePair(kind, rule, context.types)
-            if pair.type_hash == server.type_hash:
-                return pair
-            problem = (
-                f"{server.type} has the hash {server.type_hash} there, and {pair.type_hash} is that of "
-                f"{kind.name} here: the definitions differ"
-            )
-        except RmpaError as error:
-            problem = str(error)
-        try:
-            types = context.types.variant(await context.asker.learn(of=server))
-        except RmpaError as error:
-            raise NoConversion(f"{problem}; {error}") from error
-        try:
-            kind = kind or derive_service(types.store, server.type, name, context.ros1_name)
-            return ServicePair(kind, rule, types)
-        except KeyError as error:
-            raise NoConversion(f"{server.type} has no form in ROS 1: {error}") from error
 
     async def _serve(self, request: bytes) -> bytes:
         pair, server, nodes = self._pair, self.server, self._context.nodes
@@ -390,12 +419,12 @@ class ShownRos2Service:
             )
         finally:
             self._calls -= 1
-        for answer in answers:
-            if answer.ok:
-                return pair.response.to_ros1(answer.payload)
-        if answers:
-            raise PeerRefused(server.node.name, answers[0].payload.decode(errors="replace"))
-        raise UnreachableError("server of ROS 2", server.name, "it ended, or gave no response")
+        answer = first_answer(answers)
+        if answer is None:
+            raise UnreachableError("server of ROS 2", server.name, "it ended, or gave no response")
+        if not answer.ok:
+            raise PeerRefused(server.node.name, answer.text)
+        return pair.response.to_ros1(answer.payload)
 
 
 class Ros2Services:

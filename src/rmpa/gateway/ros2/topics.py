@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import struct
-from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
@@ -25,6 +24,7 @@ from rmpa.gateway.ros2.pairs import Ros2Pairs
 from rmpa.gateway.ros2.types import Ros2Sequences
 from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.gateway.topics import Export
+from rmpa.gateway.zenoh.threads import BoundedQueue
 from rmpa.ros.types.find import find_message_type, type_of_header
 from rmpa.ros.wire.tcpros import TopicDescription
 
@@ -50,7 +50,7 @@ _LATCH_LOOKS_AT_ONCE: Final = 2
 _ROS2_LINGER: Final = 5.0
 # Messages of one topic of ROS 2 that are held so; the oldest are dropped, and counted as unheard.
 _ROS2_EARLY_MESSAGES: Final = 1000
-# Bytes of these.
+# Bytes of these; one message always fits.
 _ROS2_EARLY_BYTES: Final = 16 * 1024 * 1024
 
 # Its publishers latch, in ROS 1 and ROS 2 (tf2_ros).
@@ -203,6 +203,7 @@ class Ros2Import:
     Attributes:
         problem: Why its messages do not come; empty for nothing.
         publishers: By node.
+        early: What came before a node subscribed.
     """
 
     # More than twelve fields: publishers, demand, and messages that are too early change each other.
@@ -221,8 +222,8 @@ class Ros2Import:
         self._subscribed: tuple[Declaration, OwnEndpoint] | None = None
         self._history = False
         self.sequences = Ros2Sequences()
-        self._early: deque[tuple[bytes, int, bytes]] = deque()
-        self._early_bytes = self.unheard = self.unconverted = 0
+        self.early: BoundedQueue[tuple[bytes, int, bytes]] = BoundedQueue(_ROS2_EARLY_MESSAGES, _ROS2_EARLY_BYTES)
+        self.unconverted = 0
         self._lingering: asyncio.TimerHandle | None = None
 
     @property
@@ -288,12 +289,11 @@ class Ros2Import:
             return
         if kept is not None:  # this key was subscribed to already: its history came then
             self._deliver(publisher, kept, 0)
-        early, self._early, self._early_bytes = self._early, deque(), 0
-        for gid, sequence, payload in early:
+        for gid, sequence, payload in self.early.clear():
             if self._publisher_of(gid) is publisher:
                 self._deliver(publisher, payload, sequence)
             else:
-                self._hold(gid, sequence, payload)
+                self.early.push((gid, sequence, payload), len(payload))
 
     def _describe(self, publisher: Ros2Publisher) -> None:
         if self.conversion is not None:
@@ -311,17 +311,9 @@ class Ros2Import:
 
     def _end_lingering(self) -> None:
         self._lingering = None
-        self._early.clear()
-        self._early_bytes = 0
+        self.early.clear()
         self._follow_demand()
         self.part.drop_idle(self)
-
-    def _hold(self, gid: bytes, sequence: int, payload: bytes) -> None:
-        self._early.append((gid, sequence, payload))
-        self._early_bytes += len(payload)
-        while len(self._early) > _ROS2_EARLY_MESSAGES or self._early_bytes > _ROS2_EARLY_BYTES:
-            self._early_bytes -= len(self._early.popleft()[2])
-            self.unheard += 1
 
     def _follow_demand(self) -> None:
         wanted = self.conversion is not None and any(each.wanted for each in self.publishers.values())
@@ -366,7 +358,7 @@ class Ros2Import:
         elif publisher is not None and publisher.latched:
             publisher.kept = sample.payload
         elif self._lingering is not None:
-            self._hold(gid, sequence, sample.payload)
+            self.early.push((gid, sequence, sample.payload), len(sample.payload))
 
     def _publisher_of(self, gid: bytes) -> Ros2Publisher | None:
         return self._by_gid.get(gid[:GID_BYTES]) or self._adopted.get(gid) or self._adopt(gid)

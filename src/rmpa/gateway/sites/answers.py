@@ -28,6 +28,7 @@ from rmpa.gateway.sites.params import SiteParams
 from rmpa.gateway.sites.services import ImportedService
 from rmpa.gateway.sites.site import SiteNeighbour
 from rmpa.gateway.sites.topics import SiteContext
+from rmpa.gateway.zenoh.threads import first_answer
 from rmpa.observe.operations import INFO, PARAM, REPORT, WHY
 from rmpa.observe.peer_info import (
     FAIL,
@@ -218,12 +219,7 @@ class SiteAnswers:
         self._rules = sites.context.rules
         self._params = params
         self._site = sites.own.site
-        self._queryable = sites.context.session.queryable(_why_key(self._site), self._take, _NEEDS)
-        sites.closing.append(self.close)
-
-    async def close(self) -> None:
-        """Answer no more questions of other gateways."""
-        self._queryable.close()
+        sites.questions.append((_why_key(self._site), self._take, _NEEDS))
 
     async def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Any:
         """The reply to one question of ``observe.operations``; raises as that says."""
@@ -490,20 +486,14 @@ class SiteAnswers:
         replies = await self._sites.context.session.get(
             _why_key(site), question, timeout=_SITE_ASK_TIMEOUT, all_complete=True
         )
-        problem = "it does not answer; is it of an earlier release?"
-        for reply in replies:
-            try:
-                if reply.ok:
-                    return parse_ways(reply.payload), ""
-                problem = reply.payload.decode(errors="replace")
-            except RemoteProtocolError as error:
-                problem = str(error)
-        return (), problem
+        if (reply := first_answer(replies)) is None:
+            return (), "it does not answer; is it of an earlier release?"
+        try:
+            return (parse_ways(reply.payload), "") if reply.ok else ((), reply.text)
+        except RemoteProtocolError as error:
+            return (), str(error)
 
     def _take(self, query: ArrivedQuery) -> None:
-        if not self._sites.leads:
-            query.finish()
-            return
         try:
             question = WhyQuestion.parse(query.payload)
         except RemoteProtocolError as error:
@@ -563,7 +553,7 @@ def make_site_neighbour(graph: AgentGraph, session: OpenSession, settings: Setti
         raise UnreachableError("module", where, "`rmpa peer list` there shows which are linked to its gateway")
 
     params = SiteParams(context, ask_module)
-    neighbour.on_leads = lambda leads: params.lead(leads=leads)
+    neighbour.questions.append(params.question)
     neighbour.closing.append(params.close)
     agent.sites.serve(SiteAnswers(neighbour, params))
     return neighbour

@@ -22,6 +22,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.foreign import Answering
 from rmpa.gateway.sites.keys import ROOT, MessageSource, read_json
 from rmpa.gateway.sites.services import NO_MD5, caller
+from rmpa.gateway.zenoh.threads import first_answer
 from rmpa.ros.limits import PARAM_DEPTH_MAX
 from rmpa.ros.master.parameters import leaves
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
     from rmpa.gateway.sites.topics import SiteContext
     from rmpa.gateway.zenoh.queries import ArrivedQuery
-    from rmpa.gateway.zenoh.session import Declaration
     from rmpa.ros.wire.tcpros import Buffer
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
@@ -263,27 +263,17 @@ class SiteParams:
     Args:
         context: What is shared with topics and services.
         ask: Asks a module of this site over the mesh: module, question, arguments; raises ``RmpaError``.
+
+    Attributes:
+        question: What is answered while this gateway leads its site.
     """
 
     def __init__(self, context: SiteContext, ask: Callable[[str, str, dict[str, Any]], Awaitable[object]]) -> None:
         self._context = context
         self._ask = ask
-        self._queryable: Declaration | None = None
         self._answering = Answering("parameters", f"the gateway of site {context.name} ends", _SITE_PARAMS_AT_ONCE)
-
-    def lead(self, *, leads: bool) -> None:
-        """Answer while this gateway leads its site."""
-        if leads and self._queryable is None:
-            key = f"{ROOT}/{self._context.name}/*/p/**"
-            self._queryable = self._context.session.queryable(key, self._take, _NEEDS)
-        elif not leads and self._queryable is not None:
-            self._queryable.close()
-            self._queryable = None
-
-    async def close(self) -> None:
-        """Answer no more; questions under way get an error."""
-        self.lead(leads=False)
-        await self._answering.close()
+        self.close: Final = self._answering.close
+        self.question: Final = f"{ROOT}/{context.name}/*/p/**", self._take, _NEEDS
 
     # --- questions of other sites ---------------------------------------------------------------------------------
 
@@ -353,13 +343,12 @@ class SiteParams:
             attachment(1, time.time_ns()),
             timeout=limits.SITE_PARAM_TIMEOUT,
         )
-        for reply in sorted(replies, key=lambda each: not each.ok):
-            if not reply.ok:
-                raise PeerRefused(f"{site}/{module}", reply.payload.decode(errors="replace"))
-            answer = read_text_about(reply.payload, ParamAnswer)
-            if what == transfer.NAMES:
-                return {"text": await write_text("the list of parameters", list(answer.names))}
-            return {"text": answer.text, "count": answer.count}
-        raise UnreachableError(
-            "gateway", f"site {site} for its module {module}", "`rmpa site info` shows which modules are there"
-        )
+        if (reply := first_answer(replies)) is None:
+            where = f"site {site} for its module {module}"
+            raise UnreachableError("gateway", where, "`rmpa site info` shows which modules are there")
+        if not reply.ok:
+            raise PeerRefused(f"{site}/{module}", reply.text)
+        answer = read_text_about(reply.payload, ParamAnswer)
+        if what == transfer.NAMES:
+            return {"text": await write_text("the list of parameters", list(answer.names))}
+        return {"text": answer.text, "count": answer.count}

@@ -29,7 +29,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.foreign import Answering, OwnedTasks
 from rmpa.gateway.rules import SourceKind
 from rmpa.gateway.sites.keys import ROOT, TO, UNKNOWN_TYPE, AttachmentReader, MessageSource, data_key, read_json
-from rmpa.gateway.zenoh.threads import ZenohPriority
+from rmpa.gateway.zenoh.threads import ZenohPriority, first_answer
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.wire.tcpros import ServiceDescription
 
@@ -249,12 +249,12 @@ class ImportedService:
             await asyncio.wait((asking,))
         finally:
             asking.cancel()
-        replies = [] if asking.cancelled() else asking.result()
+        reply = None if asking.cancelled() else first_answer(asking.result())
         where = f"{source.module.name} at site {source.site}"
-        for reply in sorted(replies, key=lambda each: not each.ok):
+        if reply is not None:
             if reply.ok:
                 return reply.payload
-            raise PeerRefused(where, reply.payload.decode(errors="replace"), code="service-failed")
+            raise PeerRefused(where, reply.text, code="service-failed")
         text = f"service {source.name} of {where} has left: no gateway there answers for it"
         if loop.time() - began >= within:
             text = f"service {source.name} of {where} has not answered within {within:g} s ([[service]] timeout)"

@@ -20,10 +20,12 @@ from rmpa.runtime.loop import MachineTimer
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
+    from rmpa.bridge.policy import Needs
     from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.sites.keys import SiteSource
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
     from rmpa.gateway.sites.topics import SiteContext
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import Declaration
 
 _log = logging.getLogger(__name__)
@@ -44,7 +46,7 @@ class SiteNeighbour:
         exports: What this site offers.
         imports: What is shown of the other sites.
         leads: Whether this gateway is the one of its site that exports and imports.
-        on_leads: Called when that begins, and when it ends.
+        questions: The queryables that it has while it leads: key, what answers, and what is needed for an answer.
         closing: Called when it closes.
     """
 
@@ -60,13 +62,14 @@ class SiteNeighbour:
         self.topics = SiteTopics(context)
         self.services = SiteServices(context)
         self.leads = False
-        self.on_leads: Callable[[bool], None] = lambda _: None
+        self.questions: list[tuple[str, Callable[[ArrivedQuery], None], Needs]] = list(self.topics.questions)
         self.closing: list[Callable[[], Awaitable[None]]] = [self.topics.close, self.services.close]
         self._actions = SiteActions(context.graph)
         self._leader = Leader(own, limits.LEADER_PATIENCE, time.monotonic())
         self._sites: tuple[str, ...] = ()
         self._tokens: dict[str, Declaration] = {}
         self._declared: list[Declaration] = []
+        self._answering: list[Declaration] = []
         self._refusals = RefusalLog(_log, context.counters)
         self._timer = MachineTimer(self._next_timer, self._handle_timer)
         self._closed = False
@@ -165,8 +168,7 @@ class SiteNeighbour:
     def _lead(self) -> None:
         _log.info("= this gateway leads site %s", self.own.site)
         self.leads = True
-        self.topics.lead(leads=True)
-        self.on_leads(True)
+        self._answering = [self.context.session.queryable(*question) for question in self.questions]
         items: list[SiteModule | SiteExport] = [*self.exports.modules, *self.exports.entries]
         for item in items:
             self._own_changed(item, there=True)
@@ -181,8 +183,8 @@ class SiteNeighbour:
             for item in items:
                 self._own_changed(item, there=False)
             self.leads = False
-            self.topics.lead(leads=False)
-            self.on_leads(False)
+            for declared in self._answering:
+                declared.close()
 
     def _own_changed(self, item: SiteModule | SiteExport, there: bool) -> None:
         if not self.leads:

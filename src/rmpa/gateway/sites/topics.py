@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections import deque
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -19,7 +18,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.foreign import Answering
 from rmpa.gateway.sites.keys import ROOT, AttachmentReader, MessageSource, SequenceCounter, TopicHeader
 from rmpa.gateway.topics import Export
-from rmpa.gateway.zenoh.threads import PRIORITIES, ZenohPriority, ZenohQos
+from rmpa.gateway.zenoh.threads import PRIORITIES, BoundedQueue, ZenohPriority, ZenohQos, first_answer
 from rmpa.ros.wire.tcpros import printable
 
 if TYPE_CHECKING:
@@ -183,7 +182,7 @@ class ImportedTopic:
         self._part = part
         self._description: TopicDescription | None = None
         self._problem = ""
-        self._held: deque[tuple[bytes, str]] = deque()
+        self._held: BoundedQueue[tuple[bytes, str]] = BoundedQueue(limits.HELD_MESSAGES_MAX, _HELD_BYTES)
         self._sequence, self.messages = interrupted or (SequenceCounter(), 0)
         self._resumes_until = 0.0 if interrupted is None else now + limits.RESUMED_WITHIN
         self._rate_since = 0.0, now, self.messages
@@ -329,7 +328,7 @@ class ImportedTopic:
             timeout=_HEADER_TIMEOUT,
             priority=ZenohPriority.INTERACTIVE_HIGH,
         )
-        reply = next((each for each in replies if each.ok), replies[0] if replies else None)
+        reply = first_answer(replies)
         if reply is None:
             self._problem = f"site {announced.site} does not answer the question for its header"
             return False
@@ -354,8 +353,7 @@ class ImportedTopic:
         described, self._description = self._description, header.description
         if self._description != described:
             self._topic.describe(self._description)
-        held, self._held = self._held, deque()
-        for payload, md5 in held:
+        for payload, md5 in self._held.clear():
             if md5 == header.md5sum:
                 self.dropped += self._topic.publish(payload)
             else:
@@ -363,11 +361,7 @@ class ImportedTopic:
 
     def _hold(self, payload: bytes, md5: str) -> None:
         """Keep a message until the header is known, or known anew: its publisher has another definition."""
-        self._held.append((payload, md5))
-        size = sum(len(each) for each, _ in self._held) if len(payload) > limits.LARGE_MESSAGE else 0
-        while len(self._held) > limits.HELD_MESSAGES_MAX or (size > _HELD_BYTES and len(self._held) > 1):
-            size -= len(self._held.popleft()[0])
-            self.dropped += 1
+        self.dropped += len(self._held.push((payload, md5), len(payload)))
         if self._description is not None:
             self._problem = f"its messages have the md5 sum {md5}, its header {self._description.md5sum}"
         self._ask()
@@ -399,6 +393,9 @@ class SiteTopics:
 
     Args:
         context: What is shared with services and parameters.
+
+    Attributes:
+        questions: What is answered about headers and definitions while this gateway leads its site.
     """
 
     def __init__(self, context: SiteContext) -> None:
@@ -408,9 +405,13 @@ class SiteTopics:
         self._imported: dict[_Ident, ImportedTopic] = {}
         self._interrupted: dict[_Ident, Interrupted] = {}
         self._subscriptions: dict[str, _Subscription] = {}
-        self._questions: tuple[Declaration, ...] = ()
         self._reader = AttachmentReader()
         self._headers = Answering("headers", f"the gateway of site {context.name} ends", limits.SITE_CALLS_WAITING)
+        prefix = f"{ROOT}/{context.name}/*/d"
+        self.questions: Final = (
+            (f"{prefix}/t/**", self._asked_header, _HEADER_NEEDS),
+            (f"{prefix}/m/*", self._asked_definition, _DEFINITION_NEEDS),
+        )
 
     # --- what the neighbour says ----------------------------------------------------------------------------------
 
@@ -445,20 +446,6 @@ class SiteTopics:
             self._interrupted[_ident(entry)] = interrupted
             if len(self._interrupted) > limits.INTERRUPTED_TOPICS_MAX:
                 del self._interrupted[next(iter(self._interrupted))]
-
-    def lead(self, *, leads: bool) -> None:
-        """Answer questions for headers and definitions while this gateway leads its site."""
-        for declared in self._questions:
-            declared.close()
-        prefix, session = f"{ROOT}/{self.context.name}/*/d", self.context.session
-        self._questions = (
-            (
-                session.queryable(f"{prefix}/t/**", self._asked_header, _HEADER_NEEDS),
-                session.queryable(f"{prefix}/m/*", self._asked_definition, _DEFINITION_NEEDS),
-            )
-            if leads
-            else ()
-        )
 
     def exported(self, entry: SiteExport) -> Export | None:
         """A topic that goes out."""

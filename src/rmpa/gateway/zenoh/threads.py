@@ -116,6 +116,16 @@ class ZenohReply:
     attachment: bytes
     ok: bool
 
+    @property
+    def text(self) -> str:
+        """The text of an error."""
+        return self.payload.decode(errors="replace")
+
+
+def first_answer(replies: Sequence[ZenohReply]) -> ZenohReply | None:
+    """The first answer, or the first error if there is none; ``None``: nothing answered."""
+    return min(replies, key=lambda each: not each.ok, default=None)
+
 
 _threads = threading.local()
 
@@ -131,7 +141,7 @@ def keep_thread_state() -> None:
 
 
 class BoundedQueue(Generic[_T]):
-    """Items with their sizes in bytes; beyond its bounds the oldest go, but one always fits. Its user has a lock.
+    """Items with their sizes in bytes; beyond its bounds the oldest go, but one always fits. Its user has the lock.
 
     Args:
         messages: Items that wait at most.
@@ -148,7 +158,7 @@ class BoundedQueue(Generic[_T]):
         self._bytes = 0
         self.dropped = 0
 
-    def _push(self, item: _T, size: int, besides: int = 0) -> Sequence[_T]:
+    def push(self, item: _T, size: int, besides: int = 0) -> Sequence[_T]:
         """Queue an item; return those that were dropped. ``besides``: items that count, and wait elsewhere."""
         self._items.append((item, size))
         self._bytes += size
@@ -173,7 +183,7 @@ class BoundedQueue(Generic[_T]):
         self._bytes -= size
         return turn, size
 
-    def _clear(self) -> list[_T]:
+    def clear(self) -> list[_T]:
         """Forget what waits, and return it."""
         items = [item for item, _ in self._items]
         self._items.clear()
@@ -212,7 +222,7 @@ class ArrivalQueue(BoundedQueue[_T]):
         with self._arrivals.lock:
             if self._closed:
                 return
-            if dropped := self._push(item, size):
+            if dropped := self.push(item, size):
                 self._arrivals.refused["zenoh.arrival.dropped"] += len(dropped)
                 self._give_back(dropped)
             if not self._scheduled:
@@ -222,7 +232,7 @@ class ArrivalQueue(BoundedQueue[_T]):
         """Forget what waits; nothing is delivered afterwards."""
         with self._arrivals.lock:
             self._closed = True
-            self._give_back(self._clear())
+            self._give_back(self.clear())
             self._arrivals.wake()
 
     def _give_back(self, items: Sequence[_T]) -> None:
@@ -407,7 +417,7 @@ class QueuedPublisher(BoundedQueue[tuple[bytes, bytes]]):
                 return len(messages)
             before = self.dropped
             for message in messages:
-                self._push(message, len(message[0]), self._taken)
+                self.push(message, len(message[0]), self._taken)
             self._schedule()
             return self.dropped - before
 
@@ -468,7 +478,7 @@ class QueuedPublisher(BoundedQueue[tuple[bytes, bytes]]):
 
     def _give_up(self) -> None:
         with self._lane.changed:
-            self.dropped += len(self._clear())
+            self.dropped += len(self.clear())
         self._flushed()
 
 

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import importlib.util
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.gateway.ros2.io.ros2_bed import Ros2Bed, ros2_bed
 
-def _is_there(name: str) -> bool:
-    try:
-        return importlib.util.find_spec(name) is not None
-    except ValueError:
-        return False
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of this folder."""
-    if not _is_there("xxhash"):
-        for item in items:
-            if Path(__file__).parent in item.path.parents:
-                item.add_marker(pytest.mark.skip(reason="the extra rmpa[zenoh] is not installed"))
+@pytest.fixture(autouse=True)
+def _needs_xxhash() -> None:
+    if importlib.util.find_spec("xxhash") is None:
+        pytest.skip("the extra rmpa[zenoh] is not installed")
+
+
+@pytest.fixture
+async def bed() -> AsyncIterator[Ros2Bed]:
+    async with ros2_bed() as made:
+        yield made

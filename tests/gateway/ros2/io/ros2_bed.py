@@ -9,24 +9,22 @@ from rmpa.config.rules import GatewaySettings, Ros2Settings
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, Ros2Qos, parse_token
 from rmpa.gateway.ros2.graph import gid_of
 from rmpa.gateway.ros2.ros2 import Ros2Neighbour
-from rmpa.gateway.ros2.types import Ros2Types
+from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types
+from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_graph import MemoryGraph, MemoryTopic
-from tests.gateway.memory_zenoh import MemoryZenoh, eventually
+from tests.gateway.memory_zenoh import MemoryQuery, MemoryZenoh, eventually
+from tests.gateway.ros2.type_descriptions import response
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
 
     from rmpa.config.rules import CrossingRule
-    from rmpa.core.contract import Contracts
     from rmpa.gateway.zenoh.threads import ZenohSample
 
 STRING = MessageType("std_msgs/String")
-
-
-def find_none(name: str) -> MessageType:
-    """A machine without ROS 1 packages: only what rmpa brings."""
-    return MessageType(name)
+NO_TYPE = "RIHS01_" + "0" * 64
+"""The hash of no type."""
 
 
 def string(text: str) -> bytes:
@@ -36,10 +34,11 @@ def string(text: str) -> bytes:
 class Ros2Publisher:
     """A publisher of a ROS 2 program: its token, and its messages with numbers."""
 
-    def __init__(self, bed: Ros2TopicBed, endpoint: Ros2Endpoint) -> None:
+    def __init__(self, bed: Ros2Bed, endpoint: Ros2Endpoint) -> None:
         self.endpoint = endpoint
         self._bed = bed
-        self._publisher = bed.ros2.publisher(endpoint.key(), zenoh_qos(endpoint.qos), self._matching)
+        qos = ZenohQos(cache=endpoint.qos.depth if endpoint.qos.latched else 0)
+        self._publisher = bed.ros2.publisher(endpoint.key(), qos, self._matching)
         self._token = bed.ros2.token(endpoint.token())
         self.wanted = False
         self.gid = gid_of(endpoint.token())
@@ -60,30 +59,36 @@ class Ros2Publisher:
         self._publisher.close()
 
 
-def zenoh_qos(qos: Ros2Qos) -> Any:
-    from rmpa.gateway.zenoh.threads import ZenohQos
+class Ros2Subscription:
+    """A subscription of a ROS 2 program: its token, and what it has heard."""
 
-    return ZenohQos(cache=qos.depth if qos.latched else 0)
+    def __init__(self, bed: Ros2Bed, endpoint: Ros2Endpoint) -> None:
+        self.heard: list[ZenohSample] = []
+        history = endpoint.qos.latched
+        self._declared = bed.ros2.subscribe(endpoint.key(), self.heard.append, history=history)
+        self._token = bed.ros2.token(endpoint.token())
+
+    def close(self) -> None:
+        self._declared.close()
+        self._token.close()
 
 
-class Ros2TopicBed:
+class Ros2Bed:
     """A gateway, and one program of ROS 2 in the same network."""
 
-    def __init__(
-        self,
-        rules: tuple[CrossingRule, ...] = (),
-        ros2: Ros2Settings | None = None,
-        contracts: Contracts | None = None,
-    ) -> None:
+    def __init__(self, rules: tuple[CrossingRule, ...] = (), ros2: Ros2Settings | None = None) -> None:
         self.network = MemoryZenoh()
         self.graph = MemoryGraph()
         self.ros2 = self.network.session()
-        settings = GatewaySettings(rules=rules, ros2=ros2 or Ros2Settings())
-        self.neighbour = Ros2Neighbour(
-            cast("Any", self.graph), cast("Any", self.network.session()), settings, contracts, find_none
-        )
-        self.types = Ros2Types(settings.ros2.distribution)
+        self.settings = GatewaySettings(rules=rules, ros2=ros2 or Ros2Settings())
+        self.neighbour = self.gateway()
+        self.types = Ros2Types(self.settings.ros2.distribution)
         self._numbers = iter(range(1, 1000))
+
+    def gateway(self) -> Ros2Neighbour:
+        """One more gateway at the same graph, on a machine without packages of ROS 1."""
+        session = cast("Any", self.network.session())
+        return Ros2Neighbour(cast("Any", self.graph), session, self.settings, find=MessageType)
 
     def endpoint(
         self,
@@ -103,15 +108,31 @@ class Ros2TopicBed:
     def publisher(self, name: str, **more: Any) -> Ros2Publisher:
         return Ros2Publisher(self, self.endpoint(EntityKind.PUBLISHER, name, **more))
 
-    def subscribe(self, name: str, heard: list[ZenohSample], **more: Any) -> list[Any]:
-        """A subscription of a ROS 2 program, with its token."""
-        endpoint = self.endpoint(EntityKind.SUBSCRIPTION, name, **more)
-        history = endpoint.qos.latched
-        declared = self.ros2.subscribe(endpoint.key(), heard.append, history=history)
-        return [declared, self.ros2.token(endpoint.token())]
+    def subscribe(self, name: str, **more: Any) -> Ros2Subscription:
+        return Ros2Subscription(self, self.endpoint(EntityKind.SUBSCRIPTION, name, **more))
 
-    def cdr(self, name: str, **values: Any) -> bytes:
-        return bytes(self.types.store.serialize_cdr(self.types.store.types[name](**values), name))
+    def server(
+        self, name: str, type_name: str, answer: Callable[[MemoryQuery], None] = lambda _: None, **more: Any
+    ) -> Any:
+        """A server of ROS 2: its queryable, and its token, which is returned."""
+        endpoint = self.endpoint(EntityKind.SERVICE, name, type_name, **more)
+        self.ros2.queryable(endpoint.key(), answer)
+        return self.ros2.token(endpoint.token())
+
+    def describes(self, node: str, types: Ros2Types, *names: str) -> list[bytes]:
+        """A node of ROS 2 describes types; returns what it was asked."""
+        asked: list[bytes] = []
+
+        def describe(query: MemoryQuery) -> None:
+            asked.append(query.payload)
+            (name,) = (each for each in names if each.encode() in query.payload)
+            query.answer(response(types, name))
+
+        self.server(f"{node}/get_type_description", SERVICE_TYPE, describe, node=node, type_hash=NO_TYPE)
+        return asked
+
+    def cdr(self, name: str, *more: Any, **values: Any) -> bytes:
+        return cdr(self.types, name, *more, **values)
 
     def read(self, raw: bytes, name: str = "std_msgs/msg/String") -> Any:
         return self.types.store.deserialize_cdr(raw, name)
@@ -141,9 +162,14 @@ class Ros2TopicBed:
         return self.neighbour.context.problems
 
 
+def cdr(types: Ros2Types, name: str, *more: Any, **values: Any) -> bytes:
+    """A message of ROS 2."""
+    return bytes(types.store.serialize_cdr(types.store.types[name](*more, **values), name))
+
+
 @contextlib.asynccontextmanager
-async def topic_bed(**more: Any) -> AsyncIterator[Ros2TopicBed]:
-    bed = Ros2TopicBed(**more)
+async def ros2_bed(**more: Any) -> AsyncIterator[Ros2Bed]:
+    bed = Ros2Bed(**more)
     bed.neighbour.start()
     try:
         yield bed

@@ -10,43 +10,38 @@ from rmpa.core.errors import UnreachableError
 from rmpa.observe.operations import INFO, PARAM, REPORT, WHY
 from rmpa.observe.peer_info import SiteInfo, SitesReport
 from tests.gateway.memory_zenoh import eventually
-from tests.gateway.ros2.io.ros2_bed import STRING, topic_bed
+from tests.gateway.ros2.io.ros2_bed import NO_TYPE, STRING, Ros2Bed
 
 
 class OtherSites:
     """Answers for another site."""
 
-    async def answer(self, what: str, args: dict[str, Any], _asker: str = "", /) -> Any:
-        del args
+    async def answer(self, what: str, _args: dict[str, Any], _asker: str = "", /) -> Any:
         sites = (SiteInfo(name="hall", state="this site"),)
         return SitesReport(gateway="gate", site="hall", sites=sites) if what == REPORT else ["of a site"]
 
 
-async def test_ros2_is_listed_with_its_topics_and_what_is_wrong_with_them() -> None:
-    async with topic_bed() as bed:
-        bed.graph.publisher("/mine", STRING)
-        bed.publisher("/chatter")
-        bed.subscribe("/mine", [], node="/older", type_hash="RIHS01_" + "0" * 64)
-        await eventually(lambda: bed.problems and bed.topic("/chatter"))
-        alone = bed.neighbour
-        report: SitesReport = await alone.answer(REPORT, {})
-        assert [(site.name, site.state) for site in report.sites] == [("ros2", "joined")]
-        report = await alone.answer(INFO, {"site": "ros2"})
-        (info,) = report.sites
-        rows = {(row.name, row.node): row for row in info.sources}
-        assert rows["/chatter", "/bot"].type == "std_msgs/String"
-        assert "definitions differ" in rows["/mine", "/older"].problem
-        ways = await alone.answer(WHY, {"name": "/chatter", "site": "ros2"})
-        assert [(way.peer, way.node) for way in ways] == [("ros2", "/bot")]
-        with pytest.raises(UnreachableError):
-            await alone.answer(PARAM, {"site": "hall"})
+async def test_ros2_is_listed_with_its_topics_and_what_is_wrong_with_them(bed: Ros2Bed) -> None:
+    bed.graph.publisher("/mine", STRING)
+    bed.publisher("/chatter")
+    bed.subscribe("/mine", node="/older", type_hash=NO_TYPE)
+    await eventually(lambda: bed.problems and bed.topic("/chatter"))
+    answer = bed.neighbour.answer
+    report: SitesReport = await answer(REPORT, {})
+    assert [(site.name, site.state) for site in report.sites] == [("ros2", "joined")]
+    (info,) = (await answer(INFO, {"site": "ros2"})).sites
+    rows = {(row.name, row.node): row for row in info.sources}
+    assert rows["/chatter", "/bot"].type == "std_msgs/String"
+    assert "definitions differ" in rows["/mine", "/older"].problem
+    ways = await answer(WHY, {"name": "/chatter", "site": "ros2"})
+    assert [(way.peer, way.node) for way in ways] == [("ros2", "/bot")]
+    with pytest.raises(UnreachableError):
+        await answer(PARAM, {"site": "hall"})
 
 
-async def test_questions_about_sites_go_to_what_answers_for_them() -> None:
-    async with topic_bed() as bed:
-        both = bed.neighbour
-        both.sites = OtherSites()
-        report: SitesReport = await both.answer(REPORT, {})
-        assert [site.name for site in report.sites] == ["hall", "ros2"]
-        assert await both.answer(PARAM, {"site": "hall"}) == ["of a site"]
-        assert await both.answer(WHY, {"name": "/nothing"}) == ["of a site"]
+async def test_questions_about_sites_go_to_what_answers_for_them(bed: Ros2Bed) -> None:
+    bed.neighbour.sites = OtherSites()
+    report: SitesReport = await bed.neighbour.answer(REPORT, {})
+    assert [site.name for site in report.sites] == ["hall", "ros2"]
+    for what, args in ((PARAM, {"site": "hall"}), (WHY, {"name": "/nothing"})):
+        assert await bed.neighbour.answer(what, args) == ["of a site"]

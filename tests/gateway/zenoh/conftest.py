@@ -1,0 +1,26 @@
+"""A router for each test, and sessions that are its clients."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.gateway.zenoh_bed import ZenohBed, bed
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from rmpa.gateway.zenoh.session import OpenSession
+
+
+@pytest.fixture
+async def net() -> AsyncIterator[ZenohBed]:
+    async with bed() as made:
+        yield made
+
+
+@pytest.fixture
+async def pair(net: ZenohBed) -> tuple[OpenSession, OpenSession]:
+    """One that sends or answers, and one that receives or asks."""
+    return await net.session(), await net.session()
