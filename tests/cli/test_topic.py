@@ -8,8 +8,11 @@ import signal
 import socket
 from typing import TYPE_CHECKING
 
+import msgspec
 import pytest
 
+from rmpa.cli.topic import route_line
+from rmpa.observe.snapshot import RouteInfo
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
 from tests.cli.conftest import Background, Place, with_core
@@ -290,6 +293,12 @@ def test_no_master(place: Place) -> None:
             "start one with `rmpa up` or `rmpa core`, or name it with --master [master-unreachable]\n"
         )
     assert place.run("topic", "list", "--master", "x")[0] == 2
+
+
+def test_a_route_without_a_subscriber_does_not_say_that_its_publisher_sends_nothing() -> None:
+    idle = RouteInfo(peer="a", node="/joy", direction="in", state="idle", type="sensor_msgs/Joy")
+    assert route_line(idle) == " * from a: /joy idle: no node here subscribes, so its messages are not counted"
+    assert route_line(msgspec.structs.replace(idle, state="open")) == " * from a: /joy open, 0 messages"
 
 
 def test_the_agents_core_is_asked(place: Place, agent: Callable[..., None], core: RosCore) -> None:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from rmpa.core.identity import Guid, Identity
+from rmpa.discovery.discovery import Stranger
 from rmpa.observe.peer_info import judge_refusal, judge_stranger
+from rmpa.observe.snapshot_builder import judge_strangers
 from rmpa.trust.permissions import MemberInfo, TrustReason, TrustStatus
 
 MEMBER = TrustStatus(on=True, module="pc", authority="base", revoked=("old", "back"))
@@ -36,13 +39,16 @@ PLAIN, OLD_KEY = TrustReason.UNSECURED, TrustReason.REVOKED
             "lost",
             PLAIN,
             "pending",
-            "restart the agent on lost: sudo systemctl restart rmpa if",
+            "if it is lost, its agent runs without its keys: restart it: sudo systemctl restart rmpa if",
             "rmpa trust invite --module lost",
         ),
         # Revoked ones, with their former group key or with none any more; and one that has joined again since.
         (MEMBER, "old", OLD_KEY, "revoked", "rmpa trust leave --yes on old, then run on base: rmpa trust invite", ""),
         (AUTHORITY, "old", PLAIN, "revoked", "then run here: rmpa trust invite --module old", ""),
-        (AUTHORITY, "back", PLAIN, "pending", "has a certificate, but", "rmpa trust invite --module back"),
+        (AUTHORITY, "back", PLAIN, "pending", "if it is back, its agent", "rmpa trust invite --module back"),
+        # Names that differ only in case: none is offered beside a member's, or as one that was never revoked.
+        (AUTHORITY, "Lost", PLAIN, "foreign", "it uses the name Lost without a certificate; do not invite it", ""),
+        (AUTHORITY, "OLD", PLAIN, "revoked", "its beacons have the name OLD, which was revoked", ""),
         # Another mesh, another release, another clock: as the beacons' refusal says.
         (AUTHORITY, "arm", TrustReason.FOREIGN, "foreign", "the problem", ""),
         (AUTHORITY, "arm", TrustReason.KEY, "foreign", "the problem", ""),
@@ -66,6 +72,25 @@ def test_a_member_that_was_away_with_the_former_key_is_not_shown(trust: TrustSta
 
 def test_one_that_joined_again_and_is_linked_is_not_shown_for_its_former_key() -> None:
     assert judge_stranger("back", OLD_KEY, "", trust=MEMBER, members={"base", "back"}) is None
+
+
+@pytest.mark.parametrize(
+    ("relayed", "joined", "shown"),
+    [
+        ((), {}, ["arm", "10.0.0.9:4000"]),
+        (("Arm",), {}, ["10.0.0.9:4000"] * 2),
+        ((), {"ARM": 4.5}, ["10.0.0.9:4000"] * 2),
+        ((), {"ARM": 6.0}, ["10.0.0.9:4000"]),  # heard at 5.0, before its link
+    ],
+)
+def test_a_members_name_is_not_shown_among_strangers(
+    relayed: tuple[str, ...], joined: dict[str, float], shown: list[str]
+) -> None:
+    at = Guid.of("10.0.0.9", 4000)
+    heard = [Stranger(Identity(at, b"i" * 16, name, domain=0), "", PLAIN, 4.0, 5.0) for name in ("arm", "PC")]
+    assert [
+        one.name for one in judge_strangers(heard, 7.0, AUTHORITY, joined=joined, others={"pc", *relayed})
+    ] == shown
 
 
 def test_to_a_module_without_keys_a_secured_mesh_is_pending_and_another_mesh_is_foreign() -> None:

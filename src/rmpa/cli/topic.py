@@ -261,10 +261,7 @@ def _described(graph: Graph, wanted: GraphName, crossing: TopicInfo | None) -> I
     for route in crossing.routes:
         if wanted.peer not in (None, route.peer):
             continue
-        way = "from" if route.direction == "in" else "to"
-        last = "" if route.age is None else f", last {duration(route.age)} ago"
-        relayed = f", {route.messages} messages{last}" if route.transport != "direct" or route.messages else ""
-        yield f" * {way} {route.peer}: {route.node} {shown_state(route)}{relayed}"
+        yield route_line(route)
         yield from (f"     {label:<10} {text}" for label, text in facts(route))
         if route.problem:
             warn(f"{route.peer} {route.node}: {route.problem}", "route-not-open")
@@ -272,6 +269,21 @@ def _described(graph: Graph, wanted: GraphName, crossing: TopicInfo | None) -> I
         warn(trouble, "type-mismatch")
     for trouble in crossing.unreachable:
         warn(trouble, "node-unreachable")
+
+
+def route_line(route: RouteInfo) -> str:
+    """The first line of a route: its ends, its state and what passed it.
+
+    A route without a subscriber here carries nothing: its publisher may send all the same.
+    """
+    way = "from" if route.direction == "in" else "to"
+    if route.direction == "in" and shown_state(route) == "idle":
+        passed = ": no node here subscribes, so its messages are not counted"
+    elif route.transport == "direct" and not route.messages:
+        passed = ""
+    else:
+        passed = f", {route.messages} messages" + ("" if route.age is None else f", last {duration(route.age)} ago")
+    return f" * {way} {route.peer}: {route.node} {shown_state(route)}{passed}"
 
 
 @graph_verb(argument("topic", "topic"))

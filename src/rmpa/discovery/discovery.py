@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import random
 import time
 from dataclasses import dataclass
@@ -130,6 +131,7 @@ class PacketFilter:
         self._old_key_sources = AddressLimit(trust_limits.OLD_KEY_PACKETS_PER_ADDRESS, trust_limits.OLD_KEYS_MAX)
         self._old_keys = TokenBucket(trust_limits.OLD_KEY_PACKETS_RATE, trust_limits.OLD_KEY_PACKETS_RATE)
         self._strangers: dict[tuple[str, int], Stranger] = {}
+        self._left_out = -math.inf
         self._stranger_beacons = TokenBucket(_STRANGER_BEACONS_PER_SECOND, _STRANGER_BEACONS_PER_SECOND)
         self.overrun = False
 
@@ -173,6 +175,15 @@ class PacketFilter:
         for key in [key for key, one in self._strangers.items() if now - one.heard > STRANGER_KEPT]:
             del self._strangers[key]
         return tuple(self._strangers.values())
+
+    def strangers_note(self, now: float) -> str:
+        """What a user is told while more such modules are heard than are shown; empty: all are shown."""
+        if now - self._left_out > STRANGER_KEPT or len(self.strangers(now)) < limits.STRANGERS_SHOWN:
+            return ""
+        return (
+            f"{limits.STRANGERS_SHOWN} modules that are not of this mesh are shown, which is the most; further ones "
+            f"are heard, and not shown until one of these was silent for {STRANGER_KEPT:.0f} s"
+        )
 
     def _read(self, data: bytes, host: str, now: float, *, multicast: bool, interface: int) -> Beacon | None:
         """Parse a packet within the limits of its sender."""
@@ -249,6 +260,7 @@ class PacketFilter:
             self._strangers.pop(key, None)
             return None
         if key not in self._strangers and len(self.strangers(now)) >= limits.STRANGERS_SHOWN:
+            self._left_out = now
             return None
         since = self._strangers[key].since if key in self._strangers else now
         self._strangers[key] = Stranger(identity, problem, reason, since, now)
@@ -420,7 +432,8 @@ class Discovery:
             for host, port in self._membership.silent_seeds()
             if host not in strangers
         ]
-        return (*sorted(self._warned), *silent)
+        full = self._filter.strangers_note(time.monotonic())
+        return (*sorted(self._warned), *silent, *([full] if full else ()))
 
     # --- sockets ----------------------------------------------------------------------------------------------
 

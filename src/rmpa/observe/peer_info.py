@@ -188,15 +188,19 @@ def judge_stranger(
         reason: Why its beacons are refused, as ``discovery.Stranger`` has it.
         problem: Likewise.
         trust: The state of trust here; ``None``: it is off.
-        members: The names of this module and of those that are linked, in lower case.
+        members: The names of this module and of those that are linked or relayed, in lower case. Names that differ
+            only in case are the same to a user.
 
     Returns:
         Its state, the text for ``PeerInfo.last_error``, and the command that lets it in; ``None``: it is not shown.
     """
-    revoked = trust is not None and name in trust.revoked
+    folded = name.casefold()
+    revoked = trust is not None and folded in map(str.casefold, trust.revoked)
     if trust is None or (reason is TrustReason.REVOKED and not revoked):
         return None if reason is TrustReason.REVOKED else (FOREIGN, problem, "")
-    if name.casefold() in members:
+    certificates = {member.name.casefold(): member.name for member in trust.members}
+    certified = certificates.get(folded) == name
+    if folded in members or (folded in certificates and not certified):
         if reason is TrustReason.REVOKED:
             return None  # it has joined again
         text = f"not of this mesh: it uses the name {name} without a certificate"
@@ -204,17 +208,17 @@ def judge_stranger(
     invite = f"rmpa trust invite --module {name}"
     where = "here" if trust.is_authority else f"on {trust.authority or 'the authority'}"
     lets_in = f"run {where}: {invite} (it prints the line to run on {name})"
-    certified = name in (member.name for member in trust.members)
     if revoked and not certified:
-        text = (
-            f"revoked: it was a member, and tries to join again; to let it back in, rmpa trust leave --yes on {name}"
-        )
-        return REVOKED, f"{text}, then {lets_in}", ""
+        text = f"revoked: its beacons have the name {name}, which was revoked; to let it back in, rmpa trust leave"
+        return REVOKED, f"{text} --yes on {name}, then {lets_in}", ""
     if reason is not TrustReason.UNSECURED:
         return FOREIGN, problem, ""
     if certified:
-        text = f"{name} has a certificate, but its agent runs without it; restart the agent on {name}: {_RESTART}"
-        return PENDING, f"pending: {text}; if {name} has lost its keys and is yours, {lets_in}", invite
+        text = (
+            f"its beacons have the name {name} and no certificate, while {name} has one; if it is {name}, its agent"
+        )
+        restart = f"runs without its keys: restart it: {_RESTART}; if these are lost, {lets_in}"
+        return PENDING, f"pending: {text} {restart}", invite
     text = "pending: it has no keys, so its name and address are not proved"
     return PENDING, f"{text}; if it is yours, {lets_in}", invite
 

@@ -235,8 +235,8 @@ class SnapshotBuilder:
         roster = {view.run.identity.guid: view for view in discovery.peers()}
         yield_to_data()
         statuses = {status.identity.guid: status for status in mesh.peers()}
-        infos = []
-        for guid in {*roster, *statuses, *links}:
+        infos, known_guids = [], {*roster, *statuses, *links}
+        for guid in known_guids:
             yield_to_data()
             infos.append(self._peer(roster.get(guid), statuses.get(guid), links.get(guid), now))
         shown = {
@@ -253,18 +253,15 @@ class SnapshotBuilder:
         own = {str(address) for address in (identity.guid.address, *identity.addresses)}
         infos = [info for info in infos if info.instance not in relayed] + [*relayed.values()]
         infos.sort(key=lambda info: (info.name, info.guid))
-        # A module that has joined was heard without keys before its link came up.
         joined = {session.link.name: session.link.since or now for session in links.values()}
-        members = {
-            name.casefold() for name in (self._settings.name, *joined, *(each.name for each in relayed.values()))
-        }
-        knocking = (
-            _stranger(one, now, trust, members)
-            for one in discovery.strangers()
-            if one.heard > joined.get(one.identity.name, 0.0)
-            and not any(one.identity.guid in known for known in (roster, statuses, links))
+        knocking = judge_strangers(
+            (one for one in discovery.strangers() if one.identity.guid not in known_guids),
+            now,
+            trust,
+            joined=joined,
+            others={self._settings.name, *(each.name for each in relayed.values())},
         )
-        strange = [info for info in infos if info.state in (FOREIGN, PENDING)] + [info for info in knocking if info]
+        strange = [*(info for info in infos if info.state in (FOREIGN, PENDING)), *knocking]
         strange.sort(key=lambda info: (info.name, info.guid))
         peers = [info for info in infos if info.state not in (FOREIGN, PENDING)]
         return mark_shared_addresses(peers, own), tuple(strange)
@@ -423,7 +420,32 @@ class SnapshotBuilder:
         )
 
 
-def _stranger(one: Stranger, now: float, trust: TrustStatus | None, members: set[str]) -> PeerInfo | None:
+def judge_strangers(
+    heard: Iterable[Stranger],
+    now: float,
+    trust: TrustStatus | None,
+    *,
+    joined: Mapping[str, float],
+    others: Collection[str],
+) -> Iterator[PeerInfo]:
+    """What is shown of the modules that are heard and are not of this mesh.
+
+    Args:
+        heard: These modules.
+        now: Monotonic seconds.
+        trust: The state of trust; ``None``: it is off.
+        joined: The names of linked modules, each with the time of its link: it was heard without keys before.
+        others: The names of this module and of relayed ones.
+    """
+    since = dict.fromkeys(map(str.casefold, others), 0.0) | {name.casefold(): at for name, at in joined.items()}
+    for one in heard:
+        if one.heard > since.get(one.identity.name.casefold(), 0.0):
+            info = _stranger(one, now, trust, since.keys())
+            if info is not None:
+                yield info
+
+
+def _stranger(one: Stranger, now: float, trust: TrustStatus | None, members: Collection[str]) -> PeerInfo | None:
     identity = one.identity
     shown = judge_stranger(identity.name, one.reason, one.problem, trust=trust, members=members)
     if shown is None:

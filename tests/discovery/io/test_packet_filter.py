@@ -261,4 +261,7 @@ def test_strangers_fill_no_table_and_no_time(caplog: pytest.LogCaptureFixture) -
     assert shown[0].identity == FRIEND, "one that was there before stays"
     assert len(shown) == limits.STRANGERS_SHOWN
     assert len(caplog.records) < limits.STRANGERS_SHOWN
+    note = door.intake.strangers_note(15.0)
+    assert f"{len(shown)} modules that are not of this mesh are shown, which is the most" in note
+    assert not door.intake.strangers_note(15.0 + STRANGER_KEPT)
     assert not door.intake.strangers(15.0 + STRANGER_KEPT)

@@ -217,6 +217,13 @@ AGENTS: dict[str, tuple[Callable[[], Iterable[Check]], str, str]] = {
         "peer",
         "warn",
     ),
+    "of many modules that are not of this mesh some": (
+        agent(
+            peers=(), strangers=tuple(msgspec.structs.replace(PC, name=f"m{n}", last_error="x; y") for n in range(18))
+        ),
+        "peer",
+        " ".join(["warn"] * 17),
+    ),
     "a relayed peer needs no link": (
         agent(peers=(msgspec.structs.replace(JOYSTICK, state="relayed", link=None),)),
         "peer",

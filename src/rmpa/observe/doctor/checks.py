@@ -77,6 +77,8 @@ def _agent(snapshot: Snapshot, version: str) -> Iterator[Check]:
     yield check("proxies", OK, text)
     for stranger in snapshot.strangers[: limits.DOCTOR_PEERS_LISTED]:
         yield Check.from_message("peer", WARN, stranger.last_error, where=f"{agent.name}-{stranger.name}")
+    if (left := len(snapshot.strangers) - limits.DOCTOR_PEERS_LISTED) > 0:
+        yield check("peer", WARN, f"and {left} more modules that are not of this mesh", "rmpa peer list names them")
     if not snapshot.peers and not snapshot.strangers:
         text = f"knows no peer (domain {agent.domain}, looking on {', '.join(agent.interfaces) or 'no interface'})"
         remedy = (
