@@ -81,9 +81,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
-    """Spare ``no_leaks`` the look through thousands of collected tests."""
+    """Spare ``no_leaks`` the look through thousands of collected tests; the end of an agent would thaw them again."""
     gc.collect()
     gc.freeze()
+    patch = pytest.MonkeyPatch()
+    for name in ("freeze", "unfreeze"):
+        patch.setattr(gc, name, lambda: None)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

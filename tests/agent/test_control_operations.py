@@ -17,11 +17,8 @@ from rmpa.observe.control import GraphRevision, TopicRow
 from rmpa.observe.control_client import ControlClient
 from rmpa.observe.operations import REPLIES
 from rmpa.observe.peer_info import PeerAgent
-from rmpa.ros.environment import NodeFacts, PeerNodes, RosEnvironment
-from rmpa.ros.node.node import Node
-from rmpa.ros.types.messages import MessageType
-from tests.agent.test_agent import running, until
-from tests.ros.node.peers import DEADLINE
+from rmpa.ros.environment import NodeFacts
+from tests.agent.test_agent import DEADLINE, node, running
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -45,71 +42,56 @@ ARGS: Final[dict[str, dict[str, Any]]] = {
 }
 
 
-async def test_each_operation_replies_with_its_type(settings: Callable[..., Settings], tmp_path: Path) -> None:
-    async with running(settings("a"), settings("b")) as (a, b):
-        await until(lambda: list(a.bridge.sessions.linked()) and list(b.bridge.sessions.linked()))
-        a.reloader._load = lambda: Loaded(settings("a"))
-
-        def ask() -> dict[str, object]:
-            with ControlClient(tmp_path / "a.sock") as client:
-                return {name: client.call(name, cast("Any", reply), **ARGS[name]) for name, reply in REPLIES.items()}
-
-        replies = await asyncio.to_thread(ask)
-    assert replies.keys() == ARGS.keys()
-
-
-@pytest.mark.parametrize(
-    ("op", "args", "text"),
-    [
-        ("snapshot", {"topics": "/chatter"}, "is not a list of topics"),
-        ("ping", {"peer": "b", "count": 0}, "is not between 1 and"),
-        ("ping", {"peer": "c"}, "linked peer"),
-        ("why", {"name": "chatter"}, "is not a topic, nor a service"),
-        ("param", {"peer": "b", "what": "param.nmes"}, r"did you mean param\.names\?"),
-        ("graph", {"wait": -1}, "is not between 0 and"),
-        ("node", {"what": "node.lst"}, r"did you mean node\.list\?"),
-        ("agent", {"peer": "c"}, "linked peer"),
-        ("contract", {"topic": "chatter"}, "is not a topic"),
-        ("snapshots", {}, "did you mean snapshot?"),
-    ],
+WRONG: Final[tuple[tuple[str, dict[str, Any], str], ...]] = (
+    ("snapshot", {"topics": "/chatter"}, "is not a list of topics"),
+    ("snapshot", {"most": "many"}, "is not a number of topics"),
+    ("ping", {"peer": "b", "count": 0}, "is not between 1 and"),
+    ("ping", {"peer": "bb"}, "did you mean b?"),
+    ("why", {"name": "chatter"}, "is not a topic, nor a service"),
+    ("param", {"peer": "b", "what": "param.nmes"}, "did you mean param.names?"),
+    ("graph", {"wait": -1}, "is not between 0 and"),
+    ("node", {"what": "node.lst"}, "did you mean node.list?"),
+    ("agent", {"peer": "c"}, "linked peer"),
+    ("contract", {"topic": "chatter"}, "is not a topic"),
+    ("snapshots", {}, "did you mean snapshot?"),
 )
-async def test_wrong_arguments_are_refused(
-    settings: Callable[..., Settings], tmp_path: Path, op: str, args: dict[str, Any], text: str
+
+
+async def test_each_operation_replies_with_its_type_and_refuses_wrong_arguments(
+    settings: Callable[..., Settings], tmp_path: Path
 ) -> None:
     async with running(settings("a"), settings("b")) as (a, _b):
-        await until(lambda: list(a.bridge.sessions.linked()))
+        a.reloader._load = lambda: Loaded(settings("a"))
 
-        def ask() -> object:
+        def ask() -> list[str]:
             with ControlClient(tmp_path / "a.sock") as client:
-                return client.call(op, object, **args)
+                for name, reply in REPLIES.items():
+                    client.call(name, cast("Any", reply), **ARGS[name])
+                refused = []
+                for op, args, _ in WRONG:
+                    with pytest.raises(PeerRefused) as error:
+                        client.call(op, object, **args)
+                    refused.append(str(error.value))
+            return refused
 
-        with pytest.raises(PeerRefused, match=text):
-            await asyncio.to_thread(ask)
-
-
-async def test_nodes_of_all_peers_are_listed(settings: Callable[..., Settings]) -> None:
-    async with running(settings("a"), settings("b")) as (a, _b):
-        await until(lambda: list(a.bridge.sessions.linked()))
-        (nodes,) = await a.operations.node({"what": "node.list"})
-    assert isinstance(nodes, PeerNodes)
-    assert (nodes.peer, nodes.problem) == ("b", "")
+        refused = await asyncio.to_thread(ask)
+    assert REPLIES.keys() == ARGS.keys()
+    assert [text for (_, _, text), said in zip(WRONG, refused, strict=True) if text not in said] == []
 
 
 async def test_a_node_tells_its_connections_here_and_at_a_peer(settings: Callable[..., Settings]) -> None:
-    text = MessageType("std_msgs/String")
     async with (
         running(settings("a"), settings("b")) as (a, b),
-        Node("/talker", master_uri=a.core.uri, environment=RosEnvironment()) as talker,
-        Node("/listener", master_uri=a.core.uri, environment=RosEnvironment()) as listener,
+        node("talker", a) as talker,
+        node("listener", a) as listener,
     ):
-        await until(lambda: list(b.bridge.sessions.linked()))
-        await talker.advertise("/chatter", text)
-        await listener.subscribe("/chatter", text, lambda _: None)
+        await talker.advertise("/chatter", "std_msgs/String")
+        await listener.subscribe("/chatter", "std_msgs/String", lambda _: None)
 
-        async def connections(node: str) -> set[tuple[str, bool, str]]:
-            own = await a.operations.node({"what": "node.info", "node": node})
+        async def connections(name: str) -> set[tuple[str, bool, str]]:
+            own = await a.operations.node({"what": "node.info", "node": name})
             theirs = msgspec.convert(
-                await b.operations.node({"what": "node.info", "peer": "a", "node": node}), NodeFacts
+                await b.operations.node({"what": "node.info", "peer": "a", "node": name}), NodeFacts
             )
             assert isinstance(own, NodeFacts)
             assert own.connections is not None
@@ -124,11 +106,14 @@ async def test_a_node_tells_its_connections_here_and_at_a_peer(settings: Callabl
 
 async def test_a_peer_tells_of_itself_and_a_module_is_diagnosed(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, b):
-        await until(lambda: list(a.bridge.sessions.linked()) and list(b.bridge.sessions.linked()))
         told = msgspec.convert(await a.operations.agent({"peer": "b"}), PeerAgent)
         assert (told.version, told.core_uri) == (rmpa.__version__, b.core.uri)
         assert told.rss
+        answer = await a.operations.ping({"peer": "b", "count": 2})
+        assert len(answer.times) == 2
+        assert all(time is not None and 0 <= time < DEADLINE for time in answer.times)
         (peer,) = a.operations.snapshot({}).peers
+        assert (peer.name, peer.state) == ("b", "linked")
         assert peer.link is not None
         assert [lane.name for lane in peer.link.lanes] == ["express", "bulk"]
         assert peer.link.lanes[0].bytes_in > 0
@@ -150,23 +135,7 @@ async def test_the_contract_of_a_topic_without_a_route_is_that_of_the_rules(
         assert terms["depth"].rule == "default"
 
 
-async def test_a_change_of_the_graph_ends_the_wait_for_it(settings: Callable[..., Settings], tmp_path: Path) -> None:
-    async with running(settings("a")) as (a,):
-
-        def ask(**args: object) -> int:
-            with ControlClient(tmp_path / "a.sock") as client:
-                return client.call("graph", GraphRevision, **args).revision
-
-        known = await asyncio.to_thread(ask)
-        assert await asyncio.to_thread(ask, after=known, wait=0.01) == known
-        waiting = asyncio.create_task(asyncio.to_thread(ask, after=known, wait=20.0))
-        a.core.call("registerPublisher", "/talker", "/chatter", "std_msgs/String", "http://127.0.0.1:9/")
-        changed = await asyncio.wait_for(waiting, DEADLINE)
-        assert changed != known
-        assert await asyncio.to_thread(ask, after=known, wait=20.0) == changed  # it has changed before: at once
-
-
-async def test_the_agent_tells_what_has_changed_in_its_own_core(
+async def test_a_change_of_the_graph_ends_the_wait_for_it_and_is_told(
     settings: Callable[..., Settings], tmp_path: Path
 ) -> None:
     async with running(settings("a")) as (a,):
@@ -179,9 +148,13 @@ async def test_the_agent_tells_what_has_changed_in_its_own_core(
         assert first.core_uri == a.core.uri
         assert first.rows is not None
         assert first.rows.whole
+        assert (await asyncio.to_thread(ask, after=first.revision, wait=0.01)).revision == first.revision
         waiting = asyncio.create_task(asyncio.to_thread(ask, after=first.revision, wait=20.0))
         a.core.call("registerPublisher", "/talker", "/chatter", "std_msgs/String", "http://127.0.0.1:9/")
         changed = await asyncio.wait_for(waiting, DEADLINE)
+        assert changed.revision != first.revision
+        again = await asyncio.to_thread(ask, after=first.revision, wait=20.0)  # it has changed before: at once
+        assert again.revision == changed.revision
         assert changed.rows is not None
         assert not changed.rows.whole
         assert TopicRow("/chatter", "std_msgs/String", ("/talker",), ()) in changed.rows.topics

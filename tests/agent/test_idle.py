@@ -11,11 +11,12 @@ import pytest
 from rmpa.runtime import loop as event_loop
 from rmpa.runtime.loop import AgentLoop, DirectSelector
 from tests.agent.test_agent import running
-from tests.agent.test_diagnostics import settings
 
 if TYPE_CHECKING:
     import selectors
-    from pathlib import Path
+    from collections.abc import Callable
+
+    from rmpa.config.settings import Settings
 
 _SETTLED: Final = 60.0
 """Seconds after the links are up: they rest, and the burst of beacons is over."""
@@ -70,10 +71,10 @@ def _leaping(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("_leaping")
-def test_agents_without_work_sleep(tmp_path: Path) -> None:
+def test_agents_without_work_sleep(settings: Callable[..., Settings]) -> None:
     async def main() -> tuple[float, int]:
         names = ("a", "b", "c", "d")
-        async with running(*(settings(name, tmp_path) for name in names)) as agents:
+        async with running(*(settings(name) for name in names)) as agents:
             await leap(_SETTLED)
             woken = await leap(_SPAN)
             return woken / len(agents), sum(len(list(agent.bridge.sessions.linked())) for agent in agents)

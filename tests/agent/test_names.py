@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.config.peer_rules import PeerRule, PolicySettings
+from rmpa.config.settings import TimeSettings
 from rmpa.core.contract import ContractRule
 from tests.agent.test_agent import Sink, node, running, until
 
@@ -65,30 +66,14 @@ async def test_topics_have_each_sides_names_both_ways(agents: tuple[Agent, Agent
         assert [(r.direction, r.wire) for r in info(robot, "/odom").routes] == [("out", "")]
 
 
-async def test_a_peer_is_offered_only_what_its_rules_allow(settings: Callable[..., Settings]) -> None:
-    guest = PeerRule("guest", policy=PolicySettings(allow=("/pose",)))
-    async with (
-        running(replace(settings("pc"), peers=(guest,)), settings("guest"), settings("friend")) as (
-            pc,
-            other,
-            friend,
-        ),
-        node("n", pc) as ours,
-    ):
-        for topic in ("/pose", "/secret"):
-            await ours.advertise(topic, "std_msgs/String")
-        await until(lambda: publishers(other, "/pose") and publishers(friend, "/secret"))
-        assert not publishers(other, "/secret")
-        counts = {peer.name: peer.topics_out for peer in pc.snapshots.build().peers}
-        assert counts == {"guest": 1, "friend": 2}
-
-
 async def test_a_mismatch_has_each_sides_names(agents: tuple[Agent, Agent]) -> None:
     pc, robot = agents
     async with node("base", robot) as base, node("driver", pc) as driver:
         cmd = await driver.advertise("/robot/cmd", "std_msgs/String")
         wrong = await base.subscribe("/cmd", "std_msgs/Int32")
         await until(lambda: wrong.refusals and pc.bridge.counters["mismatch.remote"])
+        assert "md5" in next(iter(wrong.refusals.values()))
+        assert robot.bridge.counters["mismatch.md5"] == 1
         for agent, topic in ((pc, "/robot/cmd"), (robot, "/cmd")):
             [text] = info(agent, topic).mismatches
             assert "std_msgs/Int32" in text
@@ -139,3 +124,28 @@ async def test_a_reload_keeps_unchanged_routes_and_connections(agents: tuple[Age
         await until(partial(again.count, 1))
         assert not listeners["named"].publishers
         assert not talkers["denied"].subscribers
+
+
+# --- what is said of a /clock that is followed --------------------------------------------------------------------
+
+
+async def test_a_followed_clock_does_not_stay_home(settings: Callable[..., Settings]) -> None:
+    shares = replace(settings("a"), time=TimeSettings(share=True))
+    follows = replace(settings("b"), time=TimeSettings(follow="a"))
+    async with running(shares, follows) as (a, b), node("simulator", a) as simulator, node("user", b) as user:
+        await simulator.advertise("/clock", "rosgraph_msgs/Clock")
+        await user.subscribe("/clock", "rosgraph_msgs/Clock", lambda _: None)
+        await until(lambda: "/rmpa/a/simulator" in b.core.publishers("/clock"))
+        (here,) = b.snapshots.build(frozenset({"/clock"})).topics
+        assert [route.direction for route in here.routes] == ["in"]
+        text = 'time.follow = "a": that module\'s comes here; one of this module does not cross'
+        assert (here.crosses, here.policy) == (True, text)
+        (there,) = a.snapshots.build(frozenset({"/clock"})).topics
+        assert (there.crosses, there.policy) == (True, "time.share = true: peers may follow this module's time")
+
+
+async def test_a_clock_without_followers_stays_home(settings: Callable[..., Settings]) -> None:
+    async with running(settings("a"), settings("b")) as (a, _), node("simulator", a) as simulator:
+        await simulator.advertise("/clock", "rosgraph_msgs/Clock")
+        (shown,) = a.snapshots.build(frozenset({"/clock"})).topics
+        assert (shown.crosses, shown.policy.startswith("built in: time does not cross")) == (False, True)

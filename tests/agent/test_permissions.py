@@ -15,14 +15,12 @@ import pytest
 
 from rmpa.agent.agent import Agent, permission_notes
 from rmpa.bridge.nodes import INFO, KILL, LIST, PING
-from rmpa.bridge.params import rules as transfer
 from rmpa.bridge.sessions import PeerSession
 from rmpa.config.peer_rules import Effect, PermissionRule
-from rmpa.config.settings import NodeSettings, ParamSettings, ServiceSettings, Settings, TrustSettings
+from rmpa.config.settings import NodeSettings, ServiceSettings, Settings, TrustSettings
 from rmpa.core.contract import ContractRule, Transport
 from rmpa.core.errors import PeerRefused
 from rmpa.observe import limits as observe_limits
-from rmpa.ros.wire.xmlrpc import serialize_response
 from rmpa.trust.permissions import Permissions
 from tests.agent.test_agent import Sink, node, running, until
 from tests.agent.test_services import serving
@@ -33,7 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.observe.why.diagnosis import Diagnosis
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 
 @pytest.fixture(autouse=True)
@@ -166,95 +163,7 @@ async def test_services_are_shown_and_called_only_as_both_sides_permit(
         await until(lambda: here("/other"))
 
 
-async def test_parameters_are_read_and_set_only_with_permission(
-    settings: Callable[..., Settings],
-) -> None:
-    params = ParamSettings(remote_get=("/**",), remote_set=("/**",))
-    a_settings = replace(
-        with_rules(settings("a"), allow("b", param="/arm/**"), deny("b", param="/arm/secret")), params=params
-    )
-    async with secured(a_settings, with_rules(settings("b"))) as (a, b):
-        link = next(iter(b.bridge.sessions.linked()))
-        for key, value in (("/arm/speed", 1), ("/arm/secret", 2), ("/arm/deep/x", 3), ("/other", 4)):
-            a.core.call("setParam", "/n", key, value)
-
-        async def asks(what: str, key: str) -> str:
-            try:
-                return str(await b.bridge.rpc.request(link, what, {"key": key}))
-            except PeerRefused as error:
-                return error.reason
-
-        async def sets(key: str, value: XmlRpcValue) -> str:
-            args = {"key": key, "text": serialize_response(value).decode()}
-            try:
-                return f"set {(await b.bridge.rpc.request(link, transfer.SET, args))['count']}"
-            except PeerRefused as error:
-                return error.reason
-
-        def no(key: str) -> str:
-            return f"the permissions there do not let b read or set {key}"
-
-        assert "1" in await asks(transfer.GET, "/arm/speed")
-        assert await asks(transfer.GET, "/arm/secret") == no("/arm/secret")
-        assert await asks(transfer.GET, "/arm") == no("/arm"), "it holds a secret, whose name is not told"
-        assert await asks(transfer.GET, "/nothing") == no("/nothing")
-        assert "/arm/speed" in (names := await asks(transfer.NAMES, ""))
-        assert "secret" not in names
-        assert "/other" not in names
-        assert await asks(transfer.DELETE, "/arm") == no("/arm")
-        assert await asks(transfer.DELETE, "/other") == no("/other")
-        assert a.bridge.counters["permission.param"] == 5
-        assert a.core.call("getParam", "/n", "/arm/secret")[2] == 2
-        assert await sets("/arm/speed", 5) == "set 1"
-        assert await sets("/arm/secret", 5) == no("/arm/secret")
-        assert await sets("/arm", {"speed": 6, "secret": 7}) == no("/arm/secret"), "a name of its own words"
-        assert await sets("/arm", 7) == no("/arm"), "the secret would be lost"
-        assert await sets("/arm/secret/deeper", 7) == no("/arm/secret/deeper"), "here too"
-        assert a.core.call("getParam", "/n", "/arm")[2] == {"speed": 5, "secret": 2, "deep": {"x": 3}}
-        assert await asks(transfer.DELETE, "/arm/deep") == "{}"
-
-
-async def test_a_gateway_has_for_another_site_what_both_may_have(settings: Callable[..., Settings]) -> None:
-    params = ParamSettings(remote_get=("/**",), remote_set=("/**",))
-    rules = (
-        allow("b", param="/arm/**"),
-        allow("yard", param="/arm/deep/** /other"),
-        deny("thief", param="/arm/deep/y"),
-    )
-    a_settings = replace(with_rules(settings("a"), *rules), params=params)
-    async with secured(a_settings, with_rules(settings("b"))) as (a, b):
-        link = next(iter(b.bridge.sessions.linked()))
-        for key, value in (("/arm/speed", 1), ("/arm/deep/x", 2), ("/arm/deep/y", 3), ("/other", 4)):
-            a.core.call("setParam", "/n", key, value)
-
-        async def asks(what: str, key: str, *askers: str, **more: object) -> str:
-            args = {"key": key, "site": "yard", "askers": list(askers), **more}
-            try:
-                return str((await b.bridge.rpc.request(link, what, args)).get("text", "done"))
-            except PeerRefused as error:
-                return error.reason
-
-        def no(key: str) -> str:
-            return f"the permissions there do not let yard read or set {key}"
-
-        five = serialize_response(5).decode()
-        assert "3" in await asks(transfer.GET, "/arm/deep/y", "base")
-        assert await asks(transfer.GET, "/arm/deep/y/", "thief") == no("/arm/deep/y")
-        assert await asks(transfer.GET, "/arm/deep", "base", "thief") == no("/arm/deep"), "one of them may not"
-        assert await asks(transfer.GET, "/arm", "base") == no("/arm")
-        assert await asks(transfer.GET, "/other", "base") == no("/other"), "the gateway may not"
-        names = await asks(transfer.NAMES, "", "thief")
-        assert ("/arm/deep/x" in names, "/arm/deep/y" in names, "/arm/speed" in names) == (True, False, False)
-        assert await asks(transfer.SET, "/arm/deep/y", "thief", text=five) == no("/arm/deep/y")
-        assert await asks(transfer.SET, "/arm/deep", "thief", text=five) == no("/arm/deep"), "y would be lost"
-        assert await asks(transfer.DELETE, "/arm/deep/", "thief") == no("/arm/deep")
-        assert a.core.call("getParam", "/n", "/arm/deep")[2] == {"x": 2, "y": 3}
-        assert await asks(transfer.DELETE, "/arm/deep", "base") == "done"
-        for bad in ({"site": 5}, {"site": "**"}, {"askers": "base"}, {"askers": ["{peer}"]}, {"askers": ["b"] * 300}):
-            assert "/arm/speed" not in await asks(transfer.NAMES, "", **bad)
-
-
-async def test_nodes_of_which_a_module_may_have_nothing_are_not_there_for_it(
+async def test_nodes_and_names_of_which_a_module_may_have_nothing_are_not_there_for_it(
     settings: Callable[..., Settings],
 ) -> None:
     a_settings = with_rules(settings("a"), allow("b", subscribe="/odom", publish="/cmd_vel"))
@@ -265,12 +174,16 @@ async def test_nodes_of_which_a_module_may_have_nothing_are_not_there_for_it(
     ):
         for topic in ("/odom", "/secret"):
             await base.advertise(topic, "std_msgs/String")
-        await base.subscribe("/cmd_vel", "std_msgs/String", lambda _: None)
+        for topic in ("/cmd_vel", "/hidden"):
+            await base.subscribe(topic, "std_msgs/String", lambda _: None)
         await secret.advertise("/secret", "std_msgs/String")
         link = next(iter(b.bridge.sessions.linked()))
         (line,) = await b.bridge.rpc.request(link, LIST, {})
         assert (line["name"], line["publications"], line["subscriptions"]) == ("/base", 1, 1)
         assert (await b.bridge.rpc.request(link, PING, {"node": "/base"}))["pid"]
+        facts = await b.bridge.rpc.request(link, INFO, {"node": "/base"})
+        assert (list(facts["publications"]), list(facts["subscriptions"])) == (["/odom"], ["/cmd_vel"])
+        assert facts["services"] == []
         for what in (PING, INFO):
             said = []
             for name in ("/secret_driver", "/secret_drivex"):
@@ -278,21 +191,6 @@ async def test_nodes_of_which_a_module_may_have_nothing_are_not_there_for_it(
                     await b.bridge.rpc.request(link, what, {"node": name})
                 said.append(refused.value.reason.replace(name, "NAME"))
             assert said == ["a has no node NAME"] * 2
-
-
-async def test_facts_about_a_node_leave_out_what_the_asker_may_not_have(
-    settings: Callable[..., Settings],
-) -> None:
-    a_settings = with_rules(settings("a"), allow("b", subscribe="/odom", publish="/cmd_vel"))
-    async with secured(a_settings, with_rules(settings("b"))) as (a, b), node("base", a) as base:
-        for topic in ("/odom", "/secret"):
-            await base.advertise(topic, "std_msgs/String")
-        for topic in ("/cmd_vel", "/hidden"):
-            await base.subscribe(topic, "std_msgs/String", lambda _: None)
-        link = next(iter(b.bridge.sessions.linked()))
-        facts = await b.bridge.rpc.request(link, INFO, {"node": "/base"})
-        assert (list(facts["publications"]), list(facts["subscriptions"])) == (["/odom"], ["/cmd_vel"])
-        assert facts["services"] == []
 
 
 async def test_nodes_are_ended_only_with_permission(settings: Callable[..., Settings]) -> None:

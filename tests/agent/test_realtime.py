@@ -4,57 +4,29 @@ from __future__ import annotations
 
 import asyncio
 import gc
-import os
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.agent.agent import Agent
-from rmpa.config.settings import Settings
-from rmpa.config.values import Multicast
-from rmpa.observe.control_client import ControlClient
 from rmpa.ros.http.rpc import call_api
-from rmpa.ros.node.node import Node
 from rmpa.runtime import limits as runtime_limits
+from tests.agent.test_agent import DEADLINE, node, running, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
-    from pathlib import Path
 
-    from rmpa.observe.snapshot import Snapshot
+    from rmpa.agent.agent import Agent
+    from rmpa.config.settings import Settings
 
-DEADLINE: Final = 20.0
-MESSAGES: Final = 20_000
+MESSAGES: Final = 10_000
 PER_TURN: Final = 50
 
 
-async def until(condition: Callable[[], object]) -> None:
-    async with asyncio.timeout(DEADLINE):
-        while not condition():
-            await asyncio.sleep(0.005)
-
-
 @pytest.fixture
-def settings(tmp_path: Path) -> Callable[[str], Settings]:
-    port = 20000 + os.getpid() % 20000
-
-    def make(name: str) -> Settings:
-        return Settings(
-            name=name, core_port=0, interfaces=("lo",), multicast=Multicast(port=port), runtime_dir=str(tmp_path)
-        )
-
-    return make
-
-
-@pytest.fixture
-async def pair(settings: Callable[[str], Settings]) -> AsyncIterator[tuple[Agent, Agent]]:
-    a, b = Agent(settings("a")), Agent(settings("b"))
-    await a.start()
-    await b.start()
-    await until(lambda: len(list(a.bridge.sessions.linked())) == len(list(b.bridge.sessions.linked())) == 1)
-    yield a, b
-    await b.close()
-    await a.close()
+async def pair(settings: Callable[..., Settings]) -> AsyncIterator[list[Agent]]:
+    async with running(settings("a"), settings("b")) as agents:
+        yield agents
 
 
 @pytest.fixture
@@ -72,13 +44,13 @@ def collections() -> Iterator[list[int]]:
 
 
 async def test_no_collection_runs_while_messages_flow(
-    pair: tuple[Agent, Agent], collections: list[int], monkeypatch: pytest.MonkeyPatch
+    pair: list[Agent], collections: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
         "rmpa.ros.node.node.NODE_MASTER_CHECK", DEADLINE
     )  # two XML-RPC calls a second of our own nodes
     a, b = pair
-    async with Node("talker", master_uri=a.core.uri) as talker, Node("hearer", master_uri=b.core.uri) as hearer:
+    async with node("talker", a) as talker, node("hearer", b) as hearer:
         heard = sent = 0
 
         def hear(_: object) -> None:
@@ -104,7 +76,7 @@ async def test_no_collection_runs_while_messages_flow(
 
         await send(1000)  # what is made at the first message has come to stay
         await asyncio.sleep(0.5)
-        gc.collect(0)
+        gc.collect()
         collections.clear()
         await send(MESSAGES)
         assert collections == []
@@ -112,7 +84,7 @@ async def test_no_collection_runs_while_messages_flow(
 
 
 async def test_garbage_of_control_work_is_collected_while_the_agent_runs(
-    pair: tuple[Agent, Agent], collections: list[int]
+    pair: list[Agent], collections: list[int]
 ) -> None:
     a, _ = pair
     gc.collect()
@@ -126,19 +98,11 @@ async def test_garbage_of_control_work_is_collected_while_the_agent_runs(
 
 
 async def test_the_collector_is_the_interpreters_again_when_the_agent_ends(
-    settings: Callable[[str], Settings],
+    settings: Callable[..., Settings], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = gc.get_threshold()
-    agent = Agent(settings("a"))
-    await agent.start()
-    assert gc.get_threshold() == runtime_limits.COLLECT_THRESHOLDS
-    assert gc.get_freeze_count()
-    await agent.close()
-    assert gc.isenabled()
-    assert gc.get_threshold() == before
-    assert gc.get_freeze_count() == 0
-
-
-def ask(runtime_dir: Path) -> Snapshot:
-    with ControlClient(runtime_dir / "a.sock") as client:
-        return client.snapshot()
+    before, done = gc.get_threshold(), list[str]()
+    for name in ("freeze", "unfreeze"):
+        monkeypatch.setattr(gc, name, partial(done.append, name))
+    async with running(settings("a")):
+        assert (gc.get_threshold(), done) == (runtime_limits.COLLECT_THRESHOLDS, ["freeze"])
+    assert (gc.isenabled(), gc.get_threshold(), done) == (True, before, ["freeze", "unfreeze"])

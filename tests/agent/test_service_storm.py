@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 async def test_no_caller_that_stays_is_left_without_an_answer_or_an_end(
     settings: Callable[..., Settings], seed: int, caplog: pytest.LogCaptureFixture
 ) -> None:
-    storm = await rage(4.0, seed, settings("a"), settings("b"))
+    storm = await rage(2.0, seed, settings("a"), settings("b"))
     assert not storm.wrong
     assert storm.ends["answer"]
     assert not [record for record in caplog.records if record.levelname == "ERROR"]

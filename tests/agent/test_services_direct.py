@@ -103,21 +103,17 @@ async def test_a_restarted_server_is_asked_for_anew(pair: tuple[Settings, Settin
         assert lookup(b) == ""
 
 
-@pytest.mark.parametrize("side", [0, 1])
-async def test_both_modules_must_want_it(pair: tuple[Settings, Settings], side: int) -> None:
-    relayed = replace(
-        pair[side], services=ServiceSettings(rules=(ServiceRule(("/add",), transport=Transport.RELAY),))
-    )
-    both = [pair[0], pair[1]]
-    both[side] = relayed
-    async with running(*both) as agents, serving(agents[0]):
-        await until(lambda: transport(agents[1]) == ("relay", "transport"))
-        agents[side].bridge.reload(pair[side])
-        await until(lambda: transport(agents[1]) == ("direct", ""))
-        await until(lambda: list(agents[0].services.direct_exports))
-        agents[side].bridge.reload(relayed)
-        await until(lambda: transport(agents[1]) == ("relay", "transport"))
-        await until(lambda: not list(agents[0].services.direct_exports))
+async def test_both_modules_must_want_it(pair: tuple[Settings, Settings]) -> None:
+    relay = ServiceSettings(rules=(ServiceRule(("/add",), transport=Transport.RELAY),))
+    async with running(*pair) as (a, b), serving(a):
+        await until(lambda: transport(b) == ("direct", ""))
+        for agent, own in zip((a, b), pair, strict=True):
+            agent.bridge.reload(replace(own, services=relay))
+            await until(lambda: transport(b) == ("relay", "transport"))
+            await until(lambda: not list(a.services.direct_exports))
+            agent.bridge.reload(own)
+            await until(lambda: transport(b) == ("direct", ""))
+            await until(lambda: list(a.services.direct_exports))
 
 
 async def test_direct_warns_once_where_it_cannot_be_had(
@@ -132,37 +128,31 @@ async def test_direct_warns_once_where_it_cannot_be_had(
         assert "timeout of 5 s" in said[0]
 
 
-HOSTILE: dict[str, Callable[[int], object]] = {
-    "a closed port": lambda _: {"port": 1},
-    "a port of another node of ours": lambda ours: {"port": ours, "probe": "/trap/get_loggers"},
-    "no port": lambda _: {"port": 0},
-    "a port beyond 16 bits": lambda _: {"port": 70_000},
-    "a text": lambda _: {"port": "22"},
-    "an address": lambda _: {"port": 1, "address": "10.0.0.9", "uri": "rosrpc://10.0.0.9:1"},
-    "a list": lambda _: [1, 2],
-    "nothing": lambda _: None,
-    "a condition of a later release": lambda _: {"why": "moon", "text": "\x1b[31mred"},
-}
-
-
-@pytest.mark.parametrize("lie", HOSTILE)
-async def test_false_answers_lead_nowhere(pair: tuple[Settings, Settings], lie: str) -> None:
+async def test_false_answers_lead_nowhere(pair: tuple[Settings, Settings]) -> None:
+    """What is no answer at all, ``tests/bridge/test_direct.py`` has."""
     async with running(*pair) as (a, b), serving(b, "/trap", "/trap") as trap:
         # It serves a service of that name too, and would take the calls.
         description = ServiceDescription("a/Add", MD5)
         trap.node.add_service(ServiceEndpoint("/add", "/trap", trap.calls.append, description=description))
-        answer = HOSTILE[lie](int(trap.node.service_uri.rpartition(":")[2]))
-        a.bridge.rpc.on_request("direct.service", lambda _session, _args: answer, Needs((), "a test"))
-        async with serving(a):
-            await until(lambda: transport(b)[1])
-            info = about(b)
-            assert info is not None
-            assert info.condition in {Condition.REACHABLE, Condition.RELEASE}
-            assert "\x1b" not in info.relayed_because
-            register(b)
-            (proxy,) = b.core.state().services["/add"].values()
-            assert lookup(b) == proxy
-            assert trap.calls == []
+        ours = int(trap.node.service_uri.rpartition(":")[2])
+        register(b)
+        for answer, condition in (
+            ({"port": 1, "address": "10.0.0.9", "uri": "rosrpc://10.0.0.9:1"}, Condition.REACHABLE),
+            ({"port": ours, "probe": "/trap/get_loggers"}, Condition.REACHABLE),
+            ([1, 2], Condition.RELEASE),
+            ({"why": "moon", "text": "\x1b[31mred"}, Condition.RELEASE),
+        ):
+            a.bridge.rpc.on_request("direct.service", lambda _session, _args: answer, Needs((), "a test"))  # noqa: B023
+            async with serving(a):
+                await until(lambda: transport(b)[1])
+                info = about(b)
+                assert info is not None
+                assert info.condition == condition
+                assert "\x1b" not in info.relayed_because
+                (proxy,) = b.core.state().services["/add"].values()
+                assert lookup(b) == proxy
+                assert trap.calls == []
+            await until(lambda: not provider(b))
 
 
 async def test_a_flood_of_notifications_does_no_harm(pair: tuple[Settings, Settings]) -> None:

@@ -1,4 +1,4 @@
-"""Services give way to data: a thousand of them, and calls of 5 MB, beside the look at the data path's sockets.
+"""Services give way to data: a thousand of them, and calls of 16 MB, beside the look at the data path's sockets.
 
 As ``test_isolation``, which has the watch; that large bodies hold nobody up is a promise of its own.
 """
@@ -32,8 +32,8 @@ __all__ = ["watched"]
 pytestmark = [pytest.mark.alone, pytest.mark.timeout(240)]
 
 SERVICES: Final = 1000
-LARGE: Final = 5_000_000
-"""Where one of 20 MB grows, the C library moves it once, which takes 10 ms."""
+LARGE: Final = 16_000_000
+"""To give memory back takes the kernel a millisecond for 10 MB, and nobody can look meanwhile."""
 
 
 def shown(world: World, namespace: str = "/fleet/") -> int:

@@ -71,16 +71,6 @@ async def test_identical_robots_are_told_and_parted(
         assert "/r1/cmd_vel" in r2.core.state().publishers
 
 
-async def test_robots_that_are_alike_start_apart_with_one_word(settings: Callable[..., Settings]) -> None:
-    apart = [replace(settings(name), prefix_peers=True) for name in ("r1", "r2")]
-    async with running(*apart) as (r1, r2), robot(r1) as (drive, own), robot(r2) as (_, other):
-        await until(lambda: "/r1/odom" in r2.core.state().publishers and "/r2/odom" in r1.core.state().publishers)
-        drive.publish(drive.make({"data": "mine"}))
-        await until(lambda: own.heard)
-        assert not other.heard
-        assert not problems(r1) + problems(r2)
-
-
 async def test_a_peer_about_which_the_user_has_decided_is_no_twin(settings: Callable[..., Settings]) -> None:
     decided = replace(settings("r1"), peers=(PeerRule("r2"),))
     async with running(decided, settings("r2")) as (r1, r2), robot(r1), robot(r2):

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.messages import Description, Message, Origin, RouteOpened
     from rmpa.bridge.services.bodies import LocalService
-    from rmpa.bridge.services.books import RemoteService, ServiceRoute
-    from rmpa.bridge.topics.exports import ExportRoute, LocalSource
+    from rmpa.bridge.services.books import RemoteService
+    from rmpa.bridge.topics.exports import LocalSource
     from rmpa.bridge.topics.imports import RemoteTopic
     from rmpa.ros.wire.tcpros import ServiceDescription
 
@@ -157,6 +157,40 @@ class ForgetAbout(NamedTuple):
     service: str
 
 
+def _detached(entry: RemoteTopic, **how: Any) -> Detach:
+    return Detach(entry.peer, entry.wire, entry.route, **how)
+
+
+def _described(entry: RemoteTopic, opened: RouteOpened) -> Describe:
+    terms = (opened.contract, opened.epoch, opened.first)
+    return Describe(entry.peer, entry.wire, opened.route, opened.description, *terms)
+
+
+_EFFECTS: Final[dict[str, Callable[..., Any]]] = {
+    "send": Send,
+    "warn": Warn,
+    "connect": Connect,
+    "disconnect": Disconnect,
+    "add_route": lambda s, peer, r: AddRoute(s, peer, r.number, r.contract, r.epoch, r.after),
+    "remove_route": RemoveRoute,
+    "suspend_route": SuspendRoute,
+    "publish": lambda e: Publish(e.peer, e.wire, e.type, e.name if e.name != e.wire.topic else "", e.origin),
+    "retract": lambda e: Retract(e.peer, e.wire),
+    "describe": _described,
+    "detach": _detached,
+    "probe": Probe,
+    "serve": lambda peer, n, r, server: ServeRoute(peer, n, r.requests, r.service, server, r.timeout),
+    "end_route": EndRoute,
+    "server_gone": ServerGone,
+    "provide": lambda e: Provide(e.peer, e.name, e.node),
+    "withdraw": lambda e, reason: Withdraw(e.peer, e.name, e.node, reason),
+    "opened": lambda e: OpenedService(e.peer, e.name, e.route, e.requests, e.about),
+    "ended": lambda e, route, reason: EndedService(e.peer, e.name, route, reason),
+    "forget_about": lambda e: ForgetAbout(e.peer, e.name),
+}
+"""What is written down of each effect."""
+
+
 class Out(Effects):
     """What a part of the bridge does for its exports and imports."""
 
@@ -187,72 +221,14 @@ class Out(Effects):
         done, self.done = self.done, []
         return done
 
-    def send(self, peer: int, message: Message) -> None:
-        self.done.append(Send(peer, message))
-
-    def warn(self, kind: str, who: str, text: str) -> None:
-        self.done.append(Warn(kind, who, text))
-
-    def connect(self, source: Source, uri: str) -> None:
-        self.done.append(Connect(source, uri))
-
-    def disconnect(self, source: Source) -> None:
-        self.done.append(Disconnect(source))
-
-    def add_route(self, source: Source, peer: int, route: ExportRoute) -> None:
-        self.done.append(AddRoute(source, peer, route.number, route.contract, route.epoch, route.after))
-
-    def remove_route(self, source: Source, peer: int, number: int) -> None:
-        self.done.append(RemoveRoute(source, peer, number))
-
-    def suspend_route(self, source: Source, peer: int, outage: float) -> None:
-        self.done.append(SuspendRoute(source, peer, outage))
-
     def position(self, entry: RemoteTopic) -> tuple[int, int] | None:
         return self._position(entry.peer, entry.wire)
 
-    def publish(self, entry: RemoteTopic) -> None:
-        topic = entry.name if entry.name != entry.wire.topic else ""
-        self.done.append(Publish(entry.peer, entry.wire, entry.type, topic, entry.origin))
-
-    def retract(self, entry: RemoteTopic) -> None:
-        self.done.append(Retract(entry.peer, entry.wire))
-
-    def describe(self, entry: RemoteTopic, opened: RouteOpened) -> None:
-        terms = (opened.contract, opened.epoch, opened.first)
-        self.done.append(Describe(entry.peer, entry.wire, opened.route, opened.description, *terms))
-
-    def detach(
-        self, entry: RemoteTopic, *, keep: bool = False, missed: bool = False, last: int | None = None
-    ) -> None:
-        self.done.append(Detach(entry.peer, entry.wire, entry.route, keep, missed, last))
-
-    def probe(self, service: str, server: LocalService) -> None:
-        self.done.append(Probe(service, server))
-
-    def serve(self, peer: int, number: int, route: ServiceRoute, server: LocalService) -> None:
-        self.done.append(ServeRoute(peer, number, route.requests, route.service, server, route.timeout))
-
-    def end_route(self, peer: int, requests: int) -> None:
-        self.done.append(EndRoute(peer, requests))
-
-    def server_gone(self, service: str) -> None:
-        self.done.append(ServerGone(service))
-
-    def provide(self, remote: RemoteService) -> None:
-        self.done.append(Provide(remote.peer, remote.name, remote.node))
-
-    def withdraw(self, remote: RemoteService, reason: str) -> None:
-        self.done.append(Withdraw(remote.peer, remote.name, remote.node, reason))
-
-    def opened(self, remote: RemoteService) -> None:
-        self.done.append(OpenedService(remote.peer, remote.name, remote.route, remote.requests, remote.about))
-
-    def ended(self, remote: RemoteService, route: int, reason: str) -> None:
-        self.done.append(EndedService(remote.peer, remote.name, route, reason))
-
-    def forget_about(self, remote: RemoteService) -> None:
-        self.done.append(ForgetAbout(remote.peer, remote.name))
+    def __getattribute__(self, name: str) -> Any:
+        effect = _EFFECTS.get(name)
+        if effect is None:
+            return super().__getattribute__(name)
+        return lambda *args, **how: self.done.append(effect(*args, **how))
 
 
 class PeerServiceRules(ServiceRules):

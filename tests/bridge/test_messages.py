@@ -67,6 +67,11 @@ STRICT = Contract(
     outage=300.0,
     transport=Transport.AUTO,
 )
+STRICT_BYTES = (
+    b'"contract":{"reliability":"reliable","durability":"transient_local","history":"keep_all","depth":5,'
+    b'"deadline":0.5,"lifespan":2.0,"liveliness":"manual_by_topic","liveliness_lease":1.0,"priority":"high",'
+    b'"max_rate":30.0,"outage":300.0,"transport":"auto"}'
+)
 PAD, R = "0" * 31 + "1", "f" * 32
 ADD_MD5 = "6a2e34150c00229791cc89ff309fff21"
 
@@ -113,12 +118,7 @@ GOLDEN: list[tuple[Message, bytes]] = [
     ),
     (
         OpenRoute(7, "/cmd", "/joy", STRICT, epoch=3, after=4711),
-        (
-            b'{"op":"open","route":7,"topic":"/cmd","node":"/joy","contract":{"reliability":"reliable",'
-            b'"durability":"transient_local","history":"keep_all","depth":5,"deadline":0.5,"lifespan":2.0,'
-            b'"liveliness":"manual_by_topic","liveliness_lease":1.0,"priority":"high","max_rate":30.0,"outage":300.0,'
-            b'"transport":"auto"},"epoch":3,"after":4711}'
-        ),
+        (b'{"op":"open","route":7,"topic":"/cmd","node":"/joy",' + STRICT_BYTES + b',"epoch":3,"after":4711}'),
     ),
     (
         RouteOpened(7, Description("sensor_msgs/Joy", "5a9ea5f83505693b71e785041e67a8bb", "Header header\n", True)),
@@ -131,10 +131,7 @@ GOLDEN: list[tuple[Message, bytes]] = [
         RouteOpened(7, Description("a/B", ADD_MD5, "", False), STRICT, 3, 1, following=4711),
         (
             b'{"op":"opened","route":7,"description":{"type":"a/B","md5":"6a2e34150c00229791cc89ff309fff21",'
-            b'"definition":"","latching":false},"contract":{"reliability":"reliable",'
-            b'"durability":"transient_local","history":"keep_all","depth":5,"deadline":0.5,"lifespan":2.0,'
-            b'"liveliness":"manual_by_topic","liveliness_lease":1.0,"priority":"high","max_rate":30.0,'
-            b'"outage":300.0,"transport":"auto"},"epoch":3,"first":1,"following":4711}'
+            b'"definition":"","latching":false},' + STRICT_BYTES + b',"epoch":3,"first":1,"following":4711}'
         ),
     ),
     (

@@ -14,6 +14,7 @@ from rmpa.bridge.messages import Advertise, AdvertiseServices, ServiceOffer, Sou
 from rmpa.bridge.peer_offers import CROWDED, Heard, ImportBook
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.bodies import LocalService
+from rmpa.bridge.topics.exports import LocalSource
 from rmpa.config.peer_rules import PeerRule, PolicySettings
 from rmpa.config.settings import LimitSettings, ServiceSettings
 from rmpa.core.contract import Contracts
@@ -126,9 +127,6 @@ def test_a_portion_waits_while_the_lane_is_busy_but_not_for_ever() -> None:
 
 @pytest.mark.parametrize("topic", ["/a", "/secret"])
 def test_the_rule_that_decides_is_told_to_whom_asks(topic: str) -> None:
-    from rmpa.bridge.messages import Source
-    from rmpa.bridge.topics.exports import LocalSource
-
     guest = PeerRule("guest", policy=PolicySettings(deny=("/a",)))
     made = Exports(Policy(PolicySettings(deny=("/secret",)), (guest,)))
     made.graph(topic, {"/n": LocalSource("a/B", "http://x:1/")})
@@ -326,15 +324,6 @@ def reload_nodes(made: Imports, nodes: int, *denied: str) -> Iterator[list[Any]]
     return made.apply_rules(policy, Contracts(), Names(), 0.0, LimitSettings(nodes=nodes))
 
 
-@pytest.mark.timeout(10)
-def test_nodes_that_a_reload_denies_give_their_places_to_refused_ones() -> None:
-    made = imports(nodes=2)
-    made.advertised(1, Advertise(added=offers(range(4), topics=2)))
-    list(reload_nodes(made, 2, "/n0"))
-    assert shown(made) == {"/n1", "/n2"}
-    assert {node: len(sources) for node, sources in made.refused_nodes(1).items()} == {"/n3": 2}
-
-
 _comes_or_goes = st.tuples(st.booleans(), st.integers(0, 6), st.integers(0, 2))
 
 
@@ -393,14 +382,6 @@ def test_another_peer_provides_what_one_has_no_place_for() -> None:
     made.advertised(1, provided("/a", node="/first"))
     made.advertised(1, provided("/b", node="/second"))
     assert made.advertised(2, provided("/b")) == [Provide(2, "/b", "/n")]
-
-
-def test_the_services_limits_are_reloaded() -> None:
-    made = services(nodes=1, count=2)
-    made.advertised(1, provided("/a", node="/first"))
-    made.advertised(1, provided("/b", "/c", node="/second"))
-    changed = [a for some in made.apply_rules(rules(), LimitSettings(nodes=2, services=3)) for a in some]
-    assert changed == [Provide(1, "/b", "/second"), Provide(1, "/c", "/second")]
 
 
 def reload_services(made: ServiceImports, nodes: int, *denied: str) -> Iterator[list[Any]]:

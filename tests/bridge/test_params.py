@@ -689,6 +689,48 @@ async def test_a_slash_at_the_end_does_not_pass_a_deny(denied: str, key: str, va
     assert owner.core.get("/speed/max") == 2
 
 
+@pytest.mark.parametrize(
+    ("asker", "who"), [({}, "pad"), ({"site": "yard", "askers": ["base", "thief"]}, "yard")], ids=["peer", "site"]
+)
+async def test_parameters_are_read_and_set_only_with_permission(asker: dict[str, Any], who: str) -> None:
+    """For another site a gateway has what both may have, and none of its modules is denied."""
+
+    def rule(modules: str, names: str, effect: Effect = Effect.ALLOW) -> PermissionRule:
+        return PermissionRule(tuple(modules.split()), (), effect, {"param": (names,)})
+
+    rules = (rule("pad yard", "/arm/**"), rule("yard", "/other"), rule("pad thief", "/arm/secret", Effect.DENY))
+    owner, peer = linked(ALL, PermissionGate(Permissions(TrustSettings(rules=rules)), counters := Counters()))
+    arm: XmlRpcValue = {"speed": 1, "secret": 2, "deep": {"x": 3}}
+    owner.core.set("/arm", arm)
+    owner.core.set("/other", 4)
+
+    async def asks(what: str, key: str, value: XmlRpcValue = None) -> str:
+        text = {} if value is None else {"text": await write_text("", value)}
+        try:
+            return str(await peer.ask(what, {"key": key, **text, **asker}))
+        except PeerRefused as error:
+            return error.reason
+
+    def no(key: str) -> str:
+        return f"the permissions there do not let {who} read or set {key}"
+
+    names = await asks(transfer.NAMES, "")
+    assert [name in names for name in ("/arm/speed", "/arm/deep/x", "secret", "/other")] == [True, True, False, False]
+    assert "1" in await asks(transfer.GET, "/arm/speed")
+    for key in ("/arm/secret", "/arm", "/nothing", "/other"):  # of a namespace that holds a secret no name is told
+        assert await asks(transfer.GET, key) == no(key)
+    assert await asks(transfer.DELETE, "/arm/") == no("/arm")
+    assert await asks(transfer.DELETE, "/other") == no("/other")
+    assert counters["permission.param"] == 6
+    assert "1" in await asks(transfer.SET, "/arm/speed", 5)
+    changed: XmlRpcValue = {"speed": 6, "secret": 7}
+    for key, value in (("/arm/secret", 5), ("/arm", 7), ("/arm/secret/deeper", 7)):  # the secret would be lost
+        assert await asks(transfer.SET, key, value) == no(key)
+    assert await asks(transfer.SET, "/arm", changed) == no("/arm/secret"), "a name of its own words"
+    assert owner.core.get("/arm") == {"speed": 5, "secret": 2, "deep": {"x": 3}}
+    assert await asks(transfer.DELETE, "/arm/deep") == "{}"
+
+
 async def test_without_trust_a_member_with_a_slash_at_its_end_is_set_as_before() -> None:
     owner, peer = linked(ALL)
     await peer.ask(transfer.SET, {"key": "/motors", "text": await write_text("", {"limit/": 5})})
@@ -720,9 +762,11 @@ async def test_a_peer_that_names_other_sites_is_refused_and_logged_by_its_own_na
     assert [line[: len("! pad may not")] for line in lines] == ["! pad may not"]
 
 
-@pytest.mark.parametrize("site", [0, False, [], {}, 0.0])
-async def test_what_is_no_name_of_a_site_is_refused(site: object) -> None:
+async def test_what_is_no_name_of_a_site_or_module_is_refused() -> None:
     owner, peer = linked(ALL, denying("/door"))
-    with pytest.raises(PeerRefused, match="is not the name of a site or a module"):
-        await peer.ask(transfer.GET, {"key": "/run_id", "site": site})
+    sites: tuple[object, ...] = (0, False, [], {}, 0.0, 5, "**")
+    bad: list[dict[str, Any]] = [{"site": site} for site in sites]
+    for args in (*bad, {"askers": ["{peer}"]}, {"askers": "base"}, {"askers": ["b"] * 300}):
+        with pytest.raises(PeerRefused, match=r"is not the name of a site or a module|askers is not a list"):
+            await peer.ask(transfer.GET, {"key": "/run_id", **args})
     assert owner.counters["ask.failed"] == 0

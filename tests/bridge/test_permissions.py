@@ -12,6 +12,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.context import Names
 from rmpa.bridge.messages import (
     Advertise,
+    AdvertiseServices,
     Description,
     OpenRoute,
     OpenService,
@@ -235,7 +236,7 @@ def test_only_services_that_a_peer_may_call_are_offered_and_a_reload_ends_its_ca
 def test_only_services_that_a_peer_may_serve_are_shown_and_another_peer_may_take_the_place() -> None:
     here = Secured(allow("arm", serve="/ik"))
     for peer in (1, 2):
-        here.service_imports.advertised(peer, _services("/ik"))
+        here.service_imports.advertised(peer, AdvertiseServices((ServiceOffer("/ik", "/n"),), (), full=True))
     first, second = here.service_imports.get(1, "/ik"), here.service_imports.get(2, "/ik")
     assert first is not None
     assert second is not None
@@ -246,12 +247,6 @@ def test_only_services_that_a_peer_may_serve_are_shown_and_another_peer_may_take
     for _ in here.service_imports.apply_rules(here.rules):
         pass
     assert (first.shown, second.shown) == (True, False)
-
-
-def _services(*names: str):  # type: ignore[no-untyped-def]
-    from rmpa.bridge.messages import AdvertiseServices
-
-    return AdvertiseServices(tuple(ServiceOffer(name, "/n") for name in names), (), full=True)
 
 
 # --- whole maps with relays ---------------------------------------------------------------------------------------
@@ -370,10 +365,6 @@ def test_an_untrusted_relay_does_not_stand_in_the_way_of_a_trusted_one() -> None
 # What the gate lets pass, counts and logs; and that `rmpa trust check` says the same.
 
 
-def permit(module: str, **names: str) -> PermissionRule:
-    return PermissionRule((module,), names={key: tuple(globs.split()) for key, globs in names.items()})
-
-
 def test_without_trust_everything_passes_and_nothing_is_counted() -> None:
     for access in Access:
         assert OPEN_GATE.admits(access, "anyone", "/anything", relay="any_relay")
@@ -412,7 +403,7 @@ def test_names_that_are_invented_do_not_fill_the_log(caplog: pytest.LogCaptureFi
 
 def test_a_relay_and_the_origin_are_judged_both(caplog: pytest.LogCaptureFixture) -> None:
     counters = Counters()
-    rules = (permit("arm", publish="/arm/**"), permit("relay", publish="/**"))
+    rules = (allow("arm", publish="/arm/**"), allow("relay", publish="/**"))
     gate = PermissionGate(Permissions(TrustSettings(rules=rules, relays=("relay",))), counters)
     assert gate.admits(Access.PUBLISH, "arm", "/arm/state", relay="relay")
     assert not gate.admits(Access.PUBLISH, "leg", "/arm/state", relay="relay"), "the relay's own right is no help"
@@ -423,7 +414,7 @@ def test_a_relay_and_the_origin_are_judged_both(caplog: pytest.LogCaptureFixture
 
 
 def test_the_other_side_is_told_the_outcome_and_no_rule() -> None:
-    gate = PermissionGate(Permissions(TrustSettings(rules=(permit("x*", call="/secret/**"),))))
+    gate = PermissionGate(Permissions(TrustSettings(rules=(allow("x*", call="/secret/**"),))))
     assert gate.why_not(Access.CALL, "arm", "/secret/go") == "the permissions there do not let arm call /secret/go"
     assert gate.why_not(Access.CALL, "x1", "/secret/go") == ""
 

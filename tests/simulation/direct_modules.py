@@ -6,9 +6,6 @@ What the drivers ask of nodes and of the kernel (``bridge.topics.direct``) is an
 from __future__ import annotations
 
 import asyncio
-import hashlib
-import random
-from collections import deque
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, cast
@@ -24,6 +21,7 @@ from rmpa.core.contract import Contracts, Transport
 from rmpa.core.counters import Counters
 from rmpa.core.errors import UnreachableError
 from rmpa.ros.master.parameters import RegistrationKind
+from tests.simulation.network import Trace
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Iterator
@@ -32,30 +30,17 @@ if TYPE_CHECKING:
 TYPE: Final = "std_msgs/String"
 
 
-class World:
-    """What is random, the tasks of nodes, and the trace; the time is the loop's."""
+class World(Trace):
+    """Chance, the tasks of nodes, and the trace; the time is the loop's."""
 
     def __init__(self, seed: int, *, keep: bool = False) -> None:
-        self.rng = random.Random(seed)
-        self.lines: deque[str] = deque(maxlen=None if keep else 200)
+        super().__init__(seed, keep=keep)
         self.tasks: set[asyncio.Task[Any]] = set()
-        self._digest = hashlib.sha256()
 
     @property
-    def now(self) -> float:
+    def now(self) -> float:  # type: ignore[override] # of a running loop
         """Seconds."""
         return asyncio.get_running_loop().time()
-
-    def note(self, who: str, what: str) -> None:
-        """Write one line of the trace."""
-        line = f"{self.now - 1000:10.6f} {who:>8} {what}"
-        self._digest.update(line.encode())
-        self.lines.append(line)
-
-    @property
-    def trace_hash(self) -> str:
-        """Of the whole trace so far."""
-        return self._digest.hexdigest()
 
     async def pause(self, most: float) -> None:
         """A random while."""
@@ -268,7 +253,6 @@ class SubscriberModule:
     def start(self) -> None:
         """A new run of its agent."""
         self.rpc = Rpc(0)
-        imports = SimpleNamespace(get=lambda _, source: self.shown.get(source), at=self._at, all=self._all)
         core = SimpleNamespace(
             publishers=lambda topic: {
                 f"/rmpa{one.node}": f"http://proxy{one.node}/" for one in self.shown if one.topic == topic
@@ -280,15 +264,31 @@ class SubscriberModule:
         shared = SimpleNamespace(
             core=core, sessions=sessions(self.peers), rpc=self.rpc, counters=Counters(), context=Rules(self)
         )
-        self.importer = TopicPaths(
-            cast("Any", shared), lambda *_: None, cast("Any", _Imports(imports)), cast("Any", _Topics(self))
-        )
+        topics = SimpleNamespace(get=lambda _peer: SimpleNamespace(publication=self._publication))
+        self.importer = TopicPaths(cast("Any", shared), lambda *_: None, cast("Any", self), cast("Any", topics))
 
-    def _at(self, topic: str) -> list[tuple[int, Source]]:
+    # --- as Imports, and as a publication -------------------------------------------------------------------------
+
+    def __iter__(self) -> Iterator[tuple[int, Source, Any]]:
+        return iter([(self.here, source, entry) for source, entry in self.shown.items()])
+
+    def get(self, _peer: int, source: Source) -> Any:
+        return self.shown.get(source)
+
+    def at(self, topic: str) -> list[tuple[int, Source]]:
         return [(self.here, source) for source in sorted(self.shown) if source.topic == topic]
 
-    def _all(self) -> Iterator[tuple[int, Source, Any]]:
-        return iter([(self.here, source, entry) for source, entry in self.shown.items()])
+    def _publication(self, source: Source) -> Any:
+        callers = frozenset(name for name in self.listeners if "relay" in self.paths(source, name))
+
+        def hang_up(name: str) -> bool:
+            paths = self.paths(source, name)
+            left = "relay" in paths
+            paths[:] = [one for one in paths if one != "relay"]
+            self.importer.listeners_changed(self.here, source)
+            return left
+
+        return SimpleNamespace(callers=callers, hang_up=hang_up) if source in self.shown else None
 
     def paths(self, source: Source, name: str) -> list[str | int]:
         """The connections of a listener to a source."""
@@ -423,40 +423,6 @@ class SubscriberModule:
         for source in list(self.shown):
             self.leave(source)
         self.here = 0
-
-
-class _Imports:
-    """The double of ``Imports``."""
-
-    def __init__(self, parts: Any) -> None:
-        self.get, self.at, self._all = parts.get, parts.at, parts.all
-
-    def __iter__(self) -> Iterator[tuple[int, Source, Any]]:
-        found: Iterator[tuple[int, Source, Any]] = self._all()
-        return found
-
-
-class _Topics:
-    """The double of the proxies' publications."""
-
-    def __init__(self, module: SubscriberModule) -> None:
-        self._module = module
-
-    def get(self, _peer: int) -> Any:
-        return SimpleNamespace(publication=self._publication)
-
-    def _publication(self, source: Source) -> Any:
-        module = self._module
-        callers = frozenset(name for name in module.listeners if "relay" in module.paths(source, name))
-
-        def hang_up(name: str) -> bool:
-            paths = module.paths(source, name)
-            left = "relay" in paths
-            paths[:] = [one for one in paths if one != "relay"]
-            module.importer.listeners_changed(module.here, source)
-            return left
-
-        return SimpleNamespace(callers=callers, hang_up=hang_up) if source in module.shown else None
 
 
 class Network:

@@ -51,7 +51,7 @@ class DirectScenario:
         try:
             run(self._play(story or self._troubles), VirtualLoop())
         except AssertionError as error:
-            raise Disagreement(self._report(error)) from None
+            raise Disagreement(self.world.report(error, f"--kind direct --seed {self.seed}")) from None
         return Outcome(self.world.trace_hash, tuple(self.world.lines), 0)
 
     async def _play(self, story: Callable[[], Coroutine[object, object, None]]) -> None:
@@ -284,10 +284,3 @@ class DirectScenario:
     def note(self, module: SubscriberModule, what: str) -> None:
         """One line of the trace."""
         self.world.note(module.name, what)
-
-    def _report(self, error: AssertionError) -> str:
-        lines = "\n".join(list(self.world.lines)[-60:])
-        return (
-            f"{error}\n--- the last events ---\n{lines}\n--- all of them, exactly so again ---\n"
-            f"python -m tests.simulation --kind direct --seed {self.seed}\n"
-        )

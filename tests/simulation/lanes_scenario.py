@@ -81,12 +81,14 @@ class LanesScenario(MeshScenario):
         inbox = peer.inboxes[source.identity.instance]
         who = f"{peer.name} from {source.name} ({source.contract.reliability}, {source.contract.priority})"
         published = source.published
-        assert set(inbox.got) <= set(published), f"{who}: what was never published whole"
+        assert set(inbox.numbers) <= set(published), f"{who}: what was never published whole"
         last = [n for n in published if n > self.before[source.identity.instance]]
         assert len(last) == len(_LAST_SERIES)
-        assert inbox.got[-len(last) :] == last, f"{who}: of the last series {inbox.got[-len(last) :]}, not {last}"
+        assert inbox.numbers[-len(last) :] == last, (
+            f"{who}: of the last series {inbox.numbers[-len(last) :]}, not {last}"
+        )
         wanted = [n for n in published if n >= source.first[peer.identity.instance]]
-        missing = sorted(set(wanted) - set(inbox.got))
+        missing = sorted(set(wanted) - set(inbox.numbers))
         assert inbox.flow is not None
         if source.contract.reliability is Reliability.RELIABLE:
             self.breaks += inbox.breaks

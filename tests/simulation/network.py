@@ -22,21 +22,49 @@ OnDatagram = Callable[[bytes, Address, bool], None]
 _KEPT_LINES: Final = 400
 
 
-class World:
-    """The simulated clock, the scheduled actions, and the trace of what happened.
+class Trace:
+    """Chance, and the trace of what happened; the clock is a subclass's.
 
     Args:
         seed: Everything that happens follows from it.
         keep: Keep the whole trace, not only its last lines.
     """
 
+    now: float
+
     def __init__(self, seed: int, *, keep: bool = False) -> None:
         self.rng = random.Random(seed)
-        self.now = 1000.0
         self.lines: deque[str] = deque(maxlen=None if keep else _KEPT_LINES)
+        self._digest = hashlib.sha256()
+
+    def note(self, who: str, what: str) -> None:
+        """Write one line of the trace."""
+        line = f"{self.now - 1000:10.6f} {who:>8} {what}"
+        self._digest.update(line.encode())
+        self.lines.append(line)
+
+    @property
+    def trace_hash(self) -> str:
+        """Of the whole trace so far."""
+        return self._digest.hexdigest()
+
+    def report(self, error: AssertionError, again: str) -> str:
+        """What failed, the last events, and the options by which it is played again."""
+        lines = "\n".join(list(self.lines)[-60:])
+        return (
+            f"{error}\n--- the last events ---\n{lines}\n--- all of them, exactly so again ---\n"
+            f"python -m tests.simulation {again}\n"
+        )
+
+
+class World(Trace):
+    """The simulated clock, the scheduled actions, and the trace; see ``Trace``."""
+
+    def __init__(self, seed: int, *, keep: bool = False) -> None:
+        super().__init__(seed, keep=keep)
+        self.now = 1000.0
         self._queue: list[tuple[float, int, Callable[[], None]]] = []
         self._count = 0
-        self._digest = hashlib.sha256()
 
     def at(self, when: float, action: Callable[[], None]) -> None:
         """Schedule ``action`` at ``when``; actions of one moment run in the order of these calls."""
@@ -57,17 +85,6 @@ class World:
             self.now, _, action = heapq.heappop(self._queue)
             action()
         self.now = until
-
-    def note(self, who: str, what: str) -> None:
-        """Write one line of the trace."""
-        line = f"{self.now - 1000:10.6f} {who:>8} {what}"
-        self._digest.update(line.encode())
-        self.lines.append(line)
-
-    @property
-    def trace_hash(self) -> str:
-        """Of the whole trace so far."""
-        return self._digest.hexdigest()
 
 
 @dataclass

@@ -112,7 +112,7 @@ class PointScenario(LanesScenario):
     def check_all(self, sender: TrafficPeer, receiver: TrafficPeer) -> None:
         """Check that the two last messages came, and the first one as its contract says."""
         inbox = receiver.inboxes[sender.identity.instance]
-        *earlier, one, other = inbox.got
+        *earlier, one, other = inbox.numbers
         assert [one, other] == sender.published[-2:]
         reliable = self.course.reliability is Reliability.RELIABLE
         if not self.trouble or (reliable and self.trouble in ("break", "swallow", "part")):

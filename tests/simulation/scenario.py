@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
@@ -17,6 +18,8 @@ from rmpa.discovery.membership import HEARTBEAT_INTERVAL
 from tests.simulation.network import Network, Weather, World
 from tests.simulation.roster_peer import RosterPeer, stranger
 
+FACTOR: Final = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
+"""How many times the usual number of seeds is played."""
 CALM: Final = core_limits.PEER_LEASE + 2 * HEARTBEAT_INTERVAL + 2.0
 """Seconds after healing within which all rosters agree: a lease for dead peers, two heartbeats for new ones."""
 AFTER_FORGERY: Final = LEASE_MAX + CALM
@@ -78,7 +81,8 @@ class Scenario:
         try:
             self.check()
         except AssertionError as error:
-            raise Disagreement(self._report(error)) from error
+            again = f"--kind {self.kind} --seed {self.seed} --peers {self.count}"
+            raise Disagreement(self.world.report(error, again)) from error
         return Outcome(self.world.trace_hash, tuple(self.world.lines), self.network.datagrams)
 
     def prepare(self) -> None:
@@ -186,13 +190,6 @@ class Scenario:
             for _ in range(3):
                 wire[rng.randrange(8, len(wire))] = rng.getrandbits(8)
             self.network.unicast(("10.66.0.9", 6666), peer.address, bytes(wire))
-
-    def _report(self, error: AssertionError) -> str:
-        lines = "\n".join(list(self.world.lines)[-60:])
-        return (
-            f"{error}\n--- the last events ---\n{lines}\n--- all of them, exactly so again ---\n"
-            f"python -m tests.simulation --kind {self.kind} --seed {self.seed} --peers {self.count}\n"
-        )
 
 
 def _names(identities: tuple[Identity, ...]) -> str:

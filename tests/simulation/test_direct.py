@@ -7,13 +7,12 @@
 from __future__ import annotations
 
 import asyncio
-import os
 
 import pytest
 
 from tests.simulation.direct_scenario import DirectScenario
+from tests.simulation.scenario import FACTOR
 
-FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
 BLOCK = 12
 
 

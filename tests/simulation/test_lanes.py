@@ -6,15 +6,13 @@ The legs, lanes, links and flows are the agent's own; ``make test-long`` runs ei
 
 from __future__ import annotations
 
-import os
-
 import pytest
 
 from rmpa.core.contract import Priority, Reliability
 from tests.simulation.lanes_scenario import LanesScenario
 from tests.simulation.point_scenario import TROUBLES, Course, PointScenario
+from tests.simulation.scenario import FACTOR
 
-FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
 BLOCK = 6
 BLOCKS = [(count, block) for count, blocks in ((2, 3), (3, 1)) for block in range(blocks * FACTOR)]
 

@@ -12,7 +12,7 @@ import pytest
 from rmpa.mesh import limits
 from tests.simulation.large_scenario import Figures, LargeScenario
 
-MODULES = 64
+MODULES = 40
 ALL_LINKS = MODULES * (MODULES - 1) // 2
 
 

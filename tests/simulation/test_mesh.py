@@ -6,17 +6,15 @@
 
 from __future__ import annotations
 
-import os
-
 import pytest
 
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.network import Weather
 from tests.simulation.rests_scenario import RestsScenario
+from tests.simulation.scenario import FACTOR
 
 pytestmark = pytest.mark.timeout(300)  # seconds of computing, beside parts of the suite that compute too
 
-FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
 BLOCK = 6
 BLOCKS = [(count, block) for count, blocks in ((2, 4), (3, 2), (4, 1), (5, 1)) for block in range(blocks * FACTOR)]
 
@@ -39,8 +37,8 @@ def test_networks_of_ten_are_linked_after_healing(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(FACTOR))
-def test_a_network_of_thirty_is_linked_after_healing(seed: int) -> None:
-    MeshScenario(seed, 30).play()
+def test_a_network_of_twenty_is_linked_after_healing(seed: int) -> None:
+    MeshScenario(seed, 20).play()
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])

@@ -7,7 +7,6 @@ by two, ``open`` and ``opened``; everything that touches a message is the agent'
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender
@@ -15,6 +14,7 @@ from rmpa.bridge.data.reception import ImportFlow, LinkTime
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.counters import Counters
 from rmpa.mesh.frames import FrameKind
+from tests.bridge.io.doubles import Outlet
 from tests.simulation.mesh_peer import MeshPeer
 
 if TYPE_CHECKING:
@@ -44,52 +44,25 @@ def number_of(message: bytes) -> int:
     return number
 
 
-@dataclass
-class Inbox:
-    """The messages that one agent received from one run of another one.
+class Inbox(Outlet):
+    """The messages that one agent received from one run of another one, by their numbers.
 
     Args:
         contract: What holds for it.
     """
 
-    contract: Contract
-    flow: ImportFlow | None = None
-    got: list[int] = field(default_factory=list)
-    torn: int = 0
-    breaks: int = 0
-    _begun: bytearray | None = None
-    _size: int = 0
+    def __init__(self, contract: Contract) -> None:
+        super().__init__()
+        self.contract = contract
+        self.flow: ImportFlow | None = None
+        self.numbers: list[int] = []
+        self.breaks = 0
 
-    def publish_framed(self, message: bytes | bytearray | memoryview) -> None:
-        """Take a whole message."""
-        assert self._begun is None, "a message in the middle of another one"
-        self._take(bytes(message))
-
-    def begin(self, size: int) -> None:
-        """Begin a message in parts."""
-        assert self._begun is None, "a message in the middle of another one"
-        self._begun, self._size = bytearray(), size
-
-    def extend(self, part: bytes | bytearray | memoryview) -> None:
-        """Take a part of it."""
-        assert self._begun is not None
-        self._begun += part
-        assert len(self._begun) <= self._size
-        if len(self._begun) == self._size:
-            whole, self._begun = bytes(self._begun), None
-            self._take(whole)
-
-    def abort(self) -> int:
-        """Drop the message in parts; return whether there was one."""
-        was = self._begun is not None
-        self._begun = None
-        self.torn += was
-        return was
-
-    def _take(self, message: bytes) -> None:
+    def take(self, message: bytes) -> None:
+        """A whole message is there."""
         number = number_of(message)
-        assert not self.got or number > self.got[-1], f"message {number} came behind {self.got[-1]}"
-        self.got.append(number)
+        assert not self.numbers or number > self.numbers[-1], f"message {number} came behind {self.numbers[-1]}"
+        self.numbers.append(number)
 
 
 class TrafficPeer(MeshPeer):
@@ -275,10 +248,8 @@ class TrafficPeer(MeshPeer):
             reliability=Reliability(said["reliability"]), priority=Priority(said["priority"]), depth=1000
         )
         if inbox.flow is None:
-            output = cast("Any", inbox)
-            inbox.flow = ImportFlow(
-                output, inbox.contract, self.times[link], Counters(), lambda _: None, lambda: None
-            )
+            nothing = (lambda _: None, lambda: None)
+            inbox.flow = ImportFlow(cast("Any", inbox), inbox.contract, self.times[link], Counters(), *nothing)
         known = inbox.flow.position is not None
         inbox.breaks += not inbox.flow.bind(link, 1, said["epoch"], said["first"]) and known
         self.flows[link, 1] = link.routes[1] = inbox.flow

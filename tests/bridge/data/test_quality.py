@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-import timeit
 from collections import Counter
 from itertools import pairwise
 
@@ -186,7 +185,7 @@ def _bandwidth(messages: list[tuple[float, float, int]]) -> float:
     return sum(size for _, _, size in messages[1:]) / (messages[-1][0] - messages[0][0])
 
 
-_RATES = (1, 10, 50, 400, 512, 700, 1_000, 5_000, 13_000, 47_000, 100_000)
+_RATES = (1, 50, 400, 512, 1_000, 13_000, 100_000)
 
 
 @pytest.mark.parametrize(
@@ -225,13 +224,6 @@ def test_rate_of_a_faster_source_ignores_its_past() -> None:
     feed(quality, [i / 10 for i in range(600)])
     feed(quality, [60.0 + i / 10_000 for i in range(3_000)])
     assert quality.summary(None, 60.3).rate == pytest.approx(10_000, rel=0.1)
-
-
-def test_noting_a_message_costs_next_to_nothing() -> None:
-    quality = Quality()
-    number = 20_000
-    best = min(timeit.repeat(lambda: quality.arrived(1.5, WALL, WALL - 350_000, 64), number=number, repeat=5))
-    assert best / number < 5e-6  # some 0.15 µs in truth: this is for an allocation or a sort that slips in
 
 
 # The watch over one source: every missed deadline is seen, once, by its timer; memory and cost are bounded.

@@ -185,7 +185,7 @@ class Link(Any):  # type: ignore[misc] # a double of what is much larger
         return [lane for lane, _, _ in self.sent]
 
 
-class Outlet(Any):  # type: ignore[misc] # a double of what is much larger
+class Outlet:
     """Local subscribers behind a proxy: one that is always there, and must never get a mixture."""
 
     def __init__(self) -> None:
@@ -204,8 +204,12 @@ class Outlet(Any):  # type: ignore[misc] # a double of what is much larger
     def publish_framed(self, framed: bytes | bytearray | memoryview) -> object:
         """Take a message."""
         assert self._half is None, "a message in the middle of another one"
-        self.got.append(bytes(framed))
+        self.take(bytes(framed))
         return None
+
+    def take(self, message: bytes) -> None:
+        """A whole message is there."""
+        self.got.append(message)
 
     def begin(self, size: int) -> None:
         """Take the beginning of one."""
@@ -219,8 +223,8 @@ class Outlet(Any):  # type: ignore[misc] # a double of what is much larger
         self.parts += 1
         assert len(self._half) <= self._size
         if len(self._half) == self._size:
-            self.got.append(bytes(self._half))
-            self._half = None
+            whole, self._half = bytes(self._half), None
+            self.take(whole)
 
     def abort(self) -> int:
         """It ends in the middle; whoever has a part of it is hung up on."""

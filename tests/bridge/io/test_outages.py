@@ -14,6 +14,7 @@ from rmpa.core.contract import ContractRule, History, Reliability
 from rmpa.mesh import limits as mesh_limits
 from tests.bridge.io.two_bridges import World, made_up
 from tests.bridge.io.virtual import VirtualLoop, run
+from tests.simulation.scenario import FACTOR
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
@@ -169,7 +170,7 @@ async def one_outage(world: World, seconds: float) -> int:
     return accounted(world, speaker, listener)
 
 
-@pytest.mark.parametrize(("window", "seconds"), [(2.0, 1.5), (30.0, 29.0), (300.0, 299.0)])
+@pytest.mark.parametrize(("window", "seconds"), [(2.0, 1.5), (30.0, 29.0)])
 def test_within_the_window_nothing_is_lost(window: float, seconds: float) -> None:
     async def scene(world: World) -> None:
         assert await one_outage(world, seconds) == 0
@@ -177,7 +178,7 @@ def test_within_the_window_nothing_is_lost(window: float, seconds: float) -> Non
     play(1, scene, outage=window, depth=100_000)
 
 
-@pytest.mark.parametrize(("window", "seconds"), [(2.0, 35.0), (30.0, 35.0), (30.0, 600.0), (5.0, 7200.0)])
+@pytest.mark.parametrize(("window", "seconds"), [(2.0, 35.0), (30.0, 35.0), (5.0, 600.0)])
 def test_beyond_it_all_that_was_kept_is_lost_and_the_receiver_says_so(window: float, seconds: float) -> None:
     async def scene(world: World) -> None:
         a, b = world.sides
@@ -234,7 +235,7 @@ def test_losses_of_an_outage_are_reported_without_further_messages() -> None:
     play(6, scene, outage=600.0, depth=100)
 
 
-@pytest.mark.parametrize("block", range(10))
+@pytest.mark.parametrize("block", range(5 * FACTOR))
 def test_many_outages_within_the_window(block: int) -> None:
     async def scene(world: World) -> None:
         speaker, listener = await begin(world)
@@ -255,7 +256,7 @@ def test_many_outages_within_the_window(block: int) -> None:
 # --- agents that end meanwhile --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("window", "seconds"), [(30.0, 10.0), (2.0, 10.0), (30.0, 300.0)])
+@pytest.mark.parametrize(("window", "seconds"), [(30.0, 10.0), (2.0, 10.0)])
 @pytest.mark.parametrize("early", [True, False])
 def test_a_receivers_agent_that_was_restarted_meanwhile_is_told(window: float, seconds: float, early: bool) -> None:
     async def scene(world: World) -> None:
@@ -272,7 +273,7 @@ def test_a_receivers_agent_that_was_restarted_meanwhile_is_told(window: float, s
     play(7, scene, outage=window, depth=100_000)
 
 
-@pytest.mark.parametrize("seconds", [10.0, 300.0])
+@pytest.mark.parametrize("seconds", [10.0, 60.0])
 def test_a_restarted_sender_makes_the_loss_unknown(seconds: float) -> None:
     async def scene(world: World) -> None:
         a, b = world.sides

@@ -14,6 +14,7 @@ from rmpa.core.contract import ContractRule, Priority, Reliability
 from rmpa.trust.permissions import Permissions
 from tests.bridge.io.two_bridges import World, made_up
 from tests.bridge.io.virtual import VirtualLoop, run
+from tests.simulation.scenario import FACTOR
 
 if TYPE_CHECKING:
     from tests.bridge.io.nodes import Listener, Speaker
@@ -107,7 +108,7 @@ def check_heard(permitted: Permitted, speaker: Speaker, listener: Listener) -> N
     assert speaker.said in heard, f"{speaker.topic} of {speaker.node} is permitted again"
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(16 * FACTOR))
 def test_nothing_is_heard_that_was_said_while_it_was_forbidden(seed: int) -> None:
     loop = VirtualLoop()
 

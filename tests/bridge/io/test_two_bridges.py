@@ -16,6 +16,7 @@ from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import Frame, FrameKind
 from tests.bridge.io.two_bridges import World, made_up
 from tests.bridge.io.virtual import VirtualLoop, run
+from tests.simulation.scenario import FACTOR
 
 if TYPE_CHECKING:
     import random
@@ -90,7 +91,7 @@ async def outages(world: World) -> None:
                 assert len({ear for ear, _ in listener.got[speaker.number]}) <= 1, "hung up on"
 
 
-@pytest.mark.parametrize("block", range(10))
+@pytest.mark.parametrize("block", range(6 * FACTOR))
 def test_reliable_topics_survive_every_outage_that_is_waited_for(block: int) -> None:
     for seed in range(block * 12, block * 12 + 12):
         play(seed, outages, clocks=bool(seed % 2))
@@ -255,7 +256,7 @@ async def come_to_rest(world: World) -> None:
     world.check_nothing_is_left()
 
 
-@pytest.mark.parametrize("block", range(10))
+@pytest.mark.parametrize("block", range(6 * FACTOR))
 def test_whatever_happens_all_is_well_in_the_end(block: int, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.ERROR)
     for seed in range(1000 + block * 10, 1000 + block * 10 + 10):

@@ -161,18 +161,6 @@ def test_many_timers_are_dealt_with_a_few_at_a_time(imports: Imports) -> None:
     assert {entry.state for _, _, entry in imports} == {"waiting"}
 
 
-def test_timers_that_were_set_anew_count_once(imports: Imports) -> None:
-    imports.advertised(1, Advertise(added=(OFFER,)))
-    imports.demand(1, CMD, 0.0, wanted=True)
-    imports.opened(1, RouteOpened(1, ABOUT), 0.0)
-    for now in range(10):
-        imports.demand(1, CMD, float(now), wanted=False)
-        imports.demand(1, CMD, now + 0.5, wanted=True)
-    assert imports.next_timer() is None
-    imports.demand(1, CMD, 20.0, wanted=False)
-    assert imports.next_timer() == 20.0 + limits.ROUTE_LINGER
-
-
 def test_what_changes_while_somebody_looks_does_no_harm(imports: Imports) -> None:
     imports.advertised(1, Advertise(added=many(3)))
     seen = []
@@ -192,15 +180,6 @@ def test_a_peer_that_nothing_waits_for_leaves_what_was_open(imports: Imports) ->
     assert len(list(imports.book.link_down(1))) >= 21
 
 
-def test_a_source_is_known_as_long_as_a_peer_offers_it(imports: Imports) -> None:
-    imports.link_up(2)
-    imports.advertised(2, Advertise(added=(OFFER,)))
-    assert imports.knows(CMD)
-    imports.link_down(2)
-    assert not imports.knows(CMD)
-    assert not imports.offered_by(2)
-
-
 # --- contracts, and links that come back --------------------------------------------------------------------------
 
 SURE = Contract(reliability=Reliability.RELIABLE)
@@ -208,26 +187,20 @@ OPENED = RouteOpened(1, ABOUT, SURE, epoch=5, first=1)
 ODOM = TopicOffer("/odom", "/base", "a/B")
 
 
-class Positions:
-    """What the data path says of reliable routes that outlived their links."""
-
-    def __init__(self) -> None:
-        self.known: dict[tuple[int, Source], tuple[int, int]] = {}
-
-    def __call__(self, peer: int, source: Source) -> tuple[int, int] | None:
-        return self.known.get((peer, source))
+Positions = dict[tuple[int, Source], tuple[int, int]]
+"""What the data path says of reliable routes that outlived their links."""
 
 
 @pytest.fixture
 def positions() -> Positions:
-    return Positions()
+    return {}
 
 
 @pytest.fixture
 def flowing(positions: Positions) -> Imports:
     """Of peer 1, /cmd flows reliably by route 1 and /odom by best effort by route 2; both are listened to."""
     rules = Contracts((ContractRule(("/cmd",), (), {"reliability": Reliability.RELIABLE}),))
-    machine = Imports(Policy(PolicySettings()), lambda: 1.0, rules, positions)
+    machine = Imports(Policy(PolicySettings()), lambda: 1.0, rules, lambda *place: positions.get(place))
     machine.link_up(1)
     machine.advertised(1, Advertise(added=(OFFER, ODOM), full=True))
     machine.demand(1, CMD, 0.0, wanted=True)
@@ -288,7 +261,7 @@ def test_only_what_is_reliable_and_listened_to_waits_for_its_peer(flowing: Impor
 def test_back_it_goes_on_behind_what_came(flowing: Imports, positions: Positions) -> None:
     flowing.link_away(1)
     flowing.link_up(1)
-    positions.known[1, CMD] = (5, 41)
+    positions[1, CMD] = (5, 41)
     assert flowing.next_timer() is None, "it may not be offered any more"
     actions = flowing.advertised(1, Advertise(added=(OFFER, ODOM)), 10.0)
     assert opens(actions) == [OpenRoute(1, "/cmd", "/joy", SURE, epoch=5, after=41)]
@@ -300,7 +273,7 @@ def test_back_it_goes_on_behind_what_came(flowing: Imports, positions: Positions
 
 @pytest.mark.parametrize("moment", ["before_its_offer", "while_asking"])
 def test_a_second_loss_changes_nothing(flowing: Imports, positions: Positions, moment: str) -> None:
-    positions.known[1, CMD] = (5, 41)
+    positions[1, CMD] = (5, 41)
     flowing.link_away(1)
     flowing.link_up(1)
     if moment == "while_asking":
@@ -334,23 +307,20 @@ def test_a_peer_that_is_back_is_no_problem_any_more(flowing: Imports) -> None:
     assert {entry.problem for entry in entries if entry} == {""}
 
 
-def test_who_leaves_while_the_peer_is_away_ends_what_waits(flowing: Imports, positions: Positions) -> None:
+@pytest.mark.parametrize("again", [False, True])
+def test_who_leaves_while_the_peer_is_away_ends_what_waits_and_who_comes_is_served_later(
+    flowing: Imports, again: bool
+) -> None:
     flowing.link_away(1)
     assert flowing.demand(1, CMD, 1.0, wanted=False) == [Detach(1, CMD, 0)]
     assert state(flowing) == "idle"
+    if again:
+        assert flowing.demand(1, CMD, 2.0, wanted=True) == []
+        assert (state(flowing), flowing.next_timer()) == ("waiting", None)
     flowing.link_up(1)
-    assert flowing.advertised(1, Advertise(added=(OFFER,)), 10.0) == []
-    assert opens(flowing.demand(1, CMD, 11.0, wanted=True)) == [OpenRoute(1, "/cmd", "/joy", SURE)]
-
-
-def test_who_comes_while_the_peer_is_away_is_served_when_it_is_back(flowing: Imports) -> None:
-    flowing.link_away(1)
-    flowing.demand(1, CMD, 1.0, wanted=False)
-    assert flowing.demand(1, CMD, 2.0, wanted=True) == []
-    assert state(flowing) == "waiting"
-    assert flowing.next_timer() is None
-    flowing.link_up(1)
-    assert opens(flowing.advertised(1, Advertise(added=(OFFER,)), 10.0)) == [OpenRoute(1, "/cmd", "/joy", SURE)]
+    actions = flowing.advertised(1, Advertise(added=(OFFER,)), 10.0)
+    actions = actions if again else actions + flowing.demand(1, CMD, 11.0, wanted=True)
+    assert opens(actions) == [OpenRoute(1, "/cmd", "/joy", SURE)]
 
 
 def test_a_short_silence_leaves_everything_where_it_is(flowing: Imports, positions: Positions) -> None:
@@ -365,7 +335,7 @@ def test_a_short_silence_leaves_everything_where_it_is(flowing: Imports, positio
     )
     assert flowing.next_timer() is None
     flowing.link_up(1)
-    positions.known[1, CMD] = (5, 41)
+    positions[1, CMD] = (5, 41)
     offers = (OFFER, ODOM, TopicOffer("/idle", "/base", "a/B"), TopicOffer("/left", "/base", "a/B"))
     actions = flowing.advertised(1, Advertise(added=offers), 10.0)
     assert opens(actions) == [
@@ -373,12 +343,6 @@ def test_a_short_silence_leaves_everything_where_it_is(flowing: Imports, positio
         OpenRoute(2, "/odom", "/base"),
     ]
     assert len(actions) == 2, "nothing appears and nothing leaves"
-
-
-def test_a_silence_that_lasts_leaves_only_what_waits(flowing: Imports) -> None:
-    flowing.link_away(1, briefly=True)
-    assert flowing.link_away(1) == ([Retract(1, ODOM.source)], True)
-    assert state(flowing) == "waiting"
 
 
 def test_what_is_latched_waits_for_a_silent_peer_while_somebody_listens(imports: Imports) -> None:

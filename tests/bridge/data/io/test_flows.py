@@ -260,7 +260,8 @@ class Inlet:
         """When the link's last silence ended: nothing came since."""
         self.time.resumed_at = lambda: self.resumed
         self.counters = Counters()
-        self.flow = ImportFlow(self.outlet, contract, self.time, self.counters, lambda _: None, self.torn)
+        output = cast("Any", self.outlet)
+        self.flow = ImportFlow(output, contract, self.time, self.counters, lambda _: None, self.torn)
         self.begin(0, first)
 
     def begin(self, epoch: int, first: int) -> bool:

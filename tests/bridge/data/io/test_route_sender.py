@@ -476,4 +476,4 @@ class FallingLink(RuleBasedStateMachine):
 
 
 TestFallingLink = FallingLink.TestCase
-TestFallingLink.settings = settings(max_examples=200, stateful_step_count=40, deadline=None)
+TestFallingLink.settings = settings(max_examples=80, stateful_step_count=40, deadline=None)

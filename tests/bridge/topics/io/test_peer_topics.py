@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -120,261 +121,237 @@ class Proxied:
         return [occurred.kind for _, occurred in self.occurred]
 
 
-def play(scene: Callable[[Proxied], Coroutine[object, object, None]]) -> None:
-    loop = VirtualLoop()
+def played(scene: Callable[..., Coroutine[object, object, None]]) -> Callable[..., None]:
+    """The test that plays a scene in made-up time."""
 
-    async def main() -> None:
+    async def main(values: dict[str, Any]) -> None:
         proxied = Proxied()
-        await scene(proxied)
+        await scene(proxied, **values)
         proxied.topics.close()
         await proxied.proxies.close()
         assert proxied.core.publishers("/cmd") == {}
 
-    with made_up(loop):
-        run(main(), loop)
-    assert not stages
+    def test(**values: Any) -> None:
+        loop = VirtualLoop()
+        with made_up(loop):
+            run(main(values), loop)
+        assert not stages
+
+    parameters = list(inspect.signature(scene).parameters.values())
+    test.__signature__ = inspect.Signature(parameters[1:])  # type: ignore[attr-defined]
+    return test
 
 
-def test_a_source_appears_flows_and_disappears() -> None:
-    async def scene(proxied: Proxied) -> None:
-        publication = await proxied.publish()
-        assert set(proxied.core.publishers("/cmd")) == {"/rmpa/b/joy"}
-        listener = Heard(publication)
-        assert proxied.demands == [True]
-        flow = proxied.describe(Contract())
-        flow.message(1, 0, framed("one"))
-        proxied.topics.detach(CMD, 1)
-        assert proxied.topics.flows == {}
-        proxied.topics.retract(CMD)
-        await asyncio.sleep(0.01)
-        assert listener.texts == ["one"]
-        assert listener.closed
-        assert proxied.core.publishers("/cmd") == {}
-
-    play(scene)
+@played
+async def test_a_source_appears_flows_and_disappears(proxied: Proxied) -> None:
+    publication = await proxied.publish()
+    assert set(proxied.core.publishers("/cmd")) == {"/rmpa/b/joy"}
+    listener = Heard(publication)
+    assert proxied.demands == [True]
+    flow = proxied.describe(Contract())
+    flow.message(1, 0, framed("one"))
+    proxied.topics.detach(CMD, 1)
+    assert proxied.topics.flows == {}
+    proxied.topics.retract(CMD)
+    await asyncio.sleep(0.01)
+    assert listener.texts == ["one"]
+    assert listener.closed
+    assert proxied.core.publishers("/cmd") == {}
 
 
-def test_a_description_without_a_proxy_has_no_effect() -> None:
-    async def scene(proxied: Proxied) -> None:
-        about = Description("a/B", MD5, "", False)
-        proxied.topics.describe(CMD, RouteOpened(1, about))
-        assert proxied.topics.flows == {}
-
-    play(scene)
+@played
+async def test_a_description_without_a_proxy_has_no_effect(proxied: Proxied) -> None:
+    about = Description("a/B", MD5, "", False)
+    proxied.topics.describe(CMD, RouteOpened(1, about))
+    assert proxied.topics.flows == {}
 
 
-def test_the_contract_bounds_the_queue_and_the_latched_messages() -> None:
-    async def scene(proxied: Proxied) -> None:
-        publication = await proxied.publish()
-        proxied.describe(Contract(durability=Durability.TRANSIENT_LOCAL, depth=2), latching=True)
-        for number, text in enumerate("abc", 1):
-            proxied.topics.flows[1].message(number, 0, framed(text))
-        assert publication._queue_messages == 2
-        assert Heard(publication).texts == ["b", "c"]
-
-    play(scene)
+@played
+async def test_the_contract_bounds_the_queue_and_the_latched_messages(proxied: Proxied) -> None:
+    publication = await proxied.publish()
+    proxied.describe(Contract(durability=Durability.TRANSIENT_LOCAL, depth=2), latching=True)
+    for number, text in enumerate("abc", 1):
+        proxied.topics.flows[1].message(number, 0, framed(text))
+    assert publication._queue_messages == 2
+    assert Heard(publication).texts == ["b", "c"]
 
 
-def test_subscribers_cut_off_in_a_message_are_called_back_later() -> None:
-    async def scene(proxied: Proxied) -> None:
-        listener = Heard(await proxied.publish())
-        flow = proxied.describe(Contract())
-        proxied.named.clear()
-        flow.part(1, 0, FIRST, framed("half", 1000)[:500])
-        proxied.topics.link_down()
-        assert listener.closed
-        assert proxied.named == [], "rospy has not noticed yet"
-        for delay in limits.CALL_BACK_DELAYS:
-            before = len(proxied.named)
-            await asyncio.sleep(delay)
-            assert len(proxied.named) == before + 1
-        await asyncio.sleep(5.0)
-        assert proxied.named == ["/cmd"] * len(limits.CALL_BACK_DELAYS)
-
-    play(scene)
+@played
+async def test_subscribers_cut_off_in_a_message_are_called_back_later(proxied: Proxied) -> None:
+    listener = Heard(await proxied.publish())
+    flow = proxied.describe(Contract())
+    proxied.named.clear()
+    flow.part(1, 0, FIRST, framed("half", 1000)[:500])
+    proxied.topics.link_down()
+    assert listener.closed
+    assert proxied.named == [], "rospy has not noticed yet"
+    for delay in limits.CALL_BACK_DELAYS:
+        before = len(proxied.named)
+        await asyncio.sleep(delay)
+        assert len(proxied.named) == before + 1
+    await asyncio.sleep(5.0)
+    assert proxied.named == ["/cmd"] * len(limits.CALL_BACK_DELAYS)
 
 
-def test_a_changed_header_reconnects_the_subscribers() -> None:
-    async def scene(proxied: Proxied) -> None:
-        publication = await proxied.publish()
-        listener = Heard(publication)
-        proxied.describe(Contract(), latching=True)
-        proxied.topics.flows[1].message(1, 0, framed("map"))
-        proxied.topics.detach(CMD, 1, keep=True)
-        proxied.named.clear()
-        flow = proxied.describe(Contract(), route=2, latching=True, definition="string data")
-        assert listener.closed
-        again = Heard(publication)
-        flow.message(1, 0, framed("map"))
-        assert again.texts == ["map"], "who was hung up on has nothing of what the others had"
-        await asyncio.sleep(2.0)
-        assert len(proxied.named) == 2
-
-    play(scene)
+@played
+async def test_a_changed_header_reconnects_the_subscribers(proxied: Proxied) -> None:
+    publication = await proxied.publish()
+    listener = Heard(publication)
+    proxied.describe(Contract(), latching=True)
+    proxied.topics.flows[1].message(1, 0, framed("map"))
+    proxied.topics.detach(CMD, 1, keep=True)
+    proxied.named.clear()
+    flow = proxied.describe(Contract(), route=2, latching=True, definition="string data")
+    assert listener.closed
+    again = Heard(publication)
+    flow.message(1, 0, framed("map"))
+    assert again.texts == ["map"], "who was hung up on has nothing of what the others had"
+    await asyncio.sleep(2.0)
+    assert len(proxied.named) == 2
 
 
 # --- over links that fall -----------------------------------------------------------------------------------------
 
 
-def test_a_sender_that_began_anew_is_said_and_brings_nothing_again() -> None:
-    async def scene(proxied: Proxied) -> None:
-        listener = Heard(await proxied.publish())
-        flow = proxied.describe(SURE, epoch=5, latching=True)
-        flow.message(1, 0, framed("map"))
-        proxied.topics.link_down()
-        proxied.topics.detach(CMD, 1, keep=True)
-        assert proxied.describe(SURE, epoch=6, latching=True) is flow
-        flow.message(1, 0, framed("map"))
-        flow.message(2, 0, framed("new map"))
-        assert listener.texts == ["map", "new map"]
-        assert proxied.kinds() == [QosEventKind.LOSS_UNKNOWN]
-
-    play(scene)
+@played
+async def test_a_sender_that_began_anew_is_said_and_brings_nothing_again(proxied: Proxied) -> None:
+    listener = Heard(await proxied.publish())
+    flow = proxied.describe(SURE, epoch=5, latching=True)
+    flow.message(1, 0, framed("map"))
+    proxied.topics.link_down()
+    proxied.topics.detach(CMD, 1, keep=True)
+    assert proxied.describe(SURE, epoch=6, latching=True) is flow
+    flow.message(1, 0, framed("map"))
+    flow.message(2, 0, framed("new map"))
+    assert listener.texts == ["map", "new map"]
+    assert proxied.kinds() == [QosEventKind.LOSS_UNKNOWN]
 
 
 @pytest.mark.parametrize(("told", "count", "kinds"), TOLD)
-def test_what_a_sender_says_that_it_has_given_up_is_lost(
-    told: dict[str, Any], count: int, kinds: list[QosEventKind]
+@played
+async def test_what_a_sender_says_that_it_has_given_up_is_lost(
+    proxied: Proxied, told: dict[str, Any], count: int, kinds: list[QosEventKind]
 ) -> None:
-    async def scene(proxied: Proxied) -> None:
-        await proxied.publish()
-        flow = proxied.describe(SURE, epoch=5)
-        flow.message(1, 0, framed("one"))
-        proxied.topics.link_down()
-        proxied.topics.detach(CMD, 1, keep=True)
-        assert proxied.describe(SURE, route=2, **told) is flow
-        assert (lost(flow), proxied.kinds()) == (count, kinds)
-
-    play(scene)
+    await proxied.publish()
+    flow = proxied.describe(SURE, epoch=5)
+    flow.message(1, 0, framed("one"))
+    proxied.topics.link_down()
+    proxied.topics.detach(CMD, 1, keep=True)
+    assert proxied.describe(SURE, route=2, **told) is flow
+    assert (lost(flow), proxied.kinds()) == (count, kinds)
 
 
 @pytest.mark.parametrize("last", [1, 3])
-def test_what_had_not_come_of_a_publisher_that_has_gone_is_lost(last: int) -> None:
-    async def scene(proxied: Proxied) -> None:
-        await proxied.publish()
-        proxied.describe(SURE, epoch=5).message(1, 0, framed("one"))
-        proxied.topics.detach(CMD, 1, missed=True, last=last)
-        new = proxied.describe(SURE, route=2, epoch=6)
-        assert (lost(new), proxied.kinds()) == (
-            last - 1,
-            [QosEventKind.MESSAGES_LOST] if last > 1 else [],
-        )
-
-    play(scene)
+@played
+async def test_what_had_not_come_of_a_publisher_that_has_gone_is_lost(proxied: Proxied, last: int) -> None:
+    await proxied.publish()
+    proxied.describe(SURE, epoch=5).message(1, 0, framed("one"))
+    proxied.topics.detach(CMD, 1, missed=True, last=last)
+    new = proxied.describe(SURE, route=2, epoch=6)
+    assert (lost(new), proxied.kinds()) == (
+        last - 1,
+        [QosEventKind.MESSAGES_LOST] if last > 1 else [],
+    )
 
 
-def test_another_transport_continues_the_flow() -> None:
-    async def scene(proxied: Proxied) -> None:
-        await proxied.publish()
-        old = proxied.describe(SURE, epoch=5)
-        proxied.topics.link_down()
-        proxied.topics.detach(CMD, 1, keep=True)
-        changed = Contract(reliability=Reliability.RELIABLE, transport=Transport.AUTO)
-        assert proxied.describe(changed, epoch=5) is old
-        assert old.contract == changed
-
-    play(scene)
+@played
+async def test_another_transport_continues_the_flow(proxied: Proxied) -> None:
+    await proxied.publish()
+    old = proxied.describe(SURE, epoch=5)
+    proxied.topics.link_down()
+    proxied.topics.detach(CMD, 1, keep=True)
+    changed = Contract(reliability=Reliability.RELIABLE, transport=Transport.AUTO)
+    assert proxied.describe(changed, epoch=5) is old
+    assert old.contract == changed
 
 
-def test_a_changed_contract_makes_a_new_flow() -> None:
-    async def scene(proxied: Proxied) -> None:
-        listener = Heard(await proxied.publish())
-        old = proxied.describe(SURE, epoch=5)
-        old.message(1, 0, framed("one"))
-        proxied.topics.link_down()
-        proxied.topics.detach(CMD, 1, keep=True)
-        new = proxied.describe(Contract(reliability=Reliability.RELIABLE, depth=7), epoch=6)
-        assert new is not old
-        new.message(1, 0, framed("two"))
-        assert listener.texts == ["one", "two"]
-        assert (lost(new), proxied.kinds()) == (0, [QosEventKind.LOSS_UNKNOWN])
-
-    play(scene)
+@played
+async def test_a_changed_contract_makes_a_new_flow(proxied: Proxied) -> None:
+    listener = Heard(await proxied.publish())
+    old = proxied.describe(SURE, epoch=5)
+    old.message(1, 0, framed("one"))
+    proxied.topics.link_down()
+    proxied.topics.detach(CMD, 1, keep=True)
+    new = proxied.describe(Contract(reliability=Reliability.RELIABLE, depth=7), epoch=6)
+    assert new is not old
+    new.message(1, 0, framed("two"))
+    assert listener.texts == ["one", "two"]
+    assert (lost(new), proxied.kinds()) == (0, [QosEventKind.LOSS_UNKNOWN])
 
 
-def test_a_short_silence_repeats_no_latched_message() -> None:
-    async def scene(proxied: Proxied) -> None:
-        publication = await proxied.publish()
-        listener = Heard(publication)
-        proxied.describe(Contract(), latching=True).message(1, 0, framed("map"))
-        proxied.topics.link_down()
-        proxied.topics.detach(CMD, 1, keep=True)
-        late = Heard(publication)
-        flow = proxied.describe(Contract(), latching=True)
-        flow.message(1, 0, framed("map"))
-        flow.message(2, 0, framed("map"))
-        assert listener.texts == late.texts == ["map", "map"]
-        assert flow.quality.messages == 1
-        assert publication.latched == (bytes(framed("map")),)
-
-    play(scene)
+@played
+async def test_a_short_silence_repeats_no_latched_message(proxied: Proxied) -> None:
+    publication = await proxied.publish()
+    listener = Heard(publication)
+    proxied.describe(Contract(), latching=True).message(1, 0, framed("map"))
+    proxied.topics.link_down()
+    proxied.topics.detach(CMD, 1, keep=True)
+    late = Heard(publication)
+    flow = proxied.describe(Contract(), latching=True)
+    flow.message(1, 0, framed("map"))
+    flow.message(2, 0, framed("map"))
+    assert listener.texts == late.texts == ["map", "map"]
+    assert flow.quality.messages == 1
+    assert publication.latched == (bytes(framed("map")),)
 
 
 # --- what becomes of the contract -----------------------------------------------------------------------------------
 
 
-def test_a_missed_deadline_is_said_when_it_is_missed() -> None:
-    async def scene(proxied: Proxied) -> None:
-        await proxied.publish()
-        began = proxied.loop.time()
-        flow = proxied.describe(Contract(deadline=1.0))
-        await asyncio.sleep(0.9)
-        flow.message(1, 0, framed("one"))
-        await asyncio.sleep(1.5)
-        assert [(round(now - began, 3), occurred.kind) for now, occurred in proxied.occurred] == [
-            (1.9, QosEventKind.DEADLINE_MISSED)
-        ]
-        proxied.topics.detach(CMD, 1)
-        await asyncio.sleep(60.0)
-        assert len(proxied.occurred) == 1, "nobody waits for it any more"
-
-    play(scene)
+@played
+async def test_a_missed_deadline_is_said_when_it_is_missed(proxied: Proxied) -> None:
+    await proxied.publish()
+    began = proxied.loop.time()
+    flow = proxied.describe(Contract(deadline=1.0))
+    await asyncio.sleep(0.9)
+    flow.message(1, 0, framed("one"))
+    await asyncio.sleep(1.5)
+    assert [(round(now - began, 3), occurred.kind) for now, occurred in proxied.occurred] == [
+        (1.9, QosEventKind.DEADLINE_MISSED)
+    ]
+    proxied.topics.detach(CMD, 1)
+    await asyncio.sleep(60.0)
+    assert len(proxied.occurred) == 1, "nobody waits for it any more"
 
 
 @pytest.mark.parametrize("silent", [False, True])
-def test_a_source_that_leaves_with_its_peer_is_lost_at_once(silent: bool) -> None:
-    async def scene(proxied: Proxied) -> None:
-        await proxied.publish()
-        proxied.describe(ALIVE)
-        proxied.topics.link_down()
-        if silent:
-            proxied.topics.detach(CMD, 1, keep=True)
-            await asyncio.sleep(AWAY_GRACE)
-            assert proxied.occurred == []
-        else:
-            proxied.topics.detach(CMD, 1)
-        proxied.topics.retract(CMD)
-        assert proxied.kinds() == [QosEventKind.LIVELINESS_LOST]
-        await asyncio.sleep(60.0)
-        assert len(proxied.occurred) == 1
-
-    play(scene)
-
-
-def test_a_source_whose_peer_stays_away_is_lost_when_its_lease_is_over() -> None:
-    async def scene(proxied: Proxied) -> None:
-        await proxied.publish()
-        proxied.describe(Contract(reliability=Reliability.RELIABLE, liveliness_lease=5.0), epoch=5)
-        await asyncio.sleep(10.0)
-        began = proxied.loop.time()
-        proxied.topics.link_down()
+@played
+async def test_a_source_that_leaves_with_its_peer_is_lost_at_once(proxied: Proxied, silent: bool) -> None:
+    await proxied.publish()
+    proxied.describe(ALIVE)
+    proxied.topics.link_down()
+    if silent:
         proxied.topics.detach(CMD, 1, keep=True)
-        await asyncio.sleep(20.0)
-        [(lost, occurred)] = proxied.occurred
-        assert occurred.kind is QosEventKind.LIVELINESS_LOST
-        assert 5.0 <= lost - began <= 5.5
+        await asyncio.sleep(AWAY_GRACE)
+        assert proxied.occurred == []
+    else:
+        proxied.topics.detach(CMD, 1)
+    proxied.topics.retract(CMD)
+    assert proxied.kinds() == [QosEventKind.LIVELINESS_LOST]
+    await asyncio.sleep(60.0)
+    assert len(proxied.occurred) == 1
 
-    play(scene)
+
+@played
+async def test_a_source_whose_peer_stays_away_is_lost_when_its_lease_is_over(proxied: Proxied) -> None:
+    await proxied.publish()
+    proxied.describe(Contract(reliability=Reliability.RELIABLE, liveliness_lease=5.0), epoch=5)
+    await asyncio.sleep(10.0)
+    began = proxied.loop.time()
+    proxied.topics.link_down()
+    proxied.topics.detach(CMD, 1, keep=True)
+    await asyncio.sleep(20.0)
+    [(lost, occurred)] = proxied.occurred
+    assert occurred.kind is QosEventKind.LIVELINESS_LOST
+    assert 5.0 <= lost - began <= 5.5
 
 
-def test_all_is_registered_again_that_the_core_has_lost() -> None:
-    async def scene(proxied: Proxied) -> None:
-        await proxied.publish()
-        registered = proxied.core.publishers("/cmd")
-        proxied.named.clear()
-        proxied.topics.reconcile({"/cmd": dict(registered)})
-        assert not proxied.named
-        proxied.topics.reconcile({})
-        assert proxied.named
-
-    play(scene)
+@played
+async def test_all_is_registered_again_that_the_core_has_lost(proxied: Proxied) -> None:
+    await proxied.publish()
+    registered = proxied.core.publishers("/cmd")
+    proxied.named.clear()
+    proxied.topics.reconcile({"/cmd": dict(registered)})
+    assert not proxied.named
+    proxied.topics.reconcile({})
+    assert proxied.named
