@@ -21,19 +21,20 @@ import sys
 import threading
 from concurrent.futures import CancelledError, Future
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
 from rmpa.config.limits import SERVICE_TIMEOUT
 from rmpa.core.errors import RmpaError
 from rmpa.core.schedule import positive
 from rmpa.ros import limits
+from rmpa.ros.node.endpoints import check_plain
 from rmpa.ros.node.node import Node
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
     from types import FrameType, TracebackType
 
-    from rmpa.ros.node.endpoints import ParamCallback, Publisher
+    from rmpa.ros.node.endpoints import ParamCallback, Publisher, Service, Subscriber
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
@@ -45,10 +46,6 @@ _QUEUE: Final = 100
 # Seconds for a node to unregister, and then for its loop to end; after them the end of the program ends them.
 _CLOSE_WITHIN: Final = 10.0
 _NO_DEFAULT: Final = object()
-
-
-class _WaitFor(Protocol):
-    def __call__(self, coroutine: Coroutine[Any, Any, _T], /) -> _T: ...
 
 
 def connect(
@@ -69,9 +66,9 @@ def connect(
 class SyncPublisher:
     """Publishes one topic of a ``SyncNode``; made by ``SyncNode.advertise``."""
 
-    def __init__(self, publisher: Publisher, wait_for: _WaitFor) -> None:
+    def __init__(self, publisher: Publisher, node: SyncNode) -> None:
         self._publisher = publisher
-        self._wait_for = wait_for
+        self._node = node
 
     @property
     def topic(self) -> str:
@@ -91,20 +88,24 @@ class SyncPublisher:
 
         Raises:
             MessageError: The message does not fit the type, whether there is a subscriber or not.
-            RmpaError: The node is closed.
+            RmpaError: The publisher is closed, or the ``with`` has ended.
         """
 
         async def publish() -> int:
             return self._publisher.publish(message, **fields)
 
-        return self._wait_for(publish())
+        return self._node._wait_for(publish())  # noqa: SLF001 - of this file
 
     def close(self) -> None:
-        """Send the queued messages, and publish the topic no more."""
-        self._wait_for(self._publisher.close())
+        """Send the queued messages, and publish the topic no more; may be called twice."""
+        self._node._end_of(self._publisher)  # noqa: SLF001 - of this file
 
     def wait_for_subscriber(self, timeout: float | None = None) -> bool:
-        """Wait until there is a subscriber; false if there is none in time."""
+        """Wait until there is a subscriber; false if there is none in time.
+
+        Raises:
+            RmpaError: The publisher or its node is closed.
+        """
 
         async def wait() -> bool:
             try:
@@ -114,7 +115,7 @@ class SyncPublisher:
                 return False
             return True
 
-        return self._wait_for(wait())
+        return self._node._wait_for(wait())  # noqa: SLF001 - of this file
 
 
 class SyncNode:
@@ -226,7 +227,7 @@ class SyncNode:
         made = self._wait_for(node.advertise(topic, kind, latch=latch, queue_messages=queue_messages))
         if made.kind is not None:
             made.kind.serialize(made.make())  # makes its code, so that the first message does not wait for that
-        return SyncPublisher(made, self._wait_for)
+        return SyncPublisher(made, self)
 
     def subscribe(
         self, topic: str, kind: str | None, callback: Callable[[Any], object], *, queue_messages: int = _QUEUE
@@ -242,9 +243,10 @@ class SyncNode:
         Returns:
             A function that ends it.
         """
+        check_plain(callback, f"the callback for {topic}")
         made = self._wait_for(self._open_node.subscribe(topic, kind, queue_messages=queue_messages))
         self._for_each(aiter(made), lambda received: callback(received.message), f"callback for {topic}")
-        return lambda: self._wait_for(made.close())
+        return lambda: self._end_of(made)
 
     def wait_for_message(self, topic: str, kind: str | None = None, timeout: float | None = None) -> Any:
         """The next message of a topic; see ``rmpa.Node.wait_for_message``.
@@ -275,6 +277,7 @@ class SyncNode:
         Returns:
             A function that ends it.
         """
+        check_plain(handler, f"the handler of {name}")
 
         async def handle(request: Any) -> Any:
             future: Future[Any] = Future()
@@ -291,7 +294,7 @@ class SyncNode:
             return await asyncio.wrap_future(future)
 
         made = self._wait_for(self._open_node.advertise_service(name, kind, handle, timeout=timeout))
-        return lambda: self._wait_for(made.close())
+        return lambda: self._end_of(made)
 
     def wait_for_service(self, name: str, timeout: float | None = None) -> None:
         """Wait until a service answers; raises UnreachableError where it does not in time."""
@@ -327,6 +330,7 @@ class SyncNode:
 
         While the callback is slow, the last 100 changes wait for it.
         """
+        check_plain(callback, f"the callback for parameter {key}")
         changes: asyncio.Queue[tuple[str, XmlRpcValue]] = asyncio.Queue(_QUEUE)
 
         def change(key: str, value: XmlRpcValue) -> None:
@@ -348,7 +352,16 @@ class SyncNode:
     def rate(self, hz: float) -> Iterator[int]:
         """The numbers 0, 1, 2 … at a rate, until the node is closed; see ``rmpa.Node.rate``."""
         ticks = self._open_node.rate(hz)
-        return iter(lambda: self._wait_for(_next(ticks)), None)
+
+        def tick() -> int | None:
+            try:
+                return self._wait_for(_next(ticks))
+            except RmpaError:
+                if self.stopped:
+                    return None
+                raise
+
+        return iter(tick, None)
 
     def timer(self, period: float, callback: Callable[[], object]) -> Callable[[], None]:
         """Call a function every ``period`` seconds, in a thread, one call at a time; see ``rmpa.Node.timer``.
@@ -356,6 +369,7 @@ class SyncNode:
         Returns:
             A function that ends it.
         """
+        check_plain(callback, "a timer's callback")
         ended = threading.Event()
 
         def tick(count: int) -> None:
@@ -426,11 +440,18 @@ class SyncNode:
             return future.result(within)
         except CancelledError:
             raise RmpaError(f"{self._arguments['name']} is closed") from None
-        except RmpaError as error:  # what happened in the loop is no help to a script's author
+        except (RmpaError, ValueError) as error:  # what happened in the loop is no help to a script's author
             raise error.with_traceback(None) from None
         except BaseException:
             future.cancel()
             raise
+
+    def _end_of(self, made: Publisher | Subscriber | Service) -> None:
+        try:
+            self._wait_for(made.close())
+        except RmpaError:
+            if not self.stopped:  # else it has ended with the node
+                raise
 
     def _for_each(
         self,

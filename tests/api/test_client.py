@@ -158,6 +158,8 @@ async def test_the_agent_is_chosen_as_the_commands_choose_it(place: Path, monkey
         await client.AgentClient().__aenter__()
     with pytest.raises(RmpaError, match="async with AgentClient"):
         await client.AgentClient().snapshot()
+    with pytest.raises(ValueError, match="the period of events is above 0 and finite, not 0"):
+        await anext(client.AgentClient().events(period=0))
     agents = [FakeAgent(place, name) for name in ("arm", "base")]
     for agent in agents:
         await agent.server.start()

@@ -184,13 +184,17 @@ def test_ctrl_c_ends_the_with_and_nothing_else(core: RosCore) -> None:
 
 def test_a_node_that_the_master_ends_is_stopped(core: RosCore) -> None:
     with rmpa.connect("n") as node:
-        node.advertise("/t", "std_msgs/String")
+        publisher = node.advertise("/t", "std_msgs/String")
         uri = str(asyncio.run(call_api(core.uri, "lookupNode", "/me", "/n")).value)
         threading.Timer(0.1, lambda: asyncio.run(call_api(uri, "shutdown", "/me", "enough"))).start()
         for count in node.rate(0.001):
             assert count == 0
         node.spin()
         assert node.stopped
+        with pytest.raises(rmpa.RmpaError, match="/t is not published any more"):
+            publisher.wait_for_subscriber(DEADLINE)
+        with pytest.raises(rmpa.RmpaError, match="/n is closed"):
+            node.advertise("/u", "std_msgs/String")
 
 
 def test_calls_that_wait_end_with_the_node(core: RosCore) -> None:
@@ -287,13 +291,41 @@ def test_a_forked_process_is_told_that_the_node_is_not_its_own(core: RosCore) ->
         assert "/t" in core.state().publishers
 
 
-def test_a_callback_may_close_the_node(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_callback_may_close_the_node(core: RosCore) -> None:
+    closed = threading.Event()
+
+    def close(_: object) -> None:
+        node.close()
+        closed.set()
+
     with rmpa.connect("n") as node:
-        node.subscribe("/t", "std_msgs/String", lambda _: node.close())
+        node.subscribe("/t", "std_msgs/String", close)
         node.advertise("/t", "std_msgs/String", latch=True).publish("x")
-        node.spin()
-    assert "failed" not in caplog.text
-    assert "/t" not in core.state().subscribers
+        assert closed.wait(DEADLINE)  # before the main thread restores the signals' handlers
+        assert node.stopped
+        assert "/t" not in core.state().subscribers
+
+
+def test_what_ends_after_its_node_has_ended_already(core: RosCore) -> None:
+    counts: list[int] = []
+    with rmpa.connect("n") as node, ThreadPoolExecutor() as threads:
+        publisher = node.advertise("/t", "std_msgs/String")
+        ends = [
+            publisher.close,
+            node.subscribe("/t", "std_msgs/String", print),
+            node.advertise_service("/s", "std_srvs/Trigger", print),
+        ]
+        counting = threads.submit(lambda: counts.extend(node.rate(100)))
+        publisher.close()
+        with pytest.raises(rmpa.RmpaError, match="/t is not published any more"):
+            publisher.publish("x")
+        node.close()
+        assert counting.result(DEADLINE) is None
+        for end in ends:
+            end()
+    assert list(node.rate(1)) == []
+    with pytest.raises(rmpa.RmpaError, match="n is closed"):
+        publisher.publish("x")
 
 
 def test_a_topic_can_be_subscribed_to_more_than_once(core: RosCore) -> None:
@@ -336,6 +368,24 @@ def test_whatever_a_handler_raises_is_the_clients_answer(
         with pytest.raises(rmpa.PeerRefused, match=type(error).__name__):
             node.call_service("/s", "std_srvs/Trigger", timeout=DEADLINE)
     assert "a call of /n failed" in caplog.text
+
+
+def test_callbacks_are_plain_functions(core: RosCore) -> None:
+    async def later(*_: object) -> None: ...
+
+    with rmpa.connect("n") as node:
+        for wrong in (later, None):
+            for call in (
+                lambda f: node.subscribe("/t", "std_msgs/String", f),
+                lambda f: node.advertise_service("/s", "std_srvs/Trigger", f),
+                lambda f: node.follow_param("/gain", f),
+                lambda f: node.timer(1, f),
+            ):
+                with pytest.raises(
+                    TypeError, match=r"(callback|handler).* is a plain function, not (None|<function )"
+                ):
+                    call(wrong)
+        assert "/t" not in core.state().subscribers
 
 
 def test_values_are_checked_without_a_subscriber(core: RosCore) -> None:

@@ -252,10 +252,18 @@ async def test_resource_client_requests_and_answers(sonar: Sonar, node: Node) ->
     await until(lambda: not sonar.adapter.adaptation.requirements)
 
 
-async def test_missing_resource_is_unreachable(node: Node) -> None:
+async def test_missing_resource_is_unreachable(node: Node, core: RosCore) -> None:
     async with ResourceClient(node, "nowhere") as one:
         with pytest.raises(UnreachableError, match="/nowhere"):
             await one.require(noise=at_most(1), timeout=0.2)
+        with pytest.raises(ValueError, match="publishes /nowhere/requirements already"):
+            await ResourceClient(node, "nowhere").__aenter__()
+    assert "/nowhere/responses" not in core.state().subscribers
+    async with ResourceClient(node, "nowhere") as one:
+        answers = asyncio.create_task(anext(one.answers(), None))
+        await asyncio.sleep(0)
+        await node.close()
+        assert await asyncio.wait_for(answers, 30) is None
 
 
 # --- preconditions

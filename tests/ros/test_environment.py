@@ -67,6 +67,9 @@ def test_remapping_arguments() -> None:
         ["__name:=bob", "__ns:=/robot", "chatter:=speech", "/abs:=/there", "_rate:=10", "-v", "x", "~own:=/mine"],
     )
     assert environment.node_name("talker") == "/robot/bob"
+    for name in ("", "/", "~"):
+        with pytest.raises(ValueError, match="is not a node's name: it names the root namespace"):
+            environment.node_name(name)
     assert environment.namespace == "/robot"
     assert environment.arguments == ("-v", "x")
     assert environment.parameters == {"rate": 10}

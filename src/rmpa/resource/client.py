@@ -68,8 +68,12 @@ class ResourceClient:
             UnreachableError: The master does not answer.
         """
         kind = MessageType(ARRAY_TYPE)
-        self._responses = await self._node.subscribe(f"{self.resource}/responses", kind, self._response_received)
-        self._requirements = await self._node.advertise(f"{self.resource}/requirements", kind, latch=True)
+        try:
+            self._responses = await self._node.subscribe(f"{self.resource}/responses", kind, self._response_received)
+            self._requirements = await self._node.advertise(f"{self.resource}/requirements", kind, latch=True)
+        except BaseException:
+            await self.__aexit__()
+            raise
         return self
 
     async def __aexit__(self, *_error: object) -> None:
@@ -161,15 +165,22 @@ class ResourceClient:
         self.ask()
 
     async def answers(self) -> AsyncIterator[RequirementAnswer]:
-        """The present answer, if there is one, and each change from now on."""
+        """The present answer, if there is one, and each change from now on, until the node is closed."""
         seen = 0
-        while True:
-            while self._version == seen:
-                self._change.clear()
-                await self._change.wait()
-            seen = self._version
-            if self.answer is not None:
-                yield self.answer
+        stopped = asyncio.ensure_future(self._node.stopped.wait())
+        stopped.add_done_callback(lambda _: self._change.set())
+        try:
+            while True:
+                while self._version == seen:
+                    if self._node.stopped.is_set():
+                        return
+                    self._change.clear()
+                    await self._change.wait()
+                seen = self._version
+                if self.answer is not None:
+                    yield self.answer
+        finally:
+            stopped.cancel()
 
     def _publish(self, publisher: Publisher, values: Mapping[str, str], mark: str = "") -> None:
         pairs: Any = [{"key": key, "value": value} for key, value in values.items()]

@@ -109,6 +109,8 @@ class RosEnvironment:
         Raises:
             ValueError: The name is not a legal one.
         """
+        if not name.strip("~/"):
+            raise ValueError(f"{name!r} is not a node's name: it names the root namespace")
         return resolve_name(self.name or name, self.namespace)
 
     def resolve(self, name: str, node: str) -> str:

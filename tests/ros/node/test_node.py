@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.core.errors import LocalProtocolError, PeerRefused, UnreachableError
+from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.rpc import call
@@ -231,6 +231,9 @@ async def test_another_md5_sum_is_reported_at_both_sides(core: RosCore, caplog: 
         await until(lambda: subscriber.refusals)
         assert "client [/listener] wants topic /t" in subscriber.refusals[talker.uri]
         assert publisher.subscribers == 0
+        text = r"no publisher of /t answers at /listener in .* s; client \[/listener\] wants topic /t"
+        with pytest.raises(UnreachableError, match=text):
+            await listener.wait_for_message("/t", "std_msgs/Int32", 0.5)
     assert "client [/listener] wants topic /t" in caplog.text
 
 
@@ -280,6 +283,38 @@ async def test_nodes_survive_a_restarted_master(core: RosCore) -> None:
         await again.close()
 
 
+async def test_a_node_that_registers_before_it_notices_the_restart_loses_nothing(core: RosCore) -> None:
+    """The master knows the node then, and not what it registered before."""
+    async with node(core, "talker") as talker:
+        await talker.advertise("/before", "std_msgs/String")
+        await talker.follow_param("/gain")
+        port = core.port
+        await core.close()
+        again = RosCore("127.0.0.1", port)
+        again._api._pid += 1  # a process of its own
+        await again.start()
+        await talker.advertise("/after", "std_msgs/String")
+        await until(lambda: {"/before", "/after"} <= again.state().publishers.keys())
+        await talker.close()
+        await again.close()
+
+
+async def test_a_refusal_of_a_restarted_master_is_told_and_the_rest_registered(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with node(core, "talker") as talker:
+        first, second = [await talker.advertise(topic, "std_msgs/String") for topic in ("/first", "/second")]
+
+        async def refuse(*, again: bool = False) -> None:
+            raise PeerRefused("the ROS master", "no more")
+
+        monkeypatch.setattr(first, "register", refuse)
+        for one in (first, second):
+            core.call("unregisterPublisher", "/talker", one.topic, talker.uri)
+        await until(lambda: "/second" in core.state().publishers)
+    assert "/talker: /first: the ROS master refused: no more [core-refuses]" in caplog.text
+
+
 async def test_the_master_ends_a_node_whose_name_is_taken(core: RosCore) -> None:
     reasons: list[str] = []
     async with node(core, "twin", on_shutdown=reasons.append) as first:
@@ -314,8 +349,89 @@ async def test_unadvertised_and_unsubscribed(core: RosCore) -> None:
             await one.advertise("/x", "no_msgs/Such")
         await publisher.close()
         await subscriber.close()
+        with pytest.raises(RmpaError, match="/n/out is not published any more: its publisher is closed"):
+            publisher.publish("x")
         assert "/n/out" not in core.state().publishers
         assert "/in" not in core.state().subscribers
+
+
+async def test_only_an_open_node_registers(core: RosCore) -> None:
+    one = node(core, "n")
+    with pytest.raises(RmpaError, match=r"/n is not open: write `async with rmpa\.Node"):
+        await one.advertise("/t", "std_msgs/String")
+    async with one:
+        with pytest.raises(RmpaError, match="/n was opened before: make another with rmpa"):
+            await one.__aenter__()
+        with pytest.raises(TypeError, match="the callback for /t is a plain function, not <function until"):
+            await one.subscribe("/t", callback=until)  # type: ignore[arg-type]
+        publisher = await one.advertise("/t", "std_msgs/String")
+        waiting = asyncio.create_task(publisher.wait_for_subscriber())
+        await asyncio.sleep(0)
+    for late in (one.advertise("/u", "std_msgs/String"), one.subscribe("/u"), waiting):
+        with pytest.raises(RmpaError, match=r"/n is closed|/t is not published any more"):
+            await asyncio.wait_for(late, DEADLINE)
+    state = core.state()
+    assert not any("/n" in who for table in (state.publishers, state.subscribers) for who in table.values())
+
+
+@pytest.mark.parametrize("ends", [False, True], ids=["the call is cancelled", "the node ends"])
+async def test_what_is_registered_while_its_call_ends_is_not_left_at_the_master(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch, ends: bool
+) -> None:
+    async with node(core, "n") as one:
+        call_master, registered, go_on = one.call_master, asyncio.Event(), asyncio.Event()
+
+        async def slow(method: str, *params: Any) -> Any:
+            if method == "unregisterSubscriber" and not go_on.is_set():
+                return 0  # it overtakes the other call
+            reply = await call_master(method, *params)
+            if method == "registerSubscriber":
+                registered.set()
+                await go_on.wait()
+            return reply
+
+        monkeypatch.setattr(one, "call_master", slow)
+        subscribing = asyncio.create_task(one.subscribe("/t"))
+        await registered.wait()
+        closing = asyncio.create_task(one.close()) if ends else None
+        while ends and not one._ended:
+            await asyncio.sleep(0)
+        go_on.set()
+        if closing is None:
+            subscribing.cancel()
+        with pytest.raises((RmpaError, asyncio.CancelledError)):
+            await subscribing
+        await until(lambda: "/t" not in core.state().subscribers)
+        if closing is not None:
+            await closing
+
+
+async def test_a_close_that_is_cancelled_goes_on(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with node(core, "n") as one:
+        publisher = await one.advertise("/t", "std_msgs/String")
+        call_master, begun, go_on = one.call_master, asyncio.Event(), asyncio.Event()
+
+        async def slow(method: str, *params: Any) -> Any:
+            begun.set()
+            await go_on.wait()
+            return await call_master(method, *params)
+
+        monkeypatch.setattr(one, "call_master", slow)
+        closing = asyncio.create_task(publisher.close())
+        await begun.wait()
+        closing.cancel()
+        await asyncio.wait([closing])
+        go_on.set()
+        await until(lambda: "/t" not in core.state().publishers)
+        await until(lambda: one.slave.publication("/t") is None)
+
+
+@pytest.mark.parametrize("bound", [0, -1])
+async def test_a_queue_has_room_for_a_message(core: RosCore, bound: int) -> None:
+    async with node(core, "n") as one:
+        for make in (one.advertise, one.subscribe):
+            with pytest.raises(ValueError, match=f"queue_messages is at least 1, not {bound}"):
+                await make("/t", "std_msgs/String", queue_messages=bound)
 
 
 async def test_an_ending_node_unregisters_side_by_side(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:

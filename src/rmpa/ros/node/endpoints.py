@@ -26,7 +26,7 @@ from rmpa.ros.types.messages import HeaderNumbers
 from rmpa.ros.wire.tcpros import ANY, LENGTH, frame_message, printable
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Mapping
+    from collections.abc import AsyncIterator, Coroutine, Mapping
 
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.node.subscription import PublisherConnection
@@ -42,6 +42,8 @@ NODE_UNREGISTER_TIMEOUT: Final = 3.0
 # Concurrent calls to unregister, each on a connection of its own.
 NODE_UNREGISTER_AT_ONCE: Final = 16
 _REMEDY: Final = "start one (rmpa up, or roscore), or set ROS_MASTER_URI to one that runs"
+
+_CLOSED: Final = "{} is not published any more: its publisher is closed"
 
 Handler = Callable[[Any], "Awaitable[Any] | Any"]
 ParamCallback = Callable[[str, "XmlRpcValue"], None]
@@ -62,6 +64,10 @@ class MasterClient:
         self._entries: list[Publisher | Subscriber | Service] = []
         # So that the end of one subscriber does not unregister the next one of its topic.
         self._registering = asyncio.Lock()
+        # What is unregistered, also where the program does not wait for it any more.
+        self._unregistering: set[asyncio.Task[None]] = set()
+        # Whether everything is unregistered, or has begun to be.
+        self._ended = False
         # The parameters that are subscribed to, with what is told of their changes.
         self._followed: dict[str, ParamCallback | None] = {}
 
@@ -95,37 +101,65 @@ class MasterClient:
 
         Raises:
             ValueError: The node has a publisher or service of that name already.
+            RmpaError: The node is not open.
         """
+        self._check_open()
         entry.serve()
         self._entries.append(entry)
         try:
             async with self._registering:
                 await entry.register()
-        except BaseException:
+            self._check_open()
+        except BaseException as error:
             if entry in self._entries:
                 self._entries.remove(entry)
             entry.withdraw()
+            if not isinstance(error, PeerRefused):  # the master may have registered it
+                self._in_background(self._unregister(entry))
             raise
+
+    def _check_open(self) -> None:
+        if not self.uri:
+            raise RmpaError(f"{self.name} is not open: write `async with rmpa.Node(...) as node:`")
+        if self._ended:
+            raise RmpaError(f"{self.name} is closed")
 
     async def remove(self, entry: Publisher | Subscriber | Service) -> None:
         """Unregister and close a publisher, subscriber or service; nothing happens if it is not registered."""
         if entry in self._entries:
             self._entries.remove(entry)
-            async with self._registering:
-                if not any((other.kind_name, other.key) == (entry.kind_name, entry.key) for other in self._entries):
-                    with contextlib.suppress(RmpaError):
-                        await self.call_master(f"unregister{entry.kind_name}", entry.key, entry.uri)
-            entry.withdraw()
+            await asyncio.shield(self._in_background(self._remove(entry)))
+
+    async def _remove(self, entry: Publisher | Subscriber | Service) -> None:
+        await self._unregister(entry)
+        entry.withdraw()
+
+    async def _unregister(self, entry: Publisher | Subscriber | Service) -> None:
+        async with self._registering:
+            if not any((other.kind_name, other.key) == (entry.kind_name, entry.key) for other in self._entries):
+                with contextlib.suppress(RmpaError):
+                    await self.call_master(f"unregister{entry.kind_name}", entry.key, entry.uri)
+
+    def _in_background(self, run: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Run it to its end, also where its caller is cancelled; the end of the node waits for it."""
+        task = asyncio.get_running_loop().create_task(run, name=f"unregister of {self.name}")
+        self._unregistering.add(task)
+        task.add_done_callback(self._unregistering.discard)
+        return task
 
     async def _register_again(self) -> None:
         """Register everything at a master that has been started again."""
         for entry in tuple(self._entries):
-            await entry.register(again=True)
+            try:
+                await entry.register(again=True)
+            except PeerRefused as error:
+                _log.warning("! %s: %s: %s [core-refuses]", self.name, entry.key, error)
         for key in tuple(self._followed):
             await self.call_master("subscribeParam", self.uri, key)
 
     async def _unregister_all(self) -> None:
         """Unregister everything, concurrently and with one deadline for a slow master."""
+        self._ended = True
         at_once = asyncio.Semaphore(NODE_UNREGISTER_AT_ONCE)
 
         async def unregister(method: str, *params: XmlRpcValue) -> None:
@@ -142,6 +176,7 @@ class MasterClient:
                     group.create_task(call, name=f"unregister {self.name}")
                 for key in self._followed:
                     group.create_task(unregister("unsubscribeParam", self.uri, key), name=f"unregister {self.name}")
+                await asyncio.gather(*self._unregistering)
         except TimeoutError:
             _log.debug("! %s: the master at %s is slow; not everything is unregistered", self.name, self.master_uri)
 
@@ -362,7 +397,10 @@ class Publisher(PublicationEvents):
         self.kind = kind
         self.numbers = HeaderNumbers(kind) if kind is not None else None
         self._change = asyncio.Event()
-        self.publication = Publication(topic, node.name, description, events=self, queue_messages=queue_messages)
+        self._closed = self._ended = False
+        self.publication = Publication(
+            topic, node.name, description, events=self, queue_messages=_at_least_one(queue_messages)
+        )
 
     @property
     def subscribers(self) -> int:
@@ -386,8 +424,11 @@ class Publisher(PublicationEvents):
 
         Raises:
             MessageError: The message does not fit the type, whether there is a subscriber or not.
+            RmpaError: The publisher was closed.
         """
         kind = self._known()
+        if self._closed:
+            raise RmpaError(_CLOSED.format(self.topic))
         payload: Buffer = kind.serialize(kind.given(message, fields))
         return self.publish_raw(self.numbers.stamp(payload) if self.numbers is not None else payload)
 
@@ -400,8 +441,14 @@ class Publisher(PublicationEvents):
         return self.publication.publish_framed(frame_message(payload))
 
     async def wait_for_subscriber(self) -> None:
-        """Wait until there is at least one subscriber."""
+        """Wait until there is at least one subscriber.
+
+        Raises:
+            RmpaError: The publisher or its node is closed.
+        """
         await self._change.wait()
+        if self._ended:
+            raise RmpaError(_CLOSED.format(self.topic))
 
     async def drained(self) -> None:
         """Wait until all published messages are sent, at most ``runtime.limits.DRAIN_TIMEOUT`` seconds."""
@@ -422,7 +469,14 @@ class Publisher(PublicationEvents):
 
     def withdraw(self) -> None:
         """Close the connections."""
+        self._closed = True
+        self.ended()
         self._node.slave.remove_publication(self.topic)
+
+    def ended(self) -> None:
+        """End ``wait_for_subscriber``; no further subscribers arrive."""
+        self._ended = True
+        self._change.set()
 
     def first_subscriber(self) -> None:
         """Of ``PublicationEvents``."""
@@ -430,7 +484,8 @@ class Publisher(PublicationEvents):
 
     def last_subscriber(self) -> None:
         """Of ``PublicationEvents``."""
-        self._change.clear()
+        if not self._ended:
+            self._change.clear()
 
     def mismatch(self, fields: Mapping[str, str], text: str) -> None:
         """Of ``PublicationEvents``."""
@@ -477,7 +532,7 @@ class Subscriber:
         self._callback = callback
         self._on_bytes = on_bytes
         self._queue: deque[Received] = deque()
-        self._queue_messages = queue_messages
+        self._queue_messages = _at_least_one(queue_messages)
         self._wake = asyncio.Event()
         self._ended = False
         self.subscription = Subscription(
@@ -558,6 +613,18 @@ class Subscriber:
 
     def _refused(self, connection: PublisherConnection, text: str) -> None:
         _refuse(self, "subscription.refused", connection.uri, text)
+
+
+def check_plain(function: object, what: str) -> None:
+    """Refuse what is no function, and a coroutine function, which nothing would await, with TypeError."""
+    if not callable(function) or inspect.iscoroutinefunction(function):
+        raise TypeError(f"{what} is a plain function, not {function!r}")
+
+
+def _at_least_one(queue_messages: int) -> int:
+    if queue_messages < 1:
+        raise ValueError(f"queue_messages is at least 1, not {queue_messages}")
+    return queue_messages
 
 
 def _refuse(end: Publisher | Subscriber, name: str, who: str, text: str) -> None:

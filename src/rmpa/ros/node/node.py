@@ -38,6 +38,7 @@ from rmpa.ros.node.endpoints import (
     Service,
     ServiceClient,
     Subscriber,
+    check_plain,
     probe,
 )
 from rmpa.ros.node.fetch_type import find_here, find_or_fetch
@@ -121,6 +122,8 @@ class Node(MasterClient):
         self._rosout: RosoutHandler | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._closing: asyncio.Task[None] | None = None
+        # The process of the master at which all is registered; ``None``: not all of it.
+        self._master_pid: XmlRpcValue = None
         master_uri = master_uri or environment.master_uri
         host = environment.host
         if not environment.host_given and is_loopback(host_of(master_uri)):
@@ -141,10 +144,13 @@ class Node(MasterClient):
 
         Raises:
             UnreachableError: The master does not answer.
+            RmpaError: The node was opened before.
         """
+        if self.uri:
+            raise RmpaError(f"{self.name} was opened before: make another with rmpa.Node(...)")
         await self.slave.start()
         try:
-            await self.call_master("getPid")
+            self._master_pid = await self.call_master("getPid")
             for key, value in self.environment.parameters.items():
                 await self.set_param(f"~{key}", value)
         except BaseException as error:
@@ -228,8 +234,11 @@ class Node(MasterClient):
             DefinitionError: The type is not known.
             UnreachableError: The master does not answer.
             PeerRefused: The master refuses the registration.
+            TypeError: ``callback`` is a coroutine function.
         """
         resolved = self._resolve(topic)
+        if callback is not None:
+            check_plain(callback, f"the callback for {resolved}")
         type_name = kind if isinstance(kind, str) else ANY
         if isinstance(kind, str):
             kind = await find_here(kind) if kind != ANY else None
@@ -273,7 +282,8 @@ class Node(MasterClient):
             where = f"{self.name} in {timeout:g} s"
         finally:
             await subscriber.close()
-        remedy = f"`rmpa why {subscriber.topic}` says what is missing"
+        refused = "".join(list(subscriber.refusals.values())[-1:])
+        remedy = refused or f"`rmpa why {subscriber.topic}` says what is missing"
         raise UnreachableError(f"publisher of {subscriber.topic}", where, remedy)
 
     # --- services ---------------------------------------------------------------------------------------------
@@ -532,11 +542,14 @@ class Node(MasterClient):
             if not (self._entries or self._followed):
                 continue
             try:
-                if (await self._call("lookupNode", self.name)).code != 1:
+                pid = await self.call_master("getPid")
+                if pid != self._master_pid or (await self._call("lookupNode", self.name)).code != 1:
                     _log.info(
                         "= %s: the master at %s was started again; registering again", self.name, self.master_uri
                     )
+                    self._master_pid = None
                     await self._register_again()
+                    self._master_pid = pid
             except RmpaError as error:
                 _log.debug("! %s: %s", self.name, error)
 
@@ -591,7 +604,7 @@ class Node(MasterClient):
             await asyncio.wait(self._tasks)
         await self._unregister_all()
         for entry in self._entries:
-            if isinstance(entry, Subscriber):
+            if not isinstance(entry, Service):
                 entry.ended()
         await asyncio.gather(*(entry.drained() for entry in self._entries if isinstance(entry, Publisher)))
         await self.slave.close()
