@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.identity import is_global_name
 from rmpa.gateway.ros2 import format as ros2_tokens
 from rmpa.gateway.ros2.format import Ros2Endpoint
 from rmpa.gateway.ros2.graph import Ros2Graph
@@ -33,6 +35,8 @@ SEEDS: list[bytes] = [
     _ENDPOINT.format(1, "MP", "std_msgs::msg::dds_::String_").encode(),
     _ENDPOINT.format(2, "SS", "std_srvs::srv::dds_::Trigger_").replace("::,10:", "2:1:2,1:3,4:").encode(),
     b"@ros2_lv/3/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/talker",
+    "@ros2_lv/0/a1/1/2/MP/%/%é/a b/%..%etc/os::system::dds_::x_/\x1b[2J/::,10:,:,:,,".encode(),
+    f"rmpa/1/eve/arm/up/{_RUN}/t/a%B/%..%etc%passwd/%\x1b[2J".encode(),
 ]
 
 
@@ -50,6 +54,12 @@ def fuzz(data: bytes) -> None:
     _read(asked_type, key)
     graph = Ros2Graph(0, "own")
     shown = graph.change(key, alive=True)
+    if isinstance(site, site_keys.SiteSource) and not (is_global_name(site.node) and is_global_name(site.name)):
+        raise AssertionError(f"{site} has a name that ROS does not allow")
+    names = [shown.name] if shown is not None else []
+    names += [shown.node.name] if isinstance(shown, Ros2Endpoint) else []
+    if not all(re.fullmatch(r"(/\w+)+", name, re.ASCII) and not name.startswith("/rmpa/") for name in names):
+        raise AssertionError(f"{names} are not all names of ROS 2")
     if graph.change(key, alive=False) != shown or len(graph) or graph.nodes:
         raise AssertionError("a token that is gone stays in the graph")
 

@@ -13,6 +13,11 @@ from rmpa.observe.why.diagnosis import Diagnosis
 _MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
 SEEDS: list[bytes] = [
     b"",
+    b"[" * 100_000,
+    b'{"a":' * 900 + b"1" + b"}" * 900,
+    b"9" * 100_000,
+    b'"\\ud800"',
+    b"\xff\xfe",
     msgspec.json.encode(TopicHeader("std_msgs/String", _MD5, "string data\n", True, "/n", 7, 5, 1)),
     msgspec.json.encode(WhyQuestion(site="hall", name="/scan", module="arm")),
     msgspec.json.encode(

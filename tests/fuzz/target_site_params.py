@@ -28,6 +28,11 @@ if TYPE_CHECKING:
 _TEXT: Final = serialize_response({"p": 1.5, "names": ["a", True], "blob": b"\0\1"}).decode()
 SEEDS: list[bytes] = [
     b"",
+    b"[" * 100_000,
+    b'{"a":' * 900 + b"1" + b"}" * 900,
+    b"9" * 100_000,
+    b'"\\ud800"',
+    b"\xff\xfe",
     msgspec.json.encode(ParamQuestion(op="get", key="/gains")),
     msgspec.json.encode(ParamQuestion(op="names", askers=("arm", "base"))),
     msgspec.json.encode(ParamQuestion(op="set", key="/gains/p", text=_TEXT)),

@@ -38,28 +38,51 @@ def _fit(one: list[str], other: list[str]) -> bool:
     return (one[0] == other[0] or "*" in (one[0], other[0])) and _fit(one[1:], other[1:])
 
 
-@dataclass
+@dataclass(eq=False)
 class Entry:
-    """What one session declared under a key."""
+    """What one session has declared under a key, until it is closed."""
 
     session: MemorySession
+    table: list[Any]
     key: str
-    callback: Callable[..., object]
-    cached: list[ZenohSample] = field(default_factory=list)
-    matched: bool | None = None
+    callback: Callable[..., object] = lambda: None
+    closed: Callable[[], None] = lambda: None
 
+    def __post_init__(self) -> None:
+        self.table.append(self)
 
-class MemoryDeclared:
-    """An entry of a table, until it is closed."""
-
-    def __init__(self, table: list[Entry], entry: Entry, closed: Callable[[], None] = lambda: None) -> None:
-        self._table, self._entry, self._closed = table, entry, closed
-        table.append(entry)
+    def call(self, *args: Any) -> None:
+        """Call back in the event loop, unless it was closed before."""
+        loop = asyncio.get_running_loop()
+        loop.call_soon(lambda: self.callback(*args) if self in self.table else None)
 
     def close(self) -> None:
-        if self._entry in self._table:
-            self._table.remove(self._entry)
-            self._closed()
+        if self in self.table:
+            self.table.remove(self)
+            self.closed()
+
+
+@dataclass(eq=False)
+class MemoryPublisher(Entry):
+    """A publisher that delivers at once."""
+
+    cache: int = field(default=0, kw_only=True)
+    cached: list[ZenohSample] = field(default_factory=list)
+    matched: bool | None = None
+    sent: int = 0
+    dropped = waiting = 0
+
+    def put(self, payload: Buffer, attachment: bytes = b"") -> int:
+        self.sent += 1
+        sample = ZenohSample(self.key, bytes(payload), attachment)
+        self.cached = [*self.cached, sample][-self.cache :] if self.cache else []
+        for each in self.session.network.subscribers:
+            if fits(each.key, sample.key):
+                each.call(sample)
+        return 0
+
+    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
+        return sum(self.put(*each) for each in messages)
 
 
 @dataclass
@@ -69,8 +92,8 @@ class MemoryQuery:
     key: str
     payload: bytes
     attachment: bytes
-    done: asyncio.Future[None]
-    parameters: str = ""
+    parameters: str
+    done: asyncio.Event = field(default_factory=asyncio.Event)
     replies: list[ZenohReply] = field(default_factory=list)
 
     def reply(self, key: str, payload: Buffer, attachment: bytes = b"") -> None:
@@ -86,38 +109,14 @@ class MemoryQuery:
         self.finish()
 
     def finish(self) -> None:
-        if not self.done.done():
-            self.done.set_result(None)
-
-
-class MemoryPublisher:
-    """A publisher that delivers at once."""
-
-    def __init__(self, network: MemoryZenoh, entry: Entry, cache: int) -> None:
-        self._network, self._entry, self._cache = network, entry, cache
-        self._declared = MemoryDeclared(network.publishers, entry)
-        self.sent = self.dropped = self.waiting = 0
-
-    def put(self, payload: Buffer, attachment: bytes = b"") -> int:
-        self.sent += 1
-        sample = ZenohSample(self._entry.key, bytes(payload), attachment)
-        self._entry.cached = [*self._entry.cached, sample][-self._cache :] if self._cache else []
-        for each in [each for each in self._network.subscribers if fits(each.key, sample.key)]:
-            self._network.soon(self._network.subscribers, each, sample)
-        return 0
-
-    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
-        return sum(self.put(*each) for each in messages)
-
-    def close(self) -> None:
-        self._declared.close()
+        self.done.set()
 
 
 class MemoryZenoh:
     """One network of sessions."""
 
     def __init__(self) -> None:
-        self.publishers: list[Entry] = []
+        self.publishers: list[MemoryPublisher] = []
         self.subscribers: list[Entry] = []
         self.queryables: list[Entry] = []
         self.tokens: list[Entry] = []
@@ -133,24 +132,19 @@ class MemoryZenoh:
         """The tokens that are declared."""
         return sorted(entry.key for entry in self.tokens)
 
-    def soon(self, table: list[Entry], entry: Entry, *args: Any) -> None:
-        """Call back in the event loop, unless it was closed before."""
-        loop = asyncio.get_running_loop()
-        loop.call_soon(lambda: entry.callback(*args) if entry in table else None)
-
     def match(self) -> None:
         """Tell each publisher whether there is a subscriber."""
         for entry in self.publishers:
             matched = any(fits(each.key, entry.key) for each in self.subscribers)
             if entry.matched is not matched:
                 entry.matched = matched
-                self.soon(self.publishers, entry, matched)
+                entry.call(matched)
 
     def tell(self, key: str, alive: bool) -> None:
         """Tell of a token."""
         for each in self.watches:
             if fits(each.key, key):
-                self.soon(self.watches, each, key, alive)
+                each.call(key, alive)
 
 
 class MemorySession:
@@ -162,65 +156,48 @@ class MemorySession:
         self.network, self.zid = network, zid
 
     def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> MemoryPublisher:
-        made = MemoryPublisher(self.network, Entry(self, key, on_matching), qos.cache)
+        made = MemoryPublisher(self, self.network.publishers, key, on_matching, cache=qos.cache)
         self.network.match()
         return made
 
-    def subscribe(
-        self, key: str, on_sample: Callable[[ZenohSample], None], *, history: bool = False
-    ) -> MemoryDeclared:
-        network, entry = self.network, Entry(self, key, on_sample)
-        declared = MemoryDeclared(network.subscribers, entry, network.match)
-        for publisher in network.publishers if history else ():
+    def subscribe(self, key: str, on_sample: Callable[[ZenohSample], None], *, history: bool = False) -> Entry:
+        made = Entry(self, self.network.subscribers, key, on_sample, self.network.match)
+        for publisher in self.network.publishers if history else ():
             for sample in publisher.cached if fits(key, publisher.key) else ():
-                network.soon(network.subscribers, entry, sample)
-        network.match()
-        return declared
+                made.call(sample)
+        self.network.match()
+        return made
 
-    def token(self, key: str) -> MemoryDeclared:
-        declared = MemoryDeclared(
-            self.network.tokens, Entry(self, key, lambda: None), lambda: self.network.tell(key, alive=False)
-        )
+    def token(self, key: str) -> Entry:
+        made = Entry(self, self.network.tokens, key, closed=lambda: self.network.tell(key, alive=False))
         self.network.tell(key, alive=True)
-        return declared
+        return made
 
-    def watch_tokens(self, key: str, on_token: Callable[[str, bool], None]) -> MemoryDeclared:
-        entry = Entry(self, key, on_token)
-        declared = MemoryDeclared(self.network.watches, entry)
+    def watch_tokens(self, key: str, on_token: Callable[[str, bool], None]) -> Entry:
+        made = Entry(self, self.network.watches, key, on_token)
         for token in self.network.tokens:
             if fits(key, token.key):
-                self.network.soon(self.network.watches, entry, token.key, True)
-        return declared
+                made.call(token.key, True)
+        return made
 
-    def queryable(self, key: str, on_query: Callable[[Any], None], _needs: object = None) -> MemoryDeclared:
-        return MemoryDeclared(self.network.queryables, Entry(self, key, on_query))
+    def queryable(self, key: str, on_query: Callable[[Any], object], _needs: object = None) -> Entry:
+        return Entry(self, self.network.queryables, key, on_query)
 
     async def get(
-        self,
-        selector: str,
-        payload: Buffer = b"",
-        attachment: bytes = b"",
-        *,
-        timeout: float = 5.0,
-        **_terms: object,
+        self, selector: str, payload: Buffer = b"", attachment: bytes = b"", *, timeout: float = 5.0, **_terms: object
     ) -> list[ZenohReply]:
-        queries = []
         key, _, parameters = selector.partition("?")
-        for entry in [entry for entry in self.network.queryables if fits(key, entry.key)]:
-            query = MemoryQuery(key, bytes(payload), attachment, asyncio.Future(), parameters)
-            queries.append(query)
-            self.network.soon(self.network.queryables, entry, query)
+        asked = [entry for entry in self.network.queryables if fits(key, entry.key)]
+        queries = [MemoryQuery(key, bytes(payload), attachment, parameters) for _ in asked]
+        for entry, query in zip(asked, queries, strict=True):
+            entry.call(query)
         if queries:
-            await asyncio.wait([query.done for query in queries], timeout=timeout)
+            await asyncio.wait([asyncio.ensure_future(query.done.wait()) for query in queries], timeout=timeout)
         return [reply for query in queries for reply in query.replies]
 
     async def close(self) -> None:
         """Take back all that it declared."""
         network = self.network
-        for table in (network.publishers, network.subscribers, network.queryables, network.watches):
-            table[:] = [entry for entry in table if entry.session is not self]
-        gone = [entry for entry in network.tokens if entry.session is self]
-        network.tokens[:] = [entry for entry in network.tokens if entry.session is not self]
-        for entry in gone:
-            network.tell(entry.key, alive=False)
-        network.match()
+        for table in (network.publishers, network.subscribers, network.queryables, network.watches, network.tokens):
+            for entry in [each for each in table if each.session is self]:
+                entry.close()

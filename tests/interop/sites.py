@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from lab.bed.gateways import JoinedSites, Site
-from lab.bed.processes import DEADLINE, Process, eventually
+from lab.bed.processes import DEADLINE, Process
 from tests.interop.modules import Module
 
 if TYPE_CHECKING:
@@ -67,11 +67,6 @@ def join(
 def nodes(module: Module) -> set[str]:
     """What the stock ``rosnode list`` says there."""
     return set(module.ros.tool("rosnode", "list").split())
-
-
-def wait_node(module: Module, node: str, timeout: float = DEADLINE) -> None:
-    """Wait until ``rosnode list`` there shows a node."""
-    eventually(lambda: node in nodes(module), timeout, what=f"{node} in the graph of {module.name}", every=0.2)
 
 
 def ended(watcher: Process, node: str, since: int, timeout: float = DEADLINE) -> int:

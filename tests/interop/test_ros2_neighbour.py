@@ -1,6 +1,7 @@
 """ROS 1 nodes beside those of other worlds, by one gateway: ROS 2 of rmw_zenoh and Zenoh programs.
 
-The other ends are ``zenoh-ros2-sdk`` and plain eclipse-zenoh: they have no code of ours.
+The other ends are ``zenoh-ros2-sdk`` and plain eclipse-zenoh: they have no code of ours. Those of actions speak
+rmw_zenoh's format, to actionlib's unmodified clients and servers.
 """
 
 from __future__ import annotations
@@ -13,14 +14,18 @@ import pytest
 
 from lab.bed.gateways import ROUTER_PORT
 from lab.bed.processes import Process, eventually
+from rmpa.gateway.ros2.conversion import ActionPair
+from rmpa.gateway.ros2.types import Ros2Types, TypePair
+from rmpa.ros.types.messages import MessageType
+from tests.interop.ros import lacks
 from tests.interop.ros2_hall import LONG, Hall, OtherEnd, running_hall
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-
 pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
+needs_actionlib = pytest.mark.skipif(bool(lacks("actionlib")), reason=lacks("actionlib"))
 needs_sdk = pytest.mark.skipif(find_spec("zenoh_ros2_sdk") is None, reason="zenoh-ros2-sdk is not installed")
 
 
@@ -92,9 +97,8 @@ def test_ros1_lists_and_hears_a_ros2_talker(hall: Hall, ros2: OtherEnd) -> None:
     for number in range(2):
         with hall.robot.ros.rospy("listener", topic="/from2", type="String", name=f"l_{number}") as listener:
             hears_all(listener, ros2, f"turn{number}")
-            code, text = hall.robot.agent.rmpa("why", "ros2:/from2")
-            assert code == 0, text
-            assert "std_msgs/msg/String of ROS 2 is std_msgs/String here" in text
+            _, text = hall.robot.agent.rmpa("why", "ros2:/from2")
+            assert "std_msgs/msg/String of ROS 2 is std_msgs/String here" in text, text
     code, text = hall.robot.agent.rmpa("site", "info", "ros2")
     assert code == 0, text
     assert "/from2" in text
@@ -150,3 +154,79 @@ def test_a_zenoh_program_calls_a_service(hall: Hall, plain: OtherEnd) -> None:
             return replies["ok"] == ["01" + text_of("on")]
 
         eventually(answered, what="the service's answer", every=0.3)
+
+
+# --- actions -----------------------------------------------------------------------------------------------------
+
+
+def hashes() -> str:
+    """The type hashes of actionlib's TestAction, by the ends of their names."""
+    kinds = [MessageType(f"actionlib/Test{part}") for part in ("Goal", "Result", "Feedback")]
+    pair = ActionPair(kinds, TypePair("actionlib/action/Test"), Ros2Types("jazzy"))
+    return json.dumps({name.rpartition("/")[2].rpartition("_")[2]: each for name, each in pair.types.values()})
+
+
+def end(hall: Hall, action: str) -> OtherEnd:
+    endpoint = f"tcp/{hall.robot.host.address}:{ROUTER_PORT}"
+    return hall.end("ros2_action_end", endpoint, action, "actionlib/Test", hashes())
+
+
+def client_of_ros1(hall: Hall, kind: str, action: str) -> Process:
+    client = hall.robot.ros.node(kind, "action_client", "--action", action, name=f"client_{kind}", commands=True)
+    client.tell("server 20")
+    assert client.wait_event("server", LONG)["found"]
+    return client
+
+
+@needs_actionlib
+def test_a_client_of_ros1_uses_a_server_of_ros2(hall: Hall) -> None:
+    end(hall, "/count2").do("serve")
+    client = client_of_ros1(hall, "roscpp", "/count2")
+    client.tell("send 5")
+    done = client.wait_event("done", LONG)
+    assert (done["state"], done["result"]) == ("SUCCEEDED", 5)
+    assert client.events("feedback")[-1]["value"] == 5
+    since = client.mark_events()
+    client.tell("send -1")
+    assert client.wait_event("done", LONG, since=since)["state"] == "REJECTED"
+    since = client.mark_events()
+    client.tell("send 100000")
+    client.wait_event("feedback", LONG, since=since)
+    client.tell("cancel")
+    assert client.wait_event("done", LONG, since=since)["state"] == "PREEMPTED"
+
+
+@needs_actionlib
+def test_a_server_of_ros2_that_is_killed_aborts_the_goal(hall: Hall) -> None:
+    server = end(hall, "/mortal")
+    server.do("serve")
+    client = client_of_ros1(hall, "rospy", "/mortal")
+    client.tell("send 100000")
+    client.wait_event("feedback", LONG)
+    server.process.kill()
+    done = client.wait_event("done", LONG)
+    assert done["state"] == "ABORTED"
+
+
+@needs_actionlib
+@pytest.mark.parametrize("kind", ["rospy", "roscpp"])
+def test_a_client_of_ros2_uses_a_server_of_ros1(hall: Hall, kind: str) -> None:
+    action = f"/count1_{kind}"
+    server = hall.robot.ros.node(kind, "action_server", "--action", action, name=f"server_{kind}")
+    client = end(hall, action)
+    client.do("client")
+    eventually(lambda: client.ask("send", "accepted", goal=5)["ok"], LONG, what="a server of actions", every=0.2)
+    done = client.process.wait_event("ended", LONG, where=lambda event: event["status"] != -1)
+    assert (done["status"], done["result"]) == (4, 5)
+    since = client.process.mark_events()
+    assert client.ask("send", "accepted", goal=-1)["ok"], "SimpleActionServer accepts, and aborts"
+    assert client.process.wait_event("ended", LONG, since=since)["status"] == 6
+    since = client.process.mark_events()
+    assert client.ask("send", "accepted", goal=100000)["ok"]
+    client.process.wait_event("feedback", LONG, since=since)
+    assert client.ask("cancel", "cancelling")["code"] == 0
+    assert client.process.wait_event("ended", LONG, since=since)["status"] == 5
+    assert client.ask("send", "accepted", goal=100000)["ok"]
+    since = client.process.mark_events()
+    server.kill()
+    assert client.process.wait_event("ended", LONG, since=since)["status"] == 6

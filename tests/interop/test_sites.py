@@ -1,4 +1,4 @@
-"""Two sites of the same addresses behind NAT, joined by a Zenoh router: real nodes at both, and faults of each part.
+"""Two sites of the same addresses behind NAT, joined by a Zenoh router: nodes, tools, and faults of each part.
 
 All tests share one set of processes, for that takes seconds to start; each leaves it as it was.
 """
@@ -8,20 +8,23 @@ from __future__ import annotations
 import json
 import time
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
+from lab.bed.agents import RMPA
 from lab.bed.namespaces import Lab
-from lab.bed.processes import eventually
+from lab.bed.processes import Process, eventually
 from tests.interop.modules import flows, whole
 from tests.interop.recordings import recorded
 from tests.interop.ros import Ros, lacks
-from tests.interop.sites import JoinedModules, ended, join, nodes, wait_node
+from tests.interop.sites import JoinedModules, ended, join, nodes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from lab.bed.agents import Agent
     from lab.bed.namespaces import Host
 
 pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
@@ -30,6 +33,10 @@ pytestmark = [pytest.mark.ros, pytest.mark.nat, pytest.mark.timeout(120)]
 LONG: Final = 40.0
 _DETECTED: Final = 2.0
 """Seconds after which a killed module must be gone at the other site: 0.2 on a machine of its own, see lab/bench."""
+LAMP: Final = Path(__file__).parent / "resources" / "lamp.py"
+RULES: Final = '[[gateway.rule]]\nnames = ["/secret/**"]\ncrossing = "none"\n'
+"""Of both gateways."""
+THERE: Final = ("--peer", "warehouse/arm")
 
 
 @pytest.fixture(scope="module")
@@ -42,25 +49,31 @@ def joined(tmp_path_factory: pytest.TempPathFactory) -> Iterator[JoinedModules]:
         def shell(host: Host) -> Ros:
             return stack.enter_context(Ros(host, home, 11311))
 
-        yield join(lab, home, shell, stack)
+        yield join(lab, home, shell, stack, config=RULES)
 
 
-@pytest.mark.parametrize("client", ["rospy", "roscpp"])
-def test_topics_cross_both_ways_whole(joined: JoinedModules, client: str) -> None:
+def does(agent: Agent, *words: str, status: int = 0) -> str:
+    """Run a command of rmpa that has to end with this status; return its output."""
+    code, output = agent.rmpa(*words, timeout=LONG)
+    assert code == status, f"rmpa {' '.join(words)}: {output}"
+    return output
+
+
+def test_topics_cross_both_ways_whole(joined: JoinedModules) -> None:
     """Every message arrives once, in order, and the publisher is a node of the other site's module."""
     arm, base = joined.arm, joined.base
-    ways = [(arm, base, "warehouse", f"/out_{client}"), (base, arm, "yard", f"/back_{client}")]
+    ways = [(arm, base, "warehouse", "/out", "roscpp", "rospy"), (base, arm, "yard", "/back", "rospy", "roscpp")]
     with ExitStack() as stack:
-        heard = {
-            topic: stack.enter_context(there.ros.node(client, "listener", topic=topic, count=200))
-            for _, there, _, topic in ways
-        }
-        for here, there, site, topic in ways:
+        heard = [
+            stack.enter_context(there.ros.node(listener, "listener", topic=topic, count=200))
+            for _, there, _, topic, _, listener in ways
+        ]
+        for got, (here, there, site, topic, talker, _) in zip(heard, ways, strict=True):
             name = f"talker_{topic[1:]}"
             options = {"topic": topic, "rate": 200, "count": 200, "size": 3000, "wait": 1}
-            stack.enter_context(here.ros.node(client, "talker", f"__name:={name}", **options))
+            stack.enter_context(here.ros.node(talker, "talker", f"__name:={name}", **options))
             proxy = f"/rmpa/{site}/{here.name}/{name}"
-            whole(heard[topic].wait_event("done", LONG), 200)
+            whole(got.wait_event("done", LONG), 200)
             assert proxy in nodes(there)
             assert proxy not in nodes(here), "it comes back to its own site"
             assert there.ros.tool("rostopic", "info", topic).count("/rmpa/") == 1, "two ways to one publisher"
@@ -214,7 +227,8 @@ def test_the_router_is_killed_and_comes_back(joined: JoinedModules) -> None:
 
 
 def test_an_uplink_is_cut_and_comes_back(joined: JoinedModules) -> None:
-    """Nothing local changes at either site, and what crosses goes on."""
+    """Nothing local changes at either site, the tools say that the site is away, and what crosses goes on."""
+    base = joined.base.agent
     with (
         joined.base.ros.rospy("listener", topic="/far") as far,
         joined.arm.ros.rospy("listener", topic="/far") as near,
@@ -224,6 +238,10 @@ def test_an_uplink_is_cut_and_comes_back(joined: JoinedModules) -> None:
         joined.warehouse.network.cut()
         eventually(lambda: "/rmpa/warehouse/arm/far" not in nodes(joined.base), what="the proxy gone")
         flows(near, 20)
+        eventually(lambda: "unreachable" in base.rmpa("site", "list")[1], LONG, what="unreachable", every=0.5)
+        for name in ("warehouse/arm:/far", "/far"):  # whose it was need not be known
+            assert "site warehouse is unreachable since" in does(base, "why", name, status=1)
+        does(base, "site", "info", "warehouse", status=1)
         joined.warehouse.network.restore()
         report = flows(far, 20, LONG)
         assert (report["bad"], report["doubled"]) == (0, 0)
@@ -269,20 +287,68 @@ def test_a_second_gateway_takes_over(joined: JoinedModules) -> None:
 
 
 def test_why_and_site_tell_of_both_sites(joined: JoinedModules) -> None:
+    base = joined.base.agent
     with (
         joined.arm.ros.rospy("talker", "__name:=told", topic="/told", rate=20),
+        joined.arm.ros.rospy("talker", "__name:=spy", topic="/secret/word", rate=20) as spy,
         joined.base.ros.rospy("listener", topic="/told") as listener,
     ):
         flows(listener, 5, LONG)
 
         def explained() -> bool:
             """Whether nothing is found wrong; messages may be late for a while on a busy machine."""
-            code, output = joined.base.agent.rmpa("why", "/told", timeout=LONG)
-            return code == 0 and "warehouse" in output
+            code, output = base.rmpa("why", "/told", timeout=LONG)
+            return code == 0 and "/told of /told from warehouse/arm to site yard" in output
 
         eventually(explained, LONG, what="rmpa why leads to the other site, and finds nothing wrong")
-        wait_node(joined.base, "/rmpa/warehouse/arm/told")
+        assert "/rmpa/warehouse/arm/told" in nodes(joined.base)
+        spy.wait_event("up")
+        output = does(base, "why", "warehouse/arm:/secret/word", status=1)
+        assert "it stops at: rule there" in output
+        assert "gateway.rule 1 (none: /secret/**)" in output
+        assert "no gateway of a site moon" in does(base, "why", "moon/arm:/none", status=1)
     for site, other in ((joined.warehouse, "yard"), (joined.yard, "warehouse")):
-        code, output = site.gateway.rmpa("site", "list", "--json")
-        assert code == 0, output
-        assert other in json.dumps(json.loads(output))
+        assert other in json.dumps(json.loads(does(site.gateway, "site", "list", "--json")))
+
+
+def test_parameters_of_another_site_are_read_set_and_refused_by_rules(joined: JoinedModules) -> None:
+    arm, base = joined.arm.agent, joined.base.agent
+    does(arm, "param", "set", "/speed", "1.5")
+    does(arm, "param", "set", "/secret/key", "42")
+    assert does(base, "param", "get", *THERE, "/speed").strip() == "1.5"
+    does(base, "param", "set", *THERE, "/gains", "{p: 1, i: [2, 3]}")
+    assert does(arm, "param", "get", "/gains/i").split() == ["-", "2", "-", "3"]
+    names = does(base, "param", "list", *THERE).split()
+    assert ("/speed" in names, "/secret/key" in names) == (True, False)
+    assert "gateway.rule 1" in does(base, "param", "set", *THERE, "/secret/key", "0", status=1)
+    assert does(arm, "param", "get", "/secret/key").strip() == "42"
+    leg = does(base, "param", "get", "--peer", "warehouse/leg", "/x", status=1)
+    assert "no module answers at site warehouse as 'leg'" in leg
+    does(base, "param", "delete", *THERE, "/gains")
+    does(arm, "param", "get", "/gains", status=1)
+
+
+def test_smart_resources_of_another_site_are_listed_and_set(joined: JoinedModules) -> None:
+    arm, base = joined.arm.agent, joined.base.agent
+    arm.kill()
+    argv: list[str | Path] = [RMPA, "run", LAMP, "--name", arm.name]
+    lamp = Process(joined.arm.host.command(argv), env=arm.env, name="lamp")
+    try:
+        lamp.wait_for("active on", LONG)
+
+        def listed() -> dict[str, Any] | None:
+            rows = json.loads(does(base, "resource", "list", "--json"))
+            return next((row for row in rows if row["name"] == "/lamp" and row["state"] == "active"), None)
+
+        row = eventually(listed, LONG, what="the lamp at base", every=0.5)
+        assert row is not None
+        assert (row["peer"], row["role"]) == ("warehouse/arm", "acting")
+        assert "warehouse/arm:/lamp" in does(base, "resource", "list")
+        assert "of module warehouse/arm" in does(base, "resource", "info", "warehouse/arm:/lamp")
+        does(base, "profile", "set", "warehouse/arm:/lamp", "slow")
+        assert does(base, "profile", "get", "warehouse/arm:/lamp").strip() == "slow"
+    finally:
+        lamp.end()
+        print(lamp.output[-4000:])
+        arm.restart()
+        arm.wait_peer(joined.warehouse.gateway.name)

@@ -9,14 +9,11 @@ import tracemalloc
 from typing import TYPE_CHECKING
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2 import transcoder
 from rmpa.gateway.ros2.conversion import Conversion, NoConversion
-from rmpa.gateway.ros2.graph import Ros2Graph
 from rmpa.gateway.ros2.pairs import Ros2Pairs, TypeMapping
 from rmpa.gateway.ros2.transcoder import LayoutPart, Transcoder
 from rmpa.gateway.ros2.types import Ros2Types, parse_type_response
@@ -50,21 +47,14 @@ def bomb1(levels: int) -> str:
     return line.join([own, *inner, f"MSG: eve/L{levels}\nint32 x"])
 
 
-@pytest.mark.parametrize("levels", [4, 8, 20])
-def test_a_described_type_that_embeds_types_without_end_is_refused_at_once(levels: int) -> None:
+@pytest.mark.parametrize("levels", [4, 20])
+def test_a_type_that_embeds_types_without_end_is_refused_at_once(levels: int) -> None:
+    """As a node of ROS 2 describes it, and as a publisher of ROS 1 does in its header, of another site too."""
     begin = time.process_time()
     with pytest.raises(RemoteProtocolError, match="with those of its types"):
         parse_type_response(respond(laughs(levels)))
-    assert time.process_time() - begin < 5
-
-
-@pytest.mark.parametrize("levels", [4, 8, 20])
-def test_a_definition_of_ros_1_likewise(levels: int) -> None:
-    """It comes in the header of a publisher, of another site too."""
-    begin = time.process_time()
-    pairs = Ros2Pairs(Ros2Types("jazzy"), TypeMapping(), MessageType)
     with pytest.raises(RmpaError):
-        pairs.outgoing(MessageType.learn("eve/L0", bomb1(levels)))
+        Ros2Pairs(Ros2Types("jazzy"), TypeMapping(), MessageType).outgoing(MessageType.learn("eve/L0", bomb1(levels)))
     assert time.process_time() - begin < 5
 
 
@@ -158,31 +148,11 @@ def test_no_name_of_a_type_gets_into_the_code_of_a_conversion(monkeypatch: pytes
         made.to_cdr(bytes(4) + struct.pack("<I", 3) + bytes(12))
 
 
-CHUNKS = [
-    *("@ros2_lv", "0", "a1", "NN", "MP", "SS", "%", "%evil", "..", "%..%..%etc%passwd", "::,10:,:,:,,"),
-    *("std_msgs::msg::dds_::String_", "os::system::dds_::x_", "RIHS01_" + "0" * 64, "\x1b[2J", "é", "a b"),
-    *("%rmpa%arm", "9" * 5000, "*", "$*", ""),
-]
-
-
-@given(st.lists(st.sampled_from(CHUNKS), min_size=8, max_size=15).map("/".join))
-def test_no_name_gets_into_the_graph_that_ros_does_not_allow(key: str) -> None:
-    graph = Ros2Graph(0, "f" * 16)
-    found = graph.change(key, alive=True)
-    if found is None:
-        return
-    names = [found.name] if not hasattr(found, "node") else [found.name, found.node.name]
-    for name in names:
-        assert name.startswith("/")
-        assert all(part.isascii() and f"_{part}".isidentifier() for part in name[1:].split("/"))
-        assert not name.startswith("/rmpa/")
-
-
 def test_a_mapping_file_is_data_and_its_errors_name_it(tmp_path: Path) -> None:
     for text in (
         "!!python/object/apply:os.system ['touch owned']",
         "- &a [*a, *a]",
-        "&a [" + "[" * 3000,
+        "&a [" + "[" * 1000,
         "- {ros1_package_name: ../../etc, ros1_message_name: passwd, ros2_package_name: x, ros2_message_name: y}",
     ):
         file = tmp_path / "rules.yaml"

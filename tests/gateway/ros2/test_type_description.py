@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
@@ -105,10 +101,3 @@ def test_a_description_that_is_not_the_publishers_is_refused() -> None:
     missing = parse_type_response(respond({WHEELS: [("x", 1, 0, 0, "a/msg/Unknown")]}))
     with pytest.raises(NoConversion, match="not complete"):
         pairs.described(WHEELS, "RIHS01_" + "0" * 64, missing)
-
-
-@given(st.binary(max_size=200))
-def test_any_bytes_are_read_or_refused(raw: bytes) -> None:
-    for data in (raw, b"\0\1\0\0" + raw):
-        with contextlib.suppress(RemoteProtocolError):
-            parse_type_response(data)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from rmpa.core.errors import ConfigError
-from rmpa.gateway.ros2.types import NO_HASH, Ros2Types, ros2_name, snake_case
+from rmpa.gateway.ros2.format import NO_HASH
+from rmpa.gateway.ros2.types import Ros2Types, ros2_name, snake_case
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 

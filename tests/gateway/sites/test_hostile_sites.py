@@ -2,35 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import time
-from typing import TYPE_CHECKING
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.identity import is_global_name
 from rmpa.gateway import limits
 from rmpa.gateway.rules import CrossingRules, SourceKind
-from rmpa.gateway.sites.answers import parse_ways
 from rmpa.gateway.sites.catalogue import SiteCatalogue, SiteHistory
 from rmpa.gateway.sites.keys import (
     AttachmentReader,
     MessageSource,
-    SiteGateway,
     SiteModule,
     SiteSource,
-    TopicHeader,
-    parse_token,
 )
-from rmpa.gateway.sites.params import ParamAnswer, ParamQuestion, from_json, read_text_about, to_json
 from rmpa.gateway.sites.plans import SiteImports
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 RUN = "0123456789abcdef" * 2
 MANY = 5000
@@ -115,56 +101,3 @@ def test_attachments_of_invented_sources_fill_no_memory() -> None:
     for number in range(5000):
         reader.read(MessageSource("0" * 32, f"/n{number}", ("eve",)).writer()(1, 1))
     assert len(reader._known) <= 256
-
-
-CHUNKS = f"rmpa 1 eve arm up {RUN} t s a%B %n %x -gateway 0 * ** .. @x $* %% %..%etc \0 \x1b[2J é - %rmpa%hall".split(
-    " "
-)
-ODD = st.one_of(st.text(max_size=60), st.lists(st.sampled_from([*CHUNKS, "", "9" * 5000]), max_size=12).map("/".join))
-
-
-@given(ODD)
-def test_a_token_is_refused_or_has_names_that_ros_allows(key: str) -> None:
-    """No name of another site gets into a graph, a file or a terminal that is not one of ROS."""
-    try:
-        item = parse_token(key)
-    except RemoteProtocolError:
-        return
-    if isinstance(item, SiteSource):
-        assert is_global_name(item.name)
-        assert is_global_name(item.node)
-        assert item.module.site.isidentifier()
-        assert item.module.name.isidentifier()
-    elif isinstance(item, SiteGateway):
-        assert 0 <= item.rank <= 999
-
-
-BOMBS = [
-    b"[" * 100_000,
-    b'{"a":' * 100_000,
-    b"[" * 400 + b"1" + b"]" * 400,
-    b'{"a":' * 900 + b"1" + b"}" * 900,
-    b"9" * 100_000,
-    b'"\\ud800"',
-    b"\xff\xfe",
-    b"1e999",
-    b"null",
-    b"",
-]
-
-
-@pytest.mark.parametrize("bomb", BOMBS, ids=lambda bomb: repr(bomb[:8]))
-@pytest.mark.parametrize(
-    "parse",
-    [
-        ParamQuestion.parse,
-        lambda data: read_text_about(data, ParamAnswer),
-        TopicHeader.parse,
-        parse_ways,
-        lambda d: to_json(from_json(d)),
-    ],
-)
-def test_json_bombs_are_refused_as_malformed(parse: Callable[[bytes], object], bomb: bytes) -> None:
-    """Deep, giant and broken texts are an error that is told, never another exception."""
-    with contextlib.suppress(RemoteProtocolError):
-        parse(bomb)

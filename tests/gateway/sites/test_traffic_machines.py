@@ -22,47 +22,37 @@ from rmpa.ros.wire.tcpros import TopicDescription
 MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
 
 
-def test_gaps_are_losses_and_repetitions_are_not_new() -> None:
-    counter = SequenceCounter()
-    assert [counter.take(7, number) for number in (5, 6, 6, 9, 9, 8, 10)] == [
-        True, True, False, True, False, False, True,
-    ]  # fmt: skip
-    assert counter.lost == 2
+def play(text: str) -> list[int | None]:
+    """The losses after each step, or ``None`` for a message that is not new.
+
+    A message is ``run:number``; the exporter tells its last one as ``run=number``; ``-``: nothing is subscribed now.
+    """
+    counter, told = SequenceCounter(), list[int | None]()
+    for step in text.split():
+        run, kind, number = step.partition(":") if ":" in step else step.partition("=")
+        new = True
+        if kind == ":":
+            new = counter.take(int(run), int(number))
+        elif kind:
+            counter.announced(int(run), int(number))
+        else:
+            counter.restart()
+        told.append(counter.lost if new else None)
+    return told
 
 
-def test_another_run_begins_anew_without_a_loss() -> None:
-    counter = SequenceCounter()
-    for run, number in ((7, 100), (8, 1), (8, 2)):
-        assert counter.take(run, number)
-    assert counter.lost == 0
-
-
-def test_a_loss_at_the_end_is_seen_once_the_exporter_tells_its_number() -> None:
-    counter = SequenceCounter()
-    counter.take(7, 1)
-    counter.announced(7, 4)
-    assert counter.lost == 3
-    counter.take(7, 2)
-    assert counter.lost == 2
-    counter.announced(8, 100)
-    assert counter.lost == 2
-    counter.take(8, 1)
-    assert counter.lost == 2
-
-
-def test_what_is_lost_before_the_first_message_counts_from_what_the_exporter_had_sent() -> None:
-    counter = SequenceCounter()
-    counter.announced(7, 10)
-    assert counter.lost == 0
-    counter.announced(7, 12)
-    assert counter.lost == 2
-    counter.take(7, 14)
-    assert counter.lost == 3
-    counter.restart()
-    counter.announced(7, 20)
-    assert counter.take(7, 19), "it was on its way while the exporter answered"
-    assert counter.take(7, 20)
-    assert counter.lost == 3
+@pytest.mark.parametrize(
+    ("steps", "lost"),
+    [
+        pytest.param("7:5 7:6 7:6 7:9 7:9 7:8 7:10", [0, 0, None, 2, None, None, 2], id="gaps and repetitions"),
+        pytest.param("7:100 8:1 8:2", [0, 0, 0], id="another run begins anew"),
+        pytest.param("7:1 7=4 7:2 8=100 8:1", [0, 3, 2, 2, 2], id="a loss at the end is seen once it is told"),
+        pytest.param("7=10 7=12 7:14", [0, 2, 3], id="losses before the first message"),
+        pytest.param("7=10 - 7=20 7:19 7:20", [0, 0, 0, 1, 0], id="on its way while the exporter answered"),
+    ],
+)
+def test_losses_follow_from_the_numbers(steps: str, lost: list[int | None]) -> None:
+    assert play(steps) == lost
 
 
 @given(st.lists(st.booleans(), min_size=1), st.integers(0, 5))
@@ -76,30 +66,29 @@ def test_everything_that_is_sent_is_received_or_counted(kept: list[bool], first:
     assert sum(kept) + counter.lost == len(kept)
 
 
-def test_a_limit_of_rate_lets_that_rate_pass() -> None:
-    allowed = TopicLimits(10, None)
-    passed = sum(allowed.admit(number / 100, 1) for number in range(1000))
-    assert 100 <= passed <= 105
+@pytest.mark.parametrize(
+    ("rate", "size", "pause", "message", "count", "passes"),
+    [
+        (10, None, 0.01, 1, 1000, range(100, 106)),
+        (None, 10_000, 0.1, 50_000, 1000, range(20, 22)),  # also of large messages
+        (None, 10_000, 0.001, 100, 10_000, range(1000, 1051)),
+    ],
+)
+def test_a_limit_lets_that_much_pass(
+    rate: float | None, size: int | None, pause: float, message: int, count: int, passes: range
+) -> None:
+    allowed = TopicLimits(rate, size)
+    assert sum(allowed.admit(number * pause, message) for number in range(count)) in passes
 
 
 def test_a_limit_of_rate_drops_nothing_of_a_topic_at_that_rate_with_jitter() -> None:
-    allowed = TopicLimits(10, None)
-    jitter = random.Random(1)
+    allowed, jitter = TopicLimits(10, None), random.Random(1)
     assert all(allowed.admit(number / 10 + jitter.uniform(0, 0.09), 1) for number in range(500))
-
-
-def test_a_limit_of_size_lets_that_many_bytes_pass_also_in_large_messages() -> None:
-    allowed = TopicLimits(None, 10_000)
-    passed = sum(allowed.admit(number / 10, 50_000) for number in range(1000))
-    assert 20 <= passed <= 21
-    small = TopicLimits(None, 10_000)
-    assert sum(100 * small.admit(number / 1000, 100) for number in range(10_000)) <= 105_000
 
 
 def test_a_message_passes_when_the_limit_says_so() -> None:
     allowed = TopicLimits(2.0, 1000)
-    assert allowed.admit(0.0, 900)
-    assert not allowed.admit(0.1, 900)
+    assert [allowed.admit(at, 900) for at in (0.0, 0.1)] == [True, False]
     due = allowed.next(0.1, 900)
     assert 0.1 < due < 2
     assert allowed.admit(due + 1e-6, 900)
@@ -145,12 +134,17 @@ def test_golden_header() -> None:
         b"[]",
         b"\xff",
         b'{"type": "std_msgs/String"}',
-        json.dumps({"type": "a/B", "md5sum": MD5.upper()}).encode(),
-        json.dumps({"type": "a", "md5sum": MD5}).encode(),
-        json.dumps({"type": "a/B", "md5sum": MD5, "run": -1}).encode(),
-        json.dumps({"type": "a/B", "md5sum": MD5, "sequence": 2**64}).encode(),
-        json.dumps({"type": "a/B", "md5sum": MD5, "definition": 1}).encode(),
-        json.dumps({"type": "a/B", "md5sum": MD5, "definition": "\ud83e"}).encode(),  # half of a surrogate pair
+        *(
+            json.dumps({"type": "a/B", "md5sum": MD5, **wrong}).encode()
+            for wrong in (
+                {"md5sum": MD5.upper()},
+                {"type": "a"},
+                {"run": -1},
+                {"sequence": 2**64},
+                {"definition": 1},
+                {"definition": "\ud83e"},  # half of a surrogate pair
+            )
+        ),
         b"[" * 100_000,
         b'{"type": "a/B", "more": "' + b"x" * limits.HEADER_MAX + b'"}',
     ],

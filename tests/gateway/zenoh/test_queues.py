@@ -17,11 +17,10 @@ if TYPE_CHECKING:
 
 
 class Handle:
-    """A publisher of Zenoh whose transport may be full."""
+    """A publisher of Zenoh, whose transport is full until it is free."""
 
     def __init__(self) -> None:
         self.free = threading.Event()
-        self.free.set()
         self.got: list[bytes] = []
 
     def put(self, payload: bytes, *, attachment: bytes | None = None) -> None:
@@ -47,7 +46,6 @@ def publisher(lane: SendingLane, handle: Handle, qos: ZenohQos, ended: list[str]
 
 async def test_behind_a_full_transport_the_oldest_are_dropped_and_all_are_counted(lane: SendingLane) -> None:
     handle = Handle()
-    handle.free.clear()
     made = publisher(lane, handle, ZenohQos(messages=100))
     dropped = sum(made.put(b"%d" % number) for number in range(1000))
     assert made.waiting <= 100
@@ -59,24 +57,17 @@ async def test_behind_a_full_transport_the_oldest_are_dropped_and_all_are_counte
 
 async def test_a_message_larger_than_the_bound_still_goes_alone(lane: SendingLane) -> None:
     handle = Handle()
-    handle.free.clear()
     made = publisher(lane, handle, ZenohQos(bytes=10))
     assert made.put(bytes(100)) == 0
-    await eventually(lambda: lane_took(made))
-    assert made.put(bytes(100)) == 0
-    assert made.put(bytes(200)) == 1
+    await eventually(lambda: not made._items)  # its turn has begun
+    assert [made.put(bytes(size)) for size in (100, 200)] == [0, 1]
     handle.free.set()
     await eventually(lambda: not made.waiting)
     assert [len(each) for each in handle.got] == [100, 200]
 
 
-def lane_took(made: QueuedPublisher) -> bool:
-    return made.waiting == 1 and not made._items
-
-
 async def test_a_flood_does_not_starve_another_publisher_of_its_priority(lane: SendingLane) -> None:
     handle = Handle()
-    handle.free.clear()
     flood, other = publisher(lane, handle, ZenohQos(messages=5000)), publisher(lane, handle, ZenohQos())
     for _ in range(5000):
         flood.put(bytes(1000))
@@ -90,7 +81,6 @@ async def test_a_publisher_that_cannot_send_is_undeclared_after_a_second_and_cou
     lane: SendingLane,
 ) -> None:
     handle, ended = Handle(), list[str]()
-    handle.free.clear()
     made = publisher(lane, handle, ZenohQos(), ended)
     for _ in range(200):
         made.put(b"x")
@@ -114,34 +104,26 @@ async def test_what_zenoh_refuses_counts_as_dropped(lane: SendingLane) -> None:
     assert made.sent == 0
 
 
-async def test_while_the_loop_is_away_the_oldest_arrivals_are_dropped_and_counted() -> None:
+@pytest.mark.parametrize(
+    ("sizes", "left"), [([1] * 100, 10), ([400] * 10 + [5000], 1)], ids=["by their number", "by their bytes"]
+)
+async def test_while_the_loop_is_away_the_oldest_arrivals_are_dropped_and_counted(
+    sizes: list[int], left: int
+) -> None:
     got: list[int] = []
     discarded: list[int] = []
-    arrivals = Arrivals(asyncio.get_running_loop())
-    queue = ArrivalQueue(arrivals, got.append, 10, 1000, discarded.append)
+    queue = ArrivalQueue(Arrivals(asyncio.get_running_loop()), got.append, 10, 1000, discarded.append)
 
     def flood() -> None:
-        for number in range(100):
-            queue.add(number, 1)
+        for number, size in enumerate(sizes):
+            queue.add(number, size)
 
     thread = threading.Thread(target=flood)
     thread.start()
     thread.join()
-    await eventually(lambda: len(got) == 10)
-    assert got == list(range(90, 100))
-    assert queue.dropped == 90
-    assert discarded == list(range(90))
-
-
-async def test_large_arrivals_are_bounded_by_their_bytes() -> None:
-    got: list[int] = []
-    queue = ArrivalQueue(Arrivals(asyncio.get_running_loop()), got.append, 1000, 1000)
-    for number in range(10):
-        queue.add(number, 400)
-    queue.add(99, 5000)
-    await eventually(lambda: got)
-    assert got == [99]
-    assert queue.dropped == 10
+    await eventually(lambda: len(got) == left)
+    numbers = list(range(len(sizes)))
+    assert (got, discarded, queue.dropped) == (numbers[-left:], numbers[:-left], len(sizes) - left)
 
 
 async def test_a_flood_on_one_subscriber_leaves_the_loop_and_the_others_their_turns() -> None:

@@ -293,7 +293,7 @@ def _nanoseconds(seconds: float | None) -> int:
 
 # The first chunk of each token; ``**`` does not match it, as it begins with ``@``.
 ADMIN_SPACE: Final = "@ros2_lv"
-# The type hash of ROS 2 Humble, which has none.
+# What stands for the type hash of distributions that have none, as ROS 2 Humble.
 NO_HASH: Final = "TypeHashNotSupported"
 _EMPTY: Final = "%"
 _NODE_PARTS: Final = 9

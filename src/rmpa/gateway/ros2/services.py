@@ -6,6 +6,7 @@ import asyncio
 import itertools
 import logging
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -322,15 +323,13 @@ class OfferedService:
         self._say("")
         key = data_key(context.settings.ros2.domain, name, pair.ros2, pair.type_hash)
         # Before its token: a client may call as soon as it sees that.
-        queryable = context.session.queryable(key, self._take, SERVICE_NEEDS)
+        take = partial(self._answering.take, respond=self._respond)
+        queryable = context.session.queryable(key, take, SERVICE_NEEDS)
         kind_of = EntityKind.SERVICE
         self._declared = (
             queryable,
             context.nodes.declare(self.source.proxy, kind_of, name, pair.ros2, pair.type_hash, Ros2Qos()),
         )
-
-    def _take(self, query: ArrivedQuery) -> None:
-        self._answering.take(query, self._respond)
 
     async def _respond(self, query: ArrivedQuery) -> tuple[bytes, bytes]:
         """Call the server; a call that fails gets Zenoh's error reply, for ROS 2 has no response that says so."""

@@ -15,6 +15,7 @@ from rosbags.typesys.store import Typestore
 
 from rmpa.core.errors import ConfigError, RemoteProtocolError
 from rmpa.gateway import limits
+from rmpa.gateway.ros2.format import NO_HASH
 from rmpa.ros.limits import DEFINITION_DEPTH_MAX, DEFINITION_FIELDS_MAX
 from rmpa.ros.types.definitions import Field
 
@@ -107,8 +108,6 @@ DISTRIBUTIONS: Final = {
 }
 # Distributions before REP 2016: their endpoints have no type hash.
 WITHOUT_HASH: Final = frozenset(("dashing", "eloquent", "foxy", "galactic", "humble"))
-# What stands for the hash in the keys of distributions that have none.
-NO_HASH: Final = "TypeHashNotSupported"
 # ROS 1's primitive times, and the messages of ROS 2 that have the same 8 bytes.
 TIMES: Final = {"time": "builtin_interfaces/msg/Time", "duration": "builtin_interfaces/msg/Duration"}
 # The one field of a type of ROS 2 that has none.

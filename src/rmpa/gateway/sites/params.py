@@ -273,12 +273,10 @@ class SiteParams:
         self._ask = ask
         self._answering = Answering("parameters", f"the gateway of site {context.name} ends", _SITE_PARAMS_AT_ONCE)
         self.close: Final = self._answering.close
-        self.question: Final = f"{ROOT}/{context.name}/*/p/**", self._take, _NEEDS
+        take = partial(self._answering.take, respond=self._respond)
+        self.question: Final = f"{ROOT}/{context.name}/*/p/**", take, _NEEDS
 
     # --- questions of other sites ---------------------------------------------------------------------------------
-
-    def _take(self, query: ArrivedQuery) -> None:
-        self._answering.take(query, self._respond)
 
     async def _respond(self, query: ArrivedQuery) -> tuple[bytes, bytes]:
         site, _ = caller(query)

@@ -62,7 +62,7 @@ class SiteNeighbour:
         self.topics = SiteTopics(context)
         self.services = SiteServices(context)
         self.leads = False
-        self.questions: list[tuple[str, Callable[[ArrivedQuery], None], Needs]] = list(self.topics.questions)
+        self.questions: list[tuple[str, Callable[[ArrivedQuery], object], Needs]] = list(self.topics.questions)
         self.closing: list[Callable[[], Awaitable[None]]] = [self.topics.close, self.services.close]
         self._actions = SiteActions(context.graph)
         self._leader = Leader(own, limits.LEADER_PATIENCE, time.monotonic())

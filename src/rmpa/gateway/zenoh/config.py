@@ -10,7 +10,7 @@ import stat
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.agent.trust import trust_store
 from rmpa.config.peer_rules import Effect
@@ -95,7 +95,6 @@ class ZenohConfig:
         listen: Endpoints to listen at.
         certificates: For encrypted endpoints; ``None``: there are none.
         access_control: Zenoh's table of who may do what; ``None``: everything.
-        lease: Seconds without a sign of life after which a transport is dead.
         uplink: Bytes a second that the line carries; ``None``: it is not known, and Linux sizes the buffers.
     """
 
@@ -104,7 +103,6 @@ class ZenohConfig:
     listen: tuple[str, ...] = ()
     certificates: MeshCertificates | None = None
     access_control: Mapping[str, object] | None = None
-    lease: float = limits.LEASE
     uplink: int | None = None
 
     def entries(self) -> dict[str, object]:
@@ -120,7 +118,7 @@ class ZenohConfig:
             },
             "scouting/delay": 0,
             "scouting/multicast/enabled": False,
-            "transport/link/tx/lease": round(self.lease * 1000),
+            "transport/link/tx/lease": round(limits.LEASE * 1000),
             "transport/link/tx/queue/congestion_control/block/wait_before_close": round(limits.BLOCK_MAX * 1e6),
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": round(limits.DROP_WAIT * 1e6),
             "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": round(
@@ -163,15 +161,12 @@ def gateway_config(settings: GatewaySettings, certificates: MeshCertificates | N
 
 def zenohd_entries(config: ZenohConfig) -> dict[str, object]:
     """The same as a nested object, which a configuration file has."""
-    nested: dict[str, object] = {}
+    nested: dict[str, Any] = {}
     for path, value in replace(config, mode="router").entries().items():
         inner = nested
         *above, last = path.split("/")
         for part in above:
-            found = inner.setdefault(part, {})
-            if not isinstance(found, dict):
-                raise TypeError(f"{path}: {part} has a value of its own")
-            inner = found
+            inner = inner.setdefault(part, {})
         inner[last] = value
     return nested
 

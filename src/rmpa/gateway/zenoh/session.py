@@ -75,11 +75,6 @@ class Declaration:
         kept.add(self)
         worker.submit(self._begin)
 
-    @property
-    def dropped(self) -> int:
-        """Arrivals that found no room."""
-        return self._queue.dropped if self._queue is not None else 0
-
     def close(self) -> None:
         """Undeclare it; no callback is called afterwards."""
         if not self._closed:
@@ -240,7 +235,7 @@ class OpenSession:
     def queryable(
         self,
         key: str,
-        on_query: Callable[[ArrivedQuery], None],
+        on_query: Callable[[ArrivedQuery], object],
         _needs: Needs | None = None,
     ) -> Declaration:
         """Answer queries."""

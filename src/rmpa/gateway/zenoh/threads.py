@@ -205,7 +205,7 @@ class ArrivalQueue(BoundedQueue[_T]):
     def __init__(
         self,
         arrivals: Arrivals,
-        deliver: Callable[[_T], None],
+        deliver: Callable[[_T], object],
         messages: int,
         size: int,
         discard: Callable[[_T], None] | None = None,
