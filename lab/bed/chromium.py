@@ -9,14 +9,17 @@ import itertools
 import os
 import shutil
 import signal
+import subprocess
 import tempfile
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from lab.bed.http_client import http_client
 from lab.bed.namespaces import MACHINE
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from types import TracebackType
 
     from lab.bed.namespaces import Host
@@ -40,47 +43,90 @@ class PageError(AssertionError):
     """A script failed, or what was waited for did not come."""
 
 
-class Chromium:
-    """One browser with one page; an asynchronous context manager.
+class Browser(NamedTuple):
+    """A browser that runs: its process, and the port of its DevTools."""
+
+    process: subprocess.Popen[bytes]
+    port: int
+
+
+@contextlib.contextmanager
+def running_browser(host: Host = MACHINE) -> Iterator[Browser]:
+    """Run a browser with a profile of its own, which several ``Chromium`` may have pages of; it blocks.
 
     Args:
         host: Where it runs.
+    """
+    assert BINARY is not None
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        flags = [*FLAGS, f"--user-data-dir={profile}"]
+        if os.geteuid() == 0:
+            flags.append("--no-sandbox")
+        process = subprocess.Popen(
+            host.command([BINARY, *flags, "about:blank"]),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            process_group=0,
+        )
+        try:
+            yield Browser(process, _port(Path(profile, "DevToolsActivePort"), process))
+        finally:
+            process.terminate()
+            try:
+                process.wait(DEADLINE)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def _port(path: Path, process: subprocess.Popen[bytes]) -> int:
+    deadline = time.monotonic() + DEADLINE
+    while not (path.exists() and path.read_text().count("\n")):
+        if process.poll() is not None or time.monotonic() > deadline:
+            raise PageError(f"Chromium does not say its port; it ended with {process.returncode}")
+        time.sleep(0.05)
+    return int(path.read_text().splitlines()[0])
+
+
+class Chromium:
+    """One page, with cookies and storage of its own; an asynchronous context manager.
+
+    Args:
+        host: Where the browser runs.
+        browser: Has the page; one of its own unless it is given.
 
     Attributes:
         errors: What the page's console says of errors, also of what the CSP blocked, and dialogs that it opened.
     """
 
-    def __init__(self, host: Host = MACHINE) -> None:
+    def __init__(self, host: Host = MACHINE, browser: Browser | None = None) -> None:
         self.errors: list[str] = []
         self._host = host
+        self._browser = browser
         self._numbers = itertools.count(1)
         self._replies: dict[int, asyncio.Future[Any]] = {}
+        self._session: dict[str, str] = {}
 
     async def __aenter__(self) -> Self:
-        assert BINARY is not None
         self._stack = contextlib.AsyncExitStack()
-        self._profile = Path(self._stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
-        flags = [*FLAGS, f"--user-data-dir={self._profile}"]
-        if os.geteuid() == 0:
-            flags.append("--no-sandbox")
-        self._process = await asyncio.create_subprocess_exec(
-            *self._host.command([BINARY, *flags, "about:blank"]),
-            stdout=asyncio.subprocess.DEVNULL,
-            stderr=asyncio.subprocess.DEVNULL,
-            process_group=0,
-        )
-        self._stack.push_async_callback(self._end)
         try:
-            port = await self._port()
+            if self._browser is None:
+                running = running_browser(self._host)
+                self._browser = await asyncio.to_thread(running.__enter__)
+                self._stack.push_async_callback(asyncio.to_thread, running.__exit__, None, None, None)
             http = await self._stack.enter_async_context(http_client(self._host))
-            async with http.get(f"http://127.0.0.1:{port}/json") as response:
-                target = next(each for each in await response.json() if each["type"] == "page")
-            self._socket = await self._stack.enter_async_context(
-                http.ws_connect(target["webSocketDebuggerUrl"], max_msg_size=0)
-            )
-            self._reader = asyncio.create_task(self._read())
+            async with http.get(f"http://127.0.0.1:{self._browser.port}/json/version") as response:
+                url = (await response.json())["webSocketDebuggerUrl"]
+            self._socket = await self._stack.enter_async_context(http.ws_connect(url, max_msg_size=0))
+            reader = asyncio.create_task(self._read())
+            self._stack.callback(reader.cancel)
+            context = await self.send("Target.createBrowserContext", disposeOnDetach=True)
+            page = await self.send("Target.createTarget", url="about:blank", **context)
+            attached = await self.send("Target.attachToTarget", targetId=page["targetId"], flatten=True)
+            self._session = {"sessionId": attached["sessionId"]}
             for domain in ("Page", "Runtime", "Log"):
                 await self.send(f"{domain}.enable")
+            await self.send("Emulation.setFocusEmulationEnabled", enabled=True)  # seen, whatever else is opened
         except BaseException:
             await self._stack.aclose()
             raise
@@ -89,31 +135,13 @@ class Chromium:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._reader.cancel()
         await self._stack.aclose()
 
     async def kill(self) -> None:
         """``kill -9``: the browser and its processes."""
-        os.killpg(self._process.pid, signal.SIGKILL)
-        await self._process.wait()
-
-    async def _end(self) -> None:
-        if self._process.returncode is None:
-            self._process.terminate()
-            try:
-                await asyncio.wait_for(self._process.wait(), DEADLINE)
-            except TimeoutError:
-                self._process.kill()
-                await self._process.wait()
-
-    async def _port(self) -> int:
-        path = self._profile / "DevToolsActivePort"
-        async with asyncio.timeout(DEADLINE):
-            while not (path.exists() and path.read_text().count("\n")):
-                if self._process.returncode is not None:
-                    raise PageError(f"Chromium ended with {self._process.returncode}")
-                await asyncio.sleep(0.05)
-        return int(path.read_text().splitlines()[0])
+        assert self._browser is not None
+        os.killpg(self._browser.process.pid, signal.SIGKILL)
+        await asyncio.to_thread(self._browser.process.wait)
 
     async def _read(self) -> None:
         async for frame in self._socket:
@@ -132,13 +160,13 @@ class Chromium:
             elif message["method"] == "Page.javascriptDialogOpening":
                 self.errors.append(f"a dialog: {message['params']['message']}")
                 answer = {"method": "Page.handleJavaScriptDialog", "params": {"accept": True}}
-                await self._socket.send_json({"id": next(self._numbers), **answer})
+                await self._socket.send_json({"id": next(self._numbers), **answer, **self._session})
 
     async def send(self, method: str, **params: Any) -> dict[str, Any]:
         """A command of the DevTools protocol, and its result."""
         number = next(self._numbers)
         reply = self._replies[number] = asyncio.get_running_loop().create_future()
-        await self._socket.send_json({"id": number, "method": method, "params": params})
+        await self._socket.send_json({"id": number, "method": method, "params": params, **self._session})
         message = await asyncio.wait_for(reply, DEADLINE)
         if "error" in message:
             raise PageError(f"{method}: {message['error']}")

@@ -15,6 +15,7 @@ from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 from rmpa.web.gateways.frame_writer import FairQueue, Opcode
 from rmpa.web.hub.graph import GraphService, GraphTopic
+from rmpa.web.hub.hub import HubClient
 from rmpa.web.hub.node_link import EVERYTHING
 from rmpa.web.hub.topics import ReceivedMessage
 
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 
     from rmpa.web.gateways.connection import ClientStream
     from rmpa.web.gateways.frame_writer import OutFrame
-    from rmpa.web.hub.hub import HubClient
 
 NOW_NS = 1_700_000_000_000_000_123
 
@@ -64,8 +64,8 @@ class Graph:
         self.searched: list[str] = []
         self.changed: Callable[[], None] = lambda: None
 
-    def add_topic(self, name: str, *types: str, publishers: tuple[str, ...] = (), subscribers: Any = ()) -> None:
-        self.topics[name] = GraphTopic(name, types, publishers, tuple(subscribers))
+    def add_topic(self, name: str, *types: str, publishers: Any = (), subscribers: Any = ()) -> None:
+        self.topics[name] = GraphTopic(name, types, publishers, subscribers)
 
     def add_service(self, name: str, kind: str, provider: str = "/server", uri: str = "rosrpc://robot:1234") -> None:
         self.services[name] = GraphService(name, kind, (provider,), uri)
@@ -237,13 +237,29 @@ class Recorded:
         return sent
 
 
+# What a session asks of its hub; where the client may not, the refusal names it so.
+_ASKED = ("subscribe", "advertise", "serve", "call", "find_service", "get_params", "set_param", "delete_param")
+_ASKED += ("follow_params", "fetch_asset")
+_RIGHTS = {"advertise": "publish", "serve": "offer services"}
+
+
 def record(client: HubClient, asked: list[Asked]) -> None:
     """Have the calls of a client written down in place of being done."""
     made: Any = client
 
-    def say(what: str, **arguments: Any) -> Asked:
-        asked.append(Asked(what, **arguments))
-        return asked[-1]
+    def recorded(name: str) -> Callable[..., Asked]:
+        signature = inspect.signature(getattr(HubClient, name))
+
+        def say(*args: Any, **kwargs: Any) -> Asked:
+            if name in _RIGHTS:
+                made.check_control(_RIGHTS[name])
+            bound = signature.bind(made, *args, **kwargs)
+            bound.apply_defaults()
+            del bound.arguments["self"]
+            asked.append(Asked(name, **{key.removesuffix("_"): value for key, value in bound.arguments.items()}))
+            return asked[-1]
+
+        return say
 
     def run(work: Any, done: Callable[[Any], None], failed: Callable[[RmpaError], None]) -> None:
         def finish(result: Any) -> None:
@@ -257,35 +273,8 @@ def record(client: HubClient, asked: list[Asked]) -> None:
         else:
             drive(work, done, failed)
 
-    names: dict[str, Callable[..., Asked]] = {
-        "subscribe": lambda topic, type_, receive, failed, differs=None: say(
-            "subscribe", topic=topic, type=type_, receive=receive, failed=failed, differs=differs
-        ),
-        "advertise": lambda topic, type_, failed, latch=False: say(
-            "advertise", topic=topic, type=type_, failed=failed, latch=latch
-        ),
-        "serve": lambda service, type_, called, failed: say(
-            "serve", service=service, type=type_, called=called, failed=failed
-        ),
-        "call": lambda service, type_, request, timeout=None: say(
-            "call", service=service, type=type_, request=bytes(request), timeout=timeout
-        ),
-        "find_service": lambda service: say("find_service", service=service),
-        "get_params": lambda names: say("get_params", names=names),
-        "set_param": lambda name, value: say("set_param", name=name, value=value),
-        "delete_param": lambda name: say("delete_param", name=name),
-        "follow_params": lambda names, changed: say("follow_params", names=names, changed=changed),
-        "fetch_asset": lambda uri, most: say("fetch_asset", uri=uri, most=most),
-    }
-    rights = {"advertise": "publish", "serve": "offer services"}
-    for name, recorded in names.items():
-
-        def checked(*args: Any, name: str = name, recorded: Callable[..., Asked] = recorded, **kwargs: Any) -> Asked:
-            if name in rights:
-                made.check_control(rights[name])
-            return recorded(*args, **kwargs)
-
-        setattr(made, name, checked)
+    for name in _ASKED:
+        setattr(made, name, recorded(name))
     made.run = run
 
 
@@ -304,28 +293,18 @@ def drive(work: Any, done: Callable[[Any], None], failed: Callable[[RmpaError], 
 
 def answer(asked: Asked, data: bytes) -> None:
     """Let the hub do something with what it was asked, as it may with any client."""
-    error = RmpaError("it cannot be done")
+    results = {"call": data, "fetch_asset": data, "find_service": "std_srvs/Empty"}
+    results |= {"set_param": None, "delete_param": None, "get_params": {"/a": 1.0, "/b": data}}
     if asked.what == "subscribe":
         asked.message(data)
-        asked.failed(error)
     elif asked.what == "serve":
-        response: Future[bytes] = Future()
-        asked.called(data, response)
-        asked.failed(error)
-    elif asked.what == "advertise":
-        asked.failed(error)
-    elif asked.what == "call":
-        asked.done(data)
-    elif asked.what == "find_service":
-        asked.done("std_srvs/Empty")
-    elif asked.what in ("set_param", "delete_param"):
-        asked.done(None)
-    elif asked.what == "get_params":
-        asked.done({"/a": 1.0, "/b": data})
+        asked.called(data, Future[bytes]())
     elif asked.what == "follow_params":
         asked.changed({"/a": [data], "/b": None})
-    elif asked.what == "fetch_asset":
-        asked.done(data)
+    elif asked.what in results:
+        asked.done(results[asked.what])
+    if asked.what in ("subscribe", "serve", "advertise"):
+        asked.failed(RmpaError("it cannot be done"))
 
 
 def decoded(frame: OutFrame) -> dict[str, Any]:

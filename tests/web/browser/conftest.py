@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import pytest
 from aiohttp import web
 
-from lab.bed.chromium import BINARY, Chromium
+from lab.bed.chromium import BINARY, Browser, Chromium, running_browser
 from tests.web.monitor.fake_server import FakeServer
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Iterator
 
 
 class Site:
@@ -36,17 +36,24 @@ class Site:
         return self.page
 
 
-@pytest.fixture
-async def site() -> AsyncIterator[Site]:
-    """The fake server in the scene ``demo``, and a browser that has opened nothing yet."""
+@pytest.fixture(scope="package")
+def browser() -> Iterator[Browser]:
+    """A browser, of which each test has a page with cookies and storage of its own."""
     if BINARY is None:
         pytest.skip("Chromium is not installed: apt install chromium")
+    with running_browser() as running:
+        yield running
+
+
+@pytest.fixture
+async def site(browser: Browser) -> AsyncIterator[Site]:
+    """The fake server in the scene ``demo``, and a page that has opened nothing yet."""
     server = FakeServer()
     runner = web.AppRunner(server.app(), shutdown_timeout=1.0)
     await runner.setup()
     try:
         await web.TCPSite(runner, "127.0.0.1", 0).start()
-        async with Chromium() as page:
+        async with Chromium(browser=browser) as page:
             await page.look()
             yield Site(server, page, runner.addresses[0][1])
     finally:

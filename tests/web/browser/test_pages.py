@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ import pytest
 
 from rmpa.web import limits
 from rmpa.web.hub.node_link import Rights
+from tests.ros.node.peers import until
 
 if TYPE_CHECKING:
     from lab.bed.chromium import Chromium
@@ -47,13 +47,26 @@ async def violations(page: Chromium) -> list[str]:
     return [str(each) for each in found]
 
 
+SMALL = """
+[...document.querySelectorAll('.top a, .top button, main button:not(.field), .module, .concerns a,'
+  + ' input:not([type=checkbox]), select')]
+  .map((each) => [each.outerHTML.slice(0, 80), each.getBoundingClientRect()])
+  .filter(([, box]) => box.width && (box.height < 43.5 || box.width < 43.5)).map(([text]) => text)"""
+"""What is too small for a finger."""
+WIDTH = "document.documentElement.scrollWidth"
+"""Of the page; innerWidth grows with what is too wide."""
+
+
 @pytest.mark.parametrize("address", PAGES)
-async def test_a_page_shows_its_thing_and_is_accessible_in_both_colours(site: Site, address: str) -> None:
+async def test_a_page_shows_its_thing_and_is_accessible_in_both_colours_and_on_a_phone(
+    site: Site, address: str
+) -> None:
     page = await site.open(address)
     await page.wait_text(PAGES[address])
     assert await violations(page) == []
-    await page.look(dark=False)
+    await page.look(360, 740, dark=False)
     assert await violations(page) == []
+    assert (await page.run(WIDTH), await page.run(SMALL)) == (360, [])
     assert (site.server.reports, page.errors) == ([], [])
 
 
@@ -63,24 +76,7 @@ async def test_the_first_page_is_accessible_whatever_is_wrong(site: Site, scene:
     assert await violations(page) == []
     await page.look(360, 800, dark=False)
     assert await violations(page) == []
-    assert await page.run("document.documentElement.scrollWidth") == 360
-
-
-@pytest.mark.parametrize("address", PAGES)
-async def test_a_phone_shows_a_page_without_sideways_scrolling_and_with_large_targets(
-    site: Site, address: str
-) -> None:
-    await site.page.look(360, 740)
-    page = await site.open(address)
-    await page.wait_text(PAGES[address])
-    assert await page.run("document.documentElement.scrollWidth") == 360  # innerWidth grows with what is too wide
-    small = await page.run(
-        "[...document.querySelectorAll('.top a, .top button, main button:not(.field), .module, .concerns a,"
-        " input:not([type=checkbox]), select')]"
-        ".map((each) => [each.outerHTML.slice(0, 80), each.getBoundingClientRect()])"
-        ".filter(([, box]) => box.width && (box.height < 43.5 || box.width < 43.5)).map(([text]) => text)"
-    )
-    assert small == []
+    assert await page.run(WIDTH) == 360
 
 
 async def test_a_small_screen_shows_the_tables_of_the_first_page_whole(site: Site) -> None:
@@ -130,6 +126,9 @@ async def test_the_colours_can_be_chosen_and_stay(site: Site) -> None:
     await page.wait(f"document.querySelector('h1') && {ground} !== {json.dumps(dark)}")
 
 
+MOVED = "window.moved.filter((each) => each.classList.contains('medium')).length"
+
+
 async def test_only_what_flows_moves_and_nothing_where_motion_is_to_be_reduced(site: Site) -> None:
     page = await site.open()
     await page.run(
@@ -138,7 +137,7 @@ async def test_only_what_flows_moves_and_nothing_where_motion_is_to_be_reduced(s
     )
     assert await page.run("document.getAnimations().length") == 0
     await page.look(still=False)
-    await page.wait("window.moved.filter((each) => each.classList.contains('medium')).length > 3")
+    await page.wait(f"{MOVED} > 3")
     assert await page.run("window.moved.every((each) => each.closest('.streams') && each.tagName === 'g')") is True
     assert await page.run("document.querySelectorAll('.streams .stream').length") == 5
     await page.look(still=True)
@@ -196,7 +195,7 @@ async def test_the_first_page_is_small(site: Site) -> None:
 
 async def test_names_and_values_of_others_are_text(site: Site) -> None:
     page = await site.open("topic/%2Fjoystick%2Fprofile")
-    await click(page, "On")
+    await page.click("On")
     await page.wait_text("<script>alert(1)</script>")
     evil = "<img src=x onerror='window.owned=1'>"
     patch = {"modules": {evil: {"state": "up"}}, "notes": ["<b id=owned>note</b>"]}
@@ -214,17 +213,9 @@ async def receive(page: Chromium, patch: dict[str, Any]) -> None:
     await page.run(f"window.rmpa.receive({json.dumps(message)}); true")
 
 
-async def click(page: Chromium, text: str) -> None:
-    """Press the button of that text as soon as it is there."""
-    found = (
-        f"[...document.querySelectorAll('button')].find((each) => each.textContent === {text!r} && !each.disabled)"
-    )
-    await page.wait(f"({found})?.click() ?? !!({found})")
-
-
 async def test_live_values_poses_and_chosen_fields_are_drawn(site: Site) -> None:
     page = await site.open("topic/%2Fodom")
-    await click(page, "On")
+    await page.click("On")
     await page.wait_text("base_link")
     await page.wait("/x -?\\d+\\.\\d\\d m, y/.test(document.querySelector('figcaption').textContent)")
     await page.wait("document.querySelector('[title=\"Plot twist.twist.linear.x\"]')")
@@ -239,7 +230,7 @@ async def test_live_values_poses_and_chosen_fields_are_drawn(site: Site) -> None
 @pytest.mark.parametrize("address", ["topic/%2Fscan", "topic/%2Fcamera%2Fimage"])
 async def test_scans_and_pictures_are_drawn(site: Site, address: str) -> None:
     page = await site.open(address, "sensors")
-    await click(page, "On")
+    await page.click("On")
     colours = (
         "(() => { const view = document.querySelector('canvas.view');"
         " const data = view.getContext('2d').getImageData(0, 0, view.width, view.height).data;"
@@ -267,16 +258,6 @@ async def test_a_module_tells_its_agents_figures_its_lanes_and_why(site: Site) -
     await page.press("w")
     await page.wait_text("It is reached")
     assert site.server.asked[-1].args == {"kind": "module", "name": "base"}
-
-
-async def test_an_agent_of_an_earlier_release_does_not_tell_its_figures_and_the_page_says_so(site: Site) -> None:
-    page = await site.open("module/joystick")
-    await page.wait_text("not reported by this peer")
-
-
-async def test_a_lane_without_a_connection_is_seen(site: Site) -> None:
-    page = await site.open("module/velocity", "sick")
-    await page.wait_text("no connection")
 
 
 async def test_a_node_shows_its_topics_services_connections_and_log(site: Site) -> None:
@@ -326,19 +307,12 @@ async def test_one_trouble_of_many_topics_is_one_line(site: Site) -> None:
     assert await page.run("document.querySelectorAll('.concerns li').length") == 1
 
 
-async def test_the_contract_of_a_topic_shows_before_it_has_a_route(site: Site) -> None:
-    page = await site.open("topic/%2Fvelocity_order")
-    await page.wait_text("rule 1: topics /velocity")
-    page = await site.open("topic/%2Fodom")
-    await page.wait_text("the defaults apply")
-
-
 async def test_a_parameter_that_another_node_changes_shows_by_itself(site: Site) -> None:
     page = await site.open("params")
     await page.wait_text("noetic")
     site.server.params["/rosdistro"] = "melodic"
     await page.wait_text("melodic")
-    await click(page, "base")
+    await page.click("base")
     await page.wait("document.querySelector('.kind').textContent === 'Of the core of base'")
     await page.wait_text("melodic")
     site.server.params["/rosdistro"] = "kinetic"
@@ -360,42 +334,47 @@ async def edit(page: Chromium, text: str, *, enter: bool = True) -> None:
 
 async def test_an_edit_that_was_begun_is_kept_when_other_parameters_change(site: Site) -> None:
     page = await site.open("params")
-    await click(page, '"noetic"')
+    await page.click('"noetic"')
     await edit(page, "half", enter=False)
     site.server.params["/fresh"] = "come"
     await page.wait_text("come")
     assert await page.run(f"{FIELD}.value") == "half"
 
 
+async def test_the_search_finds_nodes_parameters_and_resources(site: Site) -> None:
+    page = await site.open()
+    for words, kind, address in (
+        ("node base", "node", "#/node/base%3A%2Fbase"),
+        ("wheel", "parameter", "#/params/%2Fbase%2Fwheel%2Fradius"),
+        ("smart vel", "resource", "#/resource/velocity%3A%2Fvelocity"),
+    ):
+        await page.press("/")
+        await page.wait("document.activeElement.type === 'search'")
+        for key in words:
+            await page.press(key)
+        await page.wait(f"document.querySelector('.found [aria-selected=true] .kind')?.textContent === '{kind}'")
+        await page.press("Enter")
+        await page.wait(f"location.hash === '{address}' && !document.querySelector('dialog')")
+
+
 @pytest.mark.parametrize(
-    ("words", "address"),
+    ("address", "scene", "text"),
     [
-        ("node base", "#/node/base%3A%2Fbase"),
-        ("wheel", "#/params/%2Fbase%2Fwheel%2Fradius"),
-        ("smart vel", "#/resource/velocity%3A%2Fvelocity"),
+        ("module/joystick", "demo", "not reported by this peer"),  # whose agent is of an earlier release
+        ("module/velocity", "sick", "no connection"),  # one of its lanes has none
+        ("topics", "cut", "18,000 more topics are not listed: rmpa topic list"),
+        ("topic/%2Fvelocity_order", "demo", "rule 1: topics /velocity"),  # its contract, before it has a route
+        ("topic/%2Fodom", "demo", "the defaults apply"),
     ],
 )
-async def test_the_search_finds_nodes_parameters_and_resources(site: Site, words: str, address: str) -> None:
-    page = await site.open()
-    await page.press("/")
-    await page.wait("document.activeElement.type === 'search'")
-    for key in words:
-        await page.press(key)
-    await page.wait("document.querySelector('.found [aria-selected=true] .kind')")
-    kind = {"w": "parameter", "n": "node", "s": "resource"}[words[0]]
-    await page.wait(f"document.querySelector('.found [aria-selected=true] .kind').textContent === '{kind}'")
-    await page.press("Enter")
-    await page.wait(f"location.hash === '{address}'")
-
-
-async def test_topics_that_are_not_listed_are_counted(site: Site) -> None:
-    page = await site.open("topics", "cut")
-    await page.wait("document.body.textContent.includes('18,000 more topics are not listed: rmpa topic list')")
+async def test_what_is_missing_and_what_holds_is_said(site: Site, address: str, scene: str, text: str) -> None:
+    page = await site.open(address, scene)
+    await page.wait_text(text)
 
 
 async def test_a_service_is_called(site: Site) -> None:
     page = await site.open("service/base%3A%2Fbase%2Fset_parameters")
-    await click(page, "Call it")
+    await page.click("Call it")
     await page.wait_text("as asked")
     assert site.server.asked[-1].args == {
         "service": "/base/set_parameters",
@@ -407,18 +386,18 @@ async def test_a_service_is_called(site: Site) -> None:
 RATE = "[...document.querySelectorAll('button.field')].find((each) => each.ariaLabel.startsWith('Change rate'))"
 
 
-@pytest.mark.parametrize(
-    ("typed", "said"),
-    [("", "Type a number"), ("0,4", "write it as 0.4"), ("fast", "not a number"), ("500", "not within 1 … 100")],
-)
-async def test_what_is_no_value_of_a_setting_is_not_sent_and_the_draft_stays(
-    site: Site, typed: str, said: str
-) -> None:
+async def test_what_is_no_value_of_a_setting_is_not_sent_and_the_draft_stays(site: Site) -> None:
     page = await site.open("resource/base%3A%2Fbase")
     await page.wait(f"{RATE}?.click() ?? !!{RATE}")
-    await edit(page, typed)
-    await page.wait_text(said)
-    assert await page.run(f"{FIELD}.value") == typed
+    for typed, said in (
+        ("", "Type a number"),
+        ("0,4", "write it as 0.4"),
+        ("fast", "not a number"),
+        ("500", "not within 1 … 100"),
+    ):
+        await edit(page, typed)
+        await page.wait_text(said)
+        assert await page.run(f"{FIELD}.value") == typed
     assert "configure" not in [each.what for each in site.server.asked]
     await edit(page, "40")
     await page.wait_text("rate is 40 now")  # as the server says it
@@ -437,18 +416,21 @@ async def test_each_edit_has_the_cursor_and_escape_gives_it_back(site: Site) -> 
         await page.wait(f"!{FIELD} && document.activeElement.ariaLabel.startsWith({label!r})")
 
 
-@pytest.mark.parametrize(("typed", "sent"), [("True", True), ("1", None), ("on", None), ("", None)])
-async def test_a_parameter_keeps_its_type(site: Site, typed: str, sent: bool | None) -> None:
+async def test_a_parameter_keeps_its_type(site: Site) -> None:
     page = await site.open("params")
-    await click(page, "false")
-    await edit(page, typed)
-    await page.wait(f"!{FIELD}" if sent is not None else "document.querySelector('form.edit .failure')")
-    assert site.server.params["/use_sim_time"] is (sent or False)
+    await page.click("false")
+    for typed in ("1", "on", ""):
+        await edit(page, typed)
+        await page.wait(f"document.querySelector('form.edit .failure') && {FIELD}.value === {typed!r}")
+        assert site.server.params["/use_sim_time"] is False
+    await edit(page, "True")
+    await page.wait(f"!{FIELD}")
+    assert site.server.params["/use_sim_time"] is True
 
 
 async def test_a_lost_connection_keeps_values_edits_and_rights(site: Site) -> None:
     page = await site.open("params")
-    await click(page, '"noetic"')
+    await page.click('"noetic"')
     await page.wait(FIELD)
     await page.run("window.Real = WebSocket; window.WebSocket = function () { return { close() {} }; }; rmpa.drop()")
     await page.wait_text("No connection to rmpa web")
@@ -494,7 +476,7 @@ async def test_long_lists_are_drawn_in_parts(site: Site) -> None:
     rows = "[...document.querySelectorAll('tbody th')].filter((each) => each.textContent.startsWith('/many/')).length"
     await page.wait(f"{rows} > 100")
     assert await page.run(rows) <= 200
-    await click(page, "Show 200 more of 1,753")
+    await page.click("Show 200 more of 1,753")
     await page.wait(f"{rows} > 390")
 
 
@@ -542,12 +524,12 @@ async def test_a_pending_module_is_invited_by_a_button_that_shows_the_line_once(
         "pending", "foreign", "revoked"
     ]  # fmt: skip
     assert await page.run(f"{OUTSIDE}.map((each) => each.querySelectorAll('button').length)") == [1, 0, 0]
-    await click(page, "Invite arm")
+    await page.click("Invite arm")
     await page.wait_text("rmpa trust join rmpa1-forarm")
     assert "A new one for arm replaces it." in await page.run("document.querySelector('.outside').innerText")
     assert site.server.asked[-1].args == {"name": "arm"}
     assert "rmpa1-" not in await page.run("JSON.stringify(window.rmpa.state) + location + document.cookie")
-    assert await page.run("document.documentElement.scrollWidth") == 360
+    assert await page.run(WIDTH) == 360
     assert await violations(page) == []
     await page.run("location.hash = '#/topics'")
     await page.wait_text("/velocity_order")
@@ -575,15 +557,11 @@ async def test_a_robot_moves_only_while_the_stick_is_held(site: Site) -> None:
     await page.run("document.querySelector('.stick').focus()")
     await page.down("ArrowUp")
     await page.wait("document.querySelector('.stick + p').textContent.includes('forward 60 %')")
-    deadline = time.monotonic() + 10
-    while len(site.server.speeds) < 2 and time.monotonic() < deadline:
-        await page.run("new Promise((done) => setTimeout(done, 50))")
+    await until(lambda: len(site.server.speeds) > 1)
     await page.up("ArrowUp")
     await page.wait("document.querySelector('.stick + p').textContent.includes('forward 0 %')")
     await page.wait("window.rmpa.socket.bufferedAmount === 0")
-    deadline = time.monotonic() + 10
-    while not (site.server.speeds and site.server.speeds[-1].linear == 0) and time.monotonic() < deadline:
-        await page.run("new Promise((done) => setTimeout(done, 50))")
+    await until(lambda: site.server.speeds[-1].linear == 0)
     assert site.server.speeds[0].linear == 0  # one command alone moves nothing
     assert site.server.speeds[1].linear == pytest.approx(0.6 * 0.15 * limits.DRIVE_SPEED)
     assert site.server.speeds[-1].linear == 0

@@ -14,10 +14,10 @@ from rmpa.core.errors import RmpaError
 from rmpa.web import limits
 from rmpa.web.foxglove import protocol
 from rmpa.web.foxglove.protocol import from_parameter, to_parameter
-from tests.web.foxglove.client import Client
 
 if TYPE_CHECKING:
     from rmpa.web.hub.node_link import ParamValue
+    from tests.web.foxglove.client import Client
     from tests.web.recorder import Asked
 
 
@@ -113,8 +113,7 @@ def _follow(client: Client, *names: str, op: str = "subscribe") -> list[Asked]:
     return client.send({"op": f"{op}ParameterUpdates", "parameterNames": names})
 
 
-def test_parameters_are_got_by_name_or_all() -> None:
-    client = Client()
+def test_parameters_are_got_by_name_or_all(client: Client) -> None:
     client.send({"op": "getParameters", "parameterNames": ["/a", "/b", "/a"], "id": "r1"})
     assert client.last("get_params").names == ("/a", "/b")
     client.last("get_params").done({"/a": 1})
@@ -128,8 +127,7 @@ def test_parameters_are_got_by_name_or_all() -> None:
     assert _values(client) == {}
 
 
-def test_parameters_are_set_and_deleted_and_what_is_refused_is_told() -> None:
-    client = Client()
+def test_parameters_are_set_and_deleted_and_what_is_refused_is_told(client: Client) -> None:
     changes = [{"name": "/a", "value": 3, "type": "float64"}, {"name": "/b"}, {"name": "/denied", "value": 1}]
     client.send({"op": "setParameters", "parameters": changes, "id": "r"})
     assert client.hub.params.changes == [("/a", 3.0), ("/b", None)]
@@ -139,15 +137,13 @@ def test_parameters_are_set_and_deleted_and_what_is_refused_is_told() -> None:
     assert len(client.of("parameterValues")) == 1  # without an id it is not answered
 
 
-def test_one_bad_parameter_leaves_all_as_they_are() -> None:
-    client = Client()
+def test_one_bad_parameter_leaves_all_as_they_are(client: Client) -> None:
     client.send({"op": "setParameters", "parameters": [{"name": "/a", "value": 1}, {"name": "b", "value": 1}]})
     assert "write it like /base/rate" in client.errors[0]
     assert client.hub.params.changes == []
 
 
-def test_parameters_are_followed_by_name() -> None:
-    client = Client()
+def test_parameters_are_followed_by_name(client: Client) -> None:
     first = client.one("follow_params", _follow(client, "/a"))
     both = client.one("follow_params", _follow(client, "/a", "/b"))
     assert (first.names, first.closed, both.names) == (("/a",), True, ("/a", "/b"))
@@ -159,8 +155,7 @@ def test_parameters_are_followed_by_name() -> None:
     assert rest.closed
 
 
-def test_all_parameters_are_followed_and_some_left_out() -> None:
-    client = Client()
+def test_all_parameters_are_followed_and_some_left_out(client: Client) -> None:
     _follow(client, "/a")
     assert client.one("follow_params", _follow(client)).names == ()
     client.one("follow_params", _follow(client, "/a", op="unsubscribe")).changed({"/a": 1})
@@ -171,8 +166,9 @@ def test_all_parameters_are_followed_and_some_left_out() -> None:
     assert _values(client) == {"/a": 1}
 
 
-def test_requests_without_answers_and_followed_names_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    client = Client()
+def test_requests_without_answers_and_followed_names_are_bounded(
+    client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for _ in range(limits.FOXGLOVE_PARAMETER_REQUESTS_MAX + 1):
         client.send({"op": "getParameters"})
     assert len(client.errors) == 1

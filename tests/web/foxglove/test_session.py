@@ -20,8 +20,7 @@ from tests.web.recorder import NOW_NS
 # --- opening, channels ---
 
 
-def test_a_client_hears_first_of_the_server_and_that_it_is_ros_1() -> None:
-    client = Client()
+def test_a_client_hears_first_of_the_server_and_that_it_is_ros_1(client: Client) -> None:
     info = client.json[0]
     assert info["op"] == "serverInfo"
     assert info["metadata"] == {"ROS_DISTRO": "noetic"}
@@ -37,8 +36,7 @@ def test_a_client_without_rights_is_offered_nothing_but_data_and_graph() -> None
     assert Client(Rights(), sim_time=True).json[0]["capabilities"] == ["time", "connectionGraph"]
 
 
-def test_a_topic_is_offered_with_the_full_text_of_its_definition() -> None:
-    client = Client()
+def test_a_topic_is_offered_with_the_full_text_of_its_definition(client: Client) -> None:
     client.graph(GraphTopic("/odom", ("nav_msgs/Odometry",), ("/base",)))
     (channel,) = client.of("advertise")[0]["channels"]
     assert channel["topic"] == "/odom"
@@ -48,8 +46,7 @@ def test_a_topic_is_offered_with_the_full_text_of_its_definition() -> None:
     assert not channel["schema"].startswith("=")
 
 
-def test_two_types_on_one_topic_are_two_channels() -> None:
-    client = Client()
+def test_two_types_on_one_topic_are_two_channels(client: Client) -> None:
     client.graph(GraphTopic("/x", ("std_msgs/String", "std_msgs/Bool"), ("/a", "/b")))
     (advertised,) = client.of("advertise")[-1:]
     names = {c["schemaName"]: c["id"] for m in client.of("advertise") for c in m["channels"]}
@@ -58,14 +55,12 @@ def test_two_types_on_one_topic_are_two_channels() -> None:
     assert client.last("subscribe").type == "std_msgs/Bool"
 
 
-def test_topics_without_publishers_or_type_are_not_offered() -> None:
-    client = Client()
+def test_topics_without_publishers_or_type_are_not_offered(client: Client) -> None:
     client.graph(GraphTopic("/a", ("std_msgs/String",), (), ("/n",)), GraphTopic("/b", ("*",), ("/n",)))
     assert not client.of("advertise")
 
 
-def test_an_id_is_never_used_again() -> None:
-    client = Client()
+def test_an_id_is_never_used_again(client: Client) -> None:
     client.graph(CHATTER)
     client.graph()
     assert client.of("unadvertise") == [{"op": "unadvertise", "channelIds": [1]}]
@@ -73,8 +68,7 @@ def test_an_id_is_never_used_again() -> None:
     assert client.of("advertise")[-1]["channels"][0]["id"] == 2
 
 
-def test_a_graph_that_did_not_change_says_nothing() -> None:
-    client = Client()
+def test_a_graph_that_did_not_change_says_nothing(client: Client) -> None:
     client.send({"op": "subscribeConnectionGraph"})
     client.graph(CHATTER, SET_BOOL)
     before = len(client.json)
@@ -82,8 +76,7 @@ def test_a_graph_that_did_not_change_says_nothing() -> None:
     assert len(client.json) == before
 
 
-def test_an_unknown_type_is_told_and_offered_once_it_is_known() -> None:
-    client = Client()
+def test_an_unknown_type_is_told_and_offered_once_it_is_known(client: Client) -> None:
     client.hub.types.missing["std_msgs/String"] = RmpaError("no definition; install its package")
     client.graph(CHATTER)
     (status,) = client.of("status")
@@ -96,8 +89,7 @@ def test_an_unknown_type_is_told_and_offered_once_it_is_known() -> None:
     assert client.of("advertise")[0]["channels"][0]["topic"] == "/chatter"
 
 
-def test_the_warning_about_a_type_ends_with_its_last_topic() -> None:
-    client = Client()
+def test_the_warning_about_a_type_ends_with_its_last_topic(client: Client) -> None:
     client.hub.types.missing["std_msgs/String"] = RmpaError("no definition")
     client.graph(CHATTER)
     client.graph()
@@ -106,8 +98,7 @@ def test_the_warning_about_a_type_ends_with_its_last_topic() -> None:
     assert not client.of("advertise")
 
 
-def test_a_type_is_asked_for_once_for_all_topics_and_clients() -> None:
-    client = Client()
+def test_a_type_is_asked_for_once_for_all_topics_and_clients(client: Client) -> None:
     client.graph(*(GraphTopic(f"/t{n}", ("std_msgs/String",), ("/n",)) for n in range(50)))
     beside = Client(beside=client)
     assert client.hub.types.asked == ["std_msgs/String"]
@@ -124,8 +115,7 @@ def test_many_channels_come_in_several_messages(monkeypatch: pytest.MonkeyPatch)
 # --- subscriptions ---
 
 
-def test_messages_reach_the_subscription_untouched() -> None:
-    client = Client()
+def test_messages_reach_the_subscription_untouched(client: Client) -> None:
     client.graph(CHATTER)
     payload = memoryview(b"\x02\x00\x00\x00hi")
     client.subscribe().message(payload)
@@ -134,8 +124,7 @@ def test_messages_reach_the_subscription_untouched() -> None:
     assert sent is payload
 
 
-def test_a_withdrawn_channel_and_the_client_end_a_subscription() -> None:
-    client = Client()
+def test_a_withdrawn_channel_and_the_client_end_a_subscription(client: Client) -> None:
     client.graph(CHATTER)
     asked = client.subscribe()
     client.send({"op": "unsubscribe", "subscriptionIds": [7]})
@@ -148,8 +137,7 @@ def test_a_withdrawn_channel_and_the_client_end_a_subscription() -> None:
     assert not client.errors
 
 
-def test_wrong_subscriptions_are_refused_and_the_right_ones_kept() -> None:
-    client = Client()
+def test_wrong_subscriptions_are_refused_and_the_right_ones_kept(client: Client) -> None:
     client.graph(CHATTER, GraphTopic("/b", ("std_msgs/String",), ("/n",)))
     pairs = [(7, 1), (7, 2), (8, 1), (9, 99), (10, 2)]
     client.send({"op": "subscribe", "subscriptions": [{"id": i, "channelId": c} for i, c in pairs]})
@@ -168,8 +156,7 @@ def test_subscriptions_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "limit" in client.errors[0]
 
 
-def test_a_failed_subscription_is_told_and_can_be_ended() -> None:
-    client = Client()
+def test_a_failed_subscription_is_told_and_can_be_ended(client: Client) -> None:
     client.graph(CHATTER)
     client.subscribe().failed(RmpaError("md5 sums differ; rebuild the talker"))
     assert client.errors == ["md5 sums differ; rebuild the talker"]
@@ -205,8 +192,7 @@ def advertise(number: int = 3, topic: str = "/cmd", encoding: str = "ros1", type
     return {"op": "advertise", "channels": [channel]}
 
 
-def test_a_client_publishes() -> None:
-    client = Client()
+def test_a_client_publishes(client: Client) -> None:
     publisher = client.one("advertise", client.send(advertise(topic="cmd")))
     assert (publisher.topic, publisher.type) == ("/cmd", "std_msgs/String")
     client.send(struct.pack("<BI", 1, 3) + b"\x02\x00\x00\x00hi")
@@ -227,15 +213,13 @@ def test_a_client_publishes() -> None:
         advertise(topic="/"),
     ],
 )
-def test_a_topic_that_cannot_be_published_is_refused(wrong: Any) -> None:
-    client = Client()
+def test_a_topic_that_cannot_be_published_is_refused(client: Client, wrong: Any) -> None:
     client.send(wrong)
     assert len(client.errors) == 1
     assert not client.all("advertise")
 
 
-def test_published_topics_are_bounded_and_numbers_are_used_once() -> None:
-    client = Client()
+def test_published_topics_are_bounded_and_numbers_are_used_once(client: Client) -> None:
     for number in range(limits.FOXGLOVE_ADVERTISED_MAX):
         client.send(advertise(number))
     client.send(advertise(0))
@@ -244,8 +228,9 @@ def test_published_topics_are_bounded_and_numbers_are_used_once() -> None:
     assert len(client.all("advertise")) == limits.FOXGLOVE_ADVERTISED_MAX
 
 
-def test_messages_of_a_failed_publisher_are_dropped_without_a_status_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    client = Client()
+def test_messages_of_a_failed_publisher_are_dropped_without_a_status_each(
+    client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
 
     def refuse(*_: Any) -> None:
         raise RmpaError("others publish it with another type")
@@ -264,8 +249,7 @@ def call(service: int, number: int, payload: bytes = b"\x01", encoding: bytes = 
     return struct.pack("<BIII", 2, service, number, len(encoding)) + encoding + payload
 
 
-def test_a_service_is_offered_and_called() -> None:
-    client = Client()
+def test_a_service_is_offered_and_called(client: Client) -> None:
     client.graph(SET_BOOL)
     (service,) = client.of("advertiseServices")[0]["services"]
     assert service["name"] == "/set_bool"
@@ -277,8 +261,7 @@ def test_a_service_is_offered_and_called() -> None:
     assert client.binary == [struct.pack("<BIII", 3, 1, 12, 4) + b"ros1\x01\x00\x00\x00\x00"]
 
 
-def test_calls_that_fail_say_why() -> None:
-    client = Client()
+def test_calls_that_fail_say_why(client: Client) -> None:
     client.graph(SET_BOOL)
     client.one("call", client.send(call(1, 1))).failed(RmpaError("timed out; is it hanging?"))
     client.send(call(77, 3))
@@ -289,8 +272,7 @@ def test_calls_that_fail_say_why() -> None:
     assert "'json'" in failures[4]
 
 
-def test_waiting_calls_are_bounded() -> None:
-    client = Client()
+def test_waiting_calls_are_bounded(client: Client) -> None:
     client.graph(SET_BOOL)
     for number in range(limits.FOXGLOVE_CALLS_MAX + 1):
         client.send(call(1, number))
@@ -298,8 +280,7 @@ def test_waiting_calls_are_bounded() -> None:
     assert failure["callId"] == limits.FOXGLOVE_CALLS_MAX
 
 
-def test_the_type_of_a_service_is_searched_where_the_graph_does_not_say_it() -> None:
-    client = Client()
+def test_the_type_of_a_service_is_searched_where_the_graph_does_not_say_it(client: Client) -> None:
     unknown = GraphService("/set_bool", "", ("/server",))
     for _ in range(2):
         client.graph(unknown)
@@ -316,8 +297,7 @@ def test_the_type_of_a_service_is_searched_where_the_graph_does_not_say_it() -> 
 # --- graph, assets ---
 
 
-def test_the_graph_comes_whole_and_then_by_its_changes() -> None:
-    client = Client()
+def test_the_graph_comes_whole_and_then_by_its_changes(client: Client) -> None:
     client.graph(CHATTER, SET_BOOL)
     client.send({"op": "subscribeConnectionGraph"})
     (first,) = client.of("connectionGraphUpdate")
@@ -374,8 +354,7 @@ def fetch(uri: str, number: int = 5) -> dict[str, Any]:
     return {"op": "fetchAsset", "uri": uri, "requestId": number}
 
 
-def test_a_file_of_a_package_is_fetched() -> None:
-    client = Client()
+def test_a_file_of_a_package_is_fetched(client: Client) -> None:
     asked = client.one("fetch_asset", client.send(fetch("package://robot/meshes/base.stl")))
     assert (asked.uri, asked.most) == ("package://robot/meshes/base.stl", limits.FOXGLOVE_ASSET_MAX)
     asked.done(b"solid")
@@ -384,8 +363,7 @@ def test_a_file_of_a_package_is_fetched() -> None:
     assert client.binary[1] == struct.pack("<BIBI", 4, 5, 1, 12) + b"no such file"
 
 
-def test_assets_are_bounded() -> None:
-    client = Client()
+def test_assets_are_bounded(client: Client) -> None:
     for number in range(limits.FOXGLOVE_ASSETS_MAX + 1):
         client.send(fetch("package://robot/x", number))
     assert len(client.binary) == 1
@@ -414,8 +392,7 @@ def test_a_client_without_the_right_is_refused_and_told(forbidden: Any, remedy: 
     assert text.endswith(remedy)
 
 
-def test_a_malformed_message_is_told_and_too_many_end_the_session() -> None:
-    client = Client()
+def test_a_malformed_message_is_told_and_too_many_end_the_session(client: Client) -> None:
     client.send({"op": "nonsense"})
     assert "nonsense" in client.errors[0]
     assert not client.connection.ended
@@ -435,8 +412,7 @@ def test_what_a_client_may_not_do_is_refused_quietly_after_many_times_but_never_
     assert len(client.errors) == limits.FOXGLOVE_STATUS_BURST + 1
 
 
-def test_a_client_that_has_gone_is_told_no_more() -> None:
-    client = Client()
+def test_a_client_that_has_gone_is_told_no_more(client: Client) -> None:
     beside = Client(beside=client)
     client.session.closing()
     client.graph(CHATTER)
@@ -444,7 +420,6 @@ def test_a_client_that_has_gone_is_told_no_more() -> None:
     assert beside.of("advertise")
 
 
-def test_a_server_says_its_own_warnings() -> None:
-    client = Client()
+def test_a_server_says_its_own_warnings(client: Client) -> None:
     client.session.warn("slow", "slow /scan")
     assert client.json[-1] == {"op": "status", "level": 1, "message": "slow", "id": "slow /scan"}

@@ -38,6 +38,13 @@ def node(core: RosCore, name: str = "") -> Node:
     return Node(name or f"node{next(_names)}", master_uri=core.uri, environment=RosEnvironment())
 
 
+async def listen(node: Node, topic: str) -> list[bytes]:
+    """The messages that a node gets of a topic from now on."""
+    heard: list[bytes] = []
+    await node.subscribe(topic, callback=lambda message: heard.append(message.raw))
+    return heard
+
+
 @contextlib.asynccontextmanager
 async def running_hub(core: RosCore, rules: NodeRules = EVERYTHING) -> AsyncIterator[Hub]:
     """A hub that has its node, and has read the graph and the parameters."""

@@ -12,18 +12,20 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.ros.types.definitions import SEPARATOR, known_text
+from rmpa.ros.types.definitions import SEPARATOR, known_text, parse_definition
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 from rmpa.web import limits
 from rmpa.web.hub.node_link import CONTROL_REMEDY, READ_ONLY, READ_REMEDY
 from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
-from tests.web.hub.client import FakeClient, node, running_hub
+from tests.web.hub.client import FakeClient, listen, node, running_hub
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.ros.core.embedded import RosCore
+    from rmpa.ros.node.node import Node
+    from rmpa.web.hub.hub import Hub
 
 ONE, TWO = b"\x03\0\0\0one", b"\x03\0\0\0two"
 SET_BOOL = "std_srvs/SetBool"
@@ -32,64 +34,61 @@ SET_BOOL = "std_srvs/SetBool"
 # --- topics ---
 
 
-async def test_all_clients_share_one_subscription_and_one_payload(core: RosCore) -> None:
-    async with running_hub(core) as hub, node(core, "talker") as talker:
-        publisher = await talker.advertise("/t", STRING)
-        first, second = (FakeClient(hub).hear("/t") for _ in range(2))
-        await publisher.wait_for_subscriber()
-        publisher.publish_raw(ONE)
-        await until(lambda: first.messages and second.messages)
-        assert publisher.subscribers == 1
-        (message,) = first.messages
-        assert message is second.messages[0]
-        assert (message.topic, message.type, bytes(message.payload)) == ("/t", "std_msgs/String", ONE)
-        assert abs(message.stamp_ns - time.time_ns()) < DEADLINE * 1e9
+async def test_all_clients_share_one_subscription_and_one_payload(hub: Hub, talker: Node) -> None:
+    publisher = await talker.advertise("/t", STRING)
+    first, second = (FakeClient(hub).hear("/t") for _ in range(2))
+    await publisher.wait_for_subscriber()
+    publisher.publish_raw(ONE)
+    await until(lambda: first.messages and second.messages)
+    assert publisher.subscribers == 1
+    (message,) = first.messages
+    assert message is second.messages[0]
+    assert (message.topic, message.type, bytes(message.payload)) == ("/t", "std_msgs/String", ONE)
+    assert abs(message.stamp_ns - time.time_ns()) < DEADLINE * 1e9
 
 
 async def test_beyond_a_bound_only_topics_with_a_publisher_are_subscribed_to(
-    core: RosCore, monkeypatch: pytest.MonkeyPatch
+    hub: Hub, talker: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "SUBSCRIBED_TOPICS_MAX", 3)
-    async with running_hub(core) as hub, node(core, "talker") as talker:
-        publisher = await talker.advertise("/t", STRING)
-        client, other = FakeClient(hub), FakeClient(hub)
-        await until(lambda: "/t" in hub.graph.topics and hub.graph.topics["/t"].publishers)
-        for number in range(3):
-            client.hear(f"/none{number}")
-        with pytest.raises(PeerRefused, match="/none4 has no publisher"):
-            client.hear("/none4")
-        other.hear("/none1")
-        other.hear("/t")
-        await publisher.wait_for_subscriber()
+    publisher = await talker.advertise("/t", STRING)
+    client, other = FakeClient(hub), FakeClient(hub)
+    await until(lambda: "/t" in hub.graph.topics and hub.graph.topics["/t"].publishers)
+    for number in range(3):
+        client.hear(f"/none{number}")
+    with pytest.raises(PeerRefused, match="/none4 has no publisher"):
+        client.hear("/none4")
+    other.hear("/none1")
+    other.hear("/t")
+    await publisher.wait_for_subscriber()
 
 
 async def test_a_storm_of_subscriptions_leaves_nothing_registered(
-    core: RosCore, monkeypatch: pytest.MonkeyPatch
+    hub: Hub, talker: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "SUBSCRIPTION_LINGER", 0.0)
-    async with running_hub(core) as hub, node(core, "talker") as talker:
-        publisher = await talker.advertise("/t", STRING)
-        client = FakeClient(hub)
-        for number in range(1, 300):
-            heard = client.hear("/t" if number % 2 else f"/none{number}")
-            out = client.talk("/out", latch=bool(number % 2))
-            if number % 3:
-                await asyncio.sleep(0)
-            heard.close()
-            out.close()
-        last = client.hear("/t")
-        await publisher.wait_for_subscriber()
-        publisher.publish_raw(ONE)
-        await until(lambda: last.payloads == [ONE])
-        last.close()
+    publisher = await talker.advertise("/t", STRING)
+    client = FakeClient(hub)
+    for number in range(1, 300):
+        heard = client.hear("/t" if number % 2 else f"/none{number}")
+        out = client.talk("/out", latch=bool(number % 2))
+        if number % 3:
+            await asyncio.sleep(0)
+        heard.close()
+        out.close()
+    last = client.hear("/t")
+    await publisher.wait_for_subscriber()
+    publisher.publish_raw(ONE)
+    await until(lambda: last.payloads == [ONE])
+    last.close()
 
-        async def registered() -> list[str]:
-            state: Any = await talker.call_master("getSystemState")
-            return [name for part in state[:2] for name, nodes in part if "/rmpa_web" in nodes and name != "/rosout"]
+    async def registered() -> list[str]:
+        state: Any = await talker.call_master("getSystemState")
+        return [name for part in state[:2] for name, nodes in part if "/rmpa_web" in nodes and name != "/rosout"]
 
-        async with asyncio.timeout(DEADLINE):
-            while await registered():
-                await asyncio.sleep(0.05)
+    async with asyncio.timeout(DEADLINE):
+        while await registered():
+            await asyncio.sleep(0.05)
 
 
 async def test_newcomers_get_the_latched_message_of_each_source_once(core: RosCore) -> None:
@@ -103,282 +102,258 @@ async def test_newcomers_get_the_latched_message_of_each_source_once(core: RosCo
         assert sorted(early.payloads) == [ONE, TWO]
 
 
-async def test_a_latched_message_that_comes_again_after_a_reconnection_is_not_delivered_twice(core: RosCore) -> None:
-    async with running_hub(core) as hub, node(core, "a") as a:
-        publisher = await a.advertise("/map", LATCHED, latch=True)
-        publisher.publish_raw(ONE)
-        heard = FakeClient(hub).hear("/map")
-        await until(lambda: heard.payloads)
-        assert publisher.publication.hang_up("/rmpa_web")
-        await until(lambda: publisher.subscribers == 1)
-        publisher.publish_raw(TWO)
-        await until(lambda: heard.payloads[-1] == TWO)
-        publisher.publish_raw(TWO)  # the same again, over the same connection, is news
-        await until(lambda: len(heard.payloads) == 3)
-        assert heard.payloads == [ONE, TWO, TWO]
+async def test_a_latched_message_that_comes_again_is_not_delivered_twice(hub: Hub, talker: Node) -> None:
+    publisher = await talker.advertise("/map", LATCHED, latch=True)
+    publisher.publish_raw(ONE)
+    heard = FakeClient(hub).hear("/map")
+    await until(lambda: heard.payloads)
+    assert publisher.publication.hang_up("/rmpa_web")
+    await until(lambda: publisher.subscribers == 1)
+    publisher.publish_raw(TWO)
+    await until(lambda: heard.payloads[-1] == TWO)
+    publisher.publish_raw(TWO)  # the same again, over the same connection, is news
+    await until(lambda: len(heard.payloads) == 3)
+    assert heard.payloads == [ONE, TWO, TWO]
 
 
-async def test_a_client_that_fails_costs_the_others_no_message(core: RosCore) -> None:
-    async with running_hub(core) as hub, node(core, "a") as a:
-        publisher = await a.advertise("/t", STRING)
+async def test_a_client_that_fails_costs_the_others_no_message(hub: Hub, talker: Node) -> None:
+    publisher = await talker.advertise("/t", STRING)
 
-        def fail(_: object) -> None:
-            raise ValueError("a fault of a session")
+    def fail(_: object) -> None:
+        raise ValueError("a fault of a session")
 
-        broken = FakeClient(hub)
-        broken.subscribe("/t", None, fail, fail)
-        heard = FakeClient(hub).hear("/t")
-        await publisher.wait_for_subscriber()
-        publisher.publish_raw(ONE)
-        await until(lambda: heard.payloads == [ONE])
+    broken = FakeClient(hub)
+    broken.subscribe("/t", None, fail, fail)
+    heard = FakeClient(hub).hear("/t")
+    await publisher.wait_for_subscriber()
+    publisher.publish_raw(ONE)
+    await until(lambda: heard.payloads == [ONE])
 
 
-async def test_what_is_published_while_the_node_is_made_anew_is_sent_then(
-    core: RosCore, monkeypatch: pytest.MonkeyPatch
+async def test_what_waits_too_long_for_the_core_is_not_sent(
+    hub: Hub, talker: Node, core: RosCore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rmpa.web.limits.NODE_RETRY", 0.05)
-    async with running_hub(core) as hub, node(core, "base") as base:
-        heard: list[bytes] = []
-        await base.subscribe("/cmd_vel", callback=lambda message: heard.append(message.raw))
-        out = FakeClient(hub).talk("/cmd_vel")
-        out.publish(ONE)
-        await until(lambda: heard == [ONE])
-        present = hub.link.node
-        assert present is not None
-        await present.close()
-        await until(lambda: hub.link.node is None or hub.link.node is not present)
-        out.publish(TWO)  # such as the stop of a robot
-        await until(lambda: heard[-1] == TWO)
+    monkeypatch.setattr(limits, "EARLY_AGE", 0.0)  # all that waits for the registration is too old
+    heard, states = await listen(talker, "/cmd"), await listen(talker, "/state")
+    client = FakeClient(hub)
+    command = client.talk("/cmd")
+    command.publish(ONE)
+    client.talk("/state", latch=True).publish(TWO)
+    await until(lambda: states == [TWO])  # the last state counts, however old it is
+    await until(lambda: core.publishers("/cmd"))
+    while not heard:
+        command.publish(b"\x05\0\0\0three")
+        await asyncio.sleep(0.01)
+    assert ONE not in heard
 
 
-async def test_what_waits_too_long_for_the_core_is_not_sent(core: RosCore, monkeypatch: Any) -> None:
-    monkeypatch.setattr("rmpa.web.limits.EARLY_AGE", 0.0)  # all that waits for the registration is too old
-    async with running_hub(core) as hub, node(core, "echo") as echo:
-        heard: list[bytes] = []
-        for topic in ("/cmd", "/state"):
-            await echo.subscribe(topic, callback=lambda message: heard.append(message.raw))
-        client = FakeClient(hub)
-        command = client.talk("/cmd")
-        command.publish(ONE)
-        client.talk("/state", latch=True).publish(TWO)
-        await until(lambda: heard)
-        await until(lambda: core.publishers("/cmd") and core.publishers("/state"))
-        while len(heard) < 2:
-            command.publish(b"\x05\0\0\0three")
+async def test_a_publisher_that_has_gone_leaves_no_latched_message(hub: Hub, talker: Node) -> None:
+    publisher = await talker.advertise("/map", LATCHED, latch=True)
+    publisher.publish_raw(ONE)
+    early, client = FakeClient(hub).hear("/map"), FakeClient(hub)
+    await until(lambda: early.payloads)
+    await publisher.close()
+    async with asyncio.timeout(DEADLINE):
+        while True:
+            late = client.hear("/map")
             await asyncio.sleep(0.01)
-        assert ONE not in heard
-        assert TWO in heard  # the last state counts, however old it is
+            if not late.payloads:
+                return
 
 
-async def test_a_publisher_that_has_gone_leaves_no_latched_message(core: RosCore) -> None:
-    async with running_hub(core) as hub, node(core, "a") as a:
-        publisher = await a.advertise("/map", LATCHED, latch=True)
-        publisher.publish_raw(ONE)
-        early, client = FakeClient(hub).hear("/map"), FakeClient(hub)
-        await until(lambda: early.payloads)
-        await publisher.close()
-        async with asyncio.timeout(DEADLINE):
-            while True:
-                late = client.hear("/map")
-                await asyncio.sleep(0.01)
-                if not late.payloads:
-                    return
-
-
-async def test_two_types_on_one_topic_are_told_apart(core: RosCore) -> None:
-    number = MessageType("std_msgs/Int32")
-    async with running_hub(core) as hub, node(core, "a") as a, node(core, "b") as b:
-        text = await a.advertise("/t", STRING)
-        other = await b.advertise("/t", number)
-        client = FakeClient(hub)
-        texts, numbers, all_ = (client.hear("/t", kind) for kind in ("std_msgs/String", "std_msgs/Int32", None))
-        await text.wait_for_subscriber()
-        await other.wait_for_subscriber()
-        text.publish_raw(ONE)
-        other.publish_raw(b"\x05\0\0\0")
-        await until(lambda: len(all_.payloads) == 2)
+async def test_two_types_and_two_versions_of_one_on_a_topic_are_told_apart(hub: Hub, core: RosCore) -> None:
+    old, new = (
+        MessageType("std_msgs/Int32", parse_definition("std_msgs/Int32", f"{t} a")) for t in ("int8", "int32")
+    )
+    client = FakeClient(hub)
+    texts, numbers, all_ = (client.hear("/t", kind) for kind in ("std_msgs/String", "std_msgs/Int32", None))
+    async with node(core, "a") as a, node(core, "b") as b, node(core, "c") as c:
+        for talker, kind, payload in ((a, STRING, ONE), (b, old, b"\x05"), (c, new, b"\x06\0\0\0")):
+            publisher = await talker.advertise("/t", kind)
+            await publisher.wait_for_subscriber()
+            publisher.publish_raw(payload)
+        await until(lambda: len(all_.payloads) == 3)
         assert texts.payloads == [ONE]
-        assert numbers.payloads == [b"\x05\0\0\0"]
-        await until(lambda: "/t" in hub.graph.topics)
+        assert [(each.md5sum, bytes(each.payload)) for each in numbers.messages] == [
+            (old.md5sum, b"\x05"), (new.md5sum, b"\x06\0\0\0")
+        ]  # fmt: skip
+        for kind in (old, new):
+            assert (await hub.types.find_message(kind.name, kind.md5sum)).definition == kind.definition
         await until(lambda: set(hub.graph.topics["/t"].types) == {"std_msgs/String", "std_msgs/Int32"})
 
 
-async def test_a_subscription_of_another_type_is_told_and_refused_by_the_publisher(core: RosCore) -> None:
-    async with running_hub(core) as hub, node(core, "talker") as talker:
-        heard = FakeClient(hub).hear("/t", "std_msgs/Int32")  # before any publisher
-        publisher = await talker.advertise("/t", STRING)
-        await until(lambda: heard.others)
-        assert heard.others == ["std_msgs/String"]
-        await until(lambda: "/rmpa_web" in publisher.refusals)  # as of any node: "rmpa why" has it from there
-        assert "std_msgs/Int32" in publisher.refusals["/rmpa_web"]
-        other = FakeClient(hub).hear("/t")
-        await publisher.wait_for_subscriber()
-        publisher.publish_raw(ONE)
-        await until(lambda: other.payloads == [ONE])
-        await publisher.close()
-        publisher = await talker.advertise("/t", MessageType("std_msgs/Int32"))
-        await until(lambda: publisher.subscribers)
-        publisher.publish(publisher.make(7))
-        await until(lambda: heard.payloads == [b"\x07\0\0\0"])
-        assert len(heard.others) == 1
+async def test_a_subscription_of_another_type_is_told_and_refused_by_the_publisher(hub: Hub, talker: Node) -> None:
+    heard = FakeClient(hub).hear("/t", "std_msgs/Int32")  # before any publisher
+    publisher = await talker.advertise("/t", STRING)
+    await until(lambda: heard.others)
+    assert heard.others == ["std_msgs/String"]
+    await until(lambda: "/rmpa_web" in publisher.refusals)  # as of any node: "rmpa why" has it from there
+    assert "std_msgs/Int32" in publisher.refusals["/rmpa_web"]
+    other = FakeClient(hub).hear("/t")
+    await publisher.wait_for_subscriber()
+    publisher.publish_raw(ONE)
+    await until(lambda: other.payloads == [ONE])
+    await publisher.close()
+    publisher = await talker.advertise("/t", MessageType("std_msgs/Int32"))
+    await until(lambda: publisher.subscribers)
+    publisher.publish(publisher.make(7))
+    await until(lambda: heard.payloads == [b"\x07\0\0\0"])
+    assert len(heard.others) == 1
 
 
-async def test_what_clients_publish_is_numbered_as_rospy_numbers_it(core: RosCore) -> None:
-    async with running_hub(core) as hub, node(core, "echo") as echo:
-        heard: list[int] = []
-        await echo.subscribe("/points", callback=lambda message: heard.append(message.message.header.seq))
-        await until(lambda: "/points" in hub.graph.topics)
-        listener = FakeClient(hub).hear("/points")
-        point = MessageType("geometry_msgs/PointStamped")
-        outs = [FakeClient(hub).talk("/points", point.name) for _ in range(2)]
-        for out in outs:  # they share one publisher, and the first message waits for its subscribers
-            out.publish(point.serialize(point.make({"header": {"seq": 9}})))
-        await until(lambda: heard == [1, 2])
-        outs[0].publish(point.serialize(point.make()))
-        await until(lambda: heard == [1, 2, 3])
-        assert [point.deserialize(payload).header.seq for payload in listener.payloads] == [1, 2, 3]
+async def test_what_clients_publish_is_numbered_as_rospy_numbers_it(hub: Hub, talker: Node) -> None:
+    heard: list[int] = []
+    await talker.subscribe("/points", callback=lambda message: heard.append(message.message.header.seq))
+    await until(lambda: "/points" in hub.graph.topics)
+    listener = FakeClient(hub).hear("/points")
+    point = MessageType("geometry_msgs/PointStamped")
+    outs = [FakeClient(hub).talk("/points", point.name) for _ in range(2)]
+    for out in outs:  # they share one publisher, and the first message waits for its subscribers
+        out.publish(point.serialize(point.make({"header": {"seq": 9}})))
+    await until(lambda: heard == [1, 2])
+    outs[0].publish(point.serialize(point.make()))
+    await until(lambda: heard == [1, 2, 3])
+    assert [point.deserialize(payload).header.seq for payload in listener.payloads] == [1, 2, 3]
 
 
-async def test_what_is_published_before_its_type_is_known_is_numbered_too(core: RosCore) -> None:
-    async with running_hub(core) as hub, node(core, "other") as other:
-        text = f"Header header\n{SEPARATOR}\nMSG: std_msgs/Header\n{known_text('std_msgs/Header')}"
-        kind = MessageType.learn("my_msgs/Stamped", text)
-        publisher = await other.advertise("/other", kind)
-        await until(lambda: "/other" in hub.graph.topics)
-        client = FakeClient(hub)
-        heard, out = client.hear("/t"), client.talk("/t", kind.name)
-        for _ in range(2):
-            out.publish(kind.serialize(kind.make()))
-        assert heard.payloads == []
-        await until(lambda: len(heard.payloads) == 2)
-        assert [kind.deserialize(payload).header.seq for payload in heard.payloads] == [1, 2]
-        await publisher.close()
+async def test_what_is_published_before_its_type_is_known_is_numbered_too(hub: Hub, talker: Node) -> None:
+    text = f"Header header\n{SEPARATOR}\nMSG: std_msgs/Header\n{known_text('std_msgs/Header')}"
+    kind = MessageType.learn("my_msgs/Stamped", text)
+    publisher = await talker.advertise("/other", kind)
+    await until(lambda: "/other" in hub.graph.topics)
+    client = FakeClient(hub)
+    heard, out = client.hear("/t"), client.talk("/t", kind.name)
+    for _ in range(2):
+        out.publish(kind.serialize(kind.make()))
+    assert heard.payloads == []
+    await until(lambda: len(heard.payloads) == 2)
+    assert [kind.deserialize(payload).header.seq for payload in heard.payloads] == [1, 2]
+    await publisher.close()
 
 
-async def test_what_a_client_latches_reaches_late_nodes_and_clients(core: RosCore) -> None:
-    async with running_hub(core) as hub, node(core, "echo") as echo:
-        FakeClient(hub).talk("/t", latch=True).publish(ONE)
-        await until(lambda: core.publishers("/t"))
-        heard: list[bytes] = []
-        await echo.subscribe("/t", callback=lambda message: heard.append(message.raw))
-        await until(lambda: heard == [ONE])
-        late = FakeClient(hub).hear("/t")
-        await until(lambda: late.payloads == [ONE])
+async def test_what_a_client_latches_reaches_late_nodes_and_clients(hub: Hub, talker: Node, core: RosCore) -> None:
+    FakeClient(hub).talk("/t", latch=True).publish(ONE)
+    await until(lambda: core.publishers("/t"))
+    heard = await listen(talker, "/t")
+    await until(lambda: heard == [ONE])
+    late = FakeClient(hub).hear("/t")
+    await until(lambda: late.payloads == [ONE])
 
 
 async def test_clients_share_a_publisher_and_the_last_withdraws_it_after_a_while(
-    core: RosCore, monkeypatch: pytest.MonkeyPatch
+    hub: Hub, core: RosCore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "UNADVERTISE_DELAY", 0.05)
-    async with running_hub(core) as hub:
-        one, two = (FakeClient(hub).talk("/t") for _ in range(2))
-        await until(lambda: core.publishers("/t"))
-        one.close()
-        one.close()
-        assert core.publishers("/t")
-        began = time.monotonic()
-        two.close()
-        await until(lambda: not core.publishers("/t"))
-        assert time.monotonic() - began >= 0.05
+    one, two = (FakeClient(hub).talk("/t") for _ in range(2))
+    await until(lambda: core.publishers("/t"))
+    one.close()
+    one.close()
+    assert core.publishers("/t")
+    began = time.monotonic()
+    two.close()
+    await until(lambda: not core.publishers("/t"))
+    assert time.monotonic() - began >= 0.05
 
 
 async def test_a_topic_that_is_advertised_again_in_time_stays_and_latches_as_it_is_told(
-    core: RosCore, monkeypatch: pytest.MonkeyPatch
+    hub: Hub, core: RosCore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "UNADVERTISE_DELAY", DEADLINE)
-    async with running_hub(core) as hub:
-        client, listener = FakeClient(hub), FakeClient(hub)
-        for latch in (True, True, False):
-            out = client.talk("/t", latch=latch)
-            await until(lambda: core.publishers("/t"))
-            out.publish(ONE)
-            out.close()
-            assert core.publishers("/t")
-            heard = listener.hear("/t")
-            await asyncio.sleep(0)
-            assert heard.payloads == ([ONE] if latch else [])
-
-
-async def test_another_type_of_a_published_topic_is_refused(core: RosCore) -> None:
-    async with running_hub(core) as hub:
-        one = FakeClient(hub)
-        one.talk("/t")
-        with pytest.raises(PeerRefused, match="publish /t as std_msgs/String, not std_msgs/Int32"):
-            FakeClient(hub).talk("/t", "std_msgs/Int32")
-        refused = one.talk("/u", "no_msgs/Such")
-        await until(lambda: one.errors)
-        assert "no_msgs/Such" in str(one.errors[0])
-        heard = one.hear("/u")
-        FakeClient(hub).talk("/u")
-        refused.publish(ONE)  # it has ended: nothing of it goes to the publisher of another client
+    client, listener = FakeClient(hub), FakeClient(hub)
+    for latch in (True, True, False):
+        out = client.talk("/t", latch=latch)
+        await until(lambda: core.publishers("/t"))
+        out.publish(ONE)
+        out.close()
+        assert core.publishers("/t")
+        heard = listener.hear("/t")
         await asyncio.sleep(0)
-        assert heard.payloads == []
+        assert heard.payloads == ([ONE] if latch else [])
 
 
-async def test_a_node_that_was_shut_down_comes_back_with_everything(core: RosCore, monkeypatch: Any) -> None:
-    monkeypatch.setattr("rmpa.web.limits.NODE_RETRY", 0.01)
-    async with running_hub(core) as hub, node(core, "talker") as talker:
-        publisher = await talker.advertise("/t", STRING)
-        client = FakeClient(hub)
-        heard, _out = client.hear("/t"), client.talk("/u")
-        await publisher.wait_for_subscriber()
-        await until(lambda: core.publishers("/u"))
-        first = hub.link.node
-        assert first is not None
-        await first.close()
-        await until(lambda: hub.link.node not in (None, first) and core.publishers("/u"))
-        await until(lambda: publisher.subscribers == 1)
-        publisher.publish_raw(ONE)
-        await until(lambda: heard.payloads == [ONE])
+async def test_another_type_of_a_published_topic_is_refused(hub: Hub) -> None:
+    one = FakeClient(hub)
+    one.talk("/t")
+    with pytest.raises(PeerRefused, match="publish /t as std_msgs/String, not std_msgs/Int32"):
+        FakeClient(hub).talk("/t", "std_msgs/Int32")
+    refused = one.talk("/u", "no_msgs/Such")
+    await until(lambda: one.errors)
+    assert "no_msgs/Such" in str(one.errors[0])
+    heard = one.hear("/u")
+    FakeClient(hub).talk("/u")
+    refused.publish(ONE)  # it has ended: nothing of it goes to the publisher of another client
+    await asyncio.sleep(0)
+    assert heard.payloads == []
+
+
+async def test_a_node_that_was_shut_down_comes_back_with_everything(
+    hub: Hub, talker: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "NODE_RETRY", 0.05)
+    publisher = await talker.advertise("/t", STRING)
+    came = await listen(talker, "/cmd_vel")
+    client = FakeClient(hub)
+    heard, out = client.hear("/t"), client.talk("/cmd_vel")
+    await publisher.wait_for_subscriber()
+    out.publish(ONE)
+    await until(lambda: came == [ONE])
+    first = hub.link.node
+    assert first is not None
+    await first.close()
+    await until(lambda: hub.link.node is not first)
+    out.publish(TWO)  # such as the stop of a robot
+    await until(lambda: came == [ONE, TWO])
+    await until(lambda: publisher.subscribers == 1)
+    publisher.publish_raw(ONE)
+    await until(lambda: heard.payloads == [ONE])
 
 
 # --- services ---
 
 
-async def test_calls_share_a_connection_and_errors_are_told(core: RosCore) -> None:
+async def test_calls_share_a_connection_and_errors_are_told(hub: Hub, talker: Node) -> None:
     def serve(request: object) -> object:
         if not request.data:  # type: ignore[attr-defined]
             raise RmpaError("no")
         return {"success": True, "message": "yes"}
 
-    async with running_hub(core) as hub, node(core, "server") as server:
-        service = await server.advertise_service("/set", SET_BOOL, serve)
-        # The first news of a service closes the connections to one that had its name before.
-        await until(lambda: "/set" in hub.graph.services)
-        client = FakeClient(hub)
+    service = await talker.advertise_service("/set", SET_BOOL, serve)
+    # The first news of a service closes the connections to one that had its name before.
+    await until(lambda: "/set" in hub.graph.services)
+    client = FakeClient(hub)
+    for _ in range(3):
+        assert bytes(await client.call("/set", SET_BOOL, b"\x01")) == b"\x01\x03\0\0\0yes"
+    assert len(service.endpoint._clients) == 1
+    with pytest.raises(RmpaError, match="no"):
+        await client.call("/set", SET_BOOL, b"\x00")
+    with pytest.raises(RmpaError, match="/gone"):
+        await client.call("/gone", SET_BOOL, b"\x01")
+    assert await client.find_service("/set") == SET_BOOL
+    assert hub.graph.services["/set"].type == SET_BOOL
+
+
+async def test_a_client_that_goes_right_after_its_requests_leaves_no_coroutine_behind(hub: Hub) -> None:
+    client = FakeClient(hub)
+    for work in (
+        client.get_params(),
+        client.find_service("/rosout/get_loggers"),
+        client.call("/rosout/get_loggers", "", b""),
+    ):
+        client.start(work)
+    client.close()
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
         for _ in range(3):
-            assert bytes(await client.call("/set", SET_BOOL, b"\x01")) == b"\x01\x03\0\0\0yes"
-        assert len(service.endpoint._clients) == 1
-        with pytest.raises(RmpaError, match="no"):
-            await client.call("/set", SET_BOOL, b"\x00")
-        with pytest.raises(RmpaError, match="/gone"):
-            await client.call("/gone", SET_BOOL, b"\x01")
-        assert await client.find_service("/set") == SET_BOOL
-        assert hub.graph.services["/set"].type == SET_BOOL
-
-
-async def test_a_client_that_goes_right_after_its_requests_leaves_no_coroutine_behind(core: RosCore) -> None:
-    async with running_hub(core) as hub:
-        client = FakeClient(hub)
-        for work in (
-            client.get_params(),
-            client.find_service("/rosout/get_loggers"),
-            client.call("/rosout/get_loggers", "", b""),
-        ):
-            client.start(work)
-        client.close()
-        with warnings.catch_warnings(record=True) as warned:
-            warnings.simplefilter("always")
-            for _ in range(3):
-                await asyncio.sleep(0)
-            gc.collect()
-        assert not [str(each.message) for each in warned if each.category is RuntimeWarning]
-        assert not client.results
-        assert not client.errors
+            await asyncio.sleep(0)
+        gc.collect()
+    assert not [str(each.message) for each in warned if each.category is RuntimeWarning]
+    assert not client.results
+    assert not client.errors
 
 
 async def test_clients_that_leave_in_the_middle_of_their_calls_keep_no_connection_of_the_server(
-    core: RosCore,
+    hub: Hub,
+    talker: Node,
 ) -> None:
     asked = 0
 
@@ -389,142 +364,134 @@ async def test_clients_that_leave_in_the_middle_of_their_calls_keep_no_connectio
             await asyncio.Event().wait()
         return {"success": True, "message": "done"}
 
-    async with running_hub(core) as hub, node(core, "server") as server:
-        await server.advertise_service("/slow", SET_BOOL, slow)
-        leaving, staying = FakeClient(hub), FakeClient(hub)
-        for _ in range(limits.CALLS_AT_ONCE + 4):
-            leaving.start(leaving.call("/slow", SET_BOOL, b"\x01"))
-        await until(lambda: asked == limits.CALLS_AT_ONCE)
-        staying.start(staying.call("/slow", SET_BOOL, b"\x01"))
-        leaving.close()
-        await until(lambda: staying.results)
-        assert not leaving.results
-        assert not leaving.errors
-        assert asked == limits.CALLS_AT_ONCE + 1
+    await talker.advertise_service("/slow", SET_BOOL, slow)
+    leaving, staying = FakeClient(hub), FakeClient(hub)
+    for _ in range(limits.CALLS_AT_ONCE + 4):
+        leaving.start(leaving.call("/slow", SET_BOOL, b"\x01"))
+    await until(lambda: asked == limits.CALLS_AT_ONCE)
+    staying.start(staying.call("/slow", SET_BOOL, b"\x01"))
+    leaving.close()
+    await until(lambda: staying.results)
+    assert not leaving.results
+    assert not leaving.errors
+    assert asked == limits.CALLS_AT_ONCE + 1
 
 
-async def test_a_call_ends_in_time(core: RosCore) -> None:
-    async with running_hub(core) as hub, node(core, "server") as server:
-        await server.advertise_service("/slow", SET_BOOL, lambda _: asyncio.sleep(DEADLINE))
-        with pytest.raises(RmpaError, match=r"no answer within 0\.05 s"):
-            await FakeClient(hub).call("/slow", SET_BOOL, b"\x01", timeout=0.05)
+async def test_a_call_ends_in_time(hub: Hub, talker: Node) -> None:
+    await talker.advertise_service("/slow", SET_BOOL, lambda _: asyncio.sleep(DEADLINE))
+    with pytest.raises(RmpaError, match=r"no answer within 0\.05 s"):
+        await FakeClient(hub).call("/slow", SET_BOOL, b"\x01", timeout=0.05)
 
 
-async def test_a_client_serves_nodes_and_its_end_fails_the_open_call(core: RosCore) -> None:
+async def test_a_client_serves_nodes_and_its_end_fails_the_open_call(hub: Hub, talker: Node) -> None:
     kind = ServiceType(SET_BOOL)
-    async with running_hub(core) as hub, node(core, "caller") as caller:
-        client, asked = FakeClient(hub), []
-        served = client.serve("/served", SET_BOOL, lambda *call: asked.append(call), client.errors.append)
-        await until(lambda: "/served" in hub.graph.services)
-        calling = asyncio.ensure_future(caller.call_service("/served", kind, {"data": True}))
-        await until(lambda: asked)
-        request, response = asked[0]
-        assert bytes(request) == b"\x01"
-        response.set_result(b"\x01\x02\0\0\0ok")
-        assert (await calling).message == "ok"
-        second = asyncio.ensure_future(caller.call_service("/served", kind, {"data": True}))
-        await until(lambda: len(asked) == 2)
-        served.close()
-        error = (await asyncio.gather(second, return_exceptions=True))[0]
-        assert "has ended it" in str(error)
-        await until(lambda: "/served" not in hub.graph.services)
+    client, asked = FakeClient(hub), []
+    served = client.serve("/served", SET_BOOL, lambda *call: asked.append(call), client.errors.append)
+    await until(lambda: "/served" in hub.graph.services)
+    calling = asyncio.ensure_future(talker.call_service("/served", kind, {"data": True}))
+    await until(lambda: asked)
+    request, response = asked[0]
+    assert bytes(request) == b"\x01"
+    response.set_result(b"\x01\x02\0\0\0ok")
+    assert (await calling).message == "ok"
+    second = asyncio.ensure_future(talker.call_service("/served", kind, {"data": True}))
+    await until(lambda: len(asked) == 2)
+    served.close()
+    error = (await asyncio.gather(second, return_exceptions=True))[0]
+    assert "has ended it" in str(error)
+    await until(lambda: "/served" not in hub.graph.services)
 
 
-async def test_the_newest_client_that_offers_a_service_has_it(core: RosCore) -> None:
+async def test_the_newest_client_that_offers_a_service_has_it(hub: Hub, talker: Node, core: RosCore) -> None:
     """As with rosbridge_suite: the client before it may have gone without a word, and connects again."""
     kind = ServiceType(SET_BOOL)
-    async with running_hub(core) as hub, node(core, "caller") as caller:
-        old, new = FakeClient(hub), FakeClient(hub)
-        asked: dict[FakeClient, list[Any]] = {old: [], new: []}
+    old, new = FakeClient(hub), FakeClient(hub)
+    asked: dict[FakeClient, list[Any]] = {old: [], new: []}
 
-        def serve(client: FakeClient) -> None:
-            client.serve("/set", SET_BOOL, lambda *call: asked[client].append(call), client.errors.append)
+    def serve(client: FakeClient) -> None:
+        client.serve("/set", SET_BOOL, lambda *call: asked[client].append(call), client.errors.append)
 
-        serve(old)
-        await until(lambda: core.state().services.get("/set"))
-        calling = asyncio.ensure_future(caller.call_service("/set", kind, {"data": True}))
-        await until(lambda: asked[old])
-        serve(new)
-        assert [str(each) for each in old.errors] == ["another client offers /set now"]
-        with pytest.raises(RmpaError, match="has ended it"):
-            await calling
-        old.close()  # it takes nothing with it
+    serve(old)
+    await until(lambda: core.state().services.get("/set"))
+    calling = asyncio.ensure_future(talker.call_service("/set", kind, {"data": True}))
+    await until(lambda: asked[old])
+    serve(new)
+    assert [str(each) for each in old.errors] == ["another client offers /set now"]
+    with pytest.raises(RmpaError, match="has ended it"):
+        await calling
+    old.close()  # it takes nothing with it
 
-        async def call() -> Any:
-            while True:
-                with contextlib.suppress(RmpaError):  # while it is registered anew
-                    return await caller.call_service("/set", kind, {"data": True})
+    async def call() -> Any:
+        while True:
+            with contextlib.suppress(RmpaError):  # while it is registered anew
+                return await talker.call_service("/set", kind, {"data": True})
 
-        calling = asyncio.ensure_future(call())
-        await until(lambda: asked[new])
-        asked[new][0][1].set_result(b"\x01\0\0\0\0")
-        assert (await calling).success
-        assert len(asked[old]) == 1
+    calling = asyncio.ensure_future(call())
+    await until(lambda: asked[new])
+    asked[new][0][1].set_result(b"\x01\0\0\0\0")
+    assert (await calling).success
+    assert len(asked[old]) == 1
 
 
 # --- parameters, graph, types ---
 
 
-async def test_changes_of_parameters_are_told_to_followers(core: RosCore) -> None:
-    async with running_hub(core) as hub, node(core, "other") as other:
-        client = FakeClient(hub)
-        all_: list[Any] = []
-        one: list[Any] = []
-        kept = client.follow_params((), all_.append), client.follow_params(("/a/x",), one.append)
-        await client.set_param("/a", {"x": 1, "y": "two"})
-        assert (all_[-1], one[-1]) == ({"/a/x": 1, "/a/y": "two"}, {"/a/x": 1})
-        await other.set_param("/a/x", 5)
-        await until(lambda: one[-1] == {"/a/x": 5})
-        assert {"/a/x": 5, "/a/y": "two"}.items() <= (await client.get_params()).items()
-        kept[1].close()
+async def test_changes_of_parameters_are_told_to_followers(hub: Hub, talker: Node) -> None:
+    client = FakeClient(hub)
+    all_: list[Any] = []
+    one: list[Any] = []
+    kept = client.follow_params((), all_.append), client.follow_params(("/a/x",), one.append)
+    await client.set_param("/a", {"x": 1, "y": "two"})
+    assert (all_[-1], one[-1]) == ({"/a/x": 1, "/a/y": "two"}, {"/a/x": 1})
+    await talker.set_param("/a/x", 5)
+    await until(lambda: one[-1] == {"/a/x": 5})
+    assert {"/a/x": 5, "/a/y": "two"}.items() <= (await client.get_params()).items()
+    kept[1].close()
+    await client.delete_param("/a")
+    assert (all_[-1], one[-1]) == ({"/a/x": None, "/a/y": None}, {"/a/x": 5})
+    with pytest.raises(RmpaError, match="/a"):
         await client.delete_param("/a")
-        assert (all_[-1], one[-1]) == ({"/a/x": None, "/a/y": None}, {"/a/x": 5})
-        with pytest.raises(RmpaError, match="/a"):
-            await client.delete_param("/a")
-        client.close()
-        await FakeClient(hub).set_param("/b", 1)
-        assert "/b" not in all_[-1]
+    client.close()
+    await FakeClient(hub).set_param("/b", 1)
+    assert "/b" not in all_[-1]
 
 
-async def test_a_new_topic_is_seen_soon(core: RosCore) -> None:
-    async with running_hub(core) as hub, node(core, "talker") as talker:
-        FakeClient(hub)
-        told: list[bool] = []
-        hub.graph.follow(lambda: told.append("/new" in hub.graph.topics))
-        assert told == [False]
-        await talker.advertise("/new", STRING)
-        await until(lambda: told[-1])
-        topic = hub.graph.topics["/new"]
-        assert (topic.types, topic.publishers) == (("std_msgs/String",), ("/talker",))
-        assert "/talker" in hub.graph.nodes
+async def test_a_new_topic_is_seen_soon(hub: Hub, talker: Node) -> None:
+    FakeClient(hub)
+    told: list[bool] = []
+    hub.graph.follow(lambda: told.append("/new" in hub.graph.topics))
+    assert told == [False]
+    await talker.advertise("/new", STRING)
+    await until(lambda: told[-1])
+    topic = hub.graph.topics["/new"]
+    assert (topic.types, topic.publishers) == (("std_msgs/String",), ("/talker",))
+    assert "/talker" in hub.graph.nodes
 
 
-async def test_a_type_that_only_a_publisher_knows_is_learnt(core: RosCore) -> None:
+async def test_a_type_that_only_a_publisher_knows_is_learnt(hub: Hub, talker: Node) -> None:
     kind = MessageType.learn("my_msgs/Pair", "int32 a\nint32 b\n")
-    async with running_hub(core) as hub, node(core, "talker") as talker:
-        learnt: list[str] = []
-        hub.types.on_learnt = lambda found: learnt.append(found.definition)
-        assert "string data" in (await hub.types.find_message("std_msgs/String")).definition
-        assert "bool success" in (await hub.types.find_service("std_srvs/SetBool")).response.definition
-        with pytest.raises(RmpaError):
-            await hub.types.find_message("my_msgs/Pair")
-        publisher = await talker.advertise("/pair", kind)
-        FakeClient(hub).hear("/pair")
-        await publisher.wait_for_subscriber()
-        publisher.publish(kind.make({"a": 1, "b": 2}))
-        await until(lambda: kind.definition in learnt)
+    learnt: list[str] = []
+    hub.types.on_learnt = lambda found: learnt.append(found.definition)
+    assert "string data" in (await hub.types.find_message("std_msgs/String")).definition
+    assert "bool success" in (await hub.types.find_service("std_srvs/SetBool")).response.definition
+    with pytest.raises(RmpaError):
+        await hub.types.find_message("my_msgs/Pair")
+    publisher = await talker.advertise("/pair", kind)
+    FakeClient(hub).hear("/pair")
+    await publisher.wait_for_subscriber()
+    publisher.publish(kind.make({"a": 1, "b": 2}))
+    await until(lambda: kind.definition in learnt)
 
 
-async def test_clock_gives_the_time_where_the_parameter_says_so(core: RosCore) -> None:
-    async with running_hub(core) as hub, node(core, "gazebo") as gazebo:
-        assert abs(hub.time.now_ns() - time.time_ns()) < DEADLINE * 1e9
-        clock = await gazebo.advertise("/clock", "rosgraph_msgs/Clock")
-        await gazebo.set_param("/use_sim_time", True)
-        await clock.wait_for_subscriber()
-        clock.publish_raw(b"\x07\0\0\0\x05\0\0\0")
-        await until(lambda: hub.time.now_ns() == 7_000_000_005)
-        await gazebo.set_param("/use_sim_time", False)
-        await until(lambda: hub.time.now_ns() > 10**18)
+async def test_clock_gives_the_time_where_the_parameter_says_so(hub: Hub, talker: Node) -> None:
+    assert abs(hub.time.now_ns() - time.time_ns()) < DEADLINE * 1e9
+    clock = await talker.advertise("/clock", "rosgraph_msgs/Clock")
+    await talker.set_param("/use_sim_time", True)
+    await clock.wait_for_subscriber()
+    clock.publish_raw(b"\x07\0\0\0\x05\0\0\0")
+    await until(lambda: hub.time.now_ns() == 7_000_000_005)
+    await talker.set_param("/use_sim_time", False)
+    await until(lambda: hub.time.now_ns() > 10**18)
 
 
 # --- rights ---
@@ -543,10 +510,7 @@ async def test_clock_gives_the_time_where_the_parameter_says_so(core: RosCore) -
         (lambda client: client.fetch_asset("package://a/b", 10), READ_REMEDY),
     ],
 )
-async def test_a_read_only_client_changes_nothing(
-    core: RosCore, act: Callable[[FakeClient], Any], remedy: str
-) -> None:
-    async with running_hub(core) as hub:
-        with pytest.raises(PeerRefused, match="may not") as refused:
-            await act(FakeClient(hub, READ_ONLY))
-        assert refused.value.remedy == remedy
+async def test_a_read_only_client_changes_nothing(hub: Hub, act: Callable[[FakeClient], Any], remedy: str) -> None:
+    with pytest.raises(PeerRefused, match="may not") as refused:
+        await act(FakeClient(hub, READ_ONLY))
+    assert refused.value.remedy == remedy

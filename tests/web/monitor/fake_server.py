@@ -1,6 +1,6 @@
 """A server of the monitor that replays recorded snapshots of the demo: for tests, and to work on the pages.
 
-    python tests/web/monitor/fake_server.py --port 8480 [--scene demo]
+    python -m tests.web.monitor.fake_server [SCENE]
 
 It has the real pages and the real ``MonitorSession``; the agent, the hub and all answers are made up here.
 Scenes: ``demo`` (all is well), ``killed`` (the module base was killed), ``sick`` (one of each state, and alarms),
@@ -10,13 +10,13 @@ Scenes: ``demo`` (all is well), ``killed`` (the module base was killed), ``sick`
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import dataclasses
 import itertools
 import json
 import math
 import struct
+import sys
 import time
 import zlib
 from pathlib import Path
@@ -29,7 +29,7 @@ from aiohttp import WSMsgType, web
 from rmpa.core.contract import ContractRule, Contracts
 from rmpa.core.errors import RmpaError
 from rmpa.observe.peer_info import LaneInfo, PeerAgent, PeerInfo, judge_stranger
-from rmpa.observe.snapshot import Snapshot
+from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo
 from rmpa.observe.why.services import diagnose_module
 from rmpa.trust.permissions import TrustReason, TrustStatus
 from rmpa.web.gateways.frame_writer import Opcode
@@ -39,19 +39,18 @@ from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.session import MonitorSession
 from rmpa.web.monitor.state import StateBuilder, details, node_detail, node_key
+from rmpa.web.server.app import HEADERS
 from tests.web.recorder import FakeHub, PageConnection, Recorded
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.web.hub.node_link import Rights
     from rmpa.web.monitor.messages import Tree
 
 FIXTURES = Path(__file__).with_name("fixtures")
 STATIC = Path(__file__).parents[3] / "src/rmpa/web/static"
-CSP = "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; object-src 'none'"
 TICK = 0.1
-SCENES = ("demo", "killed", "sick", "large", "cut", "mute", "sensors", "knock")
+replace = msgspec.structs.replace
 _SPEEDS = struct.Struct("<6d")
 _SENSORS = {"/scan": "sensor_msgs/LaserScan", "/camera/image": "sensor_msgs/CompressedImage"}
 
@@ -91,159 +90,106 @@ class FakeAgent:
         now = time.time()
         base = self._recorded[0]
         if self.scene == "killed":
-            since = self._since.setdefault("killed", now)
-            base = self._recorded[2 if now - since < 7 else 3]
+            base = self._recorded[2 if now - self._since.setdefault("killed", now) < 1 else 3]
         else:
             self._since.clear()
-        if self.scene in ("sick", "large", "cut", "sensors", "knock"):
-            base = getattr(self, f"_{self.scene}")(base)
-        age = now - self._started
-        wobble = 1 + 0.004 * math.sin(now * 3)
-        peers = tuple(self._peer(peer, age, now) for peer in base.peers)
-        topics = tuple(
-            msgspec.structs.replace(
-                topic,
-                routes=tuple(
-                    msgspec.structs.replace(
-                        route,
-                        rate=route.rate and route.rate * wobble,
-                        messages=int(route.messages + (route.rate or 0) * age),
-                        age=route.age and abs(math.sin(now * 7)) / (route.rate or 1),
-                    )
-                    for route in topic.routes
-                ),
-            )
-            for topic in base.topics
-        )
-        agent = msgspec.structs.replace(base.agent, started=self._started, uptime=age, cpu=11 + 2 * math.sin(now / 3))
-        return msgspec.structs.replace(base, agent=agent, taken=now, peers=peers, topics=topics)
+            base = getattr(self, f"_{self.scene}", lambda same: same)(base)
+        age, wobble = now - self._started, 1 + 0.004 * math.sin(now * 3)
 
-    def _peer(self, peer: Any, age: float, now: float) -> Any:
-        link = peer.link
-        if link is not None:
-            link = msgspec.structs.replace(
-                link,
-                bytes_in=int(link.bytes_in / 90 * age),
-                bytes_out=int(link.bytes_out / 90 * age),
-                rtt=(link.rtt or 3e-4) * (1 + 0.1 * math.sin(now * 5)),
-                up_ago=age,
-                lanes=(
-                    LaneInfo(name="express", connected=True, bytes_in=int(400 * age), bytes_out=int(300 * age)),
-                    LaneInfo(name="bulk", connected=self.scene != "sick", queued=0 if self.scene != "sick" else 9000),
-                ),
-            )
-        return msgspec.structs.replace(peer, link=link, since_ago=age if link else peer.since_ago)
+        def alive(route: RouteInfo) -> RouteInfo:
+            rate = route.rate or 0
+            age_now = route.age and abs(math.sin(now * 7)) / (route.rate or 1)
+            return replace(route, rate=rate * wobble or None, messages=int(route.messages + rate * age), age=age_now)
+
+        peers = tuple(self._peer(peer, age, now) for peer in base.peers)
+        topics = tuple(replace(topic, routes=tuple(map(alive, topic.routes))) for topic in base.topics)
+        agent = replace(base.agent, started=self._started, uptime=age, cpu=11 + 2 * math.sin(now / 3))
+        return replace(base, agent=agent, taken=now, peers=peers, topics=topics)
+
+    def _peer(self, peer: PeerInfo, age: float, now: float) -> PeerInfo:
+        if (link := peer.link) is None:
+            return peer
+        sick = self.scene == "sick"
+        lanes = (
+            LaneInfo(name="express", connected=True, bytes_in=int(400 * age), bytes_out=int(300 * age)),
+            LaneInfo(name="bulk", connected=not sick, queued=9000 * sick),
+        )
+        came, went = (int(count / 90 * age) for count in (link.bytes_in, link.bytes_out))
+        rtt = (link.rtt or 3e-4) * (1 + 0.1 * math.sin(now * 5))
+        link = replace(link, bytes_in=came, bytes_out=went, rtt=rtt, up_ago=age, lanes=lanes)
+        return replace(peer, link=link, since_ago=age)
 
     def facts(self) -> list[ResourceFacts]:
         """The resources of the scene."""
-        if self.scene == "killed":
-            return [one for one in self._resources if one.peer != "base"]
+        ill = {
+            "velocity": {"level": "WARN", "message": "adapting: acceleration 3.2 m/s² instead of at most 1 m/s²"},
+            "joystick": {"level": "ERROR", "message": "non-adaptable: rate 3 Hz is below 10 Hz in every profile"},
+        }
         if self.scene == "sick":
-            ill = {
-                "velocity": {"level": "WARN", "message": "adapting: acceleration 3.2 m/s² instead of at most 1 m/s²"},
-                "joystick": {"level": "ERROR", "message": "non-adaptable: rate 3 Hz is below 10 Hz in every profile"},
-            }
-            return [
-                msgspec.structs.replace(one, health=(one.health or {}) | ill.get(str(one.peer), {}))
-                for one in self._resources
-            ]
-        return self._resources
+            return [replace(one, health=(one.health or {}) | ill.get(str(one.peer), {})) for one in self._resources]
+        return [one for one in self._resources if (one.peer, self.scene) != ("base", "killed")]
 
     def alarms(self) -> list[Tree]:
         """The alarms that stand."""
-        if self.scene != "sick":
-            return []
+        about = {"at": round(self._started + 40, 1)}
         return [
-            {
-                "id": one.key,
-                "module": str(one.peer),
-                "resource": one.key,
-                "level": one.level,
-                "text": str((one.health or {})["message"]),
-                "at": round(self._started + 40, 1),
-            }
+            {"id": one.key, "module": str(one.peer), "resource": one.key, "level": one.level, **about}
+            | {"text": str((one.health or {})["message"])}
             for one in self.facts()
-            if one.level in ("WARN", "ERROR")
+            if self.scene == "sick" and one.level in ("WARN", "ERROR")
         ]
 
     def _sick(self, base: Snapshot) -> Snapshot:
-        replace = msgspec.structs.replace
         linked = {peer.name: peer for peer in base.peers}
         some, link = linked["base"], linked["velocity"].link
         assert link is not None
-        peers = (
-            replace(
-                some, name="arm", state="linking", link=None, beacon_ago=2.0, last_error="10.0.0.7:40001: timed out"
-            ),
-            replace(
-                some, name="camera", state="refused", link=None, last_error="is of version 0.0.9, this one of 0.1.0"
-            ),
-            replace(some, name="gripper", state="linking", link=None, beacon_ago=60.0, last_error="No route to host"),
-            linked["joystick"],
-            replace(linked["velocity"], link=replace(link, heard_ago=1.8)),
-            some,
-        )
+        lost = {
+            "arm": {"state": "linking", "beacon_ago": 2.0, "last_error": "10.0.0.7:40001: timed out"},
+            "camera": {"state": "refused", "last_error": "is of version 0.0.9, this one of 0.1.0"},
+            "gripper": {"state": "linking", "beacon_ago": 60.0, "last_error": "No route to host"},
+        }
+        gone = (replace(some, name=name, link=None, **about) for name, about in lost.items())
+        silent = replace(linked["velocity"], link=replace(link, heard_ago=1.8))
+        differ = ("/pc expects geometry_msgs/TwistStamped, /velocity publishes geometry_msgs/Twist",)
         topics = tuple(
-            replace(
-                topic, mismatches=("/pc expects geometry_msgs/TwistStamped, /velocity publishes geometry_msgs/Twist",)
-            )
-            if topic.name == "/velocity_order"
-            else topic
-            for topic in base.topics
+            replace(topic, mismatches=differ) if topic.name == "/velocity_order" else topic for topic in base.topics
         )
-        return replace(
-            base, peers=peers, topics=topics, notes=("multicast does not leave eth0: is there a firewall?",)
-        )
+        notes = ("multicast does not leave eth0: is there a firewall?",)
+        return replace(base, peers=(*gone, linked["joystick"], silent, some), topics=topics, notes=notes)
 
     def _sensors(self, base: Snapshot) -> Snapshot:
         odom = next(topic for topic in base.topics if topic.name == "/odom")
-        more = tuple(msgspec.structs.replace(odom, name=name, type=kind) for name, kind in _SENSORS.items())
-        return msgspec.structs.replace(base, topics=(*base.topics, *more))
+        more = (replace(odom, name=name, type=kind) for name, kind in _SENSORS.items())
+        return replace(base, topics=(*base.topics, *more))
 
     def _cut(self, base: Snapshot) -> Snapshot:
-        topics = tuple(topic for topic in base.topics if topic.name != "/odom")
-        return msgspec.structs.replace(base, topics=topics, topics_left=18_000)
+        return replace(base, topics=tuple(each for each in base.topics if each.name != "/odom"), topics_left=18_000)
 
     def _knock(self, base: Snapshot) -> Snapshot:
         trust = TrustStatus(on=True, module="pc", is_authority=True, authority="pc", revoked=("old",))
-        return msgspec.structs.replace(
-            base, trust=trust, strangers=tuple(outside(name, trust) for name in ("arm", "base", "old"))
-        )
+        strangers = tuple(outside(name, trust) for name in ("arm", "base", "old"))
+        return replace(base, trust=trust, strangers=strangers)
 
     def _large(self, base: Snapshot) -> Snapshot:
-        replace = msgspec.structs.replace
         some = next(peer for peer in base.peers if peer.name == "base")
-        odom, idle = (
-            next(topic for topic in base.topics if topic.name == name) for name in ("/odom", "/base/context")
-        )
+        odom, idle = (next(each for each in base.topics if each.name == name) for name in ("/odom", "/base/context"))
+
+        def topic(name: str, at: int, number: int) -> TopicInfo:
+            like, rate = (odom, 1.0 + (at * 7 + number * 13) % 60) if number < 6 else (idle, None)
+            routes = tuple(replace(route, peer=name, rate=route.rate and rate) for route in like.routes)
+            return replace(like, name=f"/{name}/topic_{number:02d}", routes=routes)
+
         names = [f"module_{number:02d}" for number in range(1, 16)]
-        peers = tuple(replace(some, name=name) for name in names)
-        topics = tuple(
-            replace(
-                odom if number < 6 else idle,
-                name=f"/{name}/topic_{number:02d}",
-                routes=tuple(
-                    replace(route, peer=name, rate=route.rate and 1.0 + (at * 7 + number * 13) % 60)
-                    for route in (odom if number < 6 else idle).routes
-                ),
-            )
-            for at, name in enumerate(names)
-            for number in range(20)
-        )
-        return replace(base, peers=peers, topics=topics)
+        topics = tuple(topic(name, at, number) for at, name in enumerate(names) for number in range(20))
+        return replace(base, peers=tuple(replace(some, name=name) for name in names), topics=topics)
 
 
 class FakeServer:
-    """The pages, and one ``MonitorSession`` for each WebSocket.
+    """The pages, and one ``MonitorSession`` for each WebSocket; ``agent.scene`` changes the scene."""
 
-    Args:
-        scene: The first scene; ``agent.scene`` changes it.
-        rights: What clients may do.
-    """
-
-    def __init__(self, scene: str = "demo", rights: Rights | None = None) -> None:
+    def __init__(self, scene: str = "demo") -> None:
         self.agent = FakeAgent(scene)
-        self.rights = rights or dataclasses.replace(FULL, drive=True)
+        self.rights = dataclasses.replace(FULL, drive=True)
         self.speeds: list[SimpleNamespace] = []
         self.reports: list[str] = []
         self.asked: list[SimpleNamespace] = []
@@ -258,9 +204,8 @@ class FakeServer:
         self._builder = StateBuilder("pc")
         self._snapshot = self.agent.snapshot()
         self._state: Tree = {}
-        self._open: set[web.WebSocketResponse] = set()
         self._odometry = json.loads((FIXTURES / "odometry.json").read_text())
-        self._why = json.loads((FIXTURES / "resources.json").read_text())["why"]
+        self._answers = json.loads((FIXTURES / "answers.json").read_text())
         self._mute_since = 0.0
 
     def app(self) -> web.Application:
@@ -273,14 +218,9 @@ class FakeServer:
         app.on_response_prepare.append(self._headers)
         return app
 
-    async def drop(self) -> None:
-        """Close all connections, as a server that ends."""
-        for socket in list(self._open):
-            await socket.close()
-
     async def _headers(self, _request: web.Request, response: web.StreamResponse) -> None:
-        response.headers["Content-Security-Policy"] = f"{CSP}; report-uri /csp"
-        response.headers["X-Content-Type-Options"] = "nosniff"
+        response.headers.update(HEADERS)
+        response.headers["Content-Security-Policy"] += "; report-uri /csp"
 
     async def _index(self, _request: web.Request) -> web.FileResponse:
         return web.FileResponse(STATIC / "index.html")
@@ -310,7 +250,6 @@ class FakeServer:
     async def _socket(self, request: web.Request) -> web.WebSocketResponse:
         socket = web.WebSocketResponse(protocols=(SUBPROTOCOL,), max_msg_size=2**20)
         await socket.prepare(request)
-        self._open.add(socket)
         client = _Client(self, socket)
         beat = asyncio.ensure_future(client.run())
         try:
@@ -320,7 +259,6 @@ class FakeServer:
                     await client.flush()
         finally:
             beat.cancel()
-            self._open.discard(socket)
             client.session.closing()
             await client.flush()
         return socket
@@ -329,16 +267,10 @@ class FakeServer:
         """A nav_msgs/Odometry of the recorded drive."""
         at = time.time() * 10 % len(self._odometry)
         _, x, y, z, w, forward, turn = self._odometry[int(at)]
-        return {
-            "header": {"seq": int(at), "stamp": {"secs": int(time.time()), "nsecs": 0}, "frame_id": "odom"},
-            "child_frame_id": "base_link",
-            "pose": {
-                "pose": {"position": {"x": x, "y": y, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": z, "w": w}}
-            },
-            "twist": {
-                "twist": {"linear": {"x": forward, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": turn}}
-            },
-        }
+        pose = {"position": {"x": x, "y": y, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": z, "w": w}}
+        twist = {"linear": {"x": forward, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": turn}}
+        header = {"seq": int(at), "stamp": {"secs": int(time.time()), "nsecs": 0}, "frame_id": "odom"}
+        return {"header": header, "child_frame_id": "base_link", "pose": {"pose": pose}, "twist": {"twist": twist}}
 
     async def answer(self, what: str, args: dict[str, Any]) -> Any:
         """The answer to a question of a page.
@@ -348,7 +280,7 @@ class FakeServer:
         """
         self.asked.append(SimpleNamespace(what=what, args=args))
         try:
-            return getattr(self, f"_answer_{what}")(args)
+            return self._answers[what] if what in self._answers else getattr(self, f"_answer_{what}")(args)
         except (AttributeError, LookupError):
             raise RmpaError(f"this server cannot answer {what}") from None
 
@@ -356,7 +288,7 @@ class FakeServer:
         if args["kind"] == "module":
             told = msgspec.convert(self._answer_agent({"peer": args["name"]}), PeerAgent)
             return msgspec.to_builtins((diagnose_module(self._snapshot, args["name"], told),))
-        flows = self._why[0]
+        flows = self._answers["flows"]
         if self.agent.scene == "demo":
             return [flows]
         text = "no linked peer publishes it"
@@ -375,14 +307,10 @@ class FakeServer:
         self.params.pop(str(args["name"]), None)
         return self._answer_params({})
 
-    def _answer_param_names(self, _args: dict[str, Any]) -> Any:
-        return {"names": ["/base/rate", "/base/wheel/radius", "/rosdistro", "/use_sim_time"]}
-
     def _answer_agent(self, args: dict[str, Any]) -> Any:
         if args["peer"] == "joystick":
             raise LookupError("agent, as one of an earlier release")
-        return {"version": self._snapshot.agent.version, "uptime": 3725.0, "core_uri": "http://127.0.0.1:11311/",
-                "cpu": 4.2, "rss": 61_000_000, "files_open": 61, "files_limit": 1024, "proxies": 7}  # fmt: skip
+        return self._answers["figures"] | {"version": self._snapshot.agent.version}
 
     def _answer_contract(self, args: dict[str, Any]) -> Any:
         terms = Contracts((ContractRule(("/velocity*",), (), {"max_rate": 20.0}),)).explain(args["topic"], "")
@@ -394,40 +322,22 @@ class FakeServer:
             raise LookupError(args["name"])
         types = {topic.name: topic.type for topic in self._snapshot.topics}
         publishes, subscribes, services = (
-            [str(each) for each in cast("list[object]", known[part])]
-            for part in ("publishes", "subscribes", "services")
+            cast("list[str]", known[part]) for part in ("publishes", "subscribes", "services")
         )
-        return {
+        other = {"inbound": False, "other": "/rosout", "connected": True}
+        return self._answers["process"] | {
             "name": args["name"],
-            "uri": "http://127.0.0.1:34567/",
-            "pid": 4711,
-            "problem": "",
             "publications": {each: types[each] for each in publishes},
             "subscriptions": {each: types[each] for each in subscribes},
             "services": [each.rpartition(":")[2] for each in services],
-            "connections": [
-                {"topic": each, "inbound": False, "other": "/rosout", "connected": True} for each in publishes
-            ],
+            "connections": [{"topic": each, **other} for each in publishes],
         }
-
-    def _answer_describe(self, _args: dict[str, Any]) -> Any:
-        text = (
-            "bool data # e.g. for hardware enabling / disabling\n---\n"
-            "bool success   # indicate successful run of triggered service\nstring message"
-        )
-        return {"type": "std_srvs/SetBool", "request": {"data": False}, "text": text}
 
     def _answer_call(self, args: dict[str, Any]) -> Any:
         return {"response": {"success": True, "message": f"as asked: {args['request']}"}, "seconds": 0.0031}
 
     def _answer_invite(self, args: dict[str, Any]) -> Any:
         return {"line": f"rmpa trust join rmpa1-for{args['name']}{'x' * 80}", "until": int(time.time()) + 900}
-
-    def _answer_profile(self, _args: dict[str, Any]) -> Any:
-        return {"text": "chosen"}
-
-    def _answer_context(self, _args: dict[str, Any]) -> Any:
-        return {"text": "chosen"}
 
     def _answer_configure(self, args: dict[str, Any]) -> Any:
         return {"value": args["value"], "text": f"{args['name']} is {args['value']} now"}
@@ -459,13 +369,8 @@ class _Client(Recorded):
         topic = message.topic
         if "scan" in topic:
             ranges = [_room(number * math.pi / 180) for number in range(360)]
-            return {
-                "angle_min": 0.0,
-                "angle_increment": math.pi / 180,
-                "range_min": 0.1,
-                "range_max": 8.0,
-                "ranges": ranges,
-            }
+            limits = {"angle_min": 0.0, "angle_increment": math.pi / 180, "range_min": 0.1, "range_max": 8.0}
+            return {**limits, "ranges": ranges}
         if "image" in topic:
             return {"format": "png", "data": _png(160, 120, time.time())}
         if topic == "/odom":
@@ -521,14 +426,5 @@ def _png(width: int, height: int, at: float) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows, 1)) + chunk(b"IEND", b"")
 
 
-def main() -> None:
-    """Serve until Ctrl-C."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--port", type=int, default=8480)
-    parser.add_argument("--scene", choices=SCENES, default="demo")
-    options = parser.parse_args()
-    web.run_app(FakeServer(options.scene).app(), host="127.0.0.1", port=options.port)
-
-
 if __name__ == "__main__":
-    main()
+    web.run_app(FakeServer(*sys.argv[1:]).app(), host="127.0.0.1", port=8480)

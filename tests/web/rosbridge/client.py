@@ -31,10 +31,10 @@ class Client(Recorded):
     def subscribe(self, topic: str = "/t", **values: Any) -> Asked:
         return self.one("subscribe", self.send("subscribe", topic=topic, **values))
 
-    def publish(self, subscription: Asked, kind: str, values: Any) -> None:
+    def publish(self, subscription: Asked, values: Any = None, kind: str = "std_msgs/String") -> None:
         """Let the hub have a message for a subscription."""
         message = MessageType(kind)
-        subscription.message(message.serialize(message.make(values)), kind)
+        subscription.message(message.serialize(message.make(values or {"data": "hello"})), kind)
 
     def received(self) -> list[dict[str, Any]]:
         """What the client got since the last call."""

@@ -21,7 +21,6 @@ from rmpa.web.gateways.frame_writer import Opcode
 from rmpa.web.rosbridge import protocol as encodings
 from rmpa.web.rosbridge.protocol import (
     Compression,
-    OpError,
     PublishFrames,
     data_of,
     decode_png,
@@ -162,10 +161,3 @@ def test_hostile_pictures_are_refused(picture: str, says: str) -> None:
 def test_a_bomb_is_unpacked_up_to_its_picture_only() -> None:
     # 100 MB of zeros in a picture of one pixel: what is beyond the pixel is never unpacked.
     assert decode_png(_picture(bytes(100_000_000), 1, 1)) == "\0\0\0"
-
-
-def test_unknown_compressions_are_refused() -> None:
-    assert Compression.parse(None) is Compression.NONE
-    assert Compression.parse("cbor-raw") is Compression.CBOR_RAW
-    with pytest.raises(OpError, match="none, png, cbor or cbor-raw"):
-        Compression.parse("zip")

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from typing import TYPE_CHECKING
 
 import cbor2
 import pytest
@@ -10,7 +11,9 @@ from rmpa.web import limits
 from rmpa.web.gateways.frame_writer import Opcode
 from rmpa.web.rosbridge.protocol import decode_png
 from tests.web.recorder import NOW_NS
-from tests.web.rosbridge.client import Client
+
+if TYPE_CHECKING:
+    from tests.web.rosbridge.client import Client
 
 STRING = "std_msgs/String"
 HELLO = b"\x05\0\0\0hello"
@@ -19,163 +22,134 @@ HELLO = b"\x05\0\0\0hello"
 # --- subscribing -------------------------------------------------------------------------------------------------
 
 
-def test_a_subscriber_gets_messages_in_json() -> None:
-    client = Client()
-    asked = client.subscribe(type=STRING)
-    assert (asked.topic, asked.type) == ("/t", STRING)
-    client.publish(asked, STRING, {"data": "hello"})
-    ((opcode, parts),) = client.frames()
-    assert (opcode, b"".join(parts)) == (Opcode.TEXT, b'{"op":"publish","topic":"/t","msg":{"data":"hello"}}')
+def test_a_subscriber_gets_messages_in_json_of_the_topic_as_it_wrote_it(client: Client) -> None:
+    for name, kind in (("/t", STRING), ("t", "std_msgs/msg/String")):
+        asked = client.subscribe(name, type=kind)
+        assert (asked.topic, asked.type) == ("/t", STRING)
+        client.publish(asked)
+        ((opcode, parts),) = client.frames()
+        text = '{"op":"publish","topic":"' + name + '","msg":{"data":"hello"}}'
+        assert (opcode, b"".join(parts)) == (Opcode.TEXT, text.encode())
 
 
-def test_the_topic_is_called_as_the_client_wrote_it() -> None:
-    client = Client()
-    asked = client.subscribe("t", type="std_msgs/msg/String")
-    assert (asked.topic, asked.type) == ("/t", STRING)
-    client.publish(asked, STRING, {"data": "hello"})
-    assert client.received()[0]["topic"] == "t"
-
-
-def test_each_compression() -> None:
-    client = Client()
+def test_each_compression(client: Client) -> None:
     for compression in ("none", "png", "cbor", "cbor-raw"):
-        asked = client.subscribe(f"/{compression[-3:]}", compression=compression)
-        client.publish(asked, STRING, {"data": "hello"})
+        client.publish(client.subscribe(f"/{compression[-3:]}", compression=compression))
     none, png, cbor, raw = client.received()
-    assert none == {"op": "publish", "topic": "/one", "msg": {"data": "hello"}}
-    assert json.loads(decode_png(png["data"])) == {"op": "publish", "topic": "/png", "msg": {"data": "hello"}}
-    assert cbor == {"op": "publish", "topic": "/bor", "msg": {"data": "hello"}}
+    wanted = {"op": "publish", "msg": {"data": "hello"}}
+    assert none == wanted | {"topic": "/one"}
+    assert json.loads(decode_png(png["data"])) == wanted | {"topic": "/png"}
+    assert cbor == wanted | {"topic": "/bor"}
     secs, nsecs = divmod(NOW_NS, 10**9)
     assert raw["msg"] == {"secs": secs, "nsecs": nsecs, "bytes": HELLO}
-
-
-def test_cbor_raw_needs_no_definition() -> None:
-    client = Client()
-    client.subscribe(type="x/Y", compression="cbor-raw").message(b"abc", "x/Y")
+    client.subscribe(type="x/Y", compression="cbor-raw").message(b"abc", "x/Y")  # of a type that is not known here
     assert client.received()[0]["msg"]["bytes"] == b"abc"
 
 
-def test_several_subscriptions_are_one_with_the_best_of_all() -> None:
-    client = Client()
+def test_several_subscriptions_are_one_with_the_best_of_all(client: Client) -> None:
     asked = client.subscribe(id="a", throttle_rate=1000)
     assert not client.send("subscribe", id="b", topic="/t", throttle_rate=100, compression="cbor")
     assert not client.send("subscribe", id="c", topic="/t", throttle_rate=500, compression="png")
     for _ in range(10):
-        client.publish(asked, STRING, {"data": "hello"})
+        client.publish(asked)
         client.now += 0.05
-    frames = client.frames()
-    assert len(frames) == 5
-    assert all(opcode is Opcode.BINARY for opcode, _ in frames)
+    assert [opcode for opcode, _ in client.frames()] == [Opcode.BINARY] * 5
     client.send("unsubscribe", id="b", topic="/t")
     client.now += 0.5
-    client.publish(asked, STRING, {"data": "hello"})
+    client.publish(asked)
     assert client.received()[0]["op"] == "png"
-    client.send("unsubscribe", id="a", topic="/t")
-    assert not asked.closed
-    client.send("unsubscribe", id="c", topic="/t")
-    assert asked.closed
+    for mid, closed in (("a", False), ("c", True)):
+        client.send("unsubscribe", id=mid, topic="/t")
+        assert asked.closed is closed
 
 
-def test_unsubscribe_without_an_id_ends_all() -> None:
-    client = Client()
+def test_unsubscribe_without_an_id_ends_all(client: Client) -> None:
     asked = client.subscribe(id="a")
     client.send("subscribe", id="b", topic="/t")
     client.send("unsubscribe", topic="/t")
     assert asked.closed
 
 
-def test_the_longest_queue_is_used_and_freed_with_the_last_subscription() -> None:
-    client = Client()
-    handle = client.subscribe(id="a", type=STRING, throttle_rate=1000, queue_length=1)
+def test_the_longest_queue_is_used_and_freed_with_the_last_subscription(client: Client) -> None:
+    asked = client.subscribe(id="a", type=STRING, throttle_rate=1000, queue_length=1)
     client.send("subscribe", id="b", topic="/t", throttle_rate=1000, queue_length=3)
     for number in range(5):
-        client.publish(handle, STRING, {"data": str(number)})
+        client.publish(asked, {"data": str(number)})
     client.advance(10)
     assert [each["msg"]["data"] for each in client.received()] == ["0", "2", "3", "4"]
-    client.publish(handle, STRING, {"data": "5"})
-    client.publish(handle, STRING, {"data": "6"})
+    client.publish(asked)
+    client.publish(asked)
     client.send("unsubscribe", topic="/t")
-    assert client.session.queued.used == 0
-    assert client.session.next_timer() is None
+    assert (client.session.queued.used, client.session.next_timer()) == (0, None)
 
 
-def test_long_messages_come_in_fragments_of_the_smallest_size() -> None:
-    client = Client()
-    handle = client.subscribe(id="a", fragment_size=50)
+def test_long_messages_come_in_fragments_of_the_smallest_size(client: Client) -> None:
+    asked = client.subscribe(id="a", fragment_size=50)
     client.send("subscribe", id="b", topic="/t", fragment_size=30)
-    client.publish(handle, STRING, {"data": "x" * 100})
-    client.publish(handle, STRING, {"data": "y" * 100})
+    for letter in "xy":
+        client.publish(asked, {"data": letter * 100})
     got = client.received()
     assert {each["op"] for each in got} == {"fragment"}
     assert all(len(each["data"]) <= 30 for each in got)
-    first, second = ("".join(each["data"] for each in got if each["id"] == mid) for mid in (0, 1))
-    assert json.loads(first)["msg"]["data"] == "x" * 100
-    assert json.loads(second)["msg"]["data"] == "y" * 100
+    texts = ["".join(each["data"] for each in got if each["id"] == mid) for mid in (0, 1)]
+    assert [json.loads(text)["msg"]["data"] for text in texts] == ["x" * 100, "y" * 100]
 
 
-def test_a_broken_message_is_reported_once() -> None:
-    client = Client()
-    handle = client.subscribe()
+def test_a_broken_message_is_reported_once(client: Client) -> None:
+    asked = client.subscribe()
     for _ in range(3):
-        handle.message(b"\xff\xff\xff\xff")
+        asked.message(b"\xff\xff\xff\xff")
     assert "message of /t: 4 bytes are not a std_msgs/String" in client.error()
-    client.publish(handle, STRING, {"data": "ok"})
-    assert client.received()[0]["msg"] == {"data": "ok"}
+    client.publish(asked)
+    assert client.received()[0]["msg"] == {"data": "hello"}
 
 
-def test_another_type_than_the_topic_has_is_refused() -> None:
-    client = Client()
+def test_a_topic_has_one_type_for_subscribers(client: Client) -> None:
     client.graph.add_topic("/t", STRING)
     assert not client.send("subscribe", topic="/t", type="std_msgs/Int8")
     assert "/t has the type std_msgs/String, not std_msgs/Int8" in client.error()
-    client.send("subscribe", topic="/new", type=STRING)
+    asked = client.subscribe("/new", type=STRING)
     client.send("subscribe", topic="/new", type="std_msgs/Int8")
     assert "is subscribed as std_msgs/String" in client.error()
+    asked.differs("std_msgs/Int32")  # of a publisher that comes later
+    assert "/new has the type std_msgs/Int32, not std_msgs/String" in client.error()
 
 
-def test_a_subscription_that_the_hub_refuses_is_reported_and_may_begin_again() -> None:
-    client = Client()
-    handle = client.subscribe(id="i")
-    handle.failed(PeerRefused("the core", "not allowed", "ask for the role operator"))
+def test_a_subscription_that_the_hub_refuses_is_reported_and_may_begin_again(client: Client) -> None:
+    asked = client.subscribe(id="i")
+    asked.failed(PeerRefused("the core", "not allowed", "ask for the role operator"))
     (status,) = client.received()
     assert status["id"] == "i"
     assert status["msg"] == "subscribe /t: the core refused: not allowed; ask for the role operator"
-    assert client.subscribe() is not handle
+    assert client.subscribe() is not asked
 
 
-def test_a_subscription_without_a_type_fails_where_the_topic_does_not_appear() -> None:
-    client = Client()
+def test_a_subscription_without_a_type_fails_where_the_topic_does_not_appear(client: Client) -> None:
     none, *others = (client.subscribe(topic, id="i") for topic in ("/none", "/soon", "/published"))
     client.graph.add_topic("/soon", STRING)
     client.hub.published["/published"] = STRING
     client.advance(limits.TYPE_WAIT - 0.01)
     assert client.received() == []
     client.advance(0.01)
-    assert none.closed
-    assert not any(each.closed for each in others)
+    assert [each.closed for each in (none, *others)] == [True, False, False]
     assert "its type is not known; give its 'type'" in client.error()
-
-
-def test_a_publisher_of_another_type_that_comes_later_is_reported() -> None:
-    client = Client()
-    client.subscribe(type="std_msgs/Int32").differs(STRING)
-    assert "/t has the type std_msgs/String, not std_msgs/Int32" in client.error()
 
 
 # --- publishing --------------------------------------------------------------------------------------------------
 
 
-def test_a_client_publishes() -> None:
-    client = Client()
+def test_a_client_publishes(client: Client) -> None:
     request = client.one("advertise", client.send("advertise", topic="t", type=STRING, latch=True, queue_size=5))
     assert (request.topic, request.type, request.latch) == ("/t", STRING, True)
     client.send("publish", topic="/t", msg={"data": "hello"})
-    assert request.published == [HELLO]
-    assert not client.received()
+    assert (request.published, client.received()) == ([HELLO], [])
+    (other,) = client.send("advertise", topic="/bytes", type="std_msgs/UInt8MultiArray")
+    message = {"layout": {"dim": [], "data_offset": 0}, "data": b"\x01\x02"}
+    client.send_raw(cbor2.dumps({"op": "publish", "topic": "/bytes", "msg": message}))
+    assert other.published[0].endswith(b"\x02\0\0\0\x01\x02")
 
 
-def test_a_message_without_all_fields_is_published_with_a_warning() -> None:
-    client = Client()
+def test_a_message_without_all_fields_is_published_with_a_warning(client: Client) -> None:
     client.send("set_level", level="warning")
     (publisher,) = client.send("advertise", topic="/t", type="geometry_msgs/Point")
     client.send("publish", id="p", topic="/t", msg={"x": 1})
@@ -186,29 +160,24 @@ def test_a_message_without_all_fields_is_published_with_a_warning() -> None:
 
 
 @pytest.mark.parametrize("value", ["NaN", "Infinity", "-Infinity"])
-def test_what_python_clients_write_for_not_a_number_is_taken(value: str) -> None:
-    client = Client()
+def test_what_python_clients_write_for_not_a_number_is_taken(client: Client, value: str) -> None:
     (publisher,) = client.send("advertise", topic="/t", type="std_msgs/Float64")
     client.send_raw(f'{{"op": "publish", "topic": "/t", "msg": {{"data": {value}}}}}')
     assert publisher.published[0][-2] & 0xF0 == 0xF0
 
 
-def test_a_publisher_ends_when_the_last_id_has_unadvertised_it() -> None:
-    client = Client()
-    publisher = client.one("advertise", client.send("advertise", id="a", topic="/t", type=STRING))
-    assert not client.send("advertise", id="b", topic="/t", type=STRING)
-    client.send("unadvertise", id="a", topic="/t")
-    assert not publisher.closed
-    client.send("unadvertise", id="b", topic="/t")
-    assert publisher.closed
-    publisher = client.one("advertise", client.send("advertise", id="c", topic="/t", type=STRING))
-    client.send("advertise", id="d", topic="/t", type=STRING)
-    client.send("unadvertise", topic="/t")
-    assert publisher.closed
+def test_a_publisher_ends_when_the_last_id_has_unadvertised_it(client: Client) -> None:
+    ways: tuple[tuple[dict[str, str], ...], ...] = ({"id": "a"}, {"id": "b"}), ({},)
+    for ends in ways:
+        publisher = client.one("advertise", client.send("advertise", id="a", topic="/t", type=STRING))
+        assert not client.send("advertise", id="b", topic="/t", type=STRING)
+        for end in ends:
+            assert not publisher.closed
+            client.send("unadvertise", topic="/t", **end)
+        assert publisher.closed
 
 
-def test_a_topic_of_the_graph_may_be_published_without_advertising() -> None:
-    client = Client()
+def test_a_topic_of_the_graph_may_be_published_without_advertising(client: Client) -> None:
     client.graph.add_topic("/t", STRING)
     publisher = client.one("advertise", client.send("publish", topic="/t", msg={"data": "hello"}))
     assert (publisher.type, publisher.published) == (STRING, [HELLO])
@@ -216,40 +185,29 @@ def test_a_topic_of_the_graph_may_be_published_without_advertising() -> None:
     assert "advertise it first" in client.error()
 
 
-def test_a_topic_has_one_type() -> None:
-    client = Client()
+def test_a_topic_has_one_type_for_publishers(client: Client) -> None:
     client.graph.add_topic("/t", STRING)
-    assert not client.send("advertise", topic="/t", type="std_msgs/Int8")
-    assert "has the type std_msgs/String" in client.error()
     client.send("advertise", topic="/mine", type=STRING)
-    assert not client.send("advertise", topic="/mine", type="std_msgs/Int8")
-    assert "is advertised as std_msgs/String" in client.error()
-    assert not client.send("advertise", topic="/x", type="no_such/Type")
-    assert "no_such/Type" in client.error()
+    for topic, kind, said in (
+        ("/t", "std_msgs/Int8", "has the type std_msgs/String"),
+        ("/mine", "std_msgs/Int8", "is advertised as std_msgs/String"),
+        ("/x", "no_such/Type", "no_such/Type"),
+    ):
+        assert not client.send("advertise", topic=topic, type=kind)
+        assert said in client.error()
 
 
-def test_binary_frames_are_ops_in_cbor() -> None:
-    client = Client()
-    (publisher,) = client.send("advertise", topic="/t", type="std_msgs/UInt8MultiArray")
-    message = {"layout": {"dim": [], "data_offset": 0}, "data": b"\x01\x02"}
-    client.send_raw(cbor2.dumps({"op": "publish", "topic": "/t", "msg": message}))
-    assert publisher.published[0].endswith(b"\x02\0\0\0\x01\x02")
+# --- fragments and status ----------------------------------------------------------------------------------------
 
 
-# --- fragments, status, authentication ---------------------------------------------------------------------------
-
-
-def test_ops_in_fragments_and_pictures_are_done() -> None:
-    client = Client()
+def test_ops_in_fragments_and_pictures_are_done(client: Client) -> None:
     text = json.dumps({"op": "advertise", "topic": "/t", "type": STRING})
     assert not client.send("fragment", id=1, data=text[20:], num=1, total=2)
     assert client.send("fragment", id=1, data=text[:20], num=0, total=2)
-    other = Client()
-    handle = other.subscribe("/p", compression="png")
-    other.publish(handle, STRING, {"data": "hello"})
-    (op,) = other.received()
     # The picture holds the op publish, of a topic that is known nowhere.
-    client.send("png", **{key: op[key] for key in ("data",)})
+    client.publish(client.subscribe("/p", compression="png"))
+    (op,) = client.received()
+    client.send("png", data=op["data"])
     assert "publish /p" in client.error()
     half = len(op["data"]) // 2
     client.send("png", id="x", num=0, total=2, data=op["data"][:half])
@@ -257,8 +215,7 @@ def test_ops_in_fragments_and_pictures_are_done() -> None:
     assert "publish /p" in client.error()
 
 
-def test_fragments_within_fragments_end() -> None:
-    client = Client()
+def test_fragments_within_fragments_end(client: Client) -> None:
     text = json.dumps({"op": "set_level", "level": "info"})
     for _ in range(3):
         text = json.dumps({"op": "fragment", "id": "i", "num": 0, "total": 1, "data": text})
@@ -266,8 +223,7 @@ def test_fragments_within_fragments_end() -> None:
     assert "once only" in client.error()
 
 
-def test_an_incomplete_message_is_dropped_with_a_warning() -> None:
-    client = Client()
+def test_an_incomplete_message_is_dropped_with_a_warning(client: Client) -> None:
     client.send("set_level", level="warning")
     client.send("fragment", id="i", data="{", num=0, total=2)
     client.advance(limits.FRAGMENT_TIMEOUT)
@@ -275,9 +231,8 @@ def test_an_incomplete_message_is_dropped_with_a_warning() -> None:
     assert (status["level"], status["id"]) == ("warning", "i")
 
 
-def test_levels_of_status_messages() -> None:
-    client = Client()
-    for level, count in (("none", 0), ("error", 1), ("warning", 2), ("info", 3)):
+def test_levels_of_status_messages(client: Client) -> None:
+    for count, level in enumerate(("none", "error", "warning", "info")):
         client.send("set_level", level=level)
         client.received()
         client.send("advertise", topic="/t", type=STRING)
@@ -334,21 +289,17 @@ def test_levels_of_status_messages() -> None:
         ("x" * (limits.FRAME_MAX + 1), "exceeds the limit"),
     ],
 )  # fmt: skip
-def test_what_is_malformed_is_answered_by_an_error(data: str | bytes, says: str) -> None:
-    client = Client()
+def test_what_is_malformed_is_answered_by_an_error(client: Client, data: str | bytes, says: str) -> None:
     assert not client.send_raw(data)
     assert says in client.error()
 
 
-def test_the_error_has_the_id_of_the_op() -> None:
-    client = Client()
+def test_the_error_has_the_id_of_the_op(client: Client) -> None:
     client.send("subscribe", id="mine", topic=7)
-    (status,) = client.received()
-    assert status["id"] == "mine"
+    assert [status["id"] for status in client.received()] == ["mine"]
 
 
-def test_what_a_client_may_have_is_bounded() -> None:
-    client = Client()
+def test_what_a_client_may_have_is_bounded(client: Client) -> None:
     for number in range(limits.SUBSCRIPTIONS_MAX + 5):
         client.send("subscribe", topic=f"/t{number}")
     assert len(client.received()) == 5
