@@ -460,13 +460,29 @@ async def test_the_heading_of_another_page_has_the_focus_and_a_dialog_gives_it_b
         assert await page.run("document.activeElement.ariaLabel") == "Search (/)", ends
 
 
-async def test_a_page_that_is_opened_in_the_background_is_whole(site: Site) -> None:
-    await site.page.send(
-        "Page.addScriptToEvaluateOnNewDocument",
-        source="Object.defineProperty(document, 'hidden', {get: () => true})",
-    )
+@pytest.mark.parametrize(
+    "source",
+    [
+        "Object.defineProperty(document, 'hidden', {get: () => true})",
+        "window.requestAnimationFrame = () => 0",  # it was hidden when it had asked for a frame
+    ],
+)
+async def test_a_page_that_is_opened_in_the_background_is_whole(site: Site, source: str) -> None:
+    await site.page.send("Page.addScriptToEvaluateOnNewDocument", source=source)
     page = await site.open("topic/%2Fodom")
     await page.wait_text("No rule of [[contract]] matches it")
+
+
+async def test_a_page_says_that_its_connection_is_not_answered_and_is_there_when_it_is(site: Site) -> None:
+    site.server.hears.clear()
+    clock = "window.later = 0; const now = Date.now; Date.now = () => now() + window.later"
+    await site.page.send("Page.addScriptToEvaluateOnNewDocument", source=clock)
+    await site.page.goto(f"http://127.0.0.1:{site.port}/")
+    await site.page.wait_text("Connecting")
+    await site.page.run("window.later = 8000")
+    await site.page.wait_text("No connection to rmpa web")
+    site.server.hears.set()
+    await site.page.wait("document.querySelector('h1') && !document.querySelector('.banner')")
 
 
 async def test_long_lists_are_drawn_in_parts(site: Site) -> None:

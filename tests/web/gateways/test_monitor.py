@@ -6,6 +6,7 @@ import asyncio
 import dataclasses
 import json
 import struct
+import threading
 import time
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
@@ -51,8 +52,11 @@ class Agent:
         agent = msgspec.structs.replace(SNAPSHOT.agent, core_uri=core_uri)
         self.snapshot = msgspec.structs.replace(SNAPSHOT, agent=agent)
         self.answers = True
+        self.released = threading.Event()
+        self.released.set()
 
     def read(self) -> Snapshot:
+        assert self.released.wait(DEADLINE)
         if not self.answers:
             raise UnreachableError("agent", "its socket", "start one with `rmpa up`")
         return self.snapshot
@@ -119,8 +123,8 @@ class Page:
 
 
 @asynccontextmanager
-async def page_of(core: RosCore, rights: Rights = FULL) -> AsyncIterator[Page]:
-    agent = Agent(core.uri)
+async def page_of(core: RosCore, rights: Rights = FULL, agent: Agent | None = None) -> AsyncIterator[Page]:
+    agent = agent or Agent(core.uri)
     watch = AgentWatch(agent.read)
     try:
         async with (
@@ -178,6 +182,16 @@ async def test_a_page_is_told_when_the_agent_is_silent_and_when_it_is_back(page:
     assert page.state["modules"]
     page.agent.answers = True
     await page.sees(lambda: page.state["reach"]["ok"])
+
+
+async def test_a_page_is_greeted_although_the_agent_hangs(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "SETTLE", 0.05)
+    agent = Agent(core.uri)
+    agent.released.clear()
+    async with page_of(core, agent=agent) as page:
+        assert (await page.next("hello"))["agent"] == ""
+        agent.released.set()
+        await page.sees(lambda: page.state.get("reach", {}).get("ok"))
 
 
 async def test_live_values_and_plots_of_a_topic_and_its_details(page: Page, talker: Node) -> None:

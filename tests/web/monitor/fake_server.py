@@ -190,6 +190,8 @@ class FakeServer:
     def __init__(self, scene: str = "demo") -> None:
         self.agent = FakeAgent(scene)
         self.rights = dataclasses.replace(FULL, drive=True)
+        self.hears = asyncio.Event()
+        self.hears.set()
         self.speeds: list[SimpleNamespace] = []
         self.reports: list[str] = []
         self.asked: list[SimpleNamespace] = []
@@ -249,6 +251,7 @@ class FakeServer:
 
     async def _socket(self, request: web.Request) -> web.WebSocketResponse:
         socket = web.WebSocketResponse(protocols=(SUBPROTOCOL,), max_msg_size=2**20)
+        await self.hears.wait()
         await socket.prepare(request)
         client = _Client(self, socket)
         beat = asyncio.ensure_future(client.run())

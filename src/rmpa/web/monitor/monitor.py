@@ -6,6 +6,7 @@ The server's side of the monitor: what all pages share.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import time
@@ -77,8 +78,10 @@ class MeshFeed:
         self._task = asyncio.get_running_loop().create_task(self._run(), name="monitor's state")
 
     async def first(self) -> None:
-        """Ask the agent once, so that a page is told its name."""
-        self._take(await self._watch.reading())
+        """Ask the agent once, for ``limits.SETTLE`` at most, so that a page is told its name."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(limits.SETTLE):
+                self._take(await self._watch.reading())
 
     def follow(self, page: object, show: Callable[[Tree], None]) -> None:
         """Give a page each new state, beginning with the last one."""

@@ -75,19 +75,21 @@ class App extends Component {
     scrollTo(0, 0);
   }
 
-  // Many messages, one drawing: in the next frame, or soon in a hidden tab, which has none.
+  // Many messages, one drawing: in the next frame, or soon where none comes, as in a tab that is or becomes hidden.
   draw(done) {
     if (done) this.drawn.push(done);
     if (this.waits) return;
     this.waits = true;
     const now = () => {
+      cancelAnimationFrame(frame);
+      clearTimeout(timer);
       this.waits = false;
       this.setState({}, () => {
         for (const each of this.drawn.splice(0)) each();
       });
     };
-    if (document.hidden) setTimeout(now, 200);
-    else requestAnimationFrame(now);
+    const frame = requestAnimationFrame(now);
+    const timer = setTimeout(now, 200);
   }
 
   look() {

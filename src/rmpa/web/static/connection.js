@@ -6,7 +6,8 @@ const FIRST_WAIT = 300; // milliseconds until the next attempt, doubled up to LA
 const LAST_WAIT = 5000;
 const ANSWER_WAIT = 30000;
 const TICKS = 10; // of which the fastest counts: over 20 s two clocks do not drift apart
-const SILENT = 7000; // milliseconds without a word after which the connection is lost; a tick comes every 2 s
+// Milliseconds without a word after which the connection is lost, or the attempt given up; a tick comes every 2 s.
+const SILENT = 7000;
 
 export class Connection {
   constructor(changed) {
@@ -24,9 +25,8 @@ export class Connection {
     this.wait = FIRST_WAIT;
     this.frames = { patches: 0, bytes: 0 };
     this.ticks = []; // how far this page's clock was ahead of the server's at each of the last ticks, in seconds
-    this.heard = 0;
     this.open();
-    setInterval(() => this.phase === "open" && Date.now() - this.heard > SILENT && this.drop(), 1000);
+    setInterval(() => this.socket && Date.now() - this.heard > SILENT && this.drop(), 1000);
     addEventListener("online", () => this.retry());
     document.addEventListener("visibilitychange", () => document.hidden || this.retry());
   }
@@ -48,6 +48,7 @@ export class Connection {
     url.hash = "";
     if (this.socket) this.socket.close(); // one that is still connecting: its events are ignored from here on
     const socket = (this.socket = new WebSocket(url, "rmpa.monitor.v1"));
+    this.heard = Date.now();
     let opened = false;
     socket.binaryType = "arraybuffer";
     socket.onmessage = (event) => socket === this.socket && this.receive(event.data);
@@ -67,6 +68,7 @@ export class Connection {
   }
 
   closed(event, opened) {
+    this.socket = null;
     if (this.phase !== "lost") this.lostAt = Date.now();
     this.phase = "lost";
     this.reason = event.reason;
@@ -82,11 +84,9 @@ export class Connection {
     this.changed();
   }
 
-  // Nothing comes any more, as after the Wi-Fi has gone: the browser itself would notice much later.
+  // Nothing comes, as where the Wi-Fi has gone: the browser itself would notice much later.
   drop() {
-    const socket = this.socket;
-    this.socket = null;
-    socket.close();
+    this.socket.close();
     this.closed({ reason: "it has said nothing for some seconds" }, true);
   }
 

@@ -130,7 +130,7 @@ function Call({ connection, service, about }) {
   return html`<div class="grid">
     <div>
       <h3>${about.type}</h3>
-      <pre class="tree">${about.text}</pre>
+      <pre class="tree" tabindex="0">${about.text}</pre>
     </div>
     <form class="form" onSubmit=${call}>
       <label
@@ -149,7 +149,7 @@ function Call({ connection, service, about }) {
       <div aria-live="polite">
         <${Failure} failure=${state.failure} />${state.answer &&
         html`<p class="muted">Response after ${seconds(state.answer.seconds)}</p>
-          <pre class="tree">${JSON.stringify(state.answer.response, null, 2)}</pre>`}
+          <pre class="tree" tabindex="0">${JSON.stringify(state.answer.response, null, 2)}</pre>`}
       </div>
     </form>
   </div>`;
