@@ -46,8 +46,10 @@ async def listen(node: Node, topic: str) -> list[bytes]:
 
 
 @contextlib.asynccontextmanager
-async def running_hub(core: RosCore, rules: NodeRules = EVERYTHING) -> AsyncIterator[Hub]:
-    """A hub that has its node, and has read the graph and the parameters."""
+async def running_hub(
+    core: RosCore, rules: NodeRules = EVERYTHING, *, until_known: bool = True
+) -> AsyncIterator[Hub]:
+    """A hub; it has its node, and has read the graph and the parameters, unless ``until_known`` is false."""
 
     async def where() -> str:
         return core.uri
@@ -58,7 +60,8 @@ async def running_hub(core: RosCore, rules: NodeRules = EVERYTHING) -> AsyncIter
         rules=rules,
     ) as hub:
         hub.start()
-        await until(lambda: hub.graph.loaded.is_set() and hub.params.loaded.is_set())
+        if until_known:
+            await until(lambda: hub.graph.loaded.is_set() and hub.params.loaded.is_set())
         yield hub
 
 

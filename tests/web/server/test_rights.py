@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
-from contextlib import asynccontextmanager, nullcontext
+from contextlib import asynccontextmanager, closing, nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import aiohttp
 import msgspec
@@ -18,12 +18,10 @@ from rmpa.config.settings import Settings, TrustSettings, WebSettings
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.resource import Resource
 from rmpa.resource.descriptor import describe
-from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.master.parameters import Parameters
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
 from rmpa.trust.permissions import InviteReply
-from rmpa.web.hub.hub import Hub
 from rmpa.web.hub.node_link import EVERYTHING, FULL, READ_ONLY, NodeRules, Rights
 from rmpa.web.monitor import questions
 from rmpa.web.monitor.monitor import LogFeed
@@ -32,13 +30,16 @@ from rmpa.web.monitor.resources import MessageValues, ResourceWatch
 from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup
 from tests.ros.node.peers import DEADLINE, until
 from tests.web import snapshots
-from tests.web.hub.client import FakeClient, local_core, node, running_hub
+from tests.web.hub.client import FakeClient, running_hub
 from tests.web.server.test_gateways import running
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from rmpa.observe.snapshot import Snapshot
+    from rmpa.ros.core.embedded import RosCore
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+    from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import ParamValue
 
 RULES = (
@@ -67,13 +68,15 @@ TEXT = MessageType("std_msgs/String")
 TREE: dict[str, ParamValue] = {"speed": {"max": 1.5}, "motors": {"pid": {"p": 3}}, "name": "base"}
 
 
+PARAMETERS = Parameters()
+PARAMETERS.set("/", cast("XmlRpcValue", TREE))
+
+
 def value_of(name: str) -> ParamValue:
-    value: ParamValue = TREE
-    for part in filter(None, name.split("/")):
-        if not isinstance(value, dict) or part not in value:
-            return None
-        value = value[part]
-    return value
+    try:
+        return cast("ParamValue", PARAMETERS.get(name))
+    except KeyError:
+        return None
 
 
 @pytest.mark.parametrize(
@@ -199,77 +202,73 @@ async def test_a_client_hears_the_rule_of_what_it_may_not() -> None:
         assert "web may not call /motors/enable" in called["values"]
 
 
-async def test_rosapi_shows_no_parameter_that_is_denied() -> None:
-    async with connected() as (boss, core), node(core, "setter") as setter:
-        await setter.set_param("/motors/pid", 3)
-        await setter.set_param("/name", "base")
+async def test_rosapi_shows_no_parameter_that_is_denied_and_changes_none() -> None:
+    async with connected() as (boss, core):
+        for name, value in (("/motors/pid", 3), ("/name", "base")):
+            core.call("setParam", "/setter", name, value)
 
-        async def names() -> list[str]:
-            found = await asked(boss, op="call_service", service="/rosapi/get_param_names", args={})
-            listed: list[str] = found["values"]["names"]
-            return listed
+        async def ask(service: str, **args: str) -> Any:
+            answer = await asked(boss, op="call_service", service=f"/rosapi/{service}", args=args)
+            return answer["values"]
 
         async with asyncio.timeout(DEADLINE):
-            while "/name" not in await names():
+            while "/name" not in (names := (await ask("get_param_names"))["names"]):
                 pass
-        assert "/motors/pid" not in await names()
-        await boss.send_json(
-            {"op": "call_service", "service": "/rosapi/set_param", "args": {"name": "/motors/pid", "value": "9"}}
-        )
-        async with asyncio.timeout(DEADLINE):
-            answer = (await boss.receive()).data
-        assert "web may not param /motors/pid" in answer
-        assert await setter.get_param("/motors/pid") == 3
+        assert "/motors/pid" not in names
+        assert "web may not param /motors/pid" in await ask("set_param", name="/motors/pid", value="9")
+        assert core.call("getParam", "/setter", "/motors/pid").value == 3
 
 
-async def test_a_page_of_the_monitor_gets_no_denied_parameter_and_changes_none() -> None:
-    async with local_core() as core, running_hub(core, RULED) as hub, node(core, "setter") as setter:
-        await setter.set_param("/motors/pid", 3)
-        await setter.set_param("/name", "base")
-        await setter.advertise_service("/motors/enable", "std_srvs/Empty", lambda _: {})
-        await until(lambda: hub.params.value("/name") and hub.params.value("/motors/pid"))
-        await until(lambda: "/motors/enable" in hub.graph.services)
-        answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
+@pytest.fixture
+async def ruled(core: RosCore, request: pytest.FixtureRequest) -> AsyncIterator[Hub]:
+    """A hub whose node has the rules of the test's parameter."""
+    async with running_hub(core, request.param) as hub:
+        yield hub
 
-        async def ask(what: str, **args: object) -> Any:
-            return await answers.answer(what, args)
 
-        shown = await ask("params")
+def answers_of(hub: Hub) -> Answers:
+    return Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
+
+
+@pytest.mark.parametrize("ruled", [RULED], indirect=True)
+async def test_a_page_of_the_monitor_gets_no_denied_parameter_and_changes_none(ruled: Hub, talker: Node) -> None:
+    await talker.set_param("/motors/pid", 3)
+    await talker.set_param("/name", "base")
+    await talker.advertise_service("/motors/enable", "std_srvs/Empty", lambda _: {})
+    await until(lambda: ruled.params.value("/name") and ruled.params.value("/motors/pid"))
+    await until(lambda: "/motors/enable" in ruled.graph.services)
+    with closing(answers_of(ruled)) as answers:
+        shown = await answers.answer("params", {})
         assert shown["values"]["name"] == "base"
         assert "motors" not in shown["values"]
-        assert await ask("params", has=shown["digest"]) == {"digest": shown["digest"]}
-        assert "/motors/pid" not in (await ask("param_names"))["names"]
+        assert "/motors/pid" not in (await answers.answer("param_names", {}))["names"]
         for what, args in (
             ("set_param", {"name": "/motors/pid", "value": 4}),
             ("delete_param", {"name": "/motors"}),
             ("call", {"service": "/motors/enable"}),
         ):
             with pytest.raises(PeerRefused, match="web may not"):
-                await ask(what, **args)
-        assert await setter.get_param("/motors/pid") == 3
-        answers.close()
+                await answers.answer(what, args)
+    assert await talker.get_param("/motors/pid") == 3
 
 
-async def test_a_page_sees_nothing_of_topics_that_are_denied() -> None:
-    rules = denying(subscribe=("/rosout_agg", "/arm/**"))
-    async with local_core() as core, running_hub(core, rules) as hub, node(core) as talker:
-        values = MessageValues(hub)
-        resources, log = ResourceWatch(hub, values), LogFeed(hub, values)
+@pytest.mark.parametrize("ruled", [denying(subscribe=("/rosout_agg", "/arm/**"))], indirect=True)
+async def test_a_page_sees_nothing_of_topics_that_are_denied(ruled: Hub, talker: Node) -> None:
+    values = MessageValues(ruled)
+    with closing(ResourceWatch(ruled, values)) as resources, closing(LogFeed(ruled, values)) as log:
         resources.start()
         log.start()
         for name in ("arm", "base"):
             publisher = await talker.advertise(f"/{name}/descriptor", TEXT, latch=True)
             descriptor = msgspec.json.encode(describe(Resource(name, role="acting"), talker.name)).decode()
-            publisher.publish_raw(TEXT.serialize(TEXT.make({"data": descriptor})))
+            publisher.publish(TEXT.make({"data": descriptor}))
         await until(lambda: "/base" in resources.facts)
         assert "/arm" not in resources.facts
         assert "/rosout_agg" in str(log.refused)
-        resources.close()
-        log.close()
 
 
 async def test_a_change_is_judged_by_the_cores_parameters_that_are_still_being_read(
-    monkeypatch: pytest.MonkeyPatch,
+    core: RosCore, talker: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read, reading, go_on = Node.follow_param, asyncio.Event(), asyncio.Event()
 
@@ -278,19 +277,11 @@ async def test_a_change_is_judged_by_the_cores_parameters_that_are_still_being_r
         await go_on.wait()
         return await read(self, key)
 
-    async def where() -> str:
-        return core.uri
-
-    def made(uri: str, updated: Any) -> Node:
-        return Node("rmpa_web", master_uri=uri, environment=RosEnvironment(), on_param_update=updated)
-
     monkeypatch.setattr(Node, "follow_param", slow)
-    async with local_core() as core, node(core, "setter") as setter, Hub(where, made, rules=CAREFUL) as hub:
-        await setter.set_param("/motors/limit", 3)
-        hub.start()
+    await talker.set_param("/motors/limit", 3)
+    async with running_hub(core, CAREFUL, until_known=False) as hub:
         await until(reading.is_set)
-        boss = FakeClient(hub)
-        answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
+        boss, answers = FakeClient(hub), answers_of(hub)
         page = asyncio.ensure_future(answers.answer("delete_param", {"name": "/motors"}))
         for work in (boss.set_param("/motors", 5), boss.delete_param("/motors"), boss.set_param("/speed", 1)):
             boss.start(work)
@@ -300,38 +291,20 @@ async def test_a_change_is_judged_by_the_cores_parameters_that_are_still_being_r
         with pytest.raises(PeerRefused, match="web may not param /motors/limit"):
             await page
         await until(lambda: boss.results == [None])
-        assert await setter.get_param("/motors") == {"limit": 3}
-        boss.close()
+        assert await talker.get_param("/motors") == {"limit": 3}
         answers.close()
 
 
-class Peer:
-    """The parameters of a peer, in the place of ``PeerParams``."""
-
-    def __init__(self) -> None:
-        self.tree = Parameters()
-        self.tree.set("/", {"motors": {"limit": 3}, "speed": {"max": 1.5}})
-
-    def names(self) -> list[str]:
-        return [*self.tree.names()]
-
-    def get(self, key: str) -> Any:
-        return self.tree.get(key)
-
-    def set(self, key: str, value: Any) -> None:
-        self.tree.set(key, value)
-
-    def delete(self, key: str) -> None:
-        self.tree.delete(key)
-
-
-async def test_a_peers_parameters_are_judged_by_what_the_peer_has(monkeypatch: pytest.MonkeyPatch) -> None:
-    peer = Peer()
+@pytest.mark.parametrize("ruled", [CAREFUL], indirect=True)
+async def test_a_peers_parameters_are_judged_by_what_the_peer_has(
+    ruled: Hub, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    peer = Parameters()
+    peer.set("/", {"motors": {"limit": 3}, "speed": {"max": 1.5}})
     monkeypatch.setattr(questions, "PeerParams", lambda _client, _peer: peer)
     monkeypatch.setattr(questions, "choose_agent", lambda *_: SimpleNamespace(path=""))
     monkeypatch.setattr(questions, "ControlClient", lambda *_: nullcontext())
-    async with local_core() as core, running_hub(core, CAREFUL) as hub:
-        answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
+    with closing(answers_of(ruled)) as answers:
 
         async def ask(what: str, **args: object) -> Any:
             return await answers.answer(what, {"peer": "arm", **args})
@@ -348,8 +321,7 @@ async def test_a_peers_parameters_are_judged_by_what_the_peer_has(monkeypatch: p
         await ask("set_param", name="/speed/max", value=2)
         assert peer.get("/speed/max") == 2.0
         await ask("delete_param", name="/speed")
-        assert peer.names() == ["/motors/limit"]
-        answers.close()
+        assert [*peer.names()] == ["/motors/limit"]
 
 
 class Authority:
@@ -369,21 +341,21 @@ class Authority:
         return InviteReply(token=f"rmpa1-{len(self.asked)}", id=f"id{len(self.asked)}", expires=9)
 
 
+@pytest.mark.parametrize("ruled", [RULED], indirect=True)
 async def test_a_page_invites_pending_modules_alone_and_tells_no_log_the_token(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ruled: Hub, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("DEBUG")
     authority = Authority()
     monkeypatch.setattr(questions, "choose_agent", lambda *_: SimpleNamespace(path=""))
     monkeypatch.setattr(questions, "ControlClient", lambda *_: nullcontext(authority))
-    async with local_core() as core, running_hub(core, RULED) as hub:
-        answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
+    with closing(answers_of(ruled)) as answers:
         for name in ("pc", "base", "*", ""):
             with pytest.raises(RmpaError, match="is pending"):
                 await answers.answer("invite", {"name": name})
-        assert await answers.answer("invite", {"name": "arm"}) == {"line": "rmpa trust join rmpa1-1", "until": 9}
-        assert await answers.answer("invite", {"name": "arm"}) == {"line": "rmpa trust join rmpa1-2", "until": 9}
-        assert authority.asked == [{"what": "invite", "name": "arm"}] * 2  # the authority replaces the open token
-        answers.close()
+        for number in (1, 2):
+            told = await answers.answer("invite", {"name": "arm"})
+            assert told == {"line": f"rmpa trust join rmpa1-{number}", "until": 9}
+    assert authority.asked == [{"what": "invite", "name": "arm"}] * 2  # the authority replaces the open token
     assert questions.QUESTIONS["invite"][0] == "control"
     assert "rmpa1-" not in caplog.text
