@@ -168,11 +168,16 @@ class Connection:
     def push(self, *frames: OutFrame) -> None:
         self.sent += frames
 
-    def push_frames(self, _: ClientStream, frames: list[OutFrame]) -> None:
-        self.sent += frames
+    def pace(self, stream: ClientStream, interval: float, length: int) -> None:
+        self.queue.pace(stream, interval, length)
 
     def push_message(self, stream: ClientStream, message: ReceivedMessage) -> None:
-        self.sent += stream.frames(message, self._client.now)
+        self.queue.push(stream, lambda now: stream.frames(message, now), 1, 0, self._client.now)
+        self.flush()
+
+    def flush(self) -> None:
+        while (entry := self.queue.pop(self._client.now)) is not None:
+            self.sent += entry(self._client.now)
 
     def end(self, code: int, _reason: str, _refusal: str = "") -> None:
         self.ended.append(code)
@@ -226,9 +231,15 @@ class Recorded:
     def advance(self, seconds: float) -> None:
         """Let time pass; timers are handled at their time."""
         end = self.now + seconds
-        while (at := self.session.next_timer()) is not None and at <= end:
-            self.now = max(self.now, at)
+        while True:
+            due = [
+                at for at in (self.session.next_timer(), self.connection.queue.due) if at is not None and at <= end
+            ]
+            if not due:
+                break
+            self.now = max(self.now, min(due))
             self.session.handle_timer(self.now)
+            self.connection.flush()
         self.now = end
 
     def frames(self) -> list[OutFrame]:
@@ -238,8 +249,10 @@ class Recorded:
 
 
 # What a session asks of its hub; where the client may not, the refusal names it so.
-_ASKED = ("subscribe", "advertise", "serve", "call", "find_service", "get_params", "set_param", "delete_param")
-_ASKED += ("follow_params", "fetch_asset")
+_ASKED = (
+    *("subscribe", "advertise", "serve", "call", "find_service", "fetch_asset"),
+    *("get_params", "set_param", "delete_param", "follow_params"),
+)
 _RIGHTS = {"advertise": "publish", "serve": "offer services"}
 
 
@@ -293,7 +306,7 @@ def drive(work: Any, done: Callable[[Any], None], failed: Callable[[RmpaError], 
 
 def answer(asked: Asked, data: bytes) -> None:
     """Let the hub do something with what it was asked, as it may with any client."""
-    results = {"call": data, "fetch_asset": data, "find_service": "std_srvs/Empty"}
+    results: dict[str, Any] = {"call": data, "fetch_asset": data, "find_service": "std_srvs/Empty"}
     results |= {"set_param": None, "delete_param": None, "get_params": {"/a": 1.0, "/b": data}}
     if asked.what == "subscribe":
         asked.message(data)

@@ -441,13 +441,6 @@ SUBSCRIBERS_MAX: Final = 100
 # [Rosbridge] `queue_length`
 # At it: a larger one is lowered
 QUEUE_MESSAGES_MAX: Final = 1000
-# [Rosbridge] Bytes in the queue of a throttled topic
-# At it: the oldest messages are dropped
-# Why: One message always fits.
-QUEUE_BYTES_MAX: Final = 4 * MIB
-# [Rosbridge] Bytes in all of these queues
-# At it: the newest message is dropped
-QUEUES_BYTES_MAX: Final = 16 * MIB
 # [Rosbridge] Advertised topics
 # At it: further ones are refused
 # Told in: status

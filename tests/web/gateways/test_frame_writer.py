@@ -291,6 +291,44 @@ def test_what_an_ended_subscription_had_is_not_sent() -> None:
     assert queue.pop() is None
 
 
+def _paced(interval: float, length: int, *times: float) -> FairQueue[float]:
+    """A queue with entries that came at these times, and were taken as soon as they may be."""
+    queue: FairQueue[float] = FairQueue(total_bytes=100)
+    queue.pace(1, interval, length)
+    for time in times:
+        queue.push(1, time, 1, now=time)
+        if queue.due is None or queue.due <= time:
+            queue.pop(time)
+    return queue
+
+
+@pytest.mark.parametrize(
+    ("interval", "length", "times", "later"),
+    [
+        (0.0, 0, (0.0, 0.1, 0.2), []),  # without an interval all go at once
+        (1.0, 0, (0.0, 0.1, 0.9), []),  # without a queue what comes meanwhile is left out
+        (1.0, 2, (0.0, 0.1, 0.2, 0.3), [(1.0, 0.2), (2.0, 0.3)]),  # a full queue leaves its oldest out
+    ],
+)
+def test_a_subscription_has_its_messages_at_its_pace(
+    interval: float, length: int, times: tuple[float, ...], later: list[tuple[float, float]]
+) -> None:
+    queue = _paced(interval, length, *times)
+    for due, entry in later:
+        assert (queue.due, queue.pop(due - 0.01), queue.pop(due)) == (due, None, entry)
+    assert (queue.due, queue.bytes, queue.dropped_total) == (None, 0, 0)
+
+
+def test_another_pace_takes_effect_at_once_and_holds_up_no_other_subscription() -> None:
+    queue = _paced(10.0, 3, 0.0, 0.0, 0.1, 0.2)
+    queue.push(2, 7.0, 1, now=0.3)
+    assert (queue.pop(0.3), queue.pop(0.3)) == (7.0, None)
+    queue.pace(1, 1.0, 2)
+    assert (queue.due, queue.waiting) == (1.0, {1: 2})
+    queue.pace(1, 0.0, 2)
+    assert (queue.due, queue.pop(0.4), queue.pop(0.4)) == (None, 0.1, 0.2)
+
+
 @given(
     st.lists(
         st.one_of(

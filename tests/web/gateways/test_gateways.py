@@ -58,10 +58,12 @@ async def test_rosbridge_publishes_subscribes_and_calls(core: RosCore, talker: N
         await client.send("publish", topic="/out", msg={"data": "one"})
         await until(lambda: heard == [ONE])
         publisher = await talker.advertise("/in", STRING)
-        await client.send("subscribe", topic="/in", type="std_msgs/String")
+        await client.send("subscribe", topic="/in", type="std_msgs/String", throttle_rate=20, queue_length=5)
         await publisher.wait_for_subscriber()
-        publisher.publish_raw(TWO)
-        assert (await client.next("publish"))["msg"] == {"data": "two"}
+        for payload in (ONE, TWO):
+            publisher.publish_raw(payload)
+        for text in ("one", "two"):
+            assert (await client.next("publish"))["msg"] == {"data": text}
         await client.send("call_service", service="/set", id="7", args={"data": True})
         answer = await client.next("service_response")
         assert (answer["id"], answer["values"]) == ("7", {"success": True, "message": "done"})

@@ -300,8 +300,8 @@ async def test_a_setting_is_checked_and_the_page_is_told_what_the_resource_made_
     await page.sees(lambda: page.state.get("resources", {}).get("/motor"))
     for value, told in ((0.5, "speed is 0.5"), (5, "speed is 1.0: 5 is beyond its bounds")):
         assert (await page.ask("configure", resource="/motor", name="speed", value=value))["text"] == told
-    for value in (None, "0,4", True):
-        refused = await page.ask("configure", resource="/motor", name="speed", value=value)
+    for wrong in (None, "0,4", True):
+        refused = await page.ask("configure", resource="/motor", name="speed", value=wrong)
         assert "no value of the type double" in refused
     assert sent == [0.5, 5.0]
 

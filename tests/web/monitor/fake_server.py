@@ -131,7 +131,7 @@ class FakeAgent:
 
     def alarms(self) -> list[Tree]:
         """The alarms that stand."""
-        about = {"at": round(self._started + 40, 1)}
+        about: Tree = {"at": round(self._started + 40, 1)}
         return [
             {"id": one.key, "module": str(one.peer), "resource": one.key, "level": one.level, **about}
             | {"text": str((one.health or {})["message"])}
@@ -143,7 +143,7 @@ class FakeAgent:
         linked = {peer.name: peer for peer in base.peers}
         some, link = linked["base"], linked["velocity"].link
         assert link is not None
-        lost = {
+        lost: dict[str, dict[str, Any]] = {
             "arm": {"state": "linking", "beacon_ago": 2.0, "last_error": "10.0.0.7:40001: timed out"},
             "camera": {"state": "refused", "last_error": "is of version 0.0.9, this one of 0.1.0"},
             "gripper": {"state": "linking", "beacon_ago": 60.0, "last_error": "No route to host"},

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from rmpa.core.errors import LimitExceeded
 from rmpa.web import limits
 from rmpa.web.gateways.frame_writer import Opcode
-from rmpa.web.hub.topics import ReceivedMessage
-from rmpa.web.rosbridge.protocol import Assembler, OpError, QueuedBytes, Throttle, split
+from rmpa.web.rosbridge.protocol import Assembler, OpError, split
 
 if TYPE_CHECKING:
     import random
@@ -108,78 +107,3 @@ def test_a_message_whose_next_fragment_is_overdue_is_dropped() -> None:
     assert not list(assembler.expire(9 + limits.FRAGMENT_TIMEOUT))
     assert list(assembler.expire(10 + limits.FRAGMENT_TIMEOUT)) == ["a"]
     assert assembler.add("fragment", "a", 2, 3, "z", 80) is None
-
-
-# --- throttle_rate and queue_length ---
-
-
-def _message(number: int, size: int = 1) -> ReceivedMessage:
-    return ReceivedMessage("/t", "t/T", memoryview(bytes(size)), number)
-
-
-def _numbers(messages: list[ReceivedMessage]) -> list[int]:
-    return [each.stamp_ns for each in messages]
-
-
-def _throttle(interval: float, length: int) -> Throttle:
-    throttle = Throttle(QueuedBytes())
-    throttle.configure(interval, length)
-    return throttle
-
-
-def test_without_an_interval_all_are_sent_at_once() -> None:
-    throttle = _throttle(0, 0)
-    assert [n for number in range(5) for n in _numbers(throttle.offer(_message(number), 0))] == [0, 1, 2, 3, 4]
-
-
-def test_without_a_queue_messages_within_the_interval_are_dropped() -> None:
-    throttle = _throttle(1.0, 0)
-    sent = [n for number in range(30) for n in _numbers(throttle.offer(_message(number), number / 10))]
-    assert sent == [0, 10, 20]
-    assert throttle.next_timer() is None
-
-
-def test_a_full_queue_drops_its_oldest_and_sends_one_in_each_interval() -> None:
-    throttle = _throttle(1.0, 2)
-    assert _numbers(throttle.offer(_message(0), 0)) == [0]
-    for number in (1, 2, 3):
-        assert not throttle.offer(_message(number), 0.1)
-    assert throttle.next_timer() == 1.0
-    assert not throttle.due(0.9)
-    assert _numbers(throttle.due(1.0)) == [2]
-    assert _numbers(throttle.due(2.5)) == [3]
-    assert throttle.next_timer() is None
-
-
-def test_a_shorter_interval_takes_effect_at_once() -> None:
-    throttle = _throttle(10.0, 3)
-    throttle.offer(_message(0), 0)
-    throttle.offer(_message(1), 0)
-    throttle.offer(_message(2), 0)
-    throttle.configure(1.0, 3)
-    assert throttle.next_timer() == 1.0
-    throttle.configure(0.0, 3)
-    assert _numbers(throttle.due(1.0)) == [1, 2]
-
-
-def test_queues_are_bounded_in_bytes_and_give_them_back() -> None:
-    total = QueuedBytes()
-    size = limits.QUEUE_BYTES_MAX // 4
-    throttles = [Throttle(total) for _ in range(8)]
-    for throttle in throttles:
-        throttle.configure(100.0, 10**9)
-        assert throttle.length == limits.QUEUE_MESSAGES_MAX
-        for number in range(20):
-            throttle.offer(_message(number, size), 0)
-        assert throttle._bytes <= limits.QUEUE_BYTES_MAX
-    assert total.used <= limits.QUEUES_BYTES_MAX
-    for throttle in throttles:
-        throttle.clear()
-    assert total.used == 0
-
-
-def test_one_message_always_fits() -> None:
-    throttle = _throttle(1.0, 5)
-    throttle.offer(_message(0), 0)
-    throttle.offer(_message(1, 2 * limits.QUEUES_BYTES_MAX), 0)
-    assert _numbers(throttle.due(1.0)) == [1]

@@ -80,7 +80,7 @@ def test_the_longest_queue_is_used_and_freed_with_the_last_subscription(client: 
     client.publish(asked)
     client.publish(asked)
     client.send("unsubscribe", topic="/t")
-    assert (client.session.queued.used, client.session.next_timer()) == (0, None)
+    assert (client.connection.queue.bytes, client.connection.queue.due) == (0, None)
 
 
 def test_long_messages_come_in_fragments_of_the_smallest_size(client: Client) -> None:

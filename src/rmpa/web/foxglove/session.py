@@ -375,21 +375,19 @@ class FoxgloveSession(Session):
     def op_subscribe_parameter_updates(self, *, parameter_names: protocol.Names = ()) -> None:
         """Send changes of parameters; of all where no name is given."""
         _check_names(parameter_names)
-        if not parameter_names:
-            self._follow(set(), all_=True)
-        elif self._all:
-            self._follow(self._names.difference(parameter_names), all_=True)
-        else:
-            self._follow(self._names.union(parameter_names), all_=False)
+        self._follow_also(parameter_names, wanted=True)
 
     def op_unsubscribe_parameter_updates(self, *, parameter_names: protocol.Names = ()) -> None:
         """End updates of parameters; of all where no name is given."""
-        if not parameter_names:
-            self._follow(set(), all_=False)
-        elif self._all:
-            self._follow(self._names.union(parameter_names), all_=True)
+        self._follow_also(parameter_names, wanted=False)
+
+    def _follow_also(self, names: Iterable[str], *, wanted: bool) -> None:
+        if not names:
+            self._follow(set(), all_=wanted)
+        elif wanted is self._all:  # the names are those that are left out, where all are followed
+            self._follow(self._names.difference(names), all_=self._all)
         else:
-            self._follow(self._names.difference(parameter_names), all_=False)
+            self._follow(self._names.union(names), all_=self._all)
 
     def _follow(self, names: set[str], *, all_: bool) -> None:
         if len(names) > limits.FOXGLOVE_PARAMETERS_MAX:

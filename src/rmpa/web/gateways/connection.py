@@ -85,8 +85,6 @@ class Session(HubClient):
     kind = ""
     # Whether the protocol itself says how old a command is.
     dates_commands = False
-    # Whether the timer waits while the client takes nothing; else the session itself holds back.
-    timer_waits = True
 
     def __init__(self, hub: Hub, rights: Rights, priority: Callable[[str], int], address: str) -> None:
         super().__init__(hub, f"{self.kind} {address}", rights)
@@ -265,10 +263,10 @@ class ClientConnection:
         """Queue a message of a subscription."""
         self._queue(stream, partial(stream.frames, message), len(message.payload))
 
-    def push_frames(self, stream: ClientStream, frames: Iterable[OutFrame]) -> None:
-        """Queue frames of a subscription, whose message the session had held back."""
-        for frame in frames:
-            self._queue(stream, partial(_as_it_is, frame), sum(map(len, frame[1])))
+    def pace(self, stream: ClientStream, interval: float, length: int) -> None:
+        """Hold the messages of a subscription back; see ``FairQueue.pace``."""
+        self.queue.pace(stream, interval, length)
+        self._wake.set()
 
     def age(self) -> float:
         """Seconds that the frame which comes now may be old at most; 0 where that is not bounded."""
@@ -384,7 +382,7 @@ class ClientConnection:
             if self._close is not None:
                 continue  # the other task closes it
             if message.type == WSMsgType.PING:
-                if self.unsent <= limits.WRITE_BUFFER:  # a client that takes nothing is owed no pong
+                if self._waiting <= limits.WRITE_BUFFER:  # a client that takes nothing is owed no pong
                     self._send(Opcode.PONG, (message.data,))
             elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
                 try:
@@ -439,17 +437,16 @@ class ClientConnection:
                 if self._close is not None:
                     await socket_.close(code=self._close[0], message=self._close[1].encode()[:120])
                     return
-                entry = self.queue.pop()
+                now = self.now()
+                entry = self.queue.pop(now)
                 if entry is None:
                     self._wake.clear()
-                    await self._wake.wait()
+                    with contextlib.suppress(TimeoutError):
+                        async with asyncio.timeout_at(self.queue.due):
+                            await self._wake.wait()
                     continue
-                before = self.sent
-                for opcode, parts in entry(self.now()):
+                for opcode, parts in entry(now):
                     self._send(opcode, parts)
-                if self.sent == before:
-                    # A message that is held back needs the timer; to ask for it at each message would take time.
-                    self.arm()
                 self._tell_drops()
                 await out.drain()
                 turn += 1
@@ -483,7 +480,8 @@ class ClientConnection:
     def _queue(self, stream: ClientStream | None, entry: _Entry, size: int) -> None:
         if self._gone:
             return
-        self.queue.push(stream, entry, size + _OVERHEAD, self._priority(stream.topic) if stream else 0)
+        priority = self._priority(stream.topic) if stream else 0
+        self.queue.push(stream, entry, size + _OVERHEAD, priority, self.now())
         if self.queue.overflow:
             _log.warning("! %s does not read its answers, and is disconnected [reader-slow]", self._session.name)
             self._abort()
@@ -500,10 +498,6 @@ class ClientConnection:
 
     def _due(self) -> None:
         self._timer = None
-        if self._session.timer_waits and self._waiting > limits.WRITE_BUFFER:
-            # The client cannot take what the session holds back: it stays there, within its bounds.
-            self._timer = asyncio.get_running_loop().call_later(0.1, self._due)
-            return
         try:
             self._session.handle_timer(self.now())
         except RmpaError:

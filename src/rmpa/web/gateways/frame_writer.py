@@ -25,7 +25,7 @@ from rmpa.web import limits
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Awaitable, Callable, Iterable, Mapping
 
     from rmpa.web.hub.node_link import Payload
 
@@ -97,6 +97,15 @@ class _Queue(Generic[_T]):
     size: int = 0
 
 
+@dataclass(slots=True)
+class _Pace:
+    """Of a subscription: seconds from one message to the next, how many may wait, and when the next one may go."""
+
+    interval: float
+    length: int
+    free_at: float = float("-inf")
+
+
 class FairQueue(Generic[_T]):
     """What waits for one client: a queue for each subscription, bounded in bytes, served in turn.
 
@@ -104,6 +113,9 @@ class FairQueue(Generic[_T]):
     hold up commands. Beyond a bound the oldest message of the subscription with the most bytes is dropped, of the
     lowest priority first. What belongs to no subscription goes before all else and is never dropped; a client that
     lets it grow beyond the bound does not read at all, and is to be disconnected (``overflow``).
+
+    A subscription may want its messages at a pace (``pace``): they wait here for their time, and those that it does
+    not want do not count as dropped.
 
     Args:
         total_bytes: Bytes of all entries together. One message always fits where no other waits.
@@ -120,6 +132,7 @@ class FairQueue(Generic[_T]):
         self._urgent: _Queue[_T] = _Queue(None, 0)
         # The subscriptions that have entries, in the order of their turns.
         self._queues: dict[object, _Queue[_T]] = {}
+        self._paces: dict[object, _Pace] = {}
         # Bytes that wait.
         self.bytes = 0
         # Messages dropped so far, by subscription, of the present ones.
@@ -137,7 +150,24 @@ class FairQueue(Generic[_T]):
         """Messages that wait, by subscription."""
         return {stream: len(queue.entries) for stream, queue in self._queues.items()}
 
-    def push(self, stream: object, entry: _T, size: int, priority: int = 0) -> None:
+    @property
+    def due(self) -> float | None:
+        """When the next entry may go that its pace holds back; ``None`` where there is none."""
+        return min((pace.free_at for stream, pace in self._paces.items() if stream in self._queues), default=None)
+
+    def pace(self, stream: object, interval: float, length: int) -> None:
+        """Let a subscription have one message in each interval of so many seconds; with 0 all.
+
+        Of those that come meanwhile the newest ``length`` wait; with 0 they are left out.
+        """
+        known = self._paces.pop(stream, None)
+        if interval:
+            free_at = known.free_at + interval - known.interval if known is not None else float("-inf")
+            self._paces[stream] = _Pace(interval, length, free_at)
+            if (queue := self._queues.get(stream)) is not None:
+                self._shorten(queue, max(length, 1))
+
+    def push(self, stream: object, entry: _T, size: int, priority: int = 0, now: float = 0.0) -> None:
         """Add an entry.
 
         Args:
@@ -145,35 +175,48 @@ class FairQueue(Generic[_T]):
             entry: What is to be sent.
             size: Its bytes.
             priority: Of the subscription; a higher one is served first.
+            now: Seconds of the clock of all calls, for a subscription with a pace.
         """
+        pace = self._paces.get(stream)
+        if pace is not None and not pace.length and (now < pace.free_at or stream in self._queues):
+            return
         queue = self._urgent
         if stream is not None:
             queue = self._queues.get(stream) or self._queues.setdefault(stream, _Queue(stream, priority))
         queue.entries.append((entry, size))
         queue.size += size
         self.bytes += size
+        if pace is not None:
+            self._shorten(queue, max(pace.length, 1))
         while stream is not None and queue.size > self._each and len(queue.entries) > 1:
             self._drop_oldest(queue)
         while self.bytes > self._total and self._queues and self._drops_for(queue):
             pass
 
-    def pop(self) -> _T | None:
-        """The next entry; ``None`` where there is none."""
+    def pop(self, now: float = 0.0) -> _T | None:
+        """The next entry; ``None`` where there is none, or none whose time has come."""
         if self._urgent.entries:
             return self._take(self._urgent)
-        if not self._queues:
-            return None
+        queues: Iterable[_Queue[_T]] = self._queues.values()
+        if self._paces:
+            held = {stream for stream, pace in self._paces.items() if now < pace.free_at}
+            queues = [queue for queue in queues if queue.stream not in held]
         # The first of the highest priority: its next turn is behind all others.
-        queue = max(self._queues.values(), key=_priority)
+        queue = max(queues, key=_priority, default=None)
+        if queue is None:
+            return None
         del self._queues[queue.stream]
         entry = self._take(queue)
         if queue.entries:
             self._queues[queue.stream] = queue
+        if self._paces and (pace := self._paces.get(queue.stream)) is not None:
+            pace.free_at = now + pace.interval
         return entry
 
     def end(self, stream: object) -> None:
         """Forget a subscription, and what waits for it."""
         self.dropped.pop(stream, None)
+        self._paces.pop(stream, None)
         if (queue := self._queues.pop(stream, None)) is not None:
             self.bytes -= queue.size
 
@@ -190,6 +233,10 @@ class FairQueue(Generic[_T]):
             fullest = max(others, key=lambda queue: queue.size, default=fullest)
         self._drop_oldest(fullest)
         return True
+
+    def _shorten(self, queue: _Queue[_T], length: int) -> None:
+        while len(queue.entries) > length:
+            self._take(queue)
 
     def _drop_oldest(self, queue: _Queue[_T]) -> None:
         self._take(queue)

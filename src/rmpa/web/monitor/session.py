@@ -174,7 +174,6 @@ class MonitorSession(Session):
 
     kind = "monitor"
     dates_commands = True
-    timer_waits = False  # the robot is stopped in time, whatever waits for the page
 
     def __init__(
         self,

@@ -13,7 +13,7 @@ import json
 import math
 import struct
 import zlib
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
     from rmpa.ros.types.codec import MessageCodec
     from rmpa.web.gateways.frame_writer import OutFrame
-    from rmpa.web.hub.topics import ReceivedMessage
 
 
 Id: TypeAlias = str | int | None
@@ -404,82 +403,7 @@ def _unfilter(lines: bytes, row: int, step: int) -> bytearray:
     return out
 
 
-# --- messages that are held back (``throttle_rate``), and fragments of ops in both directions ---------------------
-
-
-class QueuedBytes:
-    """Bytes queued for all topics of a client together."""
-
-    def __init__(self) -> None:
-        self.used = 0
-
-
-class Throttle:
-    """Holds back the messages of one topic for one client: ``throttle_rate`` and ``queue_length``.
-
-    Without a queue, messages within the interval are dropped. With one they wait, the oldest is dropped when it is
-    full, and one is sent in each interval.
-
-    Args:
-        total: Bytes queued for all topics of the client.
-    """
-
-    def __init__(self, total: QueuedBytes) -> None:
-        self.interval = 0.0
-        self.length = 0
-        self._total = total
-        self._queue: deque[ReceivedMessage] = deque()
-        self._bytes = 0
-        self._free_at = float("-inf")
-
-    def configure(self, interval: float, length: int) -> None:
-        """Set the interval in seconds and the queue's length in messages; what is queued stays, as far as it fits."""
-        self._free_at += interval - self.interval
-        self.interval = interval
-        self.length = min(length, limits.QUEUE_MESSAGES_MAX)
-        while len(self._queue) > self.length:
-            self._take_oldest()
-
-    def offer(self, message: ReceivedMessage, now: float) -> list[ReceivedMessage]:
-        """Take a message; returns those to be sent now."""
-        if not self._queue and now >= self._free_at:
-            self._free_at = now + self.interval
-            return [message]
-        if not self.length:
-            return []
-        size = len(message.payload)
-        while self._queue and (len(self._queue) >= self.length or self._bytes + size > limits.QUEUE_BYTES_MAX):
-            self._take_oldest()
-        if not self._total.used or self._total.used + size <= limits.QUEUES_BYTES_MAX:
-            self._queue.append(message)
-            self._count(size)
-        return self.due(now)
-
-    def due(self, now: float) -> list[ReceivedMessage]:
-        """The messages whose time has come: all where there is no interval any more."""
-        sent: list[ReceivedMessage] = []
-        while self._queue and now >= self._free_at:
-            sent.append(self._take_oldest())
-            self._free_at = now + self.interval
-        return sent
-
-    def next_timer(self) -> float | None:
-        """When `due` has something; None for never."""
-        return self._free_at if self._queue else None
-
-    def clear(self) -> None:
-        """Drop all that is queued; the client no longer wants it."""
-        self._count(-self._bytes)
-        self._queue.clear()
-
-    def _take_oldest(self) -> ReceivedMessage:
-        message = self._queue.popleft()
-        self._count(-len(message.payload))
-        return message
-
-    def _count(self, size: int) -> None:
-        self._bytes += size
-        self._total.used += size
+# --- fragments of ops in both directions -----------------------------------------------------------------------
 
 
 def split(frame: OutFrame, size: int, mid: Id) -> list[OutFrame]:

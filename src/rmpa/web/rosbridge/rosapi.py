@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable
 
     from rmpa.ros.types.definitions import Field, Specification
+    from rmpa.ros.types.messages import MessageType
     from rmpa.web.hub.graph import GraphWatch
     from rmpa.web.hub.hub import HubClient
     from rmpa.web.hub.node_link import ParamValue
@@ -225,16 +226,13 @@ class Rosapi:
     # --- types, nodes and time ------------------------------------------------------------------------------------
 
     def _answer_message_details(self, type: str) -> Values:  # noqa: A002 - the field's name
-        kind = self._client.hub.types.message(type_name(type))
-        return {"typedefs": _typedefs(kind.name, kind.definition)}
+        return _details(self._client.hub.types.message(type_name(type)))
 
     def _answer_service_request_details(self, type: str) -> Values:  # noqa: A002 - the field's name
-        kind = self._client.hub.types.service(type_name(type)).request
-        return {"typedefs": _typedefs(kind.name, kind.definition)}
+        return _details(self._client.hub.types.service(type_name(type)).request)
 
     def _answer_service_response_details(self, type: str) -> Values:  # noqa: A002 - the field's name
-        kind = self._client.hub.types.service(type_name(type)).response
-        return {"typedefs": _typedefs(kind.name, kind.definition)}
+        return _details(self._client.hub.types.service(type_name(type)).response)
 
     def _answer_nodes(self) -> Values:
         return {"nodes": list(self._graph.nodes)}
@@ -316,6 +314,10 @@ SERVICES: Final = {
     f"{NAMESPACE}{name}": f"rosapi/{_TYPE_NAMES.get(name) or ''.join(map(str.capitalize, name.split('_')))}"
     for name in (each.removeprefix("_answer_") for each in vars(Rosapi) if each.startswith("_answer_"))
 }
+
+
+def _details(kind: MessageType) -> Values:
+    return {"typedefs": _typedefs(kind.name, kind.definition)}
 
 
 def _first_type(topic: GraphTopic) -> str:

@@ -18,8 +18,6 @@ from rmpa.web.rosbridge.protocol import (
     OpError,
     Part,
     PublishFrames,
-    QueuedBytes,
-    Throttle,
     check_count,
     decode_png,
     encode,
@@ -36,7 +34,7 @@ from rmpa.web.rosbridge.rosapi import Rosapi
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Callable, Coroutine, Iterable, Mapping
+    from collections.abc import Callable, Coroutine, Mapping
 
     from rmpa.web.gateways.frame_writer import OutFrame
     from rmpa.web.hub.hub import Hub
@@ -68,7 +66,6 @@ class _Topic(ClientStream):
         self.name = name
         self.topic = topic
         self.type = kind
-        self.throttle = Throttle(session.queued)
         # What each id asked for: interval, queue, fragment size and compression.
         self.wishes: dict[Id, tuple[float, int, int | None, Compression]] = {}
         # When it fails, if the topic is not there by then.
@@ -81,29 +78,21 @@ class _Topic(ClientStream):
     def choose(self) -> None:
         """Choose from all wishes."""
         intervals, lengths, sizes, compressions = zip(*self.wishes.values(), strict=True)
-        self.throttle.configure(min(intervals), max(lengths))
+        length = min(max(lengths), limits.QUEUE_MESSAGES_MAX)
+        self._session.connection.pace(self, min(intervals), length)
         self._compression = max(compressions)
         self._fragment_size = min(filter(None, sizes), default=None)
 
-    def frames(self, message: ReceivedMessage, now: float) -> list[OutFrame]:
-        """The frames of a message; none where it is held back."""
-        return self._encoded(self.throttle.offer(message, now))
-
-    def due(self, now: float) -> list[OutFrame]:
-        """The frames of the messages that were held back until now."""
-        return self._encoded(self.throttle.due(now))
-
-    def _encoded(self, messages: Iterable[ReceivedMessage]) -> list[OutFrame]:
-        frames: list[OutFrame] = []
-        for message in messages:
-            try:
-                frames += self._session.split(self._encode(message), self._fragment_size)
-            except RmpaError as error:
-                # Once: a publisher of broken messages may send a thousand a second.
-                if self._problem != str(error):
-                    self._problem = str(error)
-                    self._session.status("error", f"message of {self.name}: {error}")
-        return frames
+    def frames(self, message: ReceivedMessage, now: float) -> list[OutFrame]:  # noqa: ARG002
+        """The frames of a message; none of one that is broken."""
+        try:
+            return self._session.split(self._encode(message), self._fragment_size)
+        except RmpaError as error:
+            # Once: a publisher of broken messages may send a thousand a second.
+            if self._problem != str(error):
+                self._problem = str(error)
+                self._session.status("error", f"message of {self.name}: {error}")
+            return []
 
     def _encode(self, message: ReceivedMessage) -> OutFrame:
         if self._compression is Compression.CBOR_RAW:
@@ -167,7 +156,6 @@ class RosbridgeSession(Session):
     ) -> None:
         super().__init__(hub, rights, priority, address)
         self.encoder = encoder
-        self.queued = QueuedBytes()
         self._rosapi = Rosapi(self)
         self._level = "error"
         self._now = 0.0
@@ -226,15 +214,12 @@ class RosbridgeSession(Session):
 
     def next_timer(self) -> float | None:
         """When `handle_timer` is to be called; None for never."""
-        times = [self._fragments.next_timer()]
-        for topic in self._topics.values():
-            times += topic.throttle.next_timer(), topic.judged_at
+        times = [self._fragments.next_timer(), *(topic.judged_at for topic in self._topics.values())]
         return min((at for at in times if at is not None), default=None)
 
     def handle_timer(self, now: float) -> None:
-        """Send what was held back until now, and end what waits in vain."""
+        """End what waits in vain."""
         for topic in [*self._topics.values()]:
-            self.connection.push_frames(topic, topic.due(now))
             if topic.judged_at is not None and topic.judged_at <= now:
                 topic.judged_at = None
                 if not self._is_there(topic.topic):
@@ -360,7 +345,6 @@ class RosbridgeSession(Session):
 
     def _end_topic(self, topic: _Topic) -> None:
         del self._topics[topic.name]
-        topic.throttle.clear()
         self.connection.queue.end(topic)
         topic.subscription.close()
 

@@ -186,9 +186,10 @@ function step(event, order) {
   [...event.currentTarget.querySelectorAll("[data-module]")].find((each) => each.dataset.module === next)?.focus();
 }
 
+// A browser tells no change that was read before it is told: `matches` is read here at the first drawing alone.
 function useQuery(text) {
-  const query = useRef(matchMedia(text)).current;
-  const [matches, set] = useState(query.matches);
+  const [query] = useState(() => matchMedia(text));
+  const [matches, set] = useState(() => query.matches);
   useEffect(() => {
     const change = () => set(query.matches);
     query.addEventListener("change", change);
