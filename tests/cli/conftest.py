@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import io
 import json
 import os
+import re
+import shlex
 import socket
 import subprocess
 import sys
@@ -12,9 +16,11 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
+from unittest import mock
 
 import msgspec
 import pytest
@@ -23,6 +29,8 @@ from rmpa.cli.main import main
 from rmpa.observe.control_server import ControlServer, Handler
 from rmpa.observe.snapshot import PingReply, Snapshot
 from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.environment import RosEnvironment
+from rmpa.ros.node.node import Node
 from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:
@@ -30,6 +38,25 @@ if TYPE_CHECKING:
     from types import TracebackType
 
 DEADLINE = 30.0
+GOLDEN = Path(__file__).with_name("golden")
+_T = TypeVar("_T")
+
+
+def compare(name: str, said: str) -> None:
+    """Compare with a golden file; ``WRITE_GOLDEN=1 make tests ARGS=tests/cli`` writes all anew, after a change."""
+    file = GOLDEN / f"{name}.txt"
+    if os.environ.get("WRITE_GOLDEN"):
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(said, encoding="utf-8")
+    assert said == file.read_text(encoding="utf-8")
+
+
+def settled(said: str, place: Path | None = None) -> str:
+    """A transcript without what differs from run to run: ports, process ids, times, the folder."""
+    said = re.sub(r"(//[\w.-]+):\d{4,5}\b", r"\1:PORT", said)
+    said = re.sub(rf'(?i)(pid"?[:=]\s?){os.getpid()}\b', r"\1PID", said)
+    said = re.sub(r"time=[\d.]+ (µs|ms|s)\b", "time=TIME", said)
+    return said.replace(str(place), "PLACE") if place is not None else said
 
 
 def free_port() -> int:
@@ -76,29 +103,145 @@ class Place:
     def start(self, *arguments: str) -> Command:
         return Command(
             [sys.executable, "-m", "rmpa.cli.main", *arguments],
+            stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
             env=self.environ,
             cwd=self.path,
+            start_new_session=True,  # without a terminal of the test's own, whose /dev/tty would be asked
         )
 
-    def run(self, *arguments: str) -> tuple[int, str, str]:
+    @contextlib.contextmanager
+    def shell(self) -> Iterator[None]:
+        """Variables and folder of a shell here, for this process."""
+        with mock.patch.dict(os.environ, self.environ, clear=True), contextlib.chdir(self.path):
+            yield
+
+    def run(self, *arguments: str, stdin: str = "") -> tuple[int, str, str]:
+        """Run a command within this process, as a shell here would: exit code, output, errors."""
+        out, err = io.StringIO(), io.StringIO()
+        with (
+            self.shell(),
+            mock.patch.object(sys, "stdin", io.StringIO(stdin)),
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+        ):
+            code = main(arguments)
+        return code, out.getvalue(), err.getvalue()
+
+    def run_apart(self, *arguments: str) -> tuple[int, str, str]:
+        """The same by a process of its own."""
         with self.start(*arguments) as process:
             out, err = process.communicate(timeout=DEADLINE)
         return process.returncode, out, err
 
-    def json(self, *arguments: str) -> list[dict[str, object]]:
+    def transcript(self, *lines: str, group: str = "") -> str:
+        """What a shell shows of command lines of ``rmpa``, or of one of its groups, and their exit codes."""
+        said = ""
+        for line in lines:
+            code, out, err = self.run(*shlex.split(f"{group} {line}"))
+            said += f"$ rmpa {f'{group} {line}'.strip()}\n{out}{err}exit code {code}\n\n"
+        return said
+
+    def json(self, *arguments: str) -> list[dict[str, Any]]:
         code, out, err = self.run(*arguments)
         assert code == 0, err
         return [json.loads(line) for line in out.splitlines()]
 
 
+def shell_of(path: Path) -> dict[str, str]:
+    """The variables of a shell that has no setting but where its files are."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("ROS_", "RMPA_", "XDG_"))}
+    return kept | {"RMPA_RUNTIME_DIR": str(path), "HOME": str(path), "NO_COLOR": "1"}
+
+
 @pytest.fixture
 def place() -> Iterator[Place]:
+    # Not pytest's folder: the path of a control socket has at most 107 bytes.
     with tempfile.TemporaryDirectory(prefix="rmpa-test-") as name:
-        kept = {k: v for k, v in os.environ.items() if not k.startswith(("ROS_", "RMPA_", "XDG_"))}
-        yield Place(Path(name), kept | {"RMPA_RUNTIME_DIR": name, "HOME": name, "NO_COLOR": "1"})
+        yield Place(Path(name), shell_of(Path(name)))
+
+
+@dataclass
+class Machine(Place):
+    """A machine whose agents and servers write into logs in its folder, and end with the test."""
+
+    stack: ExitStack = field(default_factory=ExitStack)
+    agent: subprocess.Popen[str] | None = None
+
+    @property
+    def state(self) -> Path:
+        return self.path / ".local/state/rmpa"
+
+    def serve(self, *arguments: str, **environ: str) -> subprocess.Popen[str]:
+        with (self.path / f"{arguments[0]}.log").open("a") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "rmpa.cli.main", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                text=True,
+                env=self.environ | environ,
+                cwd=self.path,
+                start_new_session=True,
+            )
+        self.stack.callback(end, process)
+        return process
+
+    def says(self, *arguments: str, code: int = 0, stdin: str = "", **environ: str) -> str:
+        """What a command says that ends; one that may go on to serve is a process of its own."""
+        with mock.patch.dict(self.environ, environ):
+            apart = arguments[0] in {"up", "web", "gateway"}
+            found, out, err = self.run_apart(*arguments) if apart else self.run(*arguments, stdin=stdin)
+        assert found == code, out + err
+        return out + err
+
+    def log(self, command: str = "up") -> str:
+        return (self.path / f"{command}.log").read_text()
+
+    def agents(self) -> set[str]:
+        return {path.stem for path in self.path.glob("*.sock")}
+
+    def up(self, *arguments: str, **environ: str) -> subprocess.Popen[str]:
+        """Start an agent on loopback, and wait until it has a control socket."""
+        net: tuple[str, ...] = ("--multicast", f"239.255.117.117:{20000 + os.getpid() % 20000}", "--interface", "lo")
+        if "--core-port" not in arguments:
+            net = (*net, "--core-port", str(free_port()))
+        known = self.agents()
+        process = self.agent = self.serve("up", *net, *arguments, **environ)
+
+        def answers() -> bool:
+            assert process.poll() is None, self.log()
+            return self.agents() != known
+
+        until(answers)
+        return process
+
+    def down(self) -> None:
+        """End the agent that was started last."""
+        assert self.agent is not None
+        self.agent.terminate()
+        self.agent.wait(DEADLINE)
+
+    def status(self, *more: str) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(self.says("trust", "status", "--json", *more))
+        return found
+
+
+@pytest.fixture
+def machines() -> Iterator[Callable[[str], Machine]]:
+    """Makes machines, of modules with these names; empty: nothing says a name."""
+    with tempfile.TemporaryDirectory(prefix="rmpa-test-") as folder, ExitStack() as stack:
+
+        def make(name: str) -> Machine:
+            path = Path(folder) / (name or "one")
+            path.mkdir(mode=0o700)
+            if name:
+                (path / "rmpa.toml").write_text(f'name = "{name}"\n')
+            return Machine(path, shell_of(path), stack)
+
+        yield make
 
 
 class Background:
@@ -109,8 +252,8 @@ class Background:
         self._thread = threading.Thread(target=self.loop.run_forever)
         self._thread.start()
 
-    def do(self, work: Coroutine[object, object, None]) -> None:
-        asyncio.run_coroutine_threadsafe(work, self.loop).result(DEADLINE)
+    def do(self, work: Coroutine[object, object, _T]) -> _T:
+        return asyncio.run_coroutine_threadsafe(work, self.loop).result(DEADLINE)
 
     def close(self) -> None:
         self.loop.call_soon_threadsafe(self.loop.stop)
@@ -146,42 +289,43 @@ def agent(place: Place, background: Background) -> Iterator[Callable[..., None]]
 
 @pytest.fixture
 def core(background: Background) -> Iterator[RosCore]:
-    core: RosCore | None = None
-
-    async def start() -> None:
-        nonlocal core
-        core = RosCore("127.0.0.1", 0)
-        await core.start()
-
-    background.do(start())
-    assert core is not None
+    core = RosCore("127.0.0.1", 0)
+    background.do(core.start())
     yield core
     background.do(core.close())
+
+
+@pytest.fixture
+def node(core: RosCore, background: Background) -> Iterator[Callable[..., Node]]:
+    """Starts nodes at the core."""
+    nodes: list[Node] = []
+
+    def start(name: str, **more: Any) -> Node:
+        nodes.append(Node(name, master_uri=core.uri, environment=RosEnvironment(), **more))
+        return background.do(nodes[-1].__aenter__())
+
+    yield start
+    for each in nodes:
+        background.do(each.close())
+
+
+@pytest.fixture
+def listening() -> Iterator[str]:
+    """A slave API for nodes that are only registered: something listens there, or the core takes them for dead."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield f"http://127.0.0.1:{server.getsockname()[1]}/"
 
 
 Rmpa = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def rmpa(
-    core: RosCore,
-    place: Place,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    request: pytest.FixtureRequest,
-) -> Rmpa:
-    """Runs a verb of the test file's ``GROUP`` within this process, at the core: exit code, output, errors."""
-    for name in ("ROS_PACKAGE_PATH", "PYTHONPATH", "CMAKE_PREFIX_PATH", "RMPA_AGENT"):
-        monkeypatch.delenv(name, raising=False)
-    for name, value in (("ROS_MASTER_URI", core.uri), ("RMPA_RUNTIME_DIR", str(place.path)), ("NO_COLOR", "1")):
-        monkeypatch.setenv(name, value)
-
-    def run(*words: str) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = main((*request.module.GROUP, *words))
-        return code, *capsys.readouterr()
-
-    return run
+def rmpa(core: RosCore, place: Place, request: pytest.FixtureRequest) -> Rmpa:
+    """Runs a verb of the test file's ``GROUP`` at the core: exit code, output, errors."""
+    for name in ("ROS_PACKAGE_PATH", "PYTHONPATH", "CMAKE_PREFIX_PATH"):
+        place.environ.pop(name, None)
+    place.environ["ROS_MASTER_URI"] = core.uri
+    return lambda *words: place.run(*request.module.GROUP, *words)
 
 
 def with_core(uri: str) -> Snapshot:

@@ -21,7 +21,7 @@ from rmpa.config import module_name
 from rmpa.config.settings import Settings
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.observe import control_client
-from tests.cli.test_pictures import compare
+from tests.cli.conftest import compare
 
 _PROGRAMS = {
     "systemctl": """

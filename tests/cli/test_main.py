@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
-import socket
 import subprocess
 import sys
 import threading
@@ -13,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 import pytest
+from click.shell_completion import ShellComplete
 from click.testing import CliRunner
 
 import rmpa
@@ -21,7 +20,7 @@ from rmpa.cli.main import MEANT, REMOVED_VERBS, LazyGroup, cli, main
 from tests.cli.conftest import DEADLINE, with_core
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from rmpa.ros.core.embedded import RosCore
     from tests.cli.conftest import Place
@@ -53,12 +52,6 @@ def test_each_command_has_help_and_each_of_a_graph_has_json() -> None:
             assert any("--json" in parameter.opts for parameter in command.params), path
 
 
-@pytest.mark.parametrize("command", ["up", "core"])
-def test_an_option_that_is_gone_says_what_to_use(command: str, capfd: pytest.CaptureFixture[str]) -> None:
-    assert main([command, "--fresh"]) == 2
-    assert "No such option: --fresh; write --keep never" in capfd.readouterr().err
-
-
 WORDS = {"values": "{}", "value": "1"}
 QUIET = {
     "rmpa explain",
@@ -73,15 +66,9 @@ QUIET = {
 """These need neither an agent nor a master."""
 
 
-def test_an_error_is_json_too(
-    place: Place, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_error_is_json_too(place: Place) -> None:
     """Where neither an agent nor a master answers, and whatever is named is not there."""
-    for name in [name for name in os.environ if name.startswith(("ROS_", "RMPA_"))]:
-        monkeypatch.delenv(name)
-    monkeypatch.setenv("RMPA_RUNTIME_DIR", str(place.path))
-    monkeypatch.setenv("ROS_MASTER_URI", "http://127.0.0.1:9/")
-    monkeypatch.chdir(place.path)
+    place.environ["ROS_MASTER_URI"] = "http://127.0.0.1:9/"
     with_json = [
         (path, command)
         for path, _, command in ALL
@@ -94,21 +81,13 @@ def test_an_error_is_json_too(
             for parameter in command.params
             if isinstance(parameter, click.Argument) and (parameter.required or parameter.name == "names")
         ]
-        code = main([*path.split()[1:], *arguments, "--json"])
-        out, err = capsys.readouterr()
+        code, out, err = place.run(*path.split()[1:], *arguments, "--json")
         said = json.loads(out)
-        assert code in {1, 2}, out
-        assert list(said) == ["error", "code"]
+        assert (code in {1, 2}, list(said)) == (True, ["error", "code"]), out
         assert said["error"] in " ".join(err.split()) or said["error"] in err, path
-
-
-def test_an_error_is_json_only_where_that_is_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["peer", "info", "--no-such-flag"]) == 2
-    assert capsys.readouterr().out == ""
-    assert main(["peer", "info", "--no-such-flag", "--json"]) == 2
-    assert list(json.loads(capsys.readouterr().out)) == ["error", "code"]
-    assert main(["peer", "info", "--no-such-flag", "--", "--json"]) == 2
-    assert capsys.readouterr().out == ""
+    for words, told in ((("--json",), ["error", "code"]), ((), None), (("--", "--json"), None)):
+        code, out, _ = place.run("peer", "info", "--no-such-flag", *words)
+        assert (code, list(json.loads(out)) if out else None) == (2, told), "only where it is asked for"
 
 
 def test_version_of_a_build_comes_with_its_commit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,35 +102,15 @@ def test_a_bug_report_has_the_formats_and_the_system(capsys: pytest.CaptureFixtu
     assert told["version"].startswith(rmpa.__version__.removesuffix("0"))
     assert (told["protocols"]["beacon"], told["protocols"]["link"]) == (2, 3)
     assert told["python"] == ".".join(map(str, sys.version_info[:3]))
-    assert main(["--json", "topic", "list"]) == 2
-    assert "--json belongs after the command: rmpa topic list --json" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("words", "remedy"), REMOVED_VERBS.items())
-def test_a_command_that_is_gone_says_what_to_use(words: str, remedy: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*words.split(), "an-argument", "--an-option"]) == 2
-    assert f"rmpa {words}: is not a command any more; {remedy}" in " ".join(capsys.readouterr().err.split())
-
-
-def test_a_misspelt_command_is_told_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["topci", "list"]) == 2
-    assert "Did you mean `rmpa topic`?" in capsys.readouterr().err
-
-
-def test_a_setting_that_cannot_be_exits_2(place: Place) -> None:
+def test_a_mistake_names_option_or_file_line_and_key(place: Place) -> None:
     code, out, err = place.run("up", "--name", "robot-1")
-    assert (code, out) == (2, "")
+    assert (code, out, "did you mean --name robot_1?" in err) == (2, "", True)
     assert err.startswith("rmpa: --name: 'robot-1' is not a ROS base name")
-    assert "did you mean --name robot_1?" in err
-
-
-def test_a_mistake_in_the_file_names_file_line_and_key(place: Place) -> None:
     (place.path / "rmpa.toml").write_text("[core]\nprot = 1\n")
-    assert place.run("up") == (
-        2,
-        "",
-        "rmpa: rmpa.toml:2: core.prot: an unknown key; did you mean core.port? [invalid-value]\n",
-    )
+    mistake = "rmpa: rmpa.toml:2: core.prot: an unknown key; did you mean core.port? [invalid-value]\n"
+    assert place.run("up") == (2, "", mistake)
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
@@ -159,12 +118,21 @@ def test_completion_scripts(shell: str) -> None:
     assert "_RMPA_COMPLETE" in CliRunner().invoke(cli, ["completion", shell]).output
 
 
-@pytest.mark.parametrize("module", ["rmpa.cli.main", "rmpa.cli.agent", "rmpa.cli.peer", "rmpa.cli.topic"])
+@pytest.mark.parametrize("module", ["rmpa.agent.agent", "rmpa.cli.agent", "rmpa.cli.peer", "rmpa.cli.topic"])
 def test_heavy_packages_wait_until_they_are_needed(module: str) -> None:
-    importlib.import_module(module)
-    heavy = "{'aiohttp', 'rich', 'numpy', 'rosbags', 'ruamel', 'yaml', 'matplotlib'}"
-    code = f"import sys, {module}; sys.exit(' '.join({heavy} & set(sys.modules)) or 0)"
-    assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).stderr == b""
+    heavy = {"aiohttp", "rmpa.web", "rich", "numpy", "rosbags", "ruamel", "yaml", "matplotlib"}
+    assert loaded_by(f"import {module}").isdisjoint(heavy)
+
+
+def test_help_imports_no_command() -> None:
+    loaded = loaded_by("from rmpa.cli.main import main; main(['--help'])")
+    assert loaded.isdisjoint({"asyncio", "msgspec", "rmpa.cli.agent", "rmpa.cli.peer"})
+
+
+def loaded_by(code: str) -> set[str]:
+    """The modules that a program has loaded then."""
+    code = f"import sys; {code}; sys.stderr.write(' '.join(sys.modules))"
+    return {*subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stderr.split()}
 
 
 def test_help_without_arguments_is_no_error_with_a_code(capsys: pytest.CaptureFixture[str]) -> None:
@@ -172,30 +140,25 @@ def test_help_without_arguments_is_no_error_with_a_code(capsys: pytest.CaptureFi
     assert capsys.readouterr().err.endswith("why they do not come\n")
 
 
-def test_help_imports_no_command() -> None:
-    code = (
-        "import sys; from rmpa.cli.main import main; main(['--help']);"
-        "sys.exit(' '.join({'asyncio', 'msgspec', 'rmpa.cli.agent', 'rmpa.cli.peer'} & set(sys.modules)) or 0)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).stderr == b""
-
-
 @pytest.mark.parametrize(
     ("line", "hint"),
     [
+        ("topci list", "Did you mean `rmpa topic`?"),
         ("list", "Did you mean `rmpa peer list` or `rmpa topic list`?"),
         ("help", "Did you mean `rmpa --help`?"),
         ("version", "Did you mean `rmpa --version`?"),
         ("start", "Did you mean `rmpa up` or `rmpa service install`?"),
         ("--json peer list", "--json belongs after the command: rmpa peer list --json"),
         ("topic --agent base list", "--agent belongs after the command: rmpa topic list --agent"),
+        ("up --fresh", "No such option: --fresh; write --keep never"),
+        ("core --fresh", "No such option: --fresh; write --keep never"),
+        *((f"{words} an-argument --an-option", f"rmpa {words}: is not a command any more; {remedy}")
+          for words, remedy in REMOVED_VERBS.items()),
     ],
-)
-def test_a_word_at_the_wrong_place_leads_to_the_right_verb(
-    line: str, hint: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(line.split()) == 2
-    assert hint in capsys.readouterr().err
+)  # fmt: skip
+def test_a_word_that_is_wrong_or_gone_leads_to_the_right_one(place: Place, line: str, hint: str) -> None:
+    code, _, err = place.run(*line.split())
+    assert (code, hint in " ".join(err.split())) == (2, True), err
 
 
 def test_every_word_that_leads_to_a_verb_leads_to_one_that_is_there(capsys: pytest.CaptureFixture[str]) -> None:
@@ -222,35 +185,42 @@ printf '%s\\n' "${COMPREPLY[@]}"
 """
 
 
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("rmpa peer in", ["info"]),
-        ("rmpa peer info j", ["joystick"]),
-        ("rmpa topic echo /cm", ["/cmd"]),
-        ("rmpa topic echo joystick:/c", ["/cmd"]),
-        ("rmpa topic hz --agent b", ["base"]),
-        ("rmpa param get /ro", ["/rosdistro", "/rosversion"]),
-        ("rmpa service call /rosout/get", ["/rosout/get_loggers"]),
-        ("rmpa node info joy", ["joystick:/joy"]),
-        ("rmpa node info joystick:/", ["/joy"]),
-    ],
-)
-def test_bash_completes_what_the_agent_knows(
-    place: Place, agent: Callable[..., None], core: RosCore, line: str, words: list[str]
-) -> None:
+@pytest.fixture
+def joystick(agent: Callable[..., None], core: RosCore, listening: str) -> Iterator[None]:
+    """An agent whose core has a topic of peer joystick."""
     agent(snapshot=with_core(core.uri))
-    with socket.create_server(("127.0.0.1", 0)) as stands:
-        api = f"http://127.0.0.1:{stands.getsockname()[1]}/"
-        assert core.call("registerPublisher", "/rmpa/joystick/joy", "/cmd", "sensor_msgs/Joy", api).code == 1
-        (place.path / "rmpa").write_text(f'#!/bin/sh\nexec {sys.executable} -m rmpa.cli.main "$@"\n')
-        (place.path / "rmpa").chmod(0o755)
-        environ = place.environ | {"PATH": f"{place.path}:{os.environ['PATH']}"}
-        shell = ["bash", "-c", BASH, "bash", line]
-        said = subprocess.run(
-            shell, env=environ, cwd=place.path, capture_output=True, text=True, timeout=60, check=True
-        )
-        core.call("unregisterPublisher", "/rmpa/joystick/joy", "/cmd", api)
+    assert core.call("registerPublisher", "/rmpa/joystick/joy", "/cmd", "sensor_msgs/Joy", listening).code == 1
+    yield
+    core.call("unregisterPublisher", "/rmpa/joystick/joy", "/cmd", listening)
+
+
+@pytest.mark.usefixtures("joystick")
+def test_a_shell_completes_what_the_agent_knows(place: Place) -> None:
+    for line, words in {
+        "peer in": ["info"],
+        "peer info j": ["joystick"],
+        "topic echo /cm": ["/cmd"],
+        "topic hz --agent b": ["base"],
+        "param get /ro": ["/rosdistro", "/rosversion"],
+        "service call /rosout/get": ["/rosout/get_loggers"],
+        "node info joy": ["joystick:/joy"],
+    }.items():
+        *args, begun = line.split()
+        with place.shell():
+            found = ShellComplete(cli, {}, "rmpa", "_RMPA_COMPLETE").get_completions(args, begun)
+        assert [one.value for one in found] == words, line
+
+
+@pytest.mark.parametrize(
+    ("line", "words"), [("rmpa topic echo joystick:/c", ["/cmd"]), ("rmpa node info joystick:/", ["/joy"])]
+)
+@pytest.mark.usefixtures("joystick")
+def test_bash_takes_a_peer_s_name_for_three_words(place: Place, line: str, words: list[str]) -> None:
+    (place.path / "rmpa").write_text(f'#!/bin/sh\nexec {sys.executable} -m rmpa.cli.main "$@"\n')
+    (place.path / "rmpa").chmod(0o755)
+    environ = place.environ | {"PATH": f"{place.path}:{os.environ['PATH']}"}
+    shell = ["bash", "-c", BASH, "bash", line]
+    said = subprocess.run(shell, env=environ, cwd=place.path, capture_output=True, text=True, timeout=60, check=True)
     assert said.stdout.split() == words
 
 

@@ -6,15 +6,9 @@ import asyncio
 import contextlib
 import functools
 import json
-import os
 import socket
 import ssl
-import subprocess
-import sys
-import tempfile
 import threading
-from contextlib import ExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
@@ -24,10 +18,13 @@ pytest.importorskip("cryptography")
 
 from rmpa.discovery.network import list_interfaces
 from rmpa.trust.permissions import host_names, page_hosts
-from tests.cli.conftest import DEADLINE, end, free_port, until
+from tests.cli.conftest import DEADLINE, free_port, until
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from tests.cli.conftest import Machine
 
 RULES = """
 [[permission]]
@@ -38,95 +35,45 @@ publish = ["/forged"]
 """
 
 
-class Machine:
-    """A machine without any setting but where its files are: nothing but a command says a name."""
-
-    def __init__(self, folder: Path, stack: ExitStack) -> None:
-        kept = {k: v for k, v in os.environ.items() if not k.startswith(("ROS_", "RMPA_", "XDG_"))}
-        own = {"RMPA_RUNTIME_DIR": str(folder / "run"), "HOME": str(folder), "NO_COLOR": "1"}
-        self.folder, self.environ, self._stack, self._port = folder, kept | own, stack, 20000 + os.getpid() % 20000
-        self.state = folder / ".local/state/rmpa"
-
-    def start(self, *arguments: str, **environ: str) -> subprocess.Popen[str]:
-        with (self.folder / f"{arguments[0]}.log").open("w") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "rmpa.cli.main", *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                text=True,
-                env=self.environ | environ,
-                cwd=self.folder,
-                start_new_session=True,
-            )
-        self._stack.callback(end, process)
-        return process
-
-    def run(self, *arguments: str, code: int = 0, **environ: str) -> str:
-        """Run a command to its end; what it says."""
-        process = self.start(*arguments, **environ)
-        assert process.wait(DEADLINE) == code, self.log(arguments[0])
-        return self.log(arguments[0])
-
-    def log(self, command: str) -> str:
-        return (self.folder / f"{command}.log").read_text()
-
-    def up(self, *arguments: str, **environ: str) -> subprocess.Popen[str]:
-        """Start an agent on loopback, and wait until it has a control socket."""
-        net: tuple[str, ...] = ("--multicast", f"239.255.117.117:{self._port}", "--interface", "lo")
-        if "--core-port" not in arguments:
-            net = (*net, "--core-port", str(free_port()))
-        known = self.agents()
-        process = self.start("up", *net, *arguments, **environ)
-
-        def answers() -> bool:
-            assert process.poll() is None, self.log("up")
-            return self.agents() != known
-
-        until(answers)
-        return process
-
-    def agents(self) -> set[str]:
-        return {path.stem for path in (self.folder / "run").glob("*.sock")}
-
-    def end(self, process: subprocess.Popen[str]) -> None:
-        process.terminate()
-        process.wait(DEADLINE)
-        until(lambda: not self.agents())
-
-    def web(self, *arguments: str) -> str:
-        """Start ``rmpa web``, and wait until it says where it is."""
-        self.start("web", "--json", *arguments)
-        until(lambda: self.log("web").count('"url"'))
-        return self.url()
-
-    def url(self) -> str:
-        """Where ``rmpa web`` said last that it is."""
-        lines = [line for line in self.log("web").splitlines() if line.startswith('{"url"')]
-        return str(json.loads(lines[-1])["url"])
-
-
 @pytest.fixture
-def machine() -> Iterator[Machine]:
-    # Not pytest's folder: the path of a control socket has at most 107 bytes.
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        yield Machine(Path(folder), stack)
+def machine(machines: Callable[[str], Machine]) -> Machine:
+    """A machine without any setting but where its files are: nothing but a command says a name."""
+    return machines("")
+
+
+def url_of(machine: Machine) -> str:
+    """Where ``rmpa web`` said last that it is; empty: it has not yet."""
+    lines = [line for line in machine.log("web").splitlines() if line.startswith('{"url"')]
+    return str(json.loads(lines[-1])["url"]) if lines else ""
+
+
+def serve_web(machine: Machine, *arguments: str) -> str:
+    """Start ``rmpa web``, and wait until it says where it is."""
+    machine.serve("web", "--json", *arguments)
+    until(lambda: url_of(machine))
+    return url_of(machine)
+
+
+def end_agent(machine: Machine) -> None:
+    machine.down()
+    until(lambda: not machine.agents())
 
 
 def test_the_first_start_names_the_machine(machine: Machine) -> None:
-    machine.end(machine.up("--name", "arm"))
-    second = machine.up("--name", "base", RMPA_NAME="other")  # not kept: there is one
+    machine.up("--name", "arm")
+    end_agent(machine)
+    machine.up("--name", "base", RMPA_NAME="other")  # not kept: there is one
     assert machine.agents() == {"base"}
-    machine.end(second)
+    end_agent(machine)
     machine.up()
     assert machine.agents() == {"arm"}
-    assert f"the module is arm, as at its first start ({machine.state / 'module-name'})" in machine.log("up")
-    assert json.loads(machine.run("trust", "status", "--json"))["module"] == "arm"
+    assert f"the module is arm, as at its first start ({machine.state / 'module-name'})" in machine.log()
+    assert machine.status()["module"] == "arm"
     machine.up("--name", "second")
     assert machine.agents() == {"arm", "second"}
-    assert json.loads(machine.run("trust", "status", "--json"))["module"] == "arm"  # of several the kept one
+    assert machine.status()["module"] == "arm"  # of several the kept one
     (machine.state / "module-name").unlink()
-    assert "several agents run on this machine: arm, second" in machine.run("trust", "status", code=1)
+    assert "several agents run on this machine: arm, second" in machine.says("trust", "status", code=1)
 
 
 def test_a_second_module_does_not_name_the_machine(machine: Machine) -> None:
@@ -136,47 +83,48 @@ def test_a_second_module_does_not_name_the_machine(machine: Machine) -> None:
 
 
 def test_what_has_joined_is_what_starts_next(machine: Machine) -> None:
-    machine.end(machine.up("--name", "trial"))
-    said = machine.run("trust", "init", "--name", "sec")
+    machine.up("--name", "trial")
+    end_agent(machine)
+    said = machine.says("trust", "init", "--name", "sec")
     assert "Next: rmpa up here" in said
-    refused = machine.run("up", "--name", "trial", code=1)
+    refused = machine.says("up", "--name", "trial", code=1)
     assert f"beside keys of sec here in {machine.state}; start as sec: --name sec" in refused
     assert "--insecure" in refused
-    refused = machine.run("up", code=1, RMPA_STATE_DIR=str(machine.folder / "other"))
+    refused = machine.says("up", code=1, RMPA_STATE_DIR=str(machine.path / "other"))
     assert f"start with RMPA_STATE_DIR={machine.state} --name sec" in refused
     machine.up("--name", "trial", "--insecure")
     machine.up()
     assert machine.agents() == {"sec", "trial"}
-    assert json.loads(machine.run("trust", "status", "--json"))["agent"] == "secured"
-    assert json.loads(machine.run("trust", "status", "--json", "--name", "trial"))["agent"] == "plain"
+    assert machine.status()["agent"] == "secured"
+    assert machine.status("--name", "trial")["agent"] == "plain"
 
 
 def test_an_authority_in_a_state_directory_of_its_own_is_not_forgotten(machine: Machine) -> None:
-    data = str(machine.folder / "data")
-    machine.run("trust", "init", "--name", "sec", RMPA_STATE_DIR=data)
-    assert f"start with RMPA_STATE_DIR={data} --name sec;" in machine.run("up", "--name", "sec", code=1)
+    data = str(machine.path / "data")
+    machine.says("trust", "init", "--name", "sec", RMPA_STATE_DIR=data)
+    assert f"start with RMPA_STATE_DIR={data} --name sec;" in machine.says("up", "--name", "sec", code=1)
 
 
 def test_a_gateway_is_no_less_secure_than_the_agent_beside_it(machine: Machine) -> None:
     pytest.importorskip("zenoh")
-    machine.run("trust", "init", "--name", "sec")
+    machine.says("trust", "init", "--name", "sec")
     machine.up(RMPA_STATE_DIR=str(machine.state))
     gateway = ("gateway", "--router", "--listen", f"tcp/127.0.0.1:{free_port()}")
-    refused = machine.run(*gateway, code=1)
+    refused = machine.says(*gateway, code=1)
     assert "the gateway sec_gateway: has no keys, beside the agent sec in a secured mesh" in refused
     assert "rmpa trust join TOKEN --name sec_gateway; or say --insecure" in refused
     # Also where nothing of the agent's files is seen.
-    other = {"HOME": "/nonexistent", "RMPA_STATE_DIR": str(machine.folder / "gw")}
-    assert "beside the agent sec" in machine.run(*gateway, code=1, **other)
+    other = {"HOME": "/nonexistent", "RMPA_STATE_DIR": str(machine.path / "gw")}
+    assert "beside the agent sec" in machine.says(*gateway, code=1, **other)
 
 
 def test_a_gateway_without_keys_ends_when_a_secured_agent_starts_beside_it(machine: Machine) -> None:
     pytest.importorskip("zenoh")
-    other = {"HOME": "/nonexistent", "RMPA_STATE_DIR": str(machine.folder / "gw")}
+    other = {"HOME": "/nonexistent", "RMPA_STATE_DIR": str(machine.path / "gw")}
     net = ("--interface", "lo", "--multicast", f"239.255.117.118:{free_port()}")
-    gateway = machine.start("gateway", "--router", "--listen", f"tcp/127.0.0.1:{free_port()}", *net, **other)
+    gateway = machine.serve("gateway", "--router", "--listen", f"tcp/127.0.0.1:{free_port()}", *net, **other)
     until(machine.agents)
-    machine.run("trust", "init", "--name", "sec")
+    machine.says("trust", "init", "--name", "sec")
     machine.up()
     assert gateway.wait(DEADLINE) == 1
     assert "has no keys, beside the agent sec in a secured mesh; let it join" in machine.log("gateway")
@@ -184,9 +132,8 @@ def test_a_gateway_without_keys_ends_when_a_secured_agent_starts_beside_it(machi
 
 def test_a_gateway_does_not_start_beside_an_agent_that_does_not_say_whether_it_is_secured(machine: Machine) -> None:
     pytest.importorskip("zenoh")
-    (machine.folder / "run").mkdir(mode=0o700)
     with socket.socket(socket.AF_UNIX) as mute:
-        mute.bind(str(machine.folder / "run" / "mute.sock"))
+        mute.bind(str(machine.path / "mute.sock"))
         mute.listen()
 
         def hang_up() -> None:
@@ -197,7 +144,7 @@ def test_a_gateway_does_not_start_beside_an_agent_that_does_not_say_whether_it_i
         thread = threading.Thread(target=hang_up)
         thread.start()
         try:
-            said = machine.run("gateway", "--router", "--listen", f"tcp/127.0.0.1:{free_port()}", code=1)
+            said = machine.says("gateway", "--router", "--listen", f"tcp/127.0.0.1:{free_port()}", code=1)
         finally:
             mute.shutdown(socket.SHUT_RDWR)
             thread.join()
@@ -206,23 +153,23 @@ def test_a_gateway_does_not_start_beside_an_agent_that_does_not_say_whether_it_i
 
 def test_the_web_server_is_as_secure_as_the_agent_whatever_their_names(machine: Machine) -> None:
     pytest.importorskip("aiohttp")
-    (machine.folder / "agents.toml").write_text(RULES)
-    agent = machine.up("--name", "sec", "--config", "agents.toml")
-    url = machine.web("--control", "--listen", "127.0.0.1", "--port", str(free_port()))
+    (machine.path / "agents.toml").write_text(RULES)
+    machine.up("--name", "sec", "--config", "agents.toml")
+    url = serve_web(machine, "--control", "--listen", "127.0.0.1", "--port", str(free_port()))
     assert url.startswith("http://")
     # The agent comes back secured: the server is made anew, with its certificate and its permissions.
-    machine.run("trust", "init")
-    machine.end(agent)
+    machine.says("trust", "init")
+    end_agent(machine)
     machine.up("--config", "agents.toml")
-    until(lambda: machine.url().startswith("https://"))
+    until(lambda: url_of(machine).startswith("https://"))
     ca = machine.state / "sec/trust/ca.crt"
     token = (machine.state / "sec/web-token").read_text().strip()
-    statuses = asyncio.run(_statuses(ca, urlsplit(machine.url()).port or 0, token))
+    statuses = asyncio.run(_statuses(ca, urlsplit(url_of(machine)).port or 0, token))
     assert [("web may not" in text) for text in statuses] == [True, True], statuses
     # A browser that knows the CA opens the page by each name and address of this machine.
     addresses = [str(address) for interface in list_interfaces() for address in interface.addresses]
     hosts = page_hosts((*host_names(socket.gethostname()), *sorted(addresses)))
-    port = urlsplit(machine.url()).port or 0
+    port = urlsplit(url_of(machine)).port or 0
     for host in ("sec", "sec.local", "localhost", "127.0.0.1", *hosts):
         until(functools.partial(_accepts, ca, port, host))
     assert not _accepts(ca, port, "other.local")
@@ -231,12 +178,12 @@ def test_the_web_server_is_as_secure_as_the_agent_whatever_their_names(machine: 
 def test_the_web_server_of_one_agent_does_not_show_a_secured_one_that_takes_over_its_core(machine: Machine) -> None:
     pytest.importorskip("aiohttp")
     core = ("--core-port", str(free_port()))
-    agent = machine.up("--name", "open", *core)
+    machine.up("--name", "open", *core)
     port = str(free_port())
-    server = machine.start("web", "--json", "--agent", "open", "--port", port)
+    server = machine.serve("web", "--json", "--agent", "open", "--port", port)
     until(lambda: _asked(port) and "the agent open answers" in machine.log("web"))
-    machine.end(agent)
-    machine.run("trust", "init", "--name", "sec")
+    end_agent(machine)
+    machine.says("trust", "init", "--name", "sec")
     machine.up(*core)
     assert server.wait(DEADLINE) == 1
     assert "the module open: has no keys, and would start without trust, beside keys of sec" in machine.log("web")
@@ -280,9 +227,9 @@ async def _statuses(ca: Path, port: int, token: str) -> list[str]:
 
 def test_the_web_server_without_an_agent_is_that_of_the_module_with_keys(machine: Machine) -> None:
     pytest.importorskip("aiohttp")
-    assert "has joined no secured mesh" in machine.run("web", code=1, RMPA_TRUST_REQUIRE="1")
-    machine.run("trust", "init", "--name", "sec")
-    assert machine.web("--port", str(free_port())).startswith("https://")
-    refused = machine.run("web", "--agent", "other", code=1)
+    assert "has joined no secured mesh" in machine.says("web", code=1, RMPA_TRUST_REQUIRE="1")
+    machine.says("trust", "init", "--name", "sec")
+    assert serve_web(machine, "--port", str(free_port())).startswith("https://")
+    refused = machine.says("web", "--agent", "other", code=1)
     assert "start as sec: --agent sec" in refused
     assert "the module other: has no keys, and would start without trust, beside keys of sec" in refused

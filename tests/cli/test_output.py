@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING
 
 import msgspec
 import pytest
 
 from rmpa.cli.graph import read_name
+from rmpa.cli.main import help_of
 from rmpa.cli.messages import fill_stamps, flatten, pick, read_values, shorten, to_text
-from rmpa.cli.output import Table, duration, print_error, print_text, printable, size
+from rmpa.cli.output import Painted, Table, duration, print_error, print_text, printable, size, warn
 from rmpa.cli.topic import facts
+from rmpa.core import errors
+from rmpa.core.counters import _Formatter
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.observe.snapshot import RouteInfo
 from tests.observe.samples import DIRECT
@@ -140,6 +144,21 @@ def test_a_direct_topic_tells_that_it_was_interrupted() -> None:
     one = msgspec.structs.replace(DIRECT.subscribers[0], interruptions=1, interrupted_ago=None)
     texts = [text for _, text in facts(msgspec.structs.replace(DIRECT, subscribers=(one,)))]
     assert "interrupted once, the last for 39.0 s now; what is lost of that time is not counted" in texts
+
+
+def test_all_that_a_terminal_or_a_log_shows_says_where_pages_are(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(errors, "_place_of_docs", lambda: ("/usr/share/doc/rmpa/", ""))
+    page = "docs/guides/web.md"
+    print_text(page, Painted(page))
+    warn(page)
+    print_error(page, "failed")
+    logged = _Formatter().format(logging.LogRecord("rmpa", 30, "", 0, "see %s", (page,), None))
+    help_ = help_of(f"Do.\n\n---\nSee {page}.")
+    out, err = capsys.readouterr()
+    for text in (*out.splitlines(), *err.splitlines(), logged, help_["epilog"]):
+        assert f"/usr/share/doc/rmpa/{page}" in text
 
 
 def test_a_table_measures_its_columns_once(capsys: pytest.CaptureFixture[str]) -> None:

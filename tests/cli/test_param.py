@@ -14,70 +14,45 @@ from rmpa.bridge import limits
 from rmpa.bridge.params import rules as transfer
 from rmpa.cli.param import read_documents, read_yaml, write_yaml
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.observe.control_server import ControlServer
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
-from tests.observe.samples import SNAPSHOT
+from tests.cli.conftest import compare, settled
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable
     from typing import Any
 
     from rmpa.ros.core.embedded import RosCore
-    from tests.cli.conftest import Background, Place
+    from tests.cli.conftest import Place
 
 
 def test_the_verbs(place: Place, core: RosCore) -> None:
     place.environ["ROS_MASTER_URI"] = core.uri
-    assert place.run("param", "set", "/base", "{speed: 1.5, names: [a, 'on'], deep: {x: -3}}") == (0, "", "")
-    assert place.run("param", "get", "/base/deep/x") == (0, "-3\n", "")
-    assert place.run("param", "get", "/base") == (0, "deep:\n  x: -3\nnames:\n- a\n- 'on'\nspeed: 1.5\n", "")
-    assert place.json("param", "get", "base", "--json") == [{"deep": {"x": -3}, "names": ["a", "on"], "speed": 1.5}]
-    assert place.run("param", "set", "/base/deep", "-5") == (0, "", "")
-    assert place.run("param", "list", "/base")[1].split() == ["/base/deep", "/base/names", "/base/speed"]
-    code, _, err = place.run("param", "get", "/base/sped")
-    assert (code, err.split("; ")[1]) == (1, "did you mean /base/speed? [unknown-name]\n")
-    assert place.run("param", "dump", "base.yaml", "/base")[0] == 0
-    assert place.run("param", "load", "base.yaml", "/copy")[0] == 0
-    assert core.call("getParam", "/x", "/copy").value == core.call("getParam", "/x", "/base").value
-    assert place.run("param", "delete", "/copy")[0] == 0
-    assert place.run("param", "delete", "/copy")[0] == 1
     (place.path / "ns.yaml").write_text("_ns: inner\na: 1\n---\nb: 2\n")
-    assert place.json("param", "load", "ns.yaml", "/outer", "--json") == [{"set": 2}]
-    assert core.call("getParam", "/x", "/outer").value == {"inner": {"a": 1}, "b": 2}
+    said = place.transcript(
+        "set /base '{speed: 1.5, names: [a, \"on\"], deep: {x: -3}}'", "get /base/deep/x", "get /base",
+        "get base --json", "set /base/deep -5", "list /base", "get /base/sped",
+        "dump base.yaml /base", "load base.yaml /copy", "get /copy", "delete /copy", "delete /copy",
+        "load ns.yaml /outer --json", "get /outer",
+        group="param",
+    )  # fmt: skip
+    compare("param", settled(said, place.path))
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "error"),
-    [
-        (("set", "/a", "[1,"), 1, "VALUE:1:4: not YAML"),
-        (("set", "/a", "null"), 1, "VALUE: null is no value"),
-        (("set", "/a", "{1: 2}"), 1, "the key 1 is not a string"),
-        (("set", "/a", "99999999999"), 1, "does not fit the 32 bits"),
-        (("set", "/a", "{b: 1, b: 2}"), 1, "found duplicate key"),
-        (("set", "/a"), 2, "VALUE: none is given"),
-        (("set", "/a", "1", "-t", "x"), 2, "VALUE: two are given"),
-        (("set", "/", "5"), 1, "the root can only be set to a dictionary"),
-        (("set", "/a", "{b: {'c d': 1}}"), 1, "'/a/b/c d' is not a parameter's name"),
-        (("set", "/a", "-t", "nothing"), 1, "nothing cannot be read: No such file"),
-        (("get", "~a"), 2, "private to a node"),
-        (("get", "/a//b"), 2, "not a parameter's name"),
-        (("delete", "/"), 2, "the root holds every parameter"),
-        (("load", "list.yaml"), 1, "not a dictionary of parameters"),
-        (("get", "/a", "--peer", "b", "--master", "http://x:1/"), 2, "--peer"),
-        (("gte", "/a"), 2, "Did you mean `rmpa param get`?"),
-    ],
-)
-def test_mistakes_change_nothing(place: Place, core: RosCore, words: tuple[str, ...], code: int, error: str) -> None:
+def test_mistakes_change_nothing(place: Place, core: RosCore) -> None:
     place.environ["ROS_MASTER_URI"] = core.uri
     (place.path / "list.yaml").write_text("- 1\n")
-    found = place.run("param", *words)
-    assert (found[0], found[1]) == (code, "")
-    assert error in found[2]
+    said = place.transcript(
+        "set /a [1,", "set /a null", "set /a '{1: 2}'", "set /a 99999999999", "set /a '{b: 1, b: 2}'", "set /a",
+        "set /a 1 -t x", "set / 5", "set /a '{b: {\"c d\": 1}}'", "set /a -t nothing",
+        "get ~a", "get /a//b", "delete /", "load list.yaml", "get /a --peer b --master http://x:1/",
+        group="param",
+    )  # fmt: skip
+    compare("param_mistakes", settled(said, place.path))
     assert core.call("hasParam", "/x", "/a").value is False
 
 
 @pytest.fixture
-def peer(place: Place, background: Background) -> Iterator[dict[str, Any]]:
+def peer(agent: Callable[..., None]) -> dict[str, Any]:
     """A fake agent whose only peer, base, has these parameters."""
     kept: dict[str, Any] = {"/speed": 1.5, "/big": "x" * (3 * limits.ASK_EXPRESS_MAX)}
 
@@ -97,26 +72,22 @@ def peer(place: Place, background: Background) -> Iterator[dict[str, Any]]:
         del kept[key]
         return {}
 
-    server = ControlServer(place.path, "pad", {"snapshot": lambda _: SNAPSHOT, "param": ask})
-    background.do(server.start())
-    yield kept
-    background.do(server.close())
+    agent("pad", param=ask)
+    return kept
 
 
 def test_a_peers(place: Place, peer: dict[str, Any]) -> None:
-    assert place.run("param", "get", "--peer", "base", "/speed") == (0, "1.5\n", "")
     assert place.json("param", "get", "base:/big", "--json") == [peer["/big"]]
-    assert place.run("param", "list", "--peer", "base") == (0, "/big\n/speed\n", "")
-    assert place.run("param", "list", "base:/") == (0, "/big\n/speed\n", "")
-    assert "names a peer too" in place.run("param", "get", "--peer", "arm", "base:/big")[2]
     (place.path / "text").write_text("é" * 40_000)
     assert place.json("param", "set", "--peer", "base", "/new", "-t", "text", "--json") == [{"key": "/new", "set": 1}]
     assert peer["/new"] == "é" * 40_000
-    assert place.run("param", "delete", "--peer", "base", "/new") == (0, "", "")
+    said = place.transcript(
+        "get --peer base /speed", "list --peer base", "list base:/", "get --peer arm base:/big",
+        "delete --peer base /new", "get --peer base /nothing",
+        group="param",
+    )  # fmt: skip
+    compare("param_of_a_peer", said)
     assert "/new" not in peer
-    code, _, err = place.run("param", "get", "--peer", "base", "/nothing")
-    assert code == 1
-    assert "there is no parameter /nothing" in err
 
 
 _SCALARS = (

@@ -8,12 +8,13 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import msgspec
-import pytest
 
 from rmpa.cli.options import Selection, summary
 from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:
+    import pytest
+
     from tests.cli.conftest import Place
 
 Agent = Callable[..., None]
@@ -26,17 +27,13 @@ def test_ctrl_c_shows_the_summary(place: Place, agent: Agent) -> None:
         process.stdout.readline()
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
-    assert "rtt min/avg/max/sd" in out
-    assert (process.returncode, err) == (0, "")
+    assert ("rtt min/avg/max/sd" in out, process.returncode, err) == (True, 0, "")
 
 
-@pytest.mark.parametrize("command", [("list",), ("info", "x"), ("ping", "x")])
-def test_without_an_agent(place: Place, command: tuple[str, ...]) -> None:
+def test_without_an_agent_or_with_two(place: Place, agent: Agent) -> None:
     expected = f"rmpa: no agent answers at {place.path}; start one with `rmpa up` [no-agent]\n"
-    assert place.run("peer", *command) == (1, "", expected)
-
-
-def test_two_agents(place: Place, agent: Agent) -> None:
+    for words in (("list",), ("info", "x"), ("ping", "x")):
+        assert place.run("peer", *words) == (1, "", expected)
     agent("base")
     agent("second", snapshot=msgspec.structs.replace(SNAPSHOT, peers=()))
     code, _, err = place.run("peer", "list", "--json")
@@ -49,12 +46,11 @@ def test_a_closed_pipe_is_quiet(place: Place, agent: Agent) -> None:
     agent()
     with place.start("peer", "ping", "joystick", "-i", "0.01", "--json") as process:
         assert process.stdout is not None
+        assert process.stderr is not None
         assert json.loads(process.stdout.readline())["seq"] == 1
         process.stdout.close()
         process.wait(30)
-        assert process.stderr is not None
-        assert process.stderr.read() == ""
-    assert process.returncode == 141
+        assert (process.returncode, process.stderr.read()) == (141, "")
 
 
 def test_names_and_modules_are_selected_by_patterns() -> None:

@@ -1,16 +1,10 @@
-"""What the verbs say, line by line: on terminals of 80 and of 120 columns, and in a pipe beside agents of many kinds.
-
-``WRITE_GOLDEN=1 make tests ARGS=tests/cli/test_pictures.py`` writes the files anew, after a change that is meant.
-"""
+"""What the verbs say, line by line: on terminals of 80 and 120 columns, and in a pipe beside agents of many kinds."""
 
 from __future__ import annotations
 
 import io
-import os
 import re
-import shlex
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
@@ -32,7 +26,7 @@ from rmpa.observe.peer_info import (
 from rmpa.observe.snapshot import FollowedInfo, PingReply
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.trust.permissions import TrustReason
-from tests.cli.conftest import with_core
+from tests.cli.conftest import compare, with_core
 from tests.cli.test_resource import remote, running
 from tests.observe.samples import SNAPSHOT
 from tests.observe.why import test_topics
@@ -43,7 +37,6 @@ if TYPE_CHECKING:
     from rmpa.ros.core.embedded import RosCore
     from tests.cli.conftest import Place
 
-GOLDEN: Final = Path(__file__).with_name("golden")
 __all__ = ["remote", "running"]  # fixtures
 FOLLOWED: Final = (
     FollowedInfo(key="/map/frame", owner="base", owner_key="/map_frame", state="followed", size=12),
@@ -96,14 +89,6 @@ class Terminal(io.StringIO):
 
     def isatty(self) -> bool:
         return True
-
-
-def compare(name: str, said: str) -> None:
-    file = GOLDEN / f"{name}.txt"
-    if os.environ.get("WRITE_GOLDEN"):
-        file.parent.mkdir(exist_ok=True)
-        file.write_text(said, encoding="utf-8")
-    assert said == file.read_text(encoding="utf-8")
 
 
 @pytest.fixture
@@ -266,14 +251,9 @@ KINDS: Final[dict[str, tuple[dict[str, Any], tuple[str, ...]]]] = {
 
 
 @pytest.mark.parametrize("name", KINDS)
-@pytest.mark.usefixtures("shell")
-def test_verbs_in_a_pipe(agent: Callable[..., None], capsys: pytest.CaptureFixture[str], name: str) -> None:
+def test_verbs_in_a_pipe(agent: Callable[..., None], place: Place, name: str) -> None:
     answers, lines = KINDS[name]
     agent(**answers)
-    said = ""
-    for line in lines:
-        code = main(shlex.split(line))
-        out, err = capsys.readouterr()
-        assert "\x1b" not in out + err
-        said += f"$ rmpa {line}\n{out}{err}exit code {code}\n\n"
+    said = place.transcript(*lines)
+    assert "\x1b" not in said
     compare(name, said)

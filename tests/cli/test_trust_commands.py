@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import signal
-import subprocess
-import sys
-import tempfile
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,108 +12,27 @@ import pytest
 
 pytest.importorskip("cryptography")
 
-from tests.cli.conftest import DEADLINE, Place, end, free_port, until
+from tests.cli.conftest import DEADLINE, until
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    import subprocess
+    from collections.abc import Callable
+
+    from tests.cli.conftest import Machine
 
 
-class Machine:
-    """One machine of a test: a place of its own, and perhaps its agent."""
-
-    def __init__(self, folder: Path, name: str, stack: ExitStack) -> None:
-        folder.mkdir()
-        kept = {k: v for k, v in os.environ.items() if not k.startswith(("ROS_", "RMPA_", "XDG_"))}
-        own = {"RMPA_RUNTIME_DIR": str(folder / "run"), "HOME": str(folder), "NO_COLOR": "1"}
-        self.name, self.folder, self._stack = name, folder, stack
-        self.place = Place(folder, kept | own)
-        port = 20000 + os.getpid() % 20000
-        (folder / "rmpa.toml").write_text(f'name = "{name}"\n')
-        self._up = (
-            "up",
-            "--multicast",
-            f"239.255.116.116:{port}",
-            "--core-port",
-            str(free_port()),
-            "--interface",
-            "lo",
-        )
-        self.agent: subprocess.Popen[str] | None = None
-
-    def run(self, *arguments: str, stdin: str = "") -> tuple[int, str, str]:
-        process = self.start(*arguments)
-        out, err = process.communicate(stdin, timeout=DEADLINE)
-        return process.returncode, out, err
-
-    def start(self, *arguments: str) -> subprocess.Popen[str]:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "rmpa.cli.main", *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=self.place.environ,
-            cwd=self.folder,
-            start_new_session=True,  # without a terminal of the test's own, whose /dev/tty would be asked
-        )
-        self._stack.callback(end, process)
-        return process
-
-    def trust(self, *arguments: str, stdin: str = "") -> str:
-        """A command that succeeds; its standard output."""
-        code, out, err = self.run("trust", *arguments, stdin=stdin)
-        assert code == 0, err
-        return out
-
-    def refused(self, *arguments: str, stdin: str = "", code: int = 1) -> str:
-        """A command that fails; what the user reads."""
-        found, _, err = self.run("trust", *arguments, stdin=stdin)
-        assert found == code, err
-        return err
-
-    def up(self) -> None:
-        """Start the agent, and wait until it answers."""
-        log = (self.folder / "log").open("a")
-        self.agent = subprocess.Popen(
-            [sys.executable, "-m", "rmpa.cli.main", *self._up],
-            stdout=log,
-            stderr=log,
-            env=self.place.environ,
-            cwd=self.folder,
-            text=True,
-        )
-        log.close()
-        self._stack.callback(self.down)
-        until(self._answers)
-
-    def _answers(self) -> bool:
-        assert self.agent is not None
-        assert self.agent.poll() is None, self.log
-        return (self.folder / "run" / f"{self.name}.sock").exists()
-
-    def down(self) -> None:
-        if self.agent is not None:
-            self.agent.terminate()
-            self.agent.wait(DEADLINE)
-            self.agent = None
-
-    @property
-    def log(self) -> str:
-        return (self.folder / "log").read_text()
-
-    def status(self) -> dict[str, object]:
-        found: dict[str, object] = json.loads(self.trust("status", "--json"))
-        return found
-
-    def peers(self) -> dict[str, str]:
-        return {peer["name"]: peer["state"] for peer in json.loads(self.run("peer", "list", "--json")[1])}
+def peers(machine: Machine) -> dict[str, str]:
+    return {peer["name"]: peer["state"] for peer in json.loads(machine.says("peer", "list", "--json"))}
 
 
-@pytest.fixture
-def machine() -> Iterator[Callable[[str], Machine]]:
-    # Not pytest's folder: the path of a control socket has at most 107 bytes.
-    with tempfile.TemporaryDirectory(prefix="rmpa-test-") as folder, ExitStack() as stack:
-        yield lambda name: Machine(Path(folder) / name, name, stack)
+def trust(machine: Machine, *arguments: str, stdin: str = "") -> str:
+    """A command that succeeds; what it says."""
+    return machine.says("trust", *arguments, stdin=stdin)
+
+
+def refused(machine: Machine, *arguments: str, stdin: str = "", code: int = 1) -> str:
+    """A command that fails; what the user reads."""
+    return machine.says("trust", *arguments, stdin=stdin, code=code)
 
 
 def _line(process: subprocess.Popen[str], words: str) -> str:
@@ -130,73 +44,73 @@ def _line(process: subprocess.Popen[str], words: str) -> str:
     raise AssertionError(f"no line with {words!r}")
 
 
-def test_from_init_to_a_linked_mesh_and_to_a_revocation(machine: Callable[[str], Machine]) -> None:
-    base, arm = machine("base"), machine("arm")
-    out = base.trust("init", "--label", "lab")
+def test_from_init_to_a_linked_mesh_and_to_a_revocation(machines: Callable[[str], Machine]) -> None:
+    base, arm = machines("base"), machines("arm")
+    out = trust(base, "init", "--label", "lab")
     assert "base is the authority of a new mesh" in out
     assert "Keep a copy of that folder" in out
-    assert "is a member of a secured mesh already; rmpa trust status shows it" in base.refused("init")
-    assert "the agent base: does not run, so no module can join; start it: rmpa up" in base.refused("invite")
+    assert "is a member of a secured mesh already; rmpa trust status shows it" in refused(base, "init")
+    assert "the agent base: does not run, so no module can join; start it: rmpa up" in refused(base, "invite")
     base.up()
-    assert "trust is off" not in base.log
+    assert "trust is off" not in base.log()
 
-    inviting = base.start("trust", "invite")
-    assert inviting.stdout is not None
-    token = inviting.stdout.readline().strip()
-    _line(inviting, "waiting for the module")
-    assert "arm has joined; its certificate ends" in arm.trust("join", "-", stdin=token + "\n")
-    assert "arm has joined" in _line(inviting, "has joined")
+    with base.start("trust", "invite") as inviting:
+        assert inviting.stdout is not None
+        token = inviting.stdout.readline().strip()
+        _line(inviting, "waiting for the module")
+        assert "arm has joined; its certificate ends" in trust(arm, "join", "-", stdin=token + "\n")
+        assert "arm has joined" in _line(inviting, "has joined")
 
     arm.up()
-    until(lambda: arm.peers().get("base") == "linked" and base.peers().get("arm") == "linked")
+    until(lambda: peers(arm).get("base") == "linked" and peers(base).get("arm") == "linked")
     shown = base.status()
     assert (shown["is_authority"], shown["agent"], shown["problems"]) == (True, "secured", [])
-    assert [(m["name"], m["linked"]) for m in shown["members"]] == [("arm", True), ("base", True)]  # type: ignore[attr-defined]
+    assert [(m["name"], m["linked"]) for m in shown["members"]] == [("arm", True), ("base", True)]
     assert arm.status()["authority"] == "base"
-    assert "certificate: valid until" in base.trust("status")
-    assert "arm has a new certificate until" in arm.trust("renew")
-    assert "group key 2 is made" in base.trust("renew", "--group-key")
-    assert "is not the authority of its mesh; do it at base" in arm.refused("revoke", "base")
-    assert "did you mean arm?" in base.refused("revoke", "amr")
-    assert "arm is revoked (deny list 1); there is a new group key" in base.trust("revoke", "arm")
-    until(lambda: base.peers().get("arm") != "linked")
+    assert "certificate: valid until" in trust(base, "status")
+    assert "arm has a new certificate until" in trust(arm, "renew")
+    assert "group key 2 is made" in trust(base, "renew", "--group-key")
+    assert "is not the authority of its mesh; do it at base" in refused(arm, "revoke", "base")
+    assert "did you mean arm?" in refused(base, "revoke", "amr")
+    assert "arm is revoked (deny list 1); there is a new group key" in trust(base, "revoke", "arm")
+    until(lambda: peers(base).get("arm") != "linked")
     assert base.status()["revoked"] == ["arm"]
     # It comes back: leave, join with a token from standard input, start again.
     arm.down()
-    assert "arm has left its mesh" in arm.trust("leave", "--yes")
-    token = base.trust("invite", "--no-wait").strip()
-    arm.trust("join", "-", stdin=token + "\n")
+    assert "arm has left its mesh" in trust(arm, "leave", "--yes")
+    token = trust(base, "invite", "--no-wait").split()[0]
+    trust(arm, "join", "-", stdin=token + "\n")
     arm.up()
-    until(lambda: arm.peers().get("base") == "linked")
+    until(lambda: peers(arm).get("base") == "linked")
     for secret in (token, token.removeprefix("rmpa1-")):
-        assert secret not in base.log + arm.log
+        assert secret not in base.log() + arm.log()
 
 
-def test_a_token_that_cannot_be_used(machine: Callable[[str], Machine]) -> None:
-    base, arm, gripper = machine("base"), machine("arm"), machine("gripper")
-    base.trust("init")
+def test_a_token_that_cannot_be_used(machines: Callable[[str], Machine]) -> None:
+    base, arm, gripper = machines("base"), machines("arm"), machines("gripper")
+    trust(base, "init")
     base.up()
-    token = base.trust("invite", "--no-wait", "--module", "gripper").strip()
-    assert "the token is mistyped" in arm.refused("join", token[:-2] + "aa", code=2)
-    assert "it is not whole" in arm.refused("join", token[:-9], code=2)
-    assert "does not begin with rmpa1-" in arm.refused("join", "-", stdin="\n", code=2)
-    assert token not in arm.refused("join", token[:-2] + "aa", code=2)
-    assert "join with the --name that it is for" in arm.refused("join", token)
+    token = trust(base, "invite", "--no-wait", "--module", "gripper").split()[0]
+    assert "the token is mistyped" in refused(arm, "join", token[:-2] + "aa", code=2)
+    assert "it is not whole" in refused(arm, "join", token[:-9], code=2)
+    assert "does not begin with rmpa1-" in refused(arm, "join", "-", stdin="\n", code=2)
+    assert token not in refused(arm, "join", token[:-2] + "aa", code=2)
+    assert "join with the --name that it is for" in refused(arm, "join", token)
     assert arm.status()["on"] is False  # nothing is left behind
-    gripper.trust("join", token)
-    err = arm.refused("join", "--name", "gripper", token)
+    trust(gripper, "join", token)
+    err = refused(arm, "join", "--name", "gripper", token)
     assert "gripper cannot join: the token was used (used)" in err
     assert "each token lets one module join; ask for a new one: rmpa trust invite" in err
-    assert "No such option: --yes; leave it out: nothing is asked" in arm.refused("join", "--yes", token, code=2)
-    token = base.trust("invite", "--no-wait").strip()
+    assert "No such option: --yes; leave it out: nothing is asked" in refused(arm, "join", "--yes", token, code=2)
+    token = trust(base, "invite", "--no-wait").split()[0]
     base.down()
-    assert "no authority answers at" in arm.refused("join", token)
+    assert "no authority answers at" in refused(arm, "join", token)
 
 
-def test_errors_of_json_and_of_options(machine: Callable[[str], Machine]) -> None:
-    arm = machine("arm")
+def test_errors_of_json_and_of_options(machines: Callable[[str], Machine]) -> None:
+    arm = machines("arm")
     assert arm.status()["on"] is False
-    assert "trust is off: arm (name in rmpa.toml) has joined no secured mesh" in arm.trust("status")
+    assert "trust is off: arm (name in rmpa.toml) has joined no secured mesh" in trust(arm, "status")
     for words, arguments, code in (
         ("needs a TOKEN, --request or --accept", ("join",), 2),
         ("is not a time up to 30 d", ("invite", "--for", "1y"), 2),
@@ -210,23 +124,22 @@ def test_errors_of_json_and_of_options(machine: Callable[[str], Machine]) -> Non
         found, out, err = arm.run("trust", *arguments, "--json")
         assert (found, words in err) == (code, True), err
         assert words in json.loads(out)["error"]
-    arm.trust("init")
-    assert "nothing was removed" in arm.refused("leave", stdin="n\n", code=2)
-    assert "add --yes" in arm.refused("leave", code=2)
-    store = arm.folder / ".local/state/rmpa/arm/trust"
+    trust(arm, "init")
+    assert "nothing was removed" in refused(arm, "leave", stdin="n\n", code=2)
+    assert "add --yes" in arm.run_apart("trust", "leave")[2]
+    store = arm.path / ".local/state/rmpa/arm/trust"
     (store / "keys.json").unlink()
     for command in ("status", "renew"):
-        assert "keys.json: is missing; join again" in arm.refused(command)
-    code, _, err = arm.run("up")
-    assert (code, "keys.json: is missing; join again" in err) == (1, True), err
-    arm.trust("leave", "--yes")
+        assert "keys.json: is missing; join again" in refused(arm, command)
+    assert "keys.json: is missing; join again" in arm.says("up", code=1)
+    trust(arm, "leave", "--yes")
 
 
-def test_a_join_by_files(machine: Callable[[str], Machine]) -> None:
-    base, arm = machine("base"), machine("arm")
-    base.trust("init")
-    csr = arm.folder / "arm.csr"
-    out = arm.trust("join", "--request", str(csr))
+def test_a_join_by_files(machines: Callable[[str], Machine]) -> None:
+    base, arm = machines("base"), machines("arm")
+    trust(base, "init")
+    csr = arm.path / "arm.csr"
+    out = trust(arm, "join", "--request", str(csr))
     shown = re.search(r"with the key ([0-9a-f ]+);", out)
     assert shown is not None
     code, out, err = base.run("trust", "invite", "--sign", str(csr), stdin="y\n")
@@ -236,47 +149,47 @@ def test_a_join_by_files(machine: Callable[[str], Machine]) -> None:
     assert ca is not None
     answer = Path(f"{csr}.answer")
     assert answer.stat().st_mode & 0o077 == 0
-    assert "exists already" in base.refused("invite", "--yes", "--sign", str(csr), code=2)
-    assert "does not have the fingerprint of --ca" in arm.refused(
-        "join", "--accept", str(answer), "--ca", "0" * 32, code=2
+    assert "exists already" in refused(base, "invite", "--yes", "--sign", str(csr), code=2)
+    assert "does not have the fingerprint of --ca" in refused(
+        arm, "join", "--accept", str(answer), "--ca", "0" * 32, code=2
     )
-    assert "is not 32 hexadecimal digits" in arm.refused("join", "--accept", str(answer), code=2)
-    assert "is no answer of rmpa trust invite" in arm.refused("join", "--accept", str(csr), "--ca", ca[1], code=2)
-    arm.trust("join", "--accept", str(answer), "--ca", ca[1])
+    assert "is not 32 hexadecimal digits" in refused(arm, "join", "--accept", str(answer), code=2)
+    assert "is no answer of rmpa trust invite" in refused(arm, "join", "--accept", str(csr), "--ca", ca[1], code=2)
+    trust(arm, "join", "--accept", str(answer), "--ca", ca[1])
     assert arm.status()["on"] is True
-    assert not (arm.folder / ".local/state/rmpa/arm/trust/request.key").exists()
-    assert "is no request" in base.refused("invite", "--sign", str(answer), code=2)
+    assert not (arm.path / ".local/state/rmpa/arm/trust/request.key").exists()
+    assert "is no request" in refused(base, "invite", "--sign", str(answer), code=2)
     base.up()
     arm.up()
-    until(lambda: arm.peers().get("base") == "linked")
+    until(lambda: peers(arm).get("base") == "linked")
 
 
 def test_an_agent_without_trust_warns_and_says_that_it_must_be_started_again(
-    machine: Callable[[str], Machine],
+    machines: Callable[[str], Machine],
 ) -> None:
-    base = machine("base")
+    base = machines("base")
     base.up()
-    until(lambda: "peers can find it" in base.log and "trust is off" in base.log)
-    assert base.log.count("trust is off: every program that reaches port") == 1
+    until(lambda: "peers can find it" in base.log() and "trust is off" in base.log())
+    assert base.log().count("trust is off: every program that reaches port") == 1
     out = base.run("trust", "init")
     assert "the agent base runs without its keys; restart it: end it (Ctrl-C), then rmpa up" in out[2]
     shown = base.status()
     assert (shown["on"], shown["agent"]) == (True, "plain")
     assert "restart it: end it" in str(shown["problems"])
-    assert "runs without its keys, so no module can join; restart it: end it" in base.refused("invite")
+    assert "runs without its keys, so no module can join; restart it: end it" in refused(base, "invite")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_ctrl_c_or_a_closed_terminal_withdraws_the_token(
-    machine: Callable[[str], Machine], number: signal.Signals
+    machines: Callable[[str], Machine], number: signal.Signals
 ) -> None:
-    base, arm = machine("base"), machine("arm")
-    base.trust("init")
+    base, arm = machines("base"), machines("arm")
+    trust(base, "init")
     base.up()
-    inviting = base.start("trust", "invite", "--json")
-    assert inviting.stdout is not None
-    token = json.loads(inviting.stdout.readline())["token"]
-    inviting.send_signal(number)
-    _, err = inviting.communicate(timeout=DEADLINE)
+    with base.start("trust", "invite", "--json") as inviting:
+        assert inviting.stdout is not None
+        token = json.loads(inviting.stdout.readline())["token"]
+        inviting.send_signal(number)
+        _, err = inviting.communicate(timeout=DEADLINE)
     assert (inviting.returncode, "the token is withdrawn" in err) == (130, True), err
-    assert "arm cannot join: the token is unknown here (token)" in arm.refused("join", token)
+    assert "arm cannot join: the token is unknown here (token)" in refused(arm, "join", token)

@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import socket
-import subprocess
 import sys
 import urllib.error
 import urllib.request
@@ -14,15 +13,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rmpa.agent.agent import Agent
 from tests.cli.conftest import DEADLINE, free_port, until
 
 if TYPE_CHECKING:
+    import subprocess
     from collections.abc import Iterator
 
-    from tests.cli.conftest import Place
+    import pytest
 
-WEB = ("aiohttp", "rmpa.web")
+    from tests.cli.conftest import Place
 
 
 def get(port: int, path: str, token: str = "") -> tuple[int, str]:
@@ -135,16 +134,10 @@ def test_rmpa_reload_takes_other_rights_and_a_mistake_changes_nothing(place: Pla
         assert child_of(agent.pid) == pid
 
 
-def test_without_the_extra_it_says_what_to_install(place: Place) -> None:
-    block = "import sys; sys.modules['aiohttp'] = None; from rmpa.cli.main import main; sys.exit(main(['web']))"
-    done = subprocess.run(
-        [sys.executable, "-c", block], capture_output=True, text=True, env=place.environ, cwd=place.path, check=False
-    )
-    assert done.returncode == 2
-    assert (
-        done.stderr
-        == f"rmpa: rmpa web: aiohttp not installed; run {sys.executable} -m pip install 'rmpa[web]' [extra-missing]\n"
-    )
+def test_without_the_extra_it_says_what_to_install(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "aiohttp", None)
+    problem = f"aiohttp not installed; run {sys.executable} -m pip install 'rmpa[web]' [extra-missing]"
+    assert place.run("web") == (2, "", f"rmpa: rmpa web: {problem}\n")
 
 
 def test_mistakes_are_told_with_their_option(place: Place) -> None:
@@ -153,14 +146,9 @@ def test_mistakes_are_told_with_their_option(place: Place) -> None:
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))
         sock.listen()
-        code, _, err = place.run("web", "--port", str(sock.getsockname()[1]))
-        assert code == 1
-        assert "choose another --port" in err
-        code, out, _ = place.run("web", "--port", str(sock.getsockname()[1]), "--json")
-        assert "choose another --port" in json.loads(out)["error"]
-
-
-def test_the_agent_does_not_import_the_web(place: Place) -> None:
-    code = f"import sys, {Agent.__module__}, rmpa.cli.agent; print([n for n in sys.modules if n.startswith({WEB})])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=place.environ, check=True)
-    assert done.stdout.strip() == "[]"
+        code, out, err = place.run_apart("web", "--port", str(sock.getsockname()[1]), "--json")
+    assert (code, "choose another --port" in err, "choose another --port" in json.loads(out)["error"]) == (
+        1,
+        True,
+        True,
+    )

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from rmpa.config.values import did_you_mean
-from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.core.errors import ConfigError, RmpaError, with_places
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -153,7 +153,7 @@ def help_of(docstring: str | None) -> dict[str, Any]:
 
     The paragraphs of the epilog are shown as they are written.
     """
-    text, _, epilog = inspect.cleandoc(docstring or "").partition("\n---\n")
+    text, _, epilog = with_places(inspect.cleandoc(docstring or "")).partition("\n---\n")
     paragraphs = epilog.replace("{master}", _MASTER).strip().split("\n\n") if epilog else ()
     return {"help": text, "epilog": "\n\n".join(f"\b\n{each}" for each in paragraphs)}
 

@@ -15,6 +15,8 @@ from unicodedata import combining, east_asian_width
 import click
 import msgspec
 
+from rmpa.core.errors import with_places
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
@@ -53,7 +55,7 @@ def print_text(*text: Text) -> None:
     """Print lines and tables, each at once."""
     for item in text:
         if isinstance(item, str):
-            click.echo(item if isinstance(item, Painted) else printable(item))
+            click.echo(with_places(item if isinstance(item, Painted) else printable(item)))
         elif isinstance(item, Table):
             import shutil
 
@@ -121,13 +123,13 @@ def paint(text: str, colour: str | None) -> Painted:
 
 def warn(text: str, code: str = "") -> None:
     """One line on stderr with a code of ``core.codes``, yellow on a terminal; control characters are escaped."""
-    click.secho(f"! {printable(text)}" + (f" [{code}]" if code else ""), err=True, fg="yellow")
+    click.secho(f"! {with_places(printable(text))}" + (f" [{code}]" if code else ""), err=True, fg="yellow")
 
 
 def print_error(error: object, code: str) -> None:
     """``rmpa: … [code]`` on stderr. It may hold the words of a peer or a node: control characters are escaped."""
     first, *more = f"rmpa: {error}".split("\n")
-    click.echo("\n".join(map(printable, (f"{first} [{code}]", *more))), err=True)
+    click.echo(with_places("\n".join(map(printable, (f"{first} [{code}]", *more)))), err=True)
 
 
 def printable(text: str) -> str:

@@ -142,7 +142,10 @@ def open_store(peer: str | None, options: Options) -> ParamStore:
         return MasterParams(options.master())
     if options.master_uri is not None:
         raise ConfigError("--peer", "a peer is asked through this machine's agent, not at a master", "leave one out")
-    return PeerParams(options.client(observe_limits.CONTROL_HANDLER_TIMEOUT), peer)
+    client = options.client(observe_limits.CONTROL_HANDLER_TIMEOUT)
+    if context := click.get_current_context(silent=True):
+        context.with_resource(client)
+    return PeerParams(client, peer)
 
 
 def split_peer(peer: str | None, text: str) -> tuple[str | None, str]:

@@ -18,6 +18,7 @@ from heapq import heapify, heappop, heappush
 from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
 
 from rmpa.core import codes, limits
+from rmpa.core.errors import with_places
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -161,7 +162,7 @@ class _Formatter(logging.Formatter):
         """
         level, room = record.levelname.lower(), _room_of(record.name)
         trace = self.formatException(record.exc_info) if record.exc_info else ""
-        text = record.getMessage()
+        text = with_places(record.getMessage())
         if not (code := codes.of_line(text)) and trace and record.levelno >= logging.WARNING:
             code = "internal-error"
             text += f" [{code}]"

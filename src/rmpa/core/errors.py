@@ -18,13 +18,15 @@ its code of ``core.codes``, by its class or by what raises it; the command line 
 
 from __future__ import annotations
 
+import functools
+import re
 import sys
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Final
 
-if TYPE_CHECKING:
-    from pathlib import Path
+_PAGE: Final = re.compile(r"(?<![\w/])docs/[\w/-]+\.md(?:#[\w-]+)?")
 
 
 class RmpaError(Exception):
@@ -170,6 +172,33 @@ def missing_extra(name: str) -> str:
     if find_spec("pip") is None:  # pipx, uv
         return f"the command that installed rmpa, with the extra {name}: docs/start/install.md#the-extras"
     return f"{sys.executable} -m pip install 'rmpa[{name}]'"
+
+
+def with_places(text: str) -> str:
+    """A text for users whose pages, such as ``docs/guides/trust.md``, say where this rmpa has them."""
+    if "docs/" not in text:
+        return text
+    before, after = _place_of_docs()
+    return _PAGE.sub(rf"{before}\g<0>{after}", text)
+
+
+@functools.cache
+def _place_of_docs() -> tuple[str, str]:
+    """What stands before and behind ``docs/….md``: a folder of this machine, an address, or else in words."""
+    from importlib.metadata import PackageNotFoundError, metadata  # noqa: PLC0415 - it loads the modules of e-mail
+
+    source = Path(__file__).parents[2]
+    if source.name == "src" and (source.parent / "docs").is_dir():
+        return "", ""  # a clone
+    for place in (f"{sys.prefix}/share/doc/rmpa/", "/usr/share/doc/rmpa/"):
+        if Path(place, "docs").is_dir():
+            return place, ""
+    try:
+        urls = dict(url.split(", ", 1) for url in metadata("rmpa").get_all("Project-URL") or ())
+    except PackageNotFoundError:
+        urls = {}
+    before, docs, _ = urls.get("Documentation", "").partition("docs/")
+    return (before, "") if docs and ".invalid/" not in before else ("", " of RMPA's repository")
 
 
 def _advised(text: str, remedy: str) -> str:
