@@ -340,6 +340,8 @@ class Registration(Generic[_T]):
                 await self._rest(asyncio.sleep(limits.NODE_RETRY))
                 continue
             except (RmpaError, ValueError) as error:  # ValueError: an illegal name
+                if node.stopped.is_set():
+                    continue
                 self._on_failed(error if isinstance(error, RmpaError) else RmpaError(str(error)))
                 return
             self._link.on_registration()
