@@ -5,6 +5,7 @@ from __future__ import annotations
 import ssl
 import tempfile
 from datetime import UTC, datetime
+from functools import cache
 from typing import TYPE_CHECKING, cast
 
 from cryptography.hazmat.primitives import serialization
@@ -50,13 +51,6 @@ def shake(contexts: Contexts) -> tuple[TlsHandshake, TlsHandshake]:
     return client, server
 
 
-def secure_pair(
-    contexts: Contexts, one: socket.socket | Slow, other: socket.socket | Slow
-) -> tuple[SecureSocket, SecureSocket]:
-    client, server = shake(contexts)
-    return client.secure(cast("socket.socket", one)), server.secure(cast("socket.socket", other))
-
-
 class Slow:
     """A socket that takes and gives only a few bytes a call."""
 
@@ -76,6 +70,22 @@ class Slow:
         self._sock.close()
 
 
+@cache
 def make_contexts() -> Contexts:
     lab = Authority()
     return make_context(lab, server_side=False), make_context(lab, server_side=True)
+
+
+class SecurePairs:
+    """Two connected sockets, and TLS on them."""
+
+    def __init__(self, sockets: tuple[socket.socket, socket.socket]) -> None:
+        self.contexts, self.sockets = make_contexts(), sockets
+        for sock in sockets:
+            sock.setblocking(False)
+
+    def secured(self, most: int = 1 << 30, there: int = 1 << 30) -> tuple[SecureSocket, SecureSocket]:
+        """Both ends, which take and give so many bytes a call."""
+        client, server = shake(self.contexts)
+        one, other = (Slow(sock, few) for sock, few in zip(self.sockets, (most, there), strict=True))
+        return client.secure(cast("socket.socket", one)), server.secure(cast("socket.socket", other))

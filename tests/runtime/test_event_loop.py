@@ -10,13 +10,14 @@ import pytest
 from rmpa.runtime.loop import AgentLoop, DirectSelector, sorted_yielding, yield_to_data, yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Iterator
+    from collections.abc import Callable, Coroutine, Iterator
 
 DEADLINE = 20.0
+Pair = tuple[socket.socket, socket.socket]
 
 
 @pytest.fixture
-def pair() -> Iterator[tuple[socket.socket, socket.socket]]:
+def pair() -> Iterator[Pair]:
     one, other = socket.socketpair()
     one.setblocking(False)
     other.setblocking(False)
@@ -25,144 +26,131 @@ def pair() -> Iterator[tuple[socket.socket, socket.socket]]:
     other.close()
 
 
-def run(main: Coroutine[object, object, None]) -> None:
-    with asyncio.Runner(loop_factory=AgentLoop) as runner:
-        runner.run(asyncio.wait_for(main, DEADLINE))
+Ends = tuple[AgentLoop, socket.socket, socket.socket]
 
 
-def agent_loop() -> AgentLoop:
-    loop = asyncio.get_running_loop()
-    assert isinstance(loop, AgentLoop)
-    return loop
+def in_agent_loop(test: Callable[[Ends], Coroutine[object, object, None]]) -> Callable[[Pair], None]:
+    """A test that runs in an agent's loop with both ends of a pair of sockets."""
+
+    def run(pair: Pair) -> None:
+        with asyncio.Runner(loop_factory=AgentLoop) as runner:
+            loop = runner.get_loop()
+            assert isinstance(loop, AgentLoop)
+            runner.run(asyncio.wait_for(test((loop, *pair)), DEADLINE))
+
+    run.__name__ = test.__name__
+    return run
 
 
-def test_a_direct_reader_is_called_and_ends_with_remove_reader(pair: tuple[socket.socket, socket.socket]) -> None:
-    one, other = pair
+@in_agent_loop
+async def test_a_direct_reader_is_called_and_ends_with_remove_reader(ends: Ends) -> None:
+    loop, one, other = ends
+    got: list[bytes] = []
+    came = asyncio.Event()
 
-    async def main() -> None:
-        loop = agent_loop()
-        got: list[bytes] = []
-        came = asyncio.Event()
+    def read() -> None:
+        got.append(one.recv(100))
+        came.set()
 
-        def read() -> None:
-            got.append(one.recv(100))
-            came.set()
-
-        loop.add_direct_reader(one.fileno(), read)
-        for word in (b"a", b"b"):
-            came.clear()
-            other.send(word)
-            await came.wait()
-        assert got == [b"a", b"b"]
-        loop.remove_reader(one.fileno())
-        other.send(b"c")
-        await asyncio.sleep(0)
-        await asyncio.sleep(0)
-        assert got == [b"a", b"b"]
-
-    run(main())
+    loop.add_direct_reader(one.fileno(), read)
+    for word in (b"a", b"b"):
+        came.clear()
+        other.send(word)
+        await came.wait()
+    assert got == [b"a", b"b"]
+    loop.remove_reader(one.fileno())
+    other.send(b"c")
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert got == [b"a", b"b"]
 
 
-def test_reader_and_writer_of_one_socket_both_work(pair: tuple[socket.socket, socket.socket]) -> None:
-    one, other = pair
+@in_agent_loop
+async def test_reader_and_writer_of_one_socket_both_work(ends: Ends) -> None:
+    loop, one, other = ends
+    read, written = asyncio.Event(), asyncio.Event()
 
-    async def main() -> None:
-        loop = agent_loop()
-        read, written = asyncio.Event(), asyncio.Event()
+    def take() -> None:
+        one.recv(100)
+        read.set()
 
-        def take() -> None:
-            one.recv(100)
-            read.set()
+    loop.add_direct_reader(one.fileno(), take)
+    loop.add_writer(one.fileno(), written.set)
+    other.send(b"a")
+    await read.wait()
+    await written.wait()
+    loop.remove_writer(one.fileno())
+    read.clear()
+    other.send(b"b")
+    await read.wait()
+    loop.remove_reader(one.fileno())
 
-        loop.add_direct_reader(one.fileno(), take)
-        loop.add_writer(one.fileno(), written.set)
+
+@in_agent_loop
+async def test_timers_and_callbacks_set_by_a_direct_reader_run(ends: Ends) -> None:
+    loop, one, other = ends
+    soon, later = asyncio.Event(), asyncio.Event()
+
+    def read() -> None:
+        one.recv(100)
+        loop.call_soon(soon.set)
+        loop.call_later(0.001, later.set)
+
+    loop.add_direct_reader(one.fileno(), read)
+    other.send(b"a")
+    await soon.wait()
+    await later.wait()
+    loop.remove_reader(one.fileno())
+
+
+@in_agent_loop
+async def test_a_direct_reader_that_raises_does_not_end_the_loop(ends: Ends) -> None:
+    loop, one, other = ends
+    problems: list[object] = []
+    told = asyncio.Event()
+
+    def handler(_loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
+        problems.append(context["exception"])
+        told.set()
+
+    def read() -> None:
+        one.recv(100)
+        raise RuntimeError("mine")
+
+    loop.set_exception_handler(handler)
+    loop.add_direct_reader(one.fileno(), read)
+    other.send(b"a")
+    await told.wait()
+    assert [str(problem) for problem in problems] == ["mine"]
+    loop.remove_reader(one.fileno())
+
+
+@in_agent_loop
+async def test_a_reader_may_close_another_that_is_ready_too(ends: Ends) -> None:
+    loop = ends[0]
+    pairs = [socket.socketpair() for _ in range(2)]
+    called = asyncio.Event()
+    calls: list[int] = []
+
+    def read(index: int) -> None:
+        calls.append(index)
+        for one, _ in pairs:
+            loop.remove_reader(one.fileno())
+            one.close()
+        called.set()
+
+    for index, (one, _) in enumerate(pairs):
+        loop.add_direct_reader(one.fileno(), lambda index=index: read(index))  # type: ignore[misc]
+    for _, other in pairs:
         other.send(b"a")
-        await read.wait()
-        await written.wait()
-        loop.remove_writer(one.fileno())
-        read.clear()
-        other.send(b"b")
-        await read.wait()
-        loop.remove_reader(one.fileno())
-
-    run(main())
+    await called.wait()
+    await asyncio.sleep(0)
+    assert len(calls) == 1
+    for _, other in pairs:
+        other.close()
 
 
-def test_timers_and_callbacks_set_by_a_direct_reader_run(pair: tuple[socket.socket, socket.socket]) -> None:
-    one, other = pair
-
-    async def main() -> None:
-        loop = agent_loop()
-        soon, later = asyncio.Event(), asyncio.Event()
-
-        def read() -> None:
-            one.recv(100)
-            loop.call_soon(soon.set)
-            loop.call_later(0.001, later.set)
-
-        loop.add_direct_reader(one.fileno(), read)
-        other.send(b"a")
-        await soon.wait()
-        await later.wait()
-        loop.remove_reader(one.fileno())
-
-    run(main())
-
-
-def test_a_direct_reader_that_raises_does_not_end_the_loop(pair: tuple[socket.socket, socket.socket]) -> None:
-    one, other = pair
-
-    async def main() -> None:
-        loop = agent_loop()
-        problems: list[object] = []
-        told = asyncio.Event()
-
-        def handler(_loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
-            problems.append(context["exception"])
-            told.set()
-
-        def read() -> None:
-            one.recv(100)
-            raise RuntimeError("mine")
-
-        loop.set_exception_handler(handler)
-        loop.add_direct_reader(one.fileno(), read)
-        other.send(b"a")
-        await told.wait()
-        assert [str(problem) for problem in problems] == ["mine"]
-        loop.remove_reader(one.fileno())
-
-    run(main())
-
-
-def test_a_reader_may_close_another_that_is_ready_too() -> None:
-    async def main() -> None:
-        loop = agent_loop()
-        pairs = [socket.socketpair() for _ in range(2)]
-        called = asyncio.Event()
-        calls: list[int] = []
-
-        def read(index: int) -> None:
-            calls.append(index)
-            for one, _ in pairs:
-                loop.remove_reader(one.fileno())
-                one.close()
-            called.set()
-
-        for index, (one, _) in enumerate(pairs):
-            loop.add_direct_reader(one.fileno(), lambda index=index: read(index))  # type: ignore[misc]
-        for _, other in pairs:
-            other.send(b"a")
-        await called.wait()
-        await asyncio.sleep(0)
-        assert len(calls) == 1
-        for _, other in pairs:
-            other.close()
-
-    run(main())
-
-
-def test_the_selector_keeps_to_the_contract_of_selectors(pair: tuple[socket.socket, socket.socket]) -> None:
+def test_the_selector_keeps_to_the_contract_of_selectors(pair: Pair) -> None:
     one, other = pair
     selector = DirectSelector()
     key = selector.register(one, selectors.EVENT_READ, "mine")
@@ -183,146 +171,118 @@ def test_the_selector_keeps_to_the_contract_of_selectors(pair: tuple[socket.sock
     selector.close()
 
 
-def test_a_peer_that_hangs_up_is_a_read(pair: tuple[socket.socket, socket.socket]) -> None:
-    one, other = pair
-
-    async def main() -> None:
-        loop = agent_loop()
-        ended = asyncio.Event()
-        loop.add_direct_reader(one.fileno(), lambda: ended.set() if one.recv(10) == b"" else None)
-        other.close()
-        await ended.wait()
-        loop.remove_reader(one.fileno())
-
-    run(main())
+@in_agent_loop
+async def test_a_peer_that_hangs_up_is_a_read(ends: Ends) -> None:
+    loop, one, other = ends
+    ended = asyncio.Event()
+    loop.add_direct_reader(one.fileno(), lambda: ended.set() if one.recv(10) == b"" else None)
+    other.close()
+    await ended.wait()
+    loop.remove_reader(one.fileno())
 
 
-def test_data_goes_before_every_ordinary_callback(pair: tuple[socket.socket, socket.socket]) -> None:
-    one, other = pair
+@in_agent_loop
+async def test_data_goes_before_every_ordinary_callback(ends: Ends) -> None:
+    loop, one, other = ends
+    order: list[str] = []
+    loop.add_direct_reader(one.fileno(), lambda: order.append(one.recv(100).decode()))
 
-    async def main() -> None:
-        loop = agent_loop()
-        order: list[str] = []
-        loop.add_direct_reader(one.fileno(), lambda: order.append(one.recv(100).decode()))
+    def work(index: int) -> None:
+        order.append(f"work {index}")
+        other.send(f"data {index}".encode())
 
-        def work(index: int) -> None:
-            order.append(f"work {index}")
-            other.send(f"data {index}".encode())
-
-        ended = asyncio.Event()
-        for index in range(3):
-            loop.call_soon(work, index)
-        loop.call_soon(ended.set)
-        await ended.wait()
-        assert order == ["work 0", "data 0", "work 1", "data 1", "work 2", "data 2"]
-        loop.remove_reader(one.fileno())
-
-    run(main())
+    ended = asyncio.Event()
+    for index in range(3):
+        loop.call_soon(work, index)
+    loop.call_soon(ended.set)
+    await ended.wait()
+    assert order == ["work 0", "data 0", "work 1", "data 1", "work 2", "data 2"]
+    loop.remove_reader(one.fileno())
 
 
-def test_data_is_handled_when_work_yields(pair: tuple[socket.socket, socket.socket]) -> None:
-    one, other = pair
-
-    async def main() -> None:
-        loop = agent_loop()
-        got: list[bytes] = []
-        loop.add_direct_reader(one.fileno(), lambda: got.append(one.recv(100)))
-        for index in range(3):
-            other.send(b"a")
-            assert len(got) == index
-            yield_to_data()
-            assert len(got) == index + 1
-        loop.remove_reader(one.fileno())
+@in_agent_loop
+async def test_data_is_handled_when_work_yields(ends: Ends) -> None:
+    loop, one, other = ends
+    got: list[bytes] = []
+    loop.add_direct_reader(one.fileno(), lambda: got.append(one.recv(100)))
+    for index in range(3):
         other.send(b"a")
+        assert len(got) == index
         yield_to_data()
-        assert len(got) == 3
-
-    run(main())
-
-
-def test_a_reader_that_yields_is_not_called_within_itself(pair: tuple[socket.socket, socket.socket]) -> None:
-    one, other = pair
-
-    async def main() -> None:
-        loop = agent_loop()
-        inside: list[int] = []
-        ended = asyncio.Event()
-
-        def read() -> None:
-            one.recv(1)
-            inside.append(1)
-            yield_to_data()
-            assert len(inside) == 1
-            inside.pop()
-            if one.recv(1, socket.MSG_PEEK) == b"z":
-                ended.set()
-                loop.remove_reader(one.fileno())
-
-        loop.add_direct_reader(one.fileno(), read)
-        other.send(b"abz")
-        await ended.wait()
-
-    run(main())
+        assert len(got) == index + 1
+    loop.remove_reader(one.fileno())
+    other.send(b"a")
+    yield_to_data()
+    assert len(got) == 3
 
 
-def test_a_writer_of_a_direct_reader_is_called_in_between_too(pair: tuple[socket.socket, socket.socket]) -> None:
-    one, _ = pair
+@in_agent_loop
+async def test_a_reader_that_yields_is_not_called_within_itself(ends: Ends) -> None:
+    loop, one, other = ends
+    inside: list[int] = []
+    ended = asyncio.Event()
 
-    async def main() -> None:
-        loop = agent_loop()
-        written: list[str] = []
-        loop.add_direct_reader(one.fileno(), lambda: written.append("read"))
-        loop.add_writer(one.fileno(), written.append, "a")
+    def read() -> None:
+        one.recv(1)
+        inside.append(1)
         yield_to_data()
-        yield_to_data()
-        assert written == ["a", "a"]
-        loop.remove_writer(one.fileno())
-        yield_to_data()
-        assert written == ["a", "a"]
-        loop.add_writer(one.fileno(), written.append, "b")
-        loop.remove_reader(one.fileno())
-        yield_to_data()
-        assert written == ["a", "a"]
-        await asyncio.sleep(0)
-        await asyncio.sleep(0)
-        assert "b" in written
-        loop.remove_writer(one.fileno())
+        assert len(inside) == 1
+        inside.pop()
+        if one.recv(1, socket.MSG_PEEK) == b"z":
+            ended.set()
+            loop.remove_reader(one.fileno())
 
-    run(main())
+    loop.add_direct_reader(one.fileno(), read)
+    other.send(b"abz")
+    await ended.wait()
 
 
-def test_a_socket_that_was_closed_first_is_forgotten(pair: tuple[socket.socket, socket.socket]) -> None:
-    one, _ = pair
+@in_agent_loop
+async def test_a_writer_of_a_direct_reader_is_called_in_between_too(ends: Ends) -> None:
+    loop, one, _ = ends
+    written: list[str] = []
+    loop.add_direct_reader(one.fileno(), lambda: written.append("read"))
+    loop.add_writer(one.fileno(), written.append, "a")
+    yield_to_data()
+    yield_to_data()
+    assert written == ["a", "a"]
+    loop.remove_writer(one.fileno())
+    yield_to_data()
+    assert written == ["a", "a"]
+    loop.add_writer(one.fileno(), written.append, "b")
+    loop.remove_reader(one.fileno())
+    yield_to_data()
+    assert written == ["a", "a"]
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert "b" in written
+    loop.remove_writer(one.fileno())
 
-    async def main() -> None:
-        loop = agent_loop()
-        number = one.fileno()
-        loop.add_direct_reader(number, lambda: None)
-        one.close()
-        loop.remove_reader(number)
-        yield_to_data()
 
-    run(main())
+@in_agent_loop
+async def test_a_socket_that_was_closed_first_is_forgotten(ends: Ends) -> None:
+    loop, one, _ = ends
+    number = one.fileno()
+    loop.add_direct_reader(number, lambda: None)
+    one.close()
+    loop.remove_reader(number)
+    yield_to_data()
 
 
-def test_a_long_iteration_yields_regularly(pair: tuple[socket.socket, socket.socket]) -> None:
-    one, other = pair
-
-    async def main() -> None:
-        loop = agent_loop()
-        got: list[bytes] = []
-        loop.add_direct_reader(one.fileno(), lambda: got.append(one.recv(100)))
-        seen = []
-        for item in yielding_to_data(range(1000)):
-            seen.append(item)
-            if item == 100:
-                other.send(b"a")
-            if item == 200:
-                assert got == [b"a"]
-        assert seen == list(range(1000))
-        loop.remove_reader(one.fileno())
-
-    run(main())
+@in_agent_loop
+async def test_a_long_iteration_yields_regularly(ends: Ends) -> None:
+    loop, one, other = ends
+    got: list[bytes] = []
+    loop.add_direct_reader(one.fileno(), lambda: got.append(one.recv(100)))
+    seen = []
+    for item in yielding_to_data(range(1000)):
+        seen.append(item)
+        if item == 100:
+            other.send(b"a")
+        if item == 200:
+            assert got == [b"a"]
+    assert seen == list(range(1000))
+    loop.remove_reader(one.fileno())
 
 
 @pytest.mark.parametrize("count", [0, 1, 255, 256, 257, 5000])

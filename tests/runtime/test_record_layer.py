@@ -5,7 +5,6 @@ from __future__ import annotations
 import random
 import socket
 import ssl
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -13,32 +12,8 @@ pytest.importorskip("cryptography")
 
 from rmpa.core.errors import LocalProtocolError
 from rmpa.runtime.tls import INCOMPLETE, SecureSocket, TlsHandshake
-from tests.runtime.secure_pairs import Slow, make_context, make_contexts, secure_pair
+from tests.runtime.secure_pairs import SecurePairs, make_context
 from tests.trust.authority import Authority
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-
-@pytest.fixture(scope="module")
-def contexts() -> tuple[ssl.SSLContext, ssl.SSLContext]:
-    return make_contexts()
-
-
-Sockets = tuple[socket.socket, socket.socket]
-
-
-@pytest.fixture
-def sockets() -> Iterator[Sockets]:
-    listener = socket.create_server(("127.0.0.1", 0))
-    one = socket.create_connection(listener.getsockname())
-    other, _ = listener.accept()
-    listener.close()
-    for sock in (one, other):
-        sock.setblocking(False)
-    yield one, other
-    one.close()
-    other.close()
 
 
 def _transfer(sender: SecureSocket, receiver: SecureSocket, messages: list[list[bytes]], room: int) -> bytes:
@@ -66,11 +41,11 @@ def _transfer(sender: SecureSocket, receiver: SecureSocket, messages: list[list[
     return bytes(got)
 
 
-def test_a_message_is_one_record(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
-    one, other = secure_pair(contexts, *sockets)
+def test_a_message_is_one_record(tls: SecurePairs) -> None:
+    one, other = tls.secured()
     assert one.sendmsg((b"h" * 24, memoryview(b"x" * 64))) == 88
     assert not one.pending
-    assert len(sockets[1].recv(4096, socket.MSG_PEEK)) == 88 + 22
+    assert len(tls.sockets[1].recv(4096, socket.MSG_PEEK)) == 88 + 22
     view = memoryview(bytearray(4096))
     assert other.recv_into(view) == 88
     assert view[:88] == b"h" * 24 + b"x" * 64
@@ -78,29 +53,25 @@ def test_a_message_is_one_record(contexts: tuple[ssl.SSLContext, ssl.SSLContext]
         other.recv_into(view)
 
 
-def test_nothing_is_readable_on_the_way(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
-    one, _ = secure_pair(contexts, *sockets)
+def test_nothing_is_readable_on_the_way(tls: SecurePairs) -> None:
+    one, _ = tls.secured()
     one.sendmsg((b"a secret text that is long enough",))
-    assert b"secret" not in sockets[1].recv(4096)
+    assert b"secret" not in tls.sockets[1].recv(4096)
 
 
 @pytest.mark.parametrize("most", [1, 7, 1460, 1 << 20])
 @pytest.mark.parametrize("room", [1, 100, 65536])
-def test_bytes_survive_slow_sockets_and_small_buffers(
-    contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets, most: int, room: int
-) -> None:
+def test_bytes_survive_slow_sockets_and_small_buffers(tls: SecurePairs, most: int, room: int) -> None:
     rng = random.Random(f"{most} {room}")
     sizes = (1, 24, 88, 5000, 16384, 16385, 40000) if min(most, room) > 7 else (1, 24, 88, 500)
     messages = [[rng.randbytes(size)] for size in sizes]
-    one, other = secure_pair(contexts, Slow(sockets[0], most), Slow(sockets[1], most))
+    one, other = tls.secured(most, most)
     for sender, receiver in ((one, other), (other, one)):
         assert _transfer(sender, receiver, messages, room) == b"".join(part for parts in messages for part in parts)
 
 
-def test_parts_are_taken_in_order_and_at_most_so_many(
-    contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets
-) -> None:
-    one, other = secure_pair(contexts, *sockets)
+def test_parts_are_taken_in_order_and_at_most_so_many(tls: SecurePairs) -> None:
+    one, other = tls.secured()
     parts = [bytes([n]) * size for n, size in enumerate((24, 100_000, 24, 16_000, 3, 200_000))]
     whole = b"".join(parts)
     taken = one.sendmsg(parts)
@@ -116,10 +87,8 @@ def test_parts_are_taken_in_order_and_at_most_so_many(
     assert got == whole[:taken]
 
 
-def test_a_peer_that_does_not_read_is_not_written_to(
-    contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets
-) -> None:
-    one, _ = secure_pair(contexts, *sockets)
+def test_a_peer_that_does_not_read_is_not_written_to(tls: SecurePairs) -> None:
+    one, _ = tls.secured()
     taken = 0
     while not one.pending:
         taken += one.sendmsg((bytes(65536),))
@@ -129,8 +98,8 @@ def test_a_peer_that_does_not_read_is_not_written_to(
     assert not one.flush()
 
 
-def test_what_epoll_does_not_see_is_said(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
-    one, other = secure_pair(contexts, *sockets)
+def test_what_epoll_does_not_see_is_said(tls: SecurePairs) -> None:
+    one, other = tls.secured()
     one.sendmsg((b"x" * 1000,))
     view = memoryview(bytearray(400))
     assert other.recv_into(view) == 400
@@ -140,10 +109,8 @@ def test_what_epoll_does_not_see_is_said(contexts: tuple[ssl.SSLContext, ssl.SSL
     assert not other.readable
 
 
-def test_a_part_of_a_record_is_a_sign_of_life(
-    contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets
-) -> None:
-    one, other = secure_pair(contexts, Slow(sockets[0], 10), sockets[1])
+def test_a_part_of_a_record_is_a_sign_of_life(tls: SecurePairs) -> None:
+    one, other = tls.secured(10)
     one.sendmsg((b"x" * 100,))
     view = memoryview(bytearray(4096))
     assert other.recv_into(view) == INCOMPLETE
@@ -152,8 +119,8 @@ def test_a_part_of_a_record_is_a_sign_of_life(
     assert other.recv_into(view) == 100
 
 
-def test_the_end_is_the_end(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
-    one, other = secure_pair(contexts, *sockets)
+def test_the_end_is_the_end(tls: SecurePairs) -> None:
+    one, other = tls.secured()
     one.sendmsg((b"bye",))
     one.shutdown(socket.SHUT_WR)
     view = memoryview(bytearray(100))
@@ -166,23 +133,21 @@ def test_the_end_is_the_end(contexts: tuple[ssl.SSLContext, ssl.SSLContext], soc
 
 @pytest.mark.parametrize("room", [3, 100])
 @pytest.mark.parametrize("before", [b"", b"bye"])
-def test_what_follows_the_end_is_not_read(
-    contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets, before: bytes, room: int
-) -> None:
-    one, other = secure_pair(contexts, *sockets)
+def test_what_follows_the_end_is_not_read(tls: SecurePairs, before: bytes, room: int) -> None:
+    one, other = tls.secured()
     if before:
         one.sendmsg((before,))
     with pytest.raises(ssl.SSLError):
         one._tls.unwrap()
-    sockets[0].send(one._outgoing.read() + bytes(500))
+    tls.sockets[0].send(one._outgoing.read() + bytes(500))
     view = memoryview(bytearray(room))
     if before:
         assert other.recv_into(view) == len(before)
     assert other.recv_into(view) == 0
 
 
-def test_an_end_in_the_middle_is_the_end(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
-    one, other = secure_pair(contexts, Slow(sockets[0], 10), sockets[1])
+def test_an_end_in_the_middle_is_the_end(tls: SecurePairs) -> None:
+    one, other = tls.secured(10)
     one.sendmsg((b"x" * 100,))
     one.close()
     view = memoryview(bytearray(100))
@@ -190,45 +155,43 @@ def test_an_end_in_the_middle_is_the_end(contexts: tuple[ssl.SSLContext, ssl.SSL
     assert other.recv_into(view) == 0
 
 
-def test_changed_bytes_end_the_connection(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
-    _, other = secure_pair(contexts, *sockets)
-    sockets[0].send(b"\x17\x03\x03\x00\x20" + bytes(32))
+def test_changed_bytes_end_the_connection(tls: SecurePairs) -> None:
+    _, other = tls.secured()
+    tls.sockets[0].send(b"\x17\x03\x03\x00\x20" + bytes(32))
     with pytest.raises(ssl.SSLError):
         other.recv_into(memoryview(bytearray(100)))
 
 
-def test_plain_bytes_end_the_connection(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
-    _, other = secure_pair(contexts, *sockets)
-    sockets[0].send(bytes(100))
+def test_plain_bytes_end_the_connection(tls: SecurePairs) -> None:
+    _, other = tls.secured()
+    tls.sockets[0].send(bytes(100))
     with pytest.raises(ssl.SSLError):
         other.recv_into(memoryview(bytearray(100)))
 
 
-def test_bytes_behind_the_handshake_are_read_first(
-    contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets
-) -> None:
-    client, server = TlsHandshake(contexts[0], server_side=False), TlsHandshake(contexts[1], server_side=True)
+def test_bytes_behind_the_handshake_are_read_first(tls: SecurePairs) -> None:
+    client, server = TlsHandshake(tls.contexts[0], server_side=False), TlsHandshake(tls.contexts[1], server_side=True)
     with pytest.raises(LocalProtocolError):
-        client.secure(sockets[0])
+        client.secure(tls.sockets[0])
     client.receive(b"")
     server.receive(client.take_output())
     client.receive(server.take_output())
     assert client.done
     flight = client.take_output()
-    one = client.secure(sockets[0])
+    one = client.secure(tls.sockets[0])
     one.sendmsg((b"hello",))
-    server.receive(flight + sockets[1].recv(4096))
+    server.receive(flight + tls.sockets[1].recv(4096))
     assert server.done
-    other = server.secure(sockets[1])
+    other = server.secure(tls.sockets[1])
     assert other.readable
     view = memoryview(bytearray(100))
     assert other.recv_into(view) == 5
     assert bytes(view[:5]) == b"hello"
 
 
-def test_a_foreign_ca_is_told_to_the_other_side(contexts: tuple[ssl.SSLContext, ssl.SSLContext]) -> None:
+def test_a_foreign_ca_is_told_to_the_other_side(tls: SecurePairs) -> None:
     foreign = make_context(Authority(), server_side=False)
-    client, server = TlsHandshake(foreign, server_side=False), TlsHandshake(contexts[1], server_side=True)
+    client, server = TlsHandshake(foreign, server_side=False), TlsHandshake(tls.contexts[1], server_side=True)
     client.receive(b"")
     server.receive(client.take_output())
     with pytest.raises(ssl.SSLCertVerificationError) as caught:

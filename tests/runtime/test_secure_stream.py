@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 import ssl
 from typing import TYPE_CHECKING
 
@@ -14,33 +13,12 @@ pytest.importorskip("cryptography")
 from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import Outbox
 from rmpa.runtime.stream import Stream
-from tests.runtime.secure_pairs import Contexts, Slow, make_contexts, secure_pair
+from tests.runtime.message_streams import End
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
-    from rmpa.runtime.tls import SecureSocket
-
-
-@pytest.fixture(scope="module")
-def contexts() -> Contexts:
-    return make_contexts()
-
-
-@pytest.fixture
-def sockets() -> Iterator[tuple[socket.socket, socket.socket]]:
-    listener = socket.create_server(("127.0.0.1", 0))
-    one = socket.create_connection(listener.getsockname())
-    other, _ = listener.accept()
-    listener.close()
-    for sock in (one, other):
-        sock.setblocking(False)
-    yield one, other
-    one.close()
-    other.close()
-
-
-Sockets = tuple[socket.socket, socket.socket]
+    from tests.runtime.secure_pairs import SecurePairs
 
 
 async def until(condition: Callable[[], bool]) -> None:
@@ -49,33 +27,16 @@ async def until(condition: Callable[[], bool]) -> None:
             await asyncio.sleep(0.001)
 
 
-class SecureEnd:
-    """A stream of messages with a length of 4 bytes in front."""
-
-    def __init__(self, sock: socket.socket, secure: SecureSocket, outbox: Outbox | None = None) -> None:
-        self.got: list[bytes] = []
-        self.ends: list[Exception | None] = []
-        self.outbox = Outbox(1 << 20, 1 << 30) if outbox is None else outbox
-        self.stream = Stream(sock, on_bytes=self.take, on_close=self.ends.append, outbox=self.outbox, secure=secure)
-
-    def take(self, view: memoryview) -> tuple[int, int]:
-        at = 0
-        while len(view) - at >= 4:
-            size = int.from_bytes(view[at : at + 4], "big")
-            if len(view) - at - 4 < size:
-                return at, 4 + size
-            self.got.append(bytes(view[at + 4 : at + 4 + size]))
-            at += 4 + size
-        return at, 0
-
-    def send(self, data: bytes, key: int = 1) -> int:
-        return self.stream.send([len(data).to_bytes(4, "big"), memoryview(data)], key)
+def ends(tls: SecurePairs, most: int = 1 << 30, there: int = 1 << 30) -> tuple[End, End]:
+    one, other = (
+        End(sock, secure=secure) for sock, secure in zip(tls.sockets, tls.secured(most, there), strict=True)
+    )
+    return one, other
 
 
 @pytest.mark.parametrize("most", [1 << 30, 1000])
-async def test_all_sizes_in_order_both_ways(contexts: Contexts, sockets: Sockets, most: int) -> None:
-    secured = secure_pair(contexts, *(Slow(sock, most) for sock in sockets))
-    one, other = (SecureEnd(sock, secure) for sock, secure in zip(sockets, secured, strict=True))
+async def test_all_sizes_in_order_both_ways(tls: SecurePairs, most: int) -> None:
+    one, other = ends(tls, most, most)
     sizes = [0, 1, 3, 100, 16380, 16384, 65532, 200_000, 3 * MIB if most > 1000 else 9, 5, 7] * 2
     messages = [bytes([i]) * size for i, size in enumerate(sizes)]
     for message in messages:
@@ -85,37 +46,21 @@ async def test_all_sizes_in_order_both_ways(contexts: Contexts, sockets: Sockets
     assert other.got == one.got == messages
     assert one.stream.bytes_out == other.stream.bytes_in == sum(sizes) + 4 * len(sizes)
     assert not one.stream.pending_bytes
-    one.stream.close()
-    other.stream.close()
 
 
-async def test_64_mb_both_ways_at_once(contexts: Contexts, sockets: Sockets) -> None:
-    one, other = (SecureEnd(s, secure) for s, secure in zip(sockets, secure_pair(contexts, *sockets), strict=True))
+async def test_64_mb_both_ways_at_once(tls: SecurePairs) -> None:
+    one, other = ends(tls)
     message = bytes(range(256)) * (64 * MIB // 256)
     one.send(message)
     other.send(message)
     await until(lambda: len(one.got) == len(other.got) == 1)
     assert one.got == other.got == [message]
-    one.stream.close()
-    other.stream.close()
 
 
-async def test_messages_of_one_byte_at_a_time_arrive(contexts: Contexts, sockets: Sockets) -> None:
-    secured = secure_pair(contexts, Slow(sockets[0], 1), Slow(sockets[1], 1))
-    one, other = (SecureEnd(sock, secure) for sock, secure in zip(sockets, secured, strict=True))
-    messages = [bytes([i]) * i for i in range(40)]
-    for message in messages:
-        one.send(message)
-    await until(lambda: len(other.got) == len(messages))
-    assert other.got == messages
-    one.stream.close()
-    other.stream.close()
-
-
-async def test_part_of_a_record_is_a_sign_of_life(contexts: Contexts, sockets: Sockets) -> None:
+async def test_part_of_a_record_is_a_sign_of_life(tls: SecurePairs) -> None:
     """A record of 16 KiB takes 1.3 s at 100 kbit/s, longer than the lease of the express lane."""
-    sender, receiver = secure_pair(contexts, Slow(sockets[0], 100), sockets[1])
-    end = SecureEnd(sockets[1], receiver)
+    sender, receiver = tls.secured(100)
+    end = End(tls.sockets[1], secure=receiver)
     sender.sendmsg(((5000).to_bytes(4, "big"), b"x" * 5000))
     for _ in range(5):
         before = end.stream.last_in
@@ -125,15 +70,14 @@ async def test_part_of_a_record_is_a_sign_of_life(contexts: Contexts, sockets: S
     while not sender.flush():
         await asyncio.sleep(0)
     await until(lambda: end.got == [b"x" * 5000])
-    end.stream.close()
 
 
-async def test_ciphertext_never_comes_into_a_kept_outbox(contexts: Contexts, sockets: Sockets) -> None:
+async def test_ciphertext_never_comes_into_a_kept_outbox(tls: SecurePairs) -> None:
     """What waits for the next connection is plain text, and nothing of it was sent as a part."""
-    one, _ = secure_pair(contexts, *sockets)
+    one, _ = tls.secured()
     outbox = Outbox(1 << 20, 1 << 30)
     stream = Stream(
-        sockets[0],
+        tls.sockets[0],
         on_bytes=lambda view: (len(view), 0),
         on_close=lambda _: None,
         outbox=outbox,
@@ -150,10 +94,10 @@ async def test_ciphertext_never_comes_into_a_kept_outbox(contexts: Contexts, soc
     assert set(b"".join(bytes(part) for part in outbox.head(1 << 20))) == set(message)
 
 
-async def test_a_peer_that_does_not_read_costs_nothing(contexts: Contexts, sockets: Sockets) -> None:
+async def test_a_peer_that_does_not_read_costs_nothing(tls: SecurePairs) -> None:
     """Neither a loop that is busy, nor more memory than the outbox may have, nor more than a record in ciphertext."""
-    one, _ = secure_pair(contexts, *sockets)
-    end = SecureEnd(sockets[0], one, Outbox(1 << 20, MIB))
+    one, _ = tls.secured()
+    end = End(tls.sockets[0], Outbox(1 << 20, MIB), one)
     dropped = 0
     for _ in range(400):
         dropped += end.send(bytes(64 * KIB))
@@ -173,55 +117,44 @@ async def test_a_peer_that_does_not_read_costs_nothing(contexts: Contexts, socke
         await asyncio.sleep(0.001)
         turns += 1
     assert calls <= 2
-    end.stream.close()
 
 
-async def test_the_last_bytes_leave_before_the_end(contexts: Contexts, sockets: Sockets) -> None:
-    one, other = (
-        SecureEnd(sock, secure)
-        for sock, secure in zip(sockets, secure_pair(contexts, Slow(sockets[0], 50), sockets[1]), strict=True)
-    )
+async def test_the_last_bytes_leave_before_the_end(tls: SecurePairs) -> None:
+    one, other = ends(tls, 50)
     one.send(b"x" * 5000)
     assert not one.stream.pending_bytes, "the outbox has nothing, and yet not all is sent"
     one.stream.finish()
     await until(lambda: bool(other.ends))
     assert other.got == [b"x" * 5000]
     assert other.ends == [None]
-    one.stream.close()
 
 
-async def test_drained_waits_for_ciphertext(contexts: Contexts, sockets: Sockets) -> None:
-    one, other = (
-        SecureEnd(sock, secure)
-        for sock, secure in zip(sockets, secure_pair(contexts, Slow(sockets[0], 50), sockets[1]), strict=True)
-    )
+async def test_drained_waits_for_ciphertext(tls: SecurePairs) -> None:
+    one, other = ends(tls, 50)
     one.send(b"x" * 5000)
     await one.stream.drained(20)
     await until(lambda: other.got == [b"x" * 5000])
-    one.stream.close()
-    other.stream.close()
 
 
-async def test_bytes_behind_the_handshake_are_read(contexts: Contexts, sockets: Sockets) -> None:
+async def test_bytes_behind_the_handshake_are_read(tls: SecurePairs) -> None:
     """They are in OpenSSL already when the stream is made, so the loop does not report them."""
-    one, other = secure_pair(contexts, *sockets)
+    one, other = tls.secured()
     one.sendmsg((b"\0\0\0\5hello",))
     ciphertext = b""
     while not ciphertext:
         try:
-            ciphertext = sockets[1].recv(65536)
+            ciphertext = tls.sockets[1].recv(65536)
         except BlockingIOError:
             await asyncio.sleep(0)
     other._incoming.write(ciphertext)
     other.readable = True
-    end = SecureEnd(sockets[1], other)
+    end = End(tls.sockets[1], secure=other)
     await until(lambda: end.got == [b"hello"])
-    end.stream.close()
 
 
-async def test_an_end_in_the_middle_of_a_record_is_the_end(contexts: Contexts, sockets: Sockets) -> None:
-    one, other = secure_pair(contexts, Slow(sockets[0], 100), sockets[1])
-    end = SecureEnd(sockets[1], other)
+async def test_an_end_in_the_middle_of_a_record_is_the_end(tls: SecurePairs) -> None:
+    one, other = tls.secured(100)
+    end = End(tls.sockets[1], secure=other)
     one.sendmsg((b"x" * 5000,))
     one.close()
     await until(lambda: bool(end.ends))
@@ -229,10 +162,10 @@ async def test_an_end_in_the_middle_of_a_record_is_the_end(contexts: Contexts, s
     assert not end.got
 
 
-async def test_what_is_no_tls_ends_the_connection(contexts: Contexts, sockets: Sockets) -> None:
-    _, other = secure_pair(contexts, *sockets)
-    end = SecureEnd(sockets[1], other)
-    sockets[0].send(b"\0\0\0\5plain")
+async def test_what_is_no_tls_ends_the_connection(tls: SecurePairs) -> None:
+    _, other = tls.secured()
+    end = End(tls.sockets[1], secure=other)
+    tls.sockets[0].send(b"\0\0\0\5plain")
     await until(lambda: bool(end.ends))
     assert isinstance(end.ends[0], ssl.SSLError)
     assert not end.got

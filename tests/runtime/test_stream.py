@@ -17,55 +17,16 @@ from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import URGENT, Outbox
 from rmpa.runtime.stream import Stream
 from rmpa.runtime.tls import CollectedSends, after_read
+from tests.runtime.message_streams import End
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
 
 async def until(condition: Callable[[], bool]) -> None:
     async with asyncio.timeout(20):
         while not condition():
             await asyncio.sleep(0.001)
-
-
-class End:
-    """A stream of messages with a length of 4 bytes in front."""
-
-    def __init__(self, sock: socket.socket, outbox: Outbox | None = None) -> None:
-        sock.setblocking(False)
-        self.got: list[bytes] = []
-        self.ends: list[Exception | None] = []
-        self.offered: list[int] = []
-        self.on_message: Callable[[bytes], None] = self.got.append
-        box = Outbox(1 << 20, 1 << 30) if outbox is None else outbox
-        self.stream = Stream(sock, on_bytes=self.take, on_close=self.ends.append, outbox=box)
-
-    def take(self, view: memoryview) -> tuple[int, int]:
-        self.offered.append(len(view))
-        at = 0
-        while len(view) - at >= 4:
-            size = int.from_bytes(view[at : at + 4], "big")
-            if size == 0xFFFFFFFF:
-                raise RemoteProtocolError("no such length")
-            if len(view) - at - 4 < size:
-                return at, 4 + size
-            self.on_message(bytes(view[at + 4 : at + 4 + size]))
-            at += 4 + size
-        return at, 0
-
-    def send(self, data: bytes, key: int = 1) -> int:
-        return self.stream.send([len(data).to_bytes(4, "big"), memoryview(data)], key)
-
-
-@pytest.fixture
-def sockets() -> Iterator[tuple[socket.socket, socket.socket]]:
-    listener = socket.create_server(("127.0.0.1", 0))
-    one = socket.create_connection(listener.getsockname())
-    other, _ = listener.accept()
-    listener.close()
-    yield one, other
-    one.close()
-    other.close()
 
 
 Sockets = tuple[socket.socket, socket.socket]
@@ -83,8 +44,6 @@ async def test_all_sizes_in_order_both_ways_through_full_buffers(sockets: Socket
     assert one.stream.bytes_out == other.stream.bytes_in == sum(sizes) + 4 * len(sizes)
     assert not one.stream.pending_bytes
     assert len(one.stream._buffer) <= 4 * MIB, "a large buffer is given back"
-    one.stream.close()
-    other.stream.close()
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -119,7 +78,6 @@ async def test_a_claim_is_not_allocated(sockets: Sockets) -> None:
     await until(lambda: end.stream.bytes_in == 1014)
     assert end.stream.last_in > before
     assert len(end.offered) == offered, "half a message is not offered again and again"
-    end.stream.close()
 
 
 async def test_slow_reader_costs_bounded_memory_and_gets_whole_messages(sockets: Sockets) -> None:
@@ -137,13 +95,10 @@ async def test_slow_reader_costs_bounded_memory_and_gets_whole_messages(sockets:
     assert len(numbers) == 300 - dropped
     assert numbers[-1] == 299
     assert b"urgent" in other.got[:-5]
-    one.stream.close()
-    other.stream.close()
 
 
 async def test_ends_are_told_once_and_not_after_close(sockets: Sockets) -> None:
     one, other = End(sockets[0]), End(sockets[1])
-    one.stream.close()
     one.stream.close()
     await until(lambda: other.ends == [None])
     assert other.stream.closed
@@ -228,11 +183,9 @@ async def test_drained_waits_for_the_last_byte_and_not_for_ever(sockets: Sockets
     one.send(bytes(16 * MIB))
     await one.stream.drained(0.01)
     assert one.stream.pending_bytes
-    other = End(sockets[1])
+    End(sockets[1])
     await asyncio.gather(one.stream.drained(20), one.stream.drained(20))
     assert not one.stream.pending_bytes
-    one.stream.close()
-    other.stream.close()
 
 
 class Counted(socket.socket):
@@ -309,8 +262,6 @@ async def test_messages_that_are_collected_leave_in_one_call(sockets: Sockets) -
     await until(lambda: len(end.got) == 52)
     assert end.got == [*(b"%d" % i for i in range(50)), b"inner", b"after"]
     assert len(target.calls) == 2
-    one.stream.close()
-    end.stream.close()
 
 
 def test_what_is_left_for_the_end_of_a_read_is_called_once_there_also_of_one_within_another() -> None:
@@ -339,7 +290,6 @@ async def test_batches_keep_order_and_bytes_through_full_buffers(sockets: Socket
     assert not relay.out.pending_bytes
     relay.close()
     source.stream.close()
-    end.stream.close()
 
 
 async def test_messages_of_a_read_are_sent_before_a_close_in_it(sockets: Sockets) -> None:

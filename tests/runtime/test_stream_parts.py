@@ -16,9 +16,10 @@ from rmpa.core.outbox import URGENT, Outbox, QueuedMessage
 from rmpa.mesh.frames import Frame, FrameKind, pack_fragment_header
 from rmpa.runtime.stream import Stream
 from tests.core.outbox_model import Reader, fence, payload, whole
+from tests.runtime.message_streams import STREAMS, close_all
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import AsyncIterator, Callable
 
     from rmpa.core.outbox import Framer
 
@@ -34,16 +35,15 @@ async def until(condition: Callable[[], bool], receiver: Receiver | None = None)
 
 
 @pytest.fixture
-def sockets() -> Iterator[Sockets]:
-    """Two ends with room for a few KB between them."""
+async def sockets() -> AsyncIterator[Sockets]:
+    """Two ends with room for a few KB between them; the streams of a test end with them."""
     pair = socket.socketpair()
     for sock in pair:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4608)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4608)
         sock.setblocking(False)
     yield pair
-    for sock in pair:
-        sock.close()
+    close_all(*pair)
 
 
 def large_outbox(frame: Framer | None = pack_fragment_header, fragment: int = FRAGMENT) -> Outbox:
@@ -59,6 +59,7 @@ class Receiver:
         self.said: list[str] = []
         self.ends: list[Exception | None] = []
         self.stream = Stream(sock, on_bytes=self.take, on_close=self.ends.append, outbox=Outbox(1, 1))
+        STREAMS.append(self.stream)
 
     def take(self, view: memoryview) -> tuple[int, int]:
         for kind, route, number, _, what in self.reader.feed(bytes(view)):
@@ -81,6 +82,7 @@ class Sender:
             outbox=box,
             frame=pack_fragment_header,
         )
+        STREAMS.append(self.stream)
         self.number = 0
         self.sent: list[tuple[int, int]] = []
 
@@ -160,8 +162,6 @@ async def test_all_that_a_lane_may_do_in_any_order(sockets: Sockets, seed: int) 
     assert by_key([m for m in receiver.got if m[0]]) == by_key(sender.sent)
     assert not receiver.reader.begun
     assert not receiver.reader.pending
-    sender.stream.close()
-    receiver.stream.close()
 
 
 class CutThrough:
@@ -173,6 +173,7 @@ class CutThrough:
         self.open: tuple[QueuedMessage, int] | None = None
         self.ends: list[Exception | None] = []
         self.into = Stream(inbound, on_bytes=self.take, on_close=self.ends.append, outbox=Outbox(1, 1))
+        STREAMS.append(self.into)
 
     def take(self, view: memoryview) -> tuple[int, int]:
         at, size = 0, len(view)
@@ -227,8 +228,6 @@ async def test_a_bridge_that_hands_on_while_it_reads(sockets: Sockets, seed: int
     await until(lambda: len(receiver.got) == len(sizes), receiver)
     assert by_key(receiver.got) == by_key([(key, number) for number, (key, _) in enumerate(sizes, 1)])
     assert bridge.ends == receiver.ends == []
-    for stream in (bridge.into, bridge.sender.stream, receiver.stream):
-        stream.close()
     source.close()
 
 
@@ -263,8 +262,6 @@ async def test_small_messages_stay_in_front_of_a_large_one_of_the_same_read(
     receiver = Receiver(sockets[1])
     await until(lambda: len(receiver.got) == len(sizes), receiver)
     assert receiver.got == [(1, n) for n in range(1, len(sizes) + 1)]
-    for stream in (bridge.into, bridge.sender.stream, receiver.stream):
-        stream.close()
     source.close()
 
 
@@ -321,8 +318,6 @@ async def test_corked_messages_follow_what_the_outbox_sends(sockets: Sockets) ->
     await Corked(action).run()
     await until(lambda: len(receiver.got) == len(sender.sent), receiver)
     assert by_key(receiver.got) == by_key(sender.sent)
-    sender.stream.close()
-    receiver.stream.close()
 
 
 async def test_route_closed_during_a_read_keeps_corked_messages(sockets: Sockets) -> None:
@@ -337,8 +332,6 @@ async def test_route_closed_during_a_read_keeps_corked_messages(sockets: Sockets
     await Corked(action).run()
     await until(lambda: len(receiver.got) == 2, receiver)
     assert "data 1:1 aborted" in receiver.said
-    sender.stream.close()
-    receiver.stream.close()
 
 
 async def test_a_mark_stays_behind_what_is_corked(sockets: Sockets) -> None:
@@ -352,8 +345,6 @@ async def test_a_mark_stays_behind_what_is_corked(sockets: Sockets) -> None:
     await Corked(action).run()
     await until(lambda: len(receiver.got) == 6, receiver)
     assert receiver.got == sender.sent
-    sender.stream.close()
-    receiver.stream.close()
 
 
 async def test_a_mark_that_has_to_wait_is_not_dropped(sockets: Sockets) -> None:
@@ -371,8 +362,6 @@ async def test_a_mark_that_has_to_wait_is_not_dropped(sockets: Sockets) -> None:
     await until(lambda: receiver.said[-1:] == ["data 1:7 whole"], receiver)
     assert "fence 1:6 whole" in receiver.said
     assert box.dropped[1] >= 3
-    sender.stream.close()
-    receiver.stream.close()
 
 
 async def test_parts_of_one_read_leave_in_one_call(sockets: Sockets) -> None:
@@ -401,8 +390,6 @@ async def test_parts_of_one_read_leave_in_one_call(sockets: Sockets) -> None:
     await Corked(action).run()
     assert sizes == [5 * 24 + 1000]
     await until(lambda: len(receiver.got) == 3, receiver)
-    sender.stream.close()
-    receiver.stream.close()
 
 
 # --- the end of a message that never comes ------------------------------------------------------------------------
@@ -418,8 +405,6 @@ async def test_abandoned_where_the_other_side_has_a_part_it_is_told(sockets: Soc
     sender.send(1, 10)
     await until(lambda: receiver.got == [(1, 2)], receiver)
     assert receiver.said == ["data 1:1 part", "data 1:1 aborted", "data 1:2 whole"]
-    sender.stream.close()
-    receiver.stream.close()
 
 
 async def test_abandoned_message_leaves_the_outbox(sockets: Sockets) -> None:
@@ -432,8 +417,6 @@ async def test_abandoned_message_leaves_the_outbox(sockets: Sockets) -> None:
     await until(lambda: len(receiver.got) == 50, receiver)
     assert receiver.said[-51] == "data 1:1 aborted"
     assert by_key(receiver.got) == by_key(sender.sent)
-    sender.stream.close()
-    receiver.stream.close()
 
 
 async def test_one_whose_rest_waits_is_abandoned_behind_it(sockets: Sockets) -> None:
@@ -448,8 +431,6 @@ async def test_one_whose_rest_waits_is_abandoned_behind_it(sockets: Sockets) -> 
     receiver = Receiver(sockets[1])
     await until(lambda: receiver.got == [(1, 2)], receiver)
     assert receiver.said[-2:] == ["data 1:1 aborted", "data 1:2 whole"]
-    sender.stream.close()
-    receiver.stream.close()
 
 
 @pytest.mark.parametrize("began", [0, 300])
@@ -473,7 +454,6 @@ async def test_more_than_a_message_was_said_to_have_is_our_own_fault(sockets: So
     opened.extend(300)
     with pytest.raises(LocalProtocolError, match="300 bytes"):
         sender.stream.extend(opened.parcel, b"x")
-    sender.stream.close()
 
 
 # --- outboxes that outlive their stream ---------------------------------------------------------------------------
@@ -500,8 +480,6 @@ async def test_adopted_outbox_is_sent_behind_the_connections_own_bytes(sockets: 
     assert receiver.said[:2] == ["hello 0:0 whole", "ping 0:0 whole"]
     assert by_key(receiver.got[2:]) == {7: [1, 2, 4], 8: [3]}
     assert receiver.said.index("data 7:4 whole") < receiver.said.index("data 8:3 whole"), "in turns"
-    sender.stream.close()
-    receiver.stream.close()
 
 
 async def test_outbox_adopted_during_a_read_is_sent_behind_it(sockets: Sockets) -> None:
@@ -517,8 +495,6 @@ async def test_outbox_adopted_during_a_read_is_sent_behind_it(sockets: Sockets) 
     await Corked(action).run()
     await until(lambda: len(receiver.got) == 2, receiver)
     assert receiver.said == ["hello 0:0 whole", "data 7:1 whole"]
-    sender.stream.close()
-    receiver.stream.close()
 
 
 async def test_whole_entries_are_sent_by_the_next_connection(sockets: Sockets) -> None:
@@ -543,8 +519,6 @@ async def test_whole_entries_are_sent_by_the_next_connection(sockets: Sockets) -
     await until(lambda: len(receiver.got) == 4, receiver)
     assert by_key(receiver.got) == {1: [2, 3], 2: [4, 5]}
     assert not box.pending_bytes
-    second.stream.close()
-    receiver.stream.close()
 
 
 async def test_an_outbox_of_its_own_ends_with_the_stream(sockets: Sockets) -> None:
@@ -560,10 +534,9 @@ async def test_an_outbox_of_its_own_ends_with_the_stream(sockets: Sockets) -> No
 async def test_a_stream_begins_with_what_waits_in_its_outbox(sockets: Sockets) -> None:
     box = large_outbox()
     box.push(whole(1, 1, 100), 1)
-    sender, receiver = Sender(sockets[0], box), Receiver(sockets[1])
+    Sender(sockets[0], box)
+    receiver = Receiver(sockets[1])
     await until(lambda: receiver.got == [(1, 1)], receiver)
-    sender.stream.close()
-    receiver.stream.close()
 
 
 async def test_when_all_that_waited_was_too_old_the_stream_is_drained(sockets: Sockets) -> None:
@@ -582,4 +555,3 @@ async def test_when_all_that_waited_was_too_old_the_stream_is_drained(sockets: S
     assert sender.stream.bytes_out == 0
     sender.send(1, 10)
     assert sender.stream.bytes_out == 34
-    sender.stream.close()
