@@ -14,8 +14,7 @@ from tests.mesh.worlds import ACCEPTOR, DIALLER, HIGH, LOW, AnyRoute, Side, Time
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 24, 1 << 20])
-def test_handshake_control_data_and_bye_in_pieces(chunk: int) -> None:
-    time = Time()
+def test_handshake_control_data_and_bye_in_pieces(time: Time, chunk: int) -> None:
     dialler = Side(DIALLER, LOW, time, expected=HIGH.guid)
     acceptor = Side(ACCEPTOR, HIGH, time)
     deliver(dialler.take_output(), acceptor, time.now, chunk)
@@ -35,8 +34,7 @@ def test_handshake_control_data_and_bye_in_pieces(chunk: int) -> None:
     assert dialler.last() == ("closed", "shutting down")
 
 
-def test_every_split_of_the_handshake_in_two_is_the_same() -> None:
-    time = Time()
+def test_every_split_of_the_handshake_in_two_is_the_same(time: Time) -> None:
     whole = Side(DIALLER, LOW, time).take_output()
     for cut in range(1, len(whole)):
         acceptor = Side(ACCEPTOR, HIGH, time)
@@ -47,9 +45,7 @@ def test_every_split_of_the_handshake_in_two_is_the_same() -> None:
         assert acceptor.events[0][0] == "hello"
 
 
-def test_data_arrives_as_a_view_without_a_copy() -> None:
-    time = Time()
-    _, acceptor = pair(time)
+def test_data_arrives_as_a_view_without_a_copy(acceptor: Side, time: Time) -> None:
     seen: list[memoryview] = []
     acceptor.routes = AnyRoute(lambda _r, _s, _t, view: seen.append(view))
     whole = bytearray(pack_data_header(3, 1, 1, 1) + b"abc")
@@ -58,17 +54,14 @@ def test_data_arrives_as_a_view_without_a_copy() -> None:
     assert bytes(seen[0]) == b"Xbc"
 
 
-def test_data_of_a_closed_route_is_dropped_and_counted() -> None:
-    time = Time()
-    _, acceptor = pair(time)
+def test_data_of_a_closed_route_is_dropped_and_counted(acceptor: Side, time: Time) -> None:
     acceptor.routes = {}
     wire = pack_data_header(3, 1, 1, 1) + b"abc" + pack_data_header(200_000, 1, 2, 1) + bytes(100_000)
     assert acceptor.receive(memoryview(wire), time.now) == (len(wire), 0)
     assert acceptor._counters["route.unknown"] == 2
 
 
-def test_a_refusal_reaches_the_dialler_and_both_end() -> None:
-    time = Time()
+def test_a_refusal_reaches_the_dialler_and_both_end(time: Time) -> None:
     dialler = Side(DIALLER, LOW, time)
     refuse = Refuse(Refusal.BUSY, "come later")
     acceptor = Side(ACCEPTOR, HIGH, time, verdict=refuse)
@@ -97,8 +90,7 @@ def with_byte(data: bytes, offset: int, value: int) -> bytes:
         (45, 0x2F, Refusal.MALFORMED),
     ],
 )
-def test_an_unreadable_hello_is_refused_with_its_code(offset: int, value: int, code: Refusal) -> None:
-    time = Time()
+def test_an_unreadable_hello_is_refused_with_its_code(time: Time, offset: int, value: int, code: Refusal) -> None:
     acceptor = Side(ACCEPTOR, HIGH, time)
     payload = Hello.of(LOW, lease=1.0, expected=None).serialize()
     deliver(Frame(FrameKind.HELLO, with_byte(payload, offset, value)).serialize(), acceptor, time.now)
@@ -110,8 +102,7 @@ def test_an_unreadable_hello_is_refused_with_its_code(offset: int, value: int, c
     assert acceptor.events[0][0] == "refused"
 
 
-def test_a_wrong_welcome_ends_the_link_with_a_bye() -> None:
-    time = Time()
+def test_a_wrong_welcome_ends_the_link_with_a_bye(time: Time) -> None:
     dialler = Side(DIALLER, LOW, time, expected=Guid.of("10.0.0.9", 1))
     dialler.take_output()
     welcome = Hello.of(HIGH, lease=1.0, expected=LOW.guid)
@@ -124,8 +115,7 @@ def test_a_wrong_welcome_ends_the_link_with_a_bye() -> None:
 
 
 @pytest.mark.parametrize("kind", [k for k in FrameKind if k is not FrameKind.HELLO])
-def test_only_hello_opens(kind: FrameKind) -> None:
-    time = Time()
+def test_only_hello_opens(time: Time, kind: FrameKind) -> None:
     acceptor = Side(ACCEPTOR, HIGH, time)
     with pytest.raises(RemoteProtocolError, match="while handshaking"):
         acceptor.receive(memoryview(Frame(kind).serialize()), time.now)
@@ -134,23 +124,19 @@ def test_only_hello_opens(kind: FrameKind) -> None:
 
 
 @pytest.mark.parametrize("kind", [k for k in FrameKind if k not in (FrameKind.WELCOME, FrameKind.REFUSE)])
-def test_only_welcome_or_refuse_answer(kind: FrameKind) -> None:
-    time = Time()
+def test_only_welcome_or_refuse_answer(time: Time, kind: FrameKind) -> None:
     dialler = Side(DIALLER, LOW, time)
     with pytest.raises(RemoteProtocolError, match="while handshaking"):
         dialler.receive(memoryview(Frame(kind).serialize()), time.now)
 
 
 @pytest.mark.parametrize("kind", [FrameKind.HELLO, FrameKind.WELCOME, FrameKind.REFUSE])
-def test_no_handshake_while_up(kind: FrameKind) -> None:
-    time = Time()
-    _, acceptor = pair(time)
+def test_no_handshake_while_up(acceptor: Side, time: Time, kind: FrameKind) -> None:
     with pytest.raises(RemoteProtocolError, match="while up"):
         acceptor.receive(memoryview(Frame(kind).serialize()), time.now)
 
 
-def test_a_second_hello_is_an_error() -> None:
-    time = Time()
+def test_a_second_hello_is_an_error(time: Time) -> None:
     acceptor = Side(ACCEPTOR, HIGH, time)
     hello = Side(DIALLER, LOW, time).take_output()
     with pytest.raises(RemoteProtocolError, match="hello frame while up"):
@@ -165,8 +151,7 @@ def test_a_second_hello_is_an_error() -> None:
         bytes(24),
     ],
 )
-def test_garbage_on_the_port(header: bytes) -> None:
-    time = Time()
+def test_garbage_on_the_port(time: Time, header: bytes) -> None:
     acceptor = Side(ACCEPTOR, HIGH, time)
     with pytest.raises(RemoteProtocolError):
         acceptor.receive(memoryview(header), time.now)
@@ -175,17 +160,13 @@ def test_garbage_on_the_port(header: bytes) -> None:
 @pytest.mark.parametrize(
     "kind", [k for k in FrameKind if k not in (FrameKind.HELLO, FrameKind.WELCOME, FrameKind.REFUSE)]
 )
-def test_a_length_is_refused_before_its_bytes_come(kind: FrameKind) -> None:
-    time = Time()
-    _, acceptor = pair(time)
+def test_a_length_is_refused_before_its_bytes_come(acceptor: Side, time: Time, kind: FrameKind) -> None:
     header = (0xFFFFFFFF).to_bytes(4, "big") + bytes([kind, 3]) + bytes(18)
     with pytest.raises(LimitExceeded):
         acceptor.receive(memoryview(header), time.now)
 
 
-def test_keepalive_holds_an_idle_link() -> None:
-    time = Time()
-    dialler, acceptor = pair(time)
+def test_keepalive_holds_an_idle_link(dialler: Side, acceptor: Side, time: Time) -> None:
     pings = 0
     while time.now < 200.0:
         due = min(t for s in (dialler, acceptor) if (t := s.next_timer()) is not None)
@@ -202,8 +183,7 @@ def test_keepalive_holds_an_idle_link() -> None:
     assert abs(estimate[0]) <= estimate[1]
 
 
-def test_silence_for_the_others_lease_ends_the_link() -> None:
-    time = Time()
+def test_silence_for_the_others_lease_ends_the_link(time: Time) -> None:
     dialler, _ = pair(time, lane=Lane.BULK)
     pass_time(dialler, time, limits.BULK_LEASE - 0.001)
     assert dialler.state is ConnectionState.UP
@@ -216,9 +196,7 @@ def is_up(one: Side) -> bool:
     return one.state is ConnectionState.UP
 
 
-def test_a_pause_of_our_own_is_no_silence_of_the_others() -> None:
-    time = Time()
-    dialler, _ = pair(time)
+def test_a_pause_of_our_own_is_no_silence_of_the_others(dialler: Side, time: Time) -> None:
     pass_time(dialler, time, 0.3)
     time.now += 5.0  # stopped, or without a processor
     dialler.handle_timer(time.now)
@@ -233,10 +211,10 @@ def test_a_pause_of_our_own_is_no_silence_of_the_others() -> None:
 
 
 @pytest.mark.parametrize("first", ["timer", "bytes"])
-def test_after_a_pause_beyond_the_lease_nothing_is_acted_on_until_the_peer_answers(first: str) -> None:
+def test_after_a_pause_beyond_the_lease_nothing_is_acted_on_until_the_peer_answers(
+    dialler: Side, acceptor: Side, time: Time, first: str
+) -> None:
     """The peer has ended the link then, and what it asked before comes from this side's buffers."""
-    time = Time()
-    dialler, acceptor = pair(time)
     told: list[bool] = []
     for one in (dialler, acceptor):
         one.routes = AnyRoute(lambda *_, link=one: told.append(link.abandoned))
@@ -257,8 +235,7 @@ def test_after_a_pause_beyond_the_lease_nothing_is_acted_on_until_the_peer_answe
     assert told == [False, True, False], "the peer was stopped as well, and its link stands"
 
 
-def test_reason_names_lease_and_pause() -> None:
-    time = Time()
+def test_reason_names_lease_and_pause(time: Time) -> None:
     dialler, _ = pair(time, lane=Lane.BULK)
     pass_time(dialler, time, 0.3)
     time.now += 2.5
@@ -267,9 +244,7 @@ def test_reason_names_lease_and_pause() -> None:
     assert "silent for its lease of 4 s, our own pauses of 1." in dialler.seen("closed")[0][1]
 
 
-def test_peer_that_died_in_a_pause_is_given_up_within_its_lease() -> None:
-    time = Time()
-    dialler, _ = pair(time)
+def test_peer_that_died_in_a_pause_is_given_up_within_its_lease(dialler: Side, time: Time) -> None:
     time.now += 60.0
     dialler.handle_timer(time.now)
     assert is_up(dialler)
@@ -277,9 +252,7 @@ def test_peer_that_died_in_a_pause_is_given_up_within_its_lease() -> None:
     assert not is_up(dialler)
 
 
-def test_bytes_within_a_half_read_frame_renew_the_lease() -> None:
-    time = Time()
-    dialler, _ = pair(time)
+def test_bytes_within_a_half_read_frame_renew_the_lease(dialler: Side, time: Time) -> None:
     for _ in range(10):
         time.now += 0.9
         dialler.heard(time.now)
@@ -288,8 +261,7 @@ def test_bytes_within_a_half_read_frame_renew_the_lease() -> None:
 
 
 @pytest.mark.parametrize("role", [DIALLER, ACCEPTOR])
-def test_a_handshake_that_takes_too_long(role: str) -> None:
-    time = Time()
+def test_a_handshake_that_takes_too_long(time: Time, role: str) -> None:
     mine = Side(role, LOW, time)
     assert mine.next_timer() == time.now + limits.HANDSHAKE_TIMEOUT
     time.now += limits.HANDSHAKE_TIMEOUT
@@ -297,17 +269,13 @@ def test_a_handshake_that_takes_too_long(role: str) -> None:
     assert "handshake" in mine.seen("closed")[0][1]
 
 
-def test_a_pong_that_answers_nothing_is_ignored() -> None:
-    time = Time()
-    dialler, _ = pair(time)
+def test_a_pong_that_answers_nothing_is_ignored(dialler: Side, time: Time) -> None:
     before = dialler.clock.estimate(time.now)
     deliver(pong(12345, 1, 2).serialize(), dialler, time.now)
     assert dialler.clock.estimate(time.now) == before
 
 
-def test_frames_are_ignored_while_closing() -> None:
-    time = Time()
-    dialler, acceptor = pair(time)
+def test_frames_are_ignored_while_closing(dialler: Side, acceptor: Side, time: Time) -> None:
     dialler.close("done", time.now)
     dialler.close("again", time.now)
     deliver(acceptor.pack_control(b"{}") + b"\xff" * 40, dialler, time.now)
@@ -317,18 +285,14 @@ def test_frames_are_ignored_while_closing() -> None:
     assert dialler.last() == ("closed", "done")
 
 
-def test_the_driver_loses_the_connection() -> None:
-    time = Time()
-    dialler, _ = pair(time)
+def test_the_driver_loses_the_connection(dialler: Side) -> None:
     dialler.lost("reset by peer")
     dialler.lost("twice")
     assert dialler.last() == ("closed", "reset by peer")
     assert len(dialler.seen("closed")) == 1
 
 
-def test_close_within_the_data_callback_stops_reading() -> None:
-    time = Time()
-    _, acceptor = pair(time)
+def test_close_within_the_data_callback_stops_reading(acceptor: Side, time: Time) -> None:
     got: list[int] = []
 
     def on_data(_route: int, sequence: int, _stamp: int, _view: memoryview) -> None:
@@ -341,8 +305,7 @@ def test_close_within_the_data_callback_stops_reading() -> None:
     assert got == [1]
 
 
-def test_answers_out_of_turn_are_our_own_fault() -> None:
-    time = Time()
+def test_answers_out_of_turn_are_our_own_fault(time: Time) -> None:
     with pytest.raises(LocalProtocolError, match="no ping"):
         Side(ACCEPTOR, HIGH, time).ping(time.now)
 
@@ -373,8 +336,7 @@ def test_the_clock_offset_is_within_its_bound(offset_ns: int) -> None:
     assert abs(offset - offset_ns / 1e9) <= error + 1e-9
 
 
-def test_a_lease_of_a_month_is_cut() -> None:
-    time = Time()
+def test_a_lease_of_a_month_is_cut(time: Time) -> None:
     acceptor = Side(ACCEPTOR, HIGH, time)
     hello = Hello(LOW.guid, LOW.instance, LOW.name, 0, 0xFFFFFFFF)
     deliver(Frame(FrameKind.HELLO, hello.serialize()).serialize(), acceptor, time.now)
@@ -382,17 +344,14 @@ def test_a_lease_of_a_month_is_cut() -> None:
     assert acceptor.state is ConnectionState.CLOSED
 
 
-def test_identity_of_the_other_side_comes_with_the_hello() -> None:
-    time = Time()
-    dialler, _ = pair(time)
+def test_identity_of_the_other_side_comes_with_the_hello(dialler: Side) -> None:
     assert dialler.remote is not None
     assert dialler.remote.identity == Identity(HIGH.guid, HIGH.instance, "high", 0)
 
 
 @pytest.mark.parametrize("one_way", [0.05, 0.6, 1.4])
-def test_link_with_a_long_round_trip_stays_up(one_way: float) -> None:
+def test_link_with_a_long_round_trip_stays_up(time: Time, one_way: float) -> None:
     """Where a foreign flow fills a slow radio's queue: each side hears the other steadily, only late."""
-    time = Time()
     dialler = Side(DIALLER, LOW, time, expected=HIGH.guid)
     acceptor = Side(ACCEPTOR, HIGH, time)
     on_the_way: list[tuple[float, Side, bytes]] = []

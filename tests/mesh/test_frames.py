@@ -360,9 +360,7 @@ def fragments(route: int, sequence: int, payload: bytes, sizes: list[int]) -> li
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 24, 25, 4096, 1 << 20])
-def test_fragments_of_several_routes_interleave(chunk: int) -> None:
-    time = Time()
-    _, acceptor = pair(time)
+def test_fragments_of_several_routes_interleave(acceptor: Side, time: Time, chunk: int) -> None:
     one, two = bytes(range(256)) * 4, b"two" * 300
     first, second = fragments(1, 5, one, [100, 900]), fragments(2, 6, two, [1, 898])
     small = pack_data_header(5, 3, 1, 99) + b"small"
@@ -375,9 +373,7 @@ def test_fragments_of_several_routes_interleave(chunk: int) -> None:
 
 @pytest.mark.parametrize("flags", [FIRST, 0, LAST, WHOLE])
 @pytest.mark.parametrize("chunk", [1000, 65_536, 131_073])
-def test_a_large_frame_is_handed_on_while_it_arrives(flags: int, chunk: int) -> None:
-    time = Time()
-    _, acceptor = pair(time)
+def test_a_large_frame_is_handed_on_while_it_arrives(acceptor: Side, time: Time, flags: int, chunk: int) -> None:
     payload = bytes(range(251)) * 1000
     assert core_limits.CUT_THROUGH_BYTES < len(payload) <= limits.DATA_PAYLOAD_MAX
     wire = Frame(FrameKind.DATA, payload, 7, 1, 99, flags).serialize()
@@ -395,27 +391,21 @@ def test_a_large_frame_is_handed_on_while_it_arrives(flags: int, chunk: int) -> 
     assert acceptor.last() == ("control", b"{}"), "the next frame begins behind it"
 
 
-def test_short_frame_is_delivered_whole() -> None:
-    time = Time()
-    _, acceptor = pair(time)
+def test_short_frame_is_delivered_whole(acceptor: Side, time: Time) -> None:
     payload = bytes(core_limits.CUT_THROUGH_BYTES)
     deliver(pack_data_header(len(payload), 7, 1, 99) + payload, acceptor, time.now, 50_000)
     assert acceptor.data == [(7, 1, 99, payload)]
     assert acceptor.parts == []
 
 
-def test_header_alone_delivers_nothing() -> None:
-    time = Time()
-    _, acceptor = pair(time)
+def test_header_alone_delivers_nothing(acceptor: Side, time: Time) -> None:
     for size in (100, limits.DATA_PAYLOAD_MAX):
         assert acceptor.receive(memoryview(pack_data_header(size, 7, 1, 99)), time.now) == (0, 24 + size)
     assert not acceptor.parts
     assert not acceptor.data
 
 
-def test_an_abort_is_handed_on_as_a_part_without_bytes() -> None:
-    time = Time()
-    _, acceptor = pair(time)
+def test_an_abort_is_handed_on_as_a_part_without_bytes(acceptor: Side, time: Time) -> None:
     frames = fragments(7, 1, bytes(900), [300, 300])
     abort = Frame(FrameKind.DATA, b"", 7, 1, 99, LAST | ABORT).serialize()
     deliver(frames[0] + frames[1] + abort, acceptor, time.now, 11)
@@ -428,9 +418,7 @@ def test_an_abort_is_handed_on_as_a_part_without_bytes() -> None:
 
 
 @pytest.mark.parametrize("flags", [ABORT, FIRST | ABORT, WHOLE | ABORT])
-def test_an_abort_that_is_none_ends_the_link(flags: int) -> None:
-    time = Time()
-    _, acceptor = pair(time)
+def test_an_abort_that_is_none_ends_the_link(acceptor: Side, time: Time, flags: int) -> None:
     with pytest.raises(RemoteProtocolError, match="aborts"):
         acceptor.receive(memoryview(Frame(FrameKind.DATA, b"", 7, 1, 99, flags).serialize()), time.now)
     assert acceptor.state is ConnectionState.CLOSED
@@ -439,24 +427,19 @@ def test_an_abort_that_is_none_ends_the_link(flags: int) -> None:
 
 @pytest.mark.parametrize("size", [limits.DATA_PAYLOAD_MAX + 1, 0xFFFFFFFF])
 @pytest.mark.parametrize("flags", [0, FIRST, LAST, WHOLE, LAST | ABORT])
-def test_too_long_frame_is_refused_by_its_header(size: int, flags: int) -> None:
-    time = Time()
-    _, acceptor = pair(time)
+def test_too_long_frame_is_refused_by_its_header(acceptor: Side, time: Time, size: int, flags: int) -> None:
     header = size.to_bytes(4, "big") + bytes([FrameKind.DATA, flags]) + bytes(18)
     with pytest.raises(LimitExceeded):
         acceptor.receive(memoryview(header), time.now)
 
 
-def test_no_fragment_before_the_handshake_is_over() -> None:
-    time = Time()
+def test_no_fragment_before_the_handshake_is_over(time: Time) -> None:
     acceptor = Side(ACCEPTOR, HIGH, time)
     with pytest.raises(RemoteProtocolError, match="data frame while handshaking"):
         acceptor.receive(memoryview(Frame(FrameKind.DATA, b"x", flags=FIRST).serialize()), time.now)
 
 
-def test_closing_from_within_a_part_stops_the_reading() -> None:
-    time = Time()
-    _, acceptor = pair(time)
+def test_closing_from_within_a_part_stops_the_reading(acceptor: Side, time: Time) -> None:
     got: list[int] = []
 
     def on_part(_route: int, _sequence: int, _stamp: int, _flags: int, part: memoryview) -> None:
@@ -471,9 +454,7 @@ def test_closing_from_within_a_part_stops_the_reading() -> None:
     assert acceptor.data == []
 
 
-def test_rest_of_a_begun_frame_is_dropped_while_closing() -> None:
-    time = Time()
-    _, acceptor = pair(time)
+def test_rest_of_a_begun_frame_is_dropped_while_closing(acceptor: Side, time: Time) -> None:
     wire = pack_data_header(200_000, 1, 1, 0) + bytes(200_000)
     acceptor.receive(memoryview(wire[:150_000]), time.now)
     acceptor.close("done", time.now)
@@ -481,9 +462,7 @@ def test_rest_of_a_begun_frame_is_dropped_while_closing() -> None:
     assert len(acceptor.parts) == 1
 
 
-def test_half_read_frame_renews_the_lease_only_with_bytes() -> None:
-    time = Time()
-    _, acceptor = pair(time)
+def test_half_read_frame_renews_the_lease_only_with_bytes(acceptor: Side, time: Time) -> None:
     acceptor.receive(memoryview(pack_data_header(200_000, 1, 1, 0) + bytes(1000)), time.now)
     for _ in range(5):
         time.now += 0.9
@@ -496,9 +475,9 @@ def test_half_read_frame_renews_the_lease_only_with_bytes() -> None:
 
 @pytest.mark.parametrize("kind", [FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED])
 @pytest.mark.parametrize("chunk", [1, 24, 1 << 20])
-def test_marks_come_in_the_order_of_the_messages(kind: FrameKind, chunk: int) -> None:
-    time = Time()
-    dialler, acceptor = pair(time)
+def test_marks_come_in_the_order_of_the_messages(
+    dialler: Side, acceptor: Side, time: Time, kind: FrameKind, chunk: int
+) -> None:
     said: list[object] = []
     for link in (dialler, acceptor):
         link.routes = AnyRoute(lambda _r, sequence, _t, _v: said.append(sequence))
@@ -513,15 +492,12 @@ def test_marks_come_in_the_order_of_the_messages(kind: FrameKind, chunk: int) ->
 
 
 @pytest.mark.parametrize("kind", [FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED])
-def test_a_mark_has_no_bytes(kind: FrameKind) -> None:
-    time = Time()
-    _, acceptor = pair(time)
+def test_a_mark_has_no_bytes(acceptor: Side, time: Time, kind: FrameKind) -> None:
     with pytest.raises(LimitExceeded, match=kind.name.lower()):
         acceptor.receive(memoryview(bytes([0, 0, 0, 1, kind, 3]) + bytes(18)), time.now)
 
 
-def test_bulk_lane_has_its_own_lease() -> None:
-    time = Time()
+def test_bulk_lane_has_its_own_lease(time: Time) -> None:
     dialler, acceptor = pair(time, lane=Lane.BULK)
     hello, welcome = acceptor.remote, dialler.remote
     assert hello is not None

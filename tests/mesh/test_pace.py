@@ -42,9 +42,7 @@ def rest(one: Side, other: Side, time: Time) -> None:
     assert resting(one, other) == [True, True]
 
 
-def test_a_link_rests_when_neither_side_needs_it() -> None:
-    time = Time()
-    dialler, acceptor = pair(time)
+def test_a_link_rests_when_neither_side_needs_it(dialler: Side, acceptor: Side, time: Time) -> None:
     dialler.need(time.now, needed=False)
     exchange(dialler, acceptor, time)
     assert resting(dialler, acceptor) == [False, False], "the other side needs it still"
@@ -57,10 +55,8 @@ def test_a_link_rests_when_neither_side_needs_it() -> None:
     assert calm * 15 < busy
 
 
-def test_silence_is_worth_a_check_at_the_pace_of_the_link() -> None:
+def test_silence_is_worth_a_check_at_the_pace_of_the_link(dialler: Side, acceptor: Side, time: Time) -> None:
     """In use within a second, at rest before the long lease ends, and soon when it is needed again."""
-    time = Time()
-    dialler, acceptor = pair(time)
     assert dialler.keepalive.quiet_after == limits.GHOST_QUIET < limits.EXPRESS_LEASE
     rest(dialler, acceptor, time)
     assert limits.IDLE_KEEPALIVE_INTERVAL < dialler.keepalive.quiet_after < limits.IDLE_LEASE
@@ -111,9 +107,7 @@ def run_all(links: list[tuple[Side, Side]], time: Time, seconds: float) -> tuple
         exchange(*pair_, time)
 
 
-def test_silence_at_rest_ends_the_link_by_the_longer_lease() -> None:
-    time = Time()
-    dialler, acceptor = pair(time)
+def test_silence_at_rest_ends_the_link_by_the_longer_lease(dialler: Side, acceptor: Side, time: Time) -> None:
     rest(dialler, acceptor, time)
     pass_time(dialler, time, limits.IDLE_LEASE - 0.01)
     assert dialler.state is ConnectionState.UP
@@ -131,10 +125,10 @@ def test_keepalives_at_rest_are_rarer_with_more_peers(peers: int, interval: floa
     assert 2 * interval * ACCEPTOR_KEEPALIVE_FACTOR < lease
 
 
-def test_a_link_at_rest_takes_the_pace_of_a_mesh_that_grows_and_shrinks() -> None:
+def test_a_link_at_rest_takes_the_pace_of_a_mesh_that_grows_and_shrinks(
+    dialler: Side, acceptor: Side, time: Time
+) -> None:
     """The lease is promised before the side is silent for so long; a link in use stays as it is."""
-    time = Time()
-    dialler, acceptor = pair(time)
     rest(dialler, acceptor, time)
     few = run(dialler, acceptor, time, 600.0)
     for each in (dialler, acceptor):
@@ -155,10 +149,10 @@ def test_a_link_at_rest_takes_the_pace_of_a_mesh_that_grows_and_shrinks() -> Non
     assert few - 2 <= run(dialler, acceptor, time, 600.0) <= few + 2
 
 
-def test_two_sides_with_different_numbers_of_peers_keep_their_own_promises() -> None:
+def test_two_sides_with_different_numbers_of_peers_keep_their_own_promises(
+    dialler: Side, acceptor: Side, time: Time
+) -> None:
     """As with an earlier release, whose pace does not change with the number."""
-    time = Time()
-    dialler, acceptor = pair(time)
     dialler.keepalive.rest_lease = rest_lease(999)
     rest(dialler, acceptor, time)
     run(dialler, acceptor, time, 600.0)
@@ -167,8 +161,7 @@ def test_two_sides_with_different_numbers_of_peers_keep_their_own_promises() -> 
 
 
 @pytest.mark.parametrize("who", [0, 1])
-def test_the_clock_is_measured_anew_as_soon_as_a_rest_ends(who: int) -> None:
-    time = Time()
+def test_the_clock_is_measured_anew_as_soon_as_a_rest_ends(time: Time, who: int) -> None:
     both = pair(time)
     rest(*both, time)
     run(*both, time, 604.0)
@@ -186,8 +179,7 @@ def test_the_clock_is_measured_anew_as_soon_as_a_rest_ends(who: int) -> None:
 
 
 @pytest.mark.parametrize("who", [0, 1])
-def test_one_side_that_needs_the_link_brings_back_the_short_lease(who: int) -> None:
-    time = Time()
+def test_one_side_that_needs_the_link_brings_back_the_short_lease(time: Time, who: int) -> None:
     both = pair(time)
     rest(*both, time)
     run(*both, time, 33.0)
@@ -201,9 +193,9 @@ def test_one_side_that_needs_the_link_brings_back_the_short_lease(who: int) -> N
     assert alive.state is ConnectionState.CLOSED
 
 
-def test_a_peer_that_died_at_rest_is_noticed_soon_once_it_is_needed() -> None:
-    time = Time()
-    dialler, acceptor = pair(time)
+def test_a_peer_that_died_at_rest_is_noticed_soon_once_it_is_needed(
+    dialler: Side, acceptor: Side, time: Time
+) -> None:
     rest(dialler, acceptor, time)
     pass_time(dialler, time, 3.0)
     dialler.need(time.now, needed=True)
@@ -215,10 +207,10 @@ def test_a_peer_that_died_at_rest_is_noticed_soon_once_it_is_needed() -> None:
     assert dialler.last() == ("closed", "high was silent for its lease of 1.5 s")
 
 
-def test_a_pause_at_rest_that_is_shorter_than_the_lease_changes_nothing() -> None:
+def test_a_pause_at_rest_that_is_shorter_than_the_lease_changes_nothing(
+    dialler: Side, acceptor: Side, time: Time
+) -> None:
     """The peer's process is stopped for 3 s (or this one: a suspended machine), and nothing needs the link."""
-    time = Time()
-    dialler, acceptor = pair(time)
     rest(dialler, acceptor, time)
     time.now += 3.0
     run(dialler, acceptor, time, 30.0)
@@ -226,9 +218,9 @@ def test_a_pause_at_rest_that_is_shorter_than_the_lease_changes_nothing() -> Non
     assert dialler.state is acceptor.state is ConnectionState.UP
 
 
-def test_a_suspend_of_this_machine_is_not_the_peers_silence_and_the_next_use_asks_it() -> None:
-    time = Time()
-    dialler, acceptor = pair(time)
+def test_a_suspend_of_this_machine_is_not_the_peers_silence_and_the_next_use_asks_it(
+    dialler: Side, acceptor: Side, time: Time
+) -> None:
     rest(dialler, acceptor, time)
     time.now += 3600.0
     dialler.handle_timer(time.now)
@@ -239,9 +231,9 @@ def test_a_suspend_of_this_machine_is_not_the_peers_silence_and_the_next_use_ask
 
 
 @pytest.mark.parametrize("needed", [False, True])
-def test_bits_of_later_versions_in_a_pace_frame_are_ignored(*, needed: bool) -> None:
-    time = Time()
-    dialler, acceptor = pair(time)
+def test_bits_of_later_versions_in_a_pace_frame_are_ignored(
+    dialler: Side, acceptor: Side, time: Time, *, needed: bool
+) -> None:
     rest(dialler, acceptor, time)
     frame = Frame(FrameKind.PACE, route=0xFFFFFFFC | needed, sequence=16_000).serialize()
     deliver(frame, dialler, time.now)
@@ -249,9 +241,7 @@ def test_bits_of_later_versions_in_a_pace_frame_are_ignored(*, needed: bool) -> 
 
 
 @pytest.mark.parametrize("claimed", [0, 1, 10**9])
-def test_a_claimed_lease_is_held_within_bounds(claimed: int) -> None:
-    time = Time()
-    dialler, _ = pair(time)
+def test_a_claimed_lease_is_held_within_bounds(dialler: Side, time: Time, claimed: int) -> None:
     deliver(Frame(FrameKind.PACE, route=1, sequence=claimed).serialize(), dialler, time.now)
     pass_time(dialler, time, limits.LINK_LEASE_MAX + 1.0)
     assert dialler.state is ConnectionState.CLOSED
