@@ -130,14 +130,6 @@ def test_heartbeats_come_every_five_seconds_in_a_mesh_of_any_size() -> None:
     assert {b.lease_ms for b in beats} == {1000 * core_limits.PEER_LEASE}
 
 
-def test_without_multicast_every_peer_gets_its_heartbeats() -> None:
-    agent = Agent(multicast=False)
-    agent.meet(300)
-    sent = agent.run(8.0)
-    reached = {o.address[0] for o in sent if o.address and o.beacon.kind is BeaconKind.HEARTBEAT}
-    assert len(reached) == 300
-
-
 def test_forged_peers_never_displace_one_that_was_linked() -> None:
     agent = Agent()
     agent.run(1.0)

@@ -127,6 +127,7 @@ def test_each_announce_is_answered_but_not_faster_than_the_limit(one: Harness) -
         answered += len(unicasts(one.membership.outputs(), BeaconKind.ANSWER))
         one.now += limits.ANSWER_INTERVAL / 2
     assert answered == 5
+    assert one.membership.counters["beacon.answer_limited"] == 5
 
 
 def test_an_answer_is_not_answered(one: Harness) -> None:
@@ -615,6 +616,15 @@ def test_gossip_is_bounded(one: Harness) -> None:
     assert one.membership.counters["gossip.full"]
 
 
+def test_loopback_peers_are_not_told_to_other_hosts(one: Harness) -> None:
+    one.hear(Speaker(replace(who(3), guid=Guid.of("127.0.0.1", 40003)))())
+    one.membership.outputs()
+    one.hear(Speaker(who(2))())
+    one.hear(Speaker(replace(who(4), guid=Guid.of("127.0.0.1", 40004)))())
+    (far, near) = [o.beacon.gossip for o in one.membership.outputs() if o.beacon.kind is BeaconKind.ANSWER]
+    assert (far, len(near)) == ((), 2)
+
+
 def test_loopback_gossip_from_afar_is_not_believed(one: Harness) -> None:
     one.hear(Speaker(who(2))(BeaconKind.ANSWER, Guid.of("127.0.0.1", 40000)), multicast=False)
     assert unicasts(one.run(5), BeaconKind.ANNOUNCE) == []
@@ -774,16 +784,6 @@ def test_in_a_full_membership_a_stranger_takes_the_place_of_one_that_missed_a_he
     one.run(limits.HEARTBEAT_LATE)
     one.hear(Speaker(who(3))())
     assert "peer3" in one.present()
-
-
-def test_a_linked_peer_gives_way_to_nobody(one: Harness) -> None:
-    one.membership.link_up(who(3), one.now)
-    flood(one, limits.STRANGERS_MAX)
-    for second in range(60):
-        one.run(1.0)
-        flood(one, 100, first=5000 + 100 * second)
-    assert "peer3" in one.present()
-    assert len(one.membership.peers()) == limits.STRANGERS_MAX + 1
 
 
 def test_old_forged_beacon_takes_no_endpoint_when_the_link_falls(one: Harness) -> None:

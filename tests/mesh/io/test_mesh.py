@@ -61,13 +61,6 @@ async def test_a_full_mesh_with_one_link_a_pair(count: int) -> None:
         assert not peer.mesh.connections()
 
 
-async def test_one_side_alone_knows_the_other() -> None:
-    async with peers(2, found=False) as (one, other):
-        one.mesh.peer_found(other.identity)
-        await until(lambda: one.linked(other) and other.linked(one), "a link")
-        assert other.ups[0].identity == one.identity
-
-
 async def test_of_several_addresses_whichever_answers_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     """The GUID's own address does not answer, the next one refuses, at the third another program answers."""
     one, other = sorted((Peer(1, host="127.0.0.4"), Peer(2, host="127.0.0.4")), key=lambda p: p.identity.guid)

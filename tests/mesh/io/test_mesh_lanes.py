@@ -13,11 +13,9 @@ import pytest
 from rmpa.config.settings import LaneSettings
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import FIRST, LAST
-from rmpa.mesh import limits
-from rmpa.mesh.frames import Frame, FrameKind, Lane, Refusal, Refuse, pack_data_header, unpack_header
+from rmpa.mesh.frames import Frame, FrameKind, Lane, pack_data_header, unpack_header
 from rmpa.mesh.io.dial import BULK_UNSENT_BYTES, EXPRESS_UNSENT_BYTES, LINK_UNACKED
 from tests.mesh.io.meshes import DEADLINE, Peer, linked_pair, peers, raw, until
-from tests.mesh.worlds import AnyRoute
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -61,17 +59,22 @@ async def test_same_side_dials_both_lanes(count: int) -> None:
     assert not any(p.mesh.connections() for p in made)
 
 
-async def test_the_sockets_of_both_lanes_have_their_options() -> None:
-    lanes = LaneSettings(express_dscp=46, express_priority=5, bulk_dscp=8, bulk_priority=2)
+@pytest.mark.parametrize(
+    ("lanes", "options"),
+    [
+        (LaneSettings(express_dscp=46, express_priority=5, bulk_dscp=8, bulk_priority=2), [(46, 5), (8, 2)]),
+        (LaneSettings(), [(48, 6), (0, 0)]),
+    ],
+)
+async def test_the_sockets_of_both_lanes_have_their_options(
+    lanes: LaneSettings, options: list[tuple[int, int]]
+) -> None:
     async with peers(2, lanes=lanes) as (one, other):
         await until(lambda: one.both_lanes(other) and other.both_lanes(one), "both lanes")
         for peer, far in ((one, other), (other, one)):
             express = peer.link(far)
-            wanted = [
-                (express.connection, 46, 5, EXPRESS_UNSENT_BYTES),
-                (bulk_of(express), 8, 2, BULK_UNSENT_BYTES),
-            ]
-            for connection, dscp, priority, unsent in wanted:
+            both = [(express.connection, EXPRESS_UNSENT_BYTES), (bulk_of(express), BULK_UNSENT_BYTES)]
+            for (connection, unsent), (dscp, priority) in zip(both, options, strict=True):
                 sock = connection.sock
                 assert sock.getsockopt(socket.IPPROTO_IP, socket.IP_TOS) == dscp << 2
                 assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY) == priority
@@ -80,57 +83,6 @@ async def test_the_sockets_of_both_lanes_have_their_options() -> None:
                 unacked = sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
                 assert unacked == round(LINK_UNACKED * 1000)
             assert not peer.mesh.counters["link.option_refused"]
-
-
-async def test_express_lane_has_priority_by_default() -> None:
-    async with linked_pair() as (one, other):
-        link = one.link(other)
-        for connection, tos, priority in ((link.connection, 0xC0, 6), (bulk_of(link), 0, 0)):
-            assert connection.sock.getsockopt(socket.IPPROTO_IP, socket.IP_TOS) == tos
-            assert connection.sock.getsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY) == priority
-
-
-@pytest.mark.parametrize(
-    ("lane", "code"), [(Lane.BULK, Refusal.NO_EXPRESS), (0, Refusal.LANE), (3, Refusal.LANE), (255, Refusal.LANE)]
-)
-async def test_unknown_lane_and_lone_bulk_lane_are_refused(lane: int, code: Refusal) -> None:
-    async with peers(1) as (one,):
-        sock, answer = await raw(one, HAND_MADE, lane=lane)
-        assert answer.kind is FrameKind.REFUSE
-        assert Refuse.parse(answer.payload).code == code
-        sock.close()
-        await until(lambda: not one.mesh.connections(), "closed")
-        assert one.mesh.counters[f"link.refused.{code.name.lower()}"] == 1
-        assert not one.ups
-
-
-async def test_other_instance_gets_no_bulk_lane() -> None:
-    async with peers(1) as (one,):
-        express, answer = await raw(one, HAND_MADE)
-        assert answer.kind is FrameKind.WELCOME
-        sock, answer = await raw(one, replace(HAND_MADE, instance=b"x" * 16), lane=Lane.BULK)
-        assert Refuse.parse(answer.payload).code == Refusal.NO_EXPRESS
-        sock.close()
-        express.close()
-        await until(lambda: not one.mesh.connections(), "closed")
-
-
-async def test_both_sides_promise_the_bulk_lanes_lease() -> None:
-    async with linked_pair() as (one, other):
-        for link in (one.link(other), other.link(one)):
-            leases = [k.remote.lease for k in (link.connection, bulk_of(link)) if k.remote is not None]
-            assert leases == [limits.EXPRESS_LEASE, limits.BULK_LEASE]
-
-
-async def test_handlers_receive_from_both_lanes() -> None:
-    async with linked_pair() as (one, other):
-        got: list[int] = []
-        link = other.link(one)
-        link.routes = AnyRoute(lambda _r, sequence, _t, _p: got.append(sequence))
-        link.use(used=True)
-        one.link(other).bulk.send(7, 1, 0, b"x")
-        one.link(other).express.send(7, 2, 0, b"x")
-        await until(lambda: sorted(got) == [1, 2], "both")
 
 
 async def test_failed_dial_of_a_bulk_lane_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -189,30 +141,6 @@ async def test_message_sent_in_parts_arrives_as_one() -> None:
         await until(lambda: bool(other.messages(7)), "the message")
         assert other.messages(7) == [(5, payload)]
         assert len(other.messages(8)) == 5
-
-
-async def test_abandoned_message_is_not_delivered() -> None:
-    async with linked_pair() as (one, other):
-        lane = one.link(other).bulk
-        parcel = lane.open(7, 300_000, 1, 0)
-        lane.extend(parcel, bytes(100_000))
-        lane.abandon(parcel)
-        lane.extend(parcel, bytes(200_000))
-        lane.send(7, 2, 0, b"next")
-        await until(lambda: bool(other.data), "the next one")
-        assert other.data == [(7, 2, 0, b"next")]
-        assert not other._begun
-
-
-async def test_small_messages_go_between_parts_of_large_ones() -> None:
-    async with linked_pair() as (one, other):
-        lane = one.link(other).bulk
-        lane.send(7, 1, 0, bytes(32 << 20))
-        for number in range(100):
-            lane.send(8, number, 0, b"small")
-        await until(lambda: len(other.data) == 101, "all of them")
-        assert [sequence for _, sequence, _, _ in other.data[:100]] == list(range(100))
-        assert other.data[100][0] == 7
 
 
 async def test_each_route_has_its_own_bound_and_drops_its_own() -> None:
