@@ -139,17 +139,6 @@ def test_what_is_refused_leaves_nothing_behind() -> None:
     assert _verify(verifier, first).verdict is Verdict.ACCEPTED
 
 
-def test_a_rotation_loses_no_packet() -> None:
-    following = GroupKey(4, b"k" * 32)
-    sender, receiver = KeyRing([KEY], 0.0), KeyRing([KEY], 0.0)
-    signer, verifier = PacketTrust(sender, lambda: WALL), PacketTrust(receiver, lambda: WALL)
-    sender.take([following], 100.0)
-    receiver.take([following], 125.0)
-    for now in range(90, 300, 5):
-        signed = signer.sign(BEACON, float(now))
-        assert _verify(verifier, signed, now=float(now)).verdict is Verdict.ACCEPTED
-
-
 def _numbered(signer: PacketTrust, number: int) -> bytes:
     """A packet of this number, which a module with the group key can make for any run."""
     signer._number = number - 1

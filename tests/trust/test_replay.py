@@ -12,18 +12,6 @@ RUN = (1, bytes(16))
 NOW = 5.0
 
 
-def test_each_number_is_new_once() -> None:
-    window = ReplayWindow()
-    assert [window.take(RUN, n, NOW) for n in (1, 2, 2, 1, 5, 3)] == [
-        Verdict.ACCEPTED,
-        Verdict.ACCEPTED,
-        Verdict.REPEATED,
-        Verdict.REPEATED,
-        Verdict.ACCEPTED,
-        Verdict.ACCEPTED,
-    ]
-
-
 def test_what_is_behind_the_window_is_stale() -> None:
     window = ReplayWindow()
     window.take(RUN, 1000, NOW)

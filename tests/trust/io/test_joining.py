@@ -273,16 +273,6 @@ async def test_a_revoked_module_and_one_away_too_long_get_nothing(lab: Lab) -> N
             await renew_at_authority(arm, "127.0.0.1", lab.port)
 
 
-async def test_a_revoked_name_can_be_invited_again_at_once(lab: Lab) -> None:
-    async with running(lab):
-        before = lab.member(await lab.join(lab.invite()))
-        lab.authority.revoke("arm")
-        with pytest.raises(TrustError, match="arm was revoked"):
-            lab.base.judge_member(before.files.certificate, "arm")
-        again = lab.member(await lab.join(lab.invite()))
-        lab.base.judge_member(again.files.certificate, "arm")
-
-
 @pytest.mark.parametrize("again", [False, True])
 async def test_a_revocation_holds_also_if_the_clock_went_back(lab: Lab, again: bool) -> None:
     async with running(lab):
@@ -348,16 +338,6 @@ async def test_a_module_whose_name_another_one_has_by_now_renews_no_certificate(
         with pytest.raises(TrustError, match="another module has joined as arm"):
             again.issue(old.request(), "arm")
         await renew_at_authority(new, "127.0.0.1", lab.port)
-
-
-async def test_the_name_of_a_linked_module_is_not_given_to_another(lab: Lab) -> None:
-    async with running(lab):
-        lab.taken.add("arm")
-        with pytest.raises(PeerRefused, match=r"a module named arm is a member.*\(taken\)"):
-            await lab.join(lab.invite("arm"))
-        key = private_key(lab.base.files.key, "module.key")
-        with pytest.raises(ConfigError, match="a module named arm is a member"):
-            lab.authority.join_file(make_request(key, "arm"), "arm", lab.taken.__contains__)
 
 
 @pytest.mark.parametrize("wall", [0.0, WALL - 3 * DAY, WALL + 3 * DAY])
