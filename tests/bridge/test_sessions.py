@@ -374,38 +374,43 @@ async def test_where_other_machines_reach_them_each_listens_by_itself() -> None:
     await nodes.close()
 
 
-async def test_without_the_device_each_listens_by_itself_and_the_log_says_why(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    class Forbidden(socket.socket):
-        def setsockopt(self, level: int, option: int, value: int | bytes) -> None:  # type: ignore[override]
-            if option == socket.SO_BINDTODEVICE:
-                raise PermissionError(errno.EPERM, "Operation not permitted")
-            super().setsockopt(level, option, value)
+class Forbidden(socket.socket):
+    """A socket of a process that may not choose the device."""
 
+    def setsockopt(self, level: int, option: int, value: int | bytes) -> None:  # type: ignore[override]
+        if option == socket.SO_BINDTODEVICE:
+            raise PermissionError(errno.EPERM, "Operation not permitted")
+        super().setsockopt(level, option, value)
+
+
+async def _refuse(*_: object) -> None:
+    raise ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "double", "reason"),
+    [
+        (socket, "socket", Forbidden, "Operation not permitted"),
+        (shared_listener.SharedListener, "_test_address", _refuse, "Connection refused"),
+    ],
+)
+async def test_where_they_cannot_share_each_listens_by_itself_and_the_log_says_why(
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    owner: object,
+    name: str,
+    double: Any,
+    reason: str,
+) -> None:
     before = listening()
     nodes = ProxyNodes(core())
     with monkeypatch.context() as context, caplog.at_level("INFO"):
-        context.setattr(socket, "socket", Forbidden)
+        context.setattr(owner, name, double)
         await nodes.start()
-    why = "two for each, at 127.0.0.1: all cannot share two (Operation not permitted)"
+    why = f"two for each, at 127.0.0.1: all cannot share two ({reason})"
     assert nodes.listening == why
     assert [r.message for r in caplog.records] == [f"= proxies listen by sockets of their own, {why}"]
     assert await proxies(nodes) == ["127.0.0.1"] * 3
-    assert listening() == before
-    await nodes.close()
-
-
-async def test_a_failed_trial_leaves_nothing_open(monkeypatch: pytest.MonkeyPatch) -> None:
-    before = listening()
-
-    async def refuse(*_: object) -> None:
-        raise ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
-
-    monkeypatch.setattr(shared_listener.SharedListener, "_test_address", refuse)
-    nodes = ProxyNodes(core())
-    await nodes.start()
-    assert "Connection refused" in nodes.listening
     assert listening() == before
     await nodes.close()
 

@@ -381,19 +381,17 @@ async def test_a_secured_peer_learns_no_more_of_a_topic_after_it_was_withdrawn(m
     assert (module.granted, module.told) == ([], [])
 
 
-async def test_a_secured_peer_tries_again_what_it_may_have(module: Module) -> None:
-    module.permit(TrustSettings(direct=True))
-    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=False)
-    assert (await module.open())["text"] == "/talker has just left"
-    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
-    assert [(peer, what) for peer, what, _ in module.told] == [(1, AGAIN)]
-
-
-async def test_without_trust_a_peer_tries_again_when_a_topic_is_published(module: Module) -> None:
+@pytest.mark.parametrize("secured", [True, False])
+async def test_a_peer_tries_again_when_what_it_may_have_is_published(module: Module, *, secured: bool) -> None:
     offered = dict(module.offered)
-    module.offered.clear()
-    assert (await module.open())["why"] == Condition.OFFERED
-    module.offered.update(offered)
+    if secured:
+        module.permit(TrustSettings(direct=True))
+        module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=False)
+        assert (await module.open())["text"] == "/talker has just left"
+    else:
+        module.offered.clear()
+        assert (await module.open())["why"] == Condition.OFFERED
+        module.offered.update(offered)
     module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
     assert [(peer, what) for peer, what, _ in module.told] == [(1, AGAIN)]
 
