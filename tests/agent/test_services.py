@@ -89,6 +89,17 @@ def come_back(links: Iterable[tuple[Agent, PeerLink]]) -> None:
         agent.bridge.sessions.link_up(link)
 
 
+Served = tuple["Agent", "Agent", Server]
+
+
+@pytest.fixture
+async def served(settings: Callable[..., Settings]) -> AsyncIterator[Served]:
+    """The agents of two modules, and a server in the first one that the second one has."""
+    async with running(settings("a"), settings("b")) as (a, b), serving(a) as server:
+        await until(lambda: provider(b) == "/rmpa/a/adder")
+        yield a, b, server
+
+
 async def test_a_call_is_counted_on_both_sides(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, b), serving(a) as server:
         await until(lambda: provider(b) == "/rmpa/a/adder")
@@ -120,131 +131,116 @@ def offered(agent: Agent, session: PeerSession) -> None:
     agent.services.imports.take_in(session.peer, "/add", ServiceOffer("/add", "/adder"), 0.0)
 
 
-async def test_types_are_told_although_the_offer_came_again_since_the_service_was_opened(
-    settings: Callable[..., Settings],
-) -> None:
+async def test_types_are_told_although_the_offer_came_again_since_the_service_was_opened(served: Served) -> None:
     """The catalogue of a new link comes at the same time as the first call opens a service."""
-    async with running(settings("a"), settings("b")) as (a, b), serving(a) as server:
-        await until(lambda: provider(b))
-        (session,) = b.bridge.sessions
-        for _ in range(2):
-            connection = await connect(b)
-            offered(b, session)
-            other = await asyncio.wait_for(connect(b), 20.0)
-            assert other.description.type == "a/Add"
-            assert await other.call(b"1", 20.0) == (True, b"1")
-            other.close()
-            connection.close()
+    _a, b, server = served
+    (session,) = b.bridge.sessions
+    for _ in range(2):
         connection = await connect(b)
-        server.keeps = True
-        asked = asyncio.create_task(connection.call(b"2", 20.0))
-        await until(lambda: len(server.calls) == 3)
         offered(b, session)
         other = await asyncio.wait_for(connect(b), 20.0)
         assert other.description.type == "a/Add"
-        server.calls[-1].reply(True, b"kept")
-        assert await asked == (True, b"kept"), "a call under way is not disturbed"
+        assert await other.call(b"1", 20.0) == (True, b"1")
         other.close()
         connection.close()
+    connection = await connect(b)
+    server.keeps = True
+    asked = asyncio.create_task(connection.call(b"2", 20.0))
+    await until(lambda: len(server.calls) == 3)
+    offered(b, session)
+    other = await asyncio.wait_for(connect(b), 20.0)
+    assert other.description.type == "a/Add"
+    server.calls[-1].reply(True, b"kept")
+    assert await asked == (True, b"kept"), "a call under way is not disturbed"
+    other.close()
+    connection.close()
 
 
-async def test_a_short_outage_keeps_services_and_answers_calls(
-    settings: Callable[..., Settings],
-) -> None:
-    async with running(settings("a"), settings("b")) as (a, b), serving(a) as server:
-        await until(lambda: provider(b) == "/rmpa/a/adder")
-        connection = await connect(b)
-        server.keeps = True
-        asked = asyncio.create_task(connection.call(b"1", 20.0))
-        await until(lambda: server.calls)
-        changes = b.core.state().services
-        links = fall_silent(a, b)
-        ok, text = await asked
-        assert not ok
-        assert b"the link to a was lost" in text
-        server.keeps = False
-        waiting = asyncio.create_task(connection.call(b"2", 20.0))
-        await asyncio.sleep(0.1)
-        assert b.core.state().services == changes, "nobody was told of it"
-        come_back(links)
-        assert await waiting == (True, b"2")
-        connection.close()
+async def test_a_short_outage_keeps_services_and_answers_calls(served: Served) -> None:
+    a, b, server = served
+    connection = await connect(b)
+    server.keeps = True
+    asked = asyncio.create_task(connection.call(b"1", 20.0))
+    await until(lambda: server.calls)
+    changes = b.core.state().services
+    links = fall_silent(a, b)
+    ok, text = await asked
+    assert not ok
+    assert b"the link to a was lost" in text
+    server.keeps = False
+    waiting = asyncio.create_task(connection.call(b"2", 20.0))
+    await asyncio.sleep(0.1)
+    assert b.core.state().services == changes, "nobody was told of it"
+    come_back(links)
+    assert await waiting == (True, b"2")
+    connection.close()
 
 
-async def test_a_link_that_stays_away_takes_its_services_and_tells_who_waits(
-    settings: Callable[..., Settings],
-) -> None:
-    async with running(settings("a"), settings("b")) as (a, b), serving(a):
-        await until(lambda: provider(b) == "/rmpa/a/adder")
-        connection = await connect(b)
-        links = fall_silent(a, b)
-        ok, text = await connection.call(b"1", 20.0)
-        assert not ok
-        assert b"/add] of a: a is gone" in text
-        assert provider(b) == ""
-        come_back(reversed(links))
-        await until(lambda: provider(b) == "/rmpa/a/adder")
-        connection = await connect(b)
-        assert await connection.call(b"2", 20.0) == (True, b"2")
-        connection.close()
+async def test_a_link_that_stays_away_takes_its_services_and_tells_who_waits(served: Served) -> None:
+    a, b, _server = served
+    connection = await connect(b)
+    links = fall_silent(a, b)
+    ok, text = await connection.call(b"1", 20.0)
+    assert not ok
+    assert b"/add] of a: a is gone" in text
+    assert provider(b) == ""
+    come_back(reversed(links))
+    await until(lambda: provider(b) == "/rmpa/a/adder")
+    connection = await connect(b)
+    assert await connection.call(b"2", 20.0) == (True, b"2")
+    connection.close()
 
 
-async def test_a_local_service_hides_the_peers_until_it_ends(
-    settings: Callable[..., Settings],
-) -> None:
-    async with running(settings("a"), settings("b")) as (a, b), serving(a):
-        await until(lambda: provider(b) == "/rmpa/a/adder")
-        seen: list[str] = []
-        b.core.on_change(lambda change: seen.append(provider(b)) if change.name == "/add" else None)
-        async with serving(b, name="/mine"):
-            await until(lambda: provider(b) == "/mine")
-            b.services.reconcile()
-            await asyncio.sleep(0.05)
-            assert provider(b) == "/mine"
-            (info,) = [i for i in b.operations.snapshot({}).services if i.peer == "a"]
-            assert (info.state, info.hidden) == ("hidden", "/mine of this module provides it itself")
-        await until(lambda: provider(b) == "/rmpa/a/adder")
-        assert seen == ["/mine", "/mine", "", "/rmpa/a/adder"], "ours went, its came; its went, ours came"
-
-
-async def test_a_removed_proxy_comes_back(settings: Callable[..., Settings]) -> None:
-    async with running(settings("a"), settings("b")) as (a, b), serving(a):
-        await until(lambda: provider(b) == "/rmpa/a/adder")
-        (uri,) = b.core.state().services["/add"].values()
-        b.core.call("unregisterService", "/rmpa/a/adder", "/add", uri)
-        assert provider(b) == ""
+async def test_a_local_service_hides_the_peers_until_it_ends(served: Served) -> None:
+    _a, b, _server = served
+    seen: list[str] = []
+    b.core.on_change(lambda change: seen.append(provider(b)) if change.name == "/add" else None)
+    async with serving(b, name="/mine"):
+        await until(lambda: provider(b) == "/mine")
         b.services.reconcile()
-        assert provider(b) == "/rmpa/a/adder"
+        await asyncio.sleep(0.05)
+        assert provider(b) == "/mine"
+        (info,) = [i for i in b.operations.snapshot({}).services if i.peer == "a"]
+        assert (info.state, info.hidden) == ("hidden", "/mine of this module provides it itself")
+    await until(lambda: provider(b) == "/rmpa/a/adder")
+    assert seen == ["/mine", "/mine", "", "/rmpa/a/adder"], "ours went, its came; its went, ours came"
 
 
-async def test_a_server_at_a_new_address_is_found(settings: Callable[..., Settings]) -> None:
-    async with running(settings("a"), settings("b")) as (a, b), serving(a):
-        await until(lambda: provider(b) == "/rmpa/a/adder")
-        connection = await connect(b)
-        assert await connection.call(b"1", 20.0) == (True, b"1")
-        async with serving(a):  # the same node once more: the master ends the first one
-            await until(lambda: any(shown.caller is None for shown in b.services))
-            again = await connect(b)
-            assert await again.call(b"2", 20.0) == (True, b"2")
-            again.close()
-        connection.close()
+async def test_a_removed_proxy_comes_back(served: Served) -> None:
+    _a, b, _server = served
+    (uri,) = b.core.state().services["/add"].values()
+    b.core.call("unregisterService", "/rmpa/a/adder", "/add", uri)
+    assert provider(b) == ""
+    b.services.reconcile()
+    assert provider(b) == "/rmpa/a/adder"
+
+
+async def test_a_server_at_a_new_address_is_found(served: Served) -> None:
+    a, b, _server = served
+    connection = await connect(b)
+    assert await connection.call(b"1", 20.0) == (True, b"1")
+    async with serving(a):  # the same node once more: the master ends the first one
+        await until(lambda: any(shown.caller is None for shown in b.services))
+        again = await connect(b)
+        assert await again.call(b"2", 20.0) == (True, b"2")
+        again.close()
+    connection.close()
 
 
 async def test_another_md5_sum_is_refused_and_both_sides_say_so(
-    settings: Callable[..., Settings], caplog: pytest.LogCaptureFixture
+    served: Served, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async with running(settings("a"), settings("b")) as (a, b), serving(a):
-        await until(lambda: provider(b) == "/rmpa/a/adder")
-        with pytest.raises(PeerRefused, match=MD5):
-            await connect(b, md5sum="f" * 32)
-        await until(lambda: a.bridge.counters["service.mismatch_remote"])
-        assert b.bridge.counters["service.mismatch"] == 1
-        (info,) = [i for i in b.operations.snapshot({}).services if i.name == "/add"]
-        assert "md5sum" in info.problem
-        said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-        assert sum(MD5 in line for line in said) == 2
-        connection = await connect(b, md5sum=MD5)
-        connection.close()
+    a, b, _server = served
+    with pytest.raises(PeerRefused, match=MD5):
+        await connect(b, md5sum="f" * 32)
+    await until(lambda: a.bridge.counters["service.mismatch_remote"])
+    assert b.bridge.counters["service.mismatch"] == 1
+    (info,) = [i for i in b.operations.snapshot({}).services if i.name == "/add"]
+    assert "md5sum" in info.problem
+    said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert sum(MD5 in line for line in said) == 2
+    connection = await connect(b, md5sum=MD5)
+    connection.close()
 
 
 async def test_peer_rules_hold_for_services_and_reload(

@@ -19,10 +19,10 @@ from rmpa.ros.node.service_server import ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import ServiceDescription
 from tests.agent.test_agent import running, until
-from tests.agent.test_services import MD5, Server, come_back, fall_silent, provider, serving
+from tests.agent.test_services import MD5, Served, Server, come_back, fall_silent, provider, serving
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import AsyncIterator, Callable
 
     from rmpa.agent.agent import Agent
     from rmpa.bridge.sessions import PeerSession
@@ -65,31 +65,37 @@ def own_uri(server: Server) -> str:
     return server.node.service_uri.replace("localhost", "127.0.0.1")
 
 
-async def test_registered_nodes_are_told_the_server_and_others_the_proxy(pair: tuple[Settings, Settings]) -> None:
+@pytest.fixture
+async def direct(pair: tuple[Settings, Settings]) -> AsyncIterator[Served]:
+    """The agents of two modules, and a server in the first one that nodes of the second one call directly."""
     async with running(*pair) as (a, b), serving(a) as server:
         await until(lambda: transport(b) == ("direct", ""))
-        (proxy,) = b.core.state().services["/add"].values()
-        register(b)
-        register(b, "/rmpa_service_call")
-        assert lookup(b) == own_uri(server) != proxy
-        for caller in ("/unknown", "/rmpa", "/rmpa/a/adder", "/rmpa_service", "/rmpa_service_call"):
-            assert lookup(b, caller=caller) == proxy, caller
-        connection = await ServiceConnection.open(lookup(b), "/add", CLIENT)
-        assert await connection.call(b"1", 20.0) == (True, b"1")
-        connection.close()
-        (here,) = [i for i in b.operations.snapshot({}).services if i.name == "/add"]
-        (there,) = [i for i in a.operations.snapshot({}).services if i.name == "/add"]
-        assert (here.address, here.lookups, here.calls) == (own_uri(server), 2, 0)
-        assert (there.direct_callers, there.calls) == (("b",), 0)
+        yield a, b, server
 
 
-async def test_the_proxy_answers_where_the_lookup_says_so(pair: tuple[Settings, Settings]) -> None:
+async def test_registered_nodes_are_told_the_server_and_others_the_proxy(direct: Served) -> None:
+    a, b, server = direct
+    (proxy,) = b.core.state().services["/add"].values()
+    register(b)
+    register(b, "/rmpa_service_call")
+    assert lookup(b) == own_uri(server) != proxy
+    for caller in ("/unknown", "/rmpa", "/rmpa/a/adder", "/rmpa_service", "/rmpa_service_call"):
+        assert lookup(b, caller=caller) == proxy, caller
+    connection = await ServiceConnection.open(lookup(b), "/add", CLIENT)
+    assert await connection.call(b"1", 20.0) == (True, b"1")
+    connection.close()
+    (here,) = [i for i in b.operations.snapshot({}).services if i.name == "/add"]
+    (there,) = [i for i in a.operations.snapshot({}).services if i.name == "/add"]
+    assert (here.address, here.lookups, here.calls) == (own_uri(server), 2, 0)
+    assert (there.direct_callers, there.calls) == (("b",), 0)
+
+
+async def test_the_proxy_answers_where_the_lookup_says_so(direct: Served) -> None:
     """A service of this module hides the peer's at once, before the bridge has looked at it."""
-    async with running(*pair) as (a, b), serving(a):
-        await until(lambda: transport(b)[0] == "direct")
-        register(b)
-        b.core.call("registerService", "/mine", "/add", "rosrpc://127.0.0.1:9", "http://127.0.0.1:9/")
-        assert lookup(b) == "rosrpc://127.0.0.1:9"
+    _a, b, _server = direct
+    register(b)
+    b.core.call("registerService", "/mine", "/add", "rosrpc://127.0.0.1:9", "http://127.0.0.1:9/")
+    assert lookup(b) == "rosrpc://127.0.0.1:9"
 
 
 async def test_a_restarted_server_is_asked_for_anew(pair: tuple[Settings, Settings]) -> None:
@@ -176,27 +182,23 @@ async def test_a_flood_of_notifications_does_no_harm(pair: tuple[Settings, Setti
         assert len(list(b.services.direct_imports)) == 2
 
 
-async def test_a_malformed_notification_ends_its_link_alone(pair: tuple[Settings, Settings]) -> None:
-    async with running(*pair) as (a, b), serving(a):
-        await until(lambda: transport(b)[0] == "direct")
-        (session,) = a.bridge.sessions.linked()
-        link = session.link
-        a.bridge.rpc.notify(session, AGAIN, {"name": "no name", "node": 7})
-        await until(lambda: [s.link for s in a.bridge.sessions.linked()] not in ([], [link]))
-        await until(lambda: transport(b)[0] == "direct")
+async def test_a_malformed_notification_ends_its_link_alone(direct: Served) -> None:
+    a, b, _server = direct
+    (session,) = a.bridge.sessions.linked()
+    link = session.link
+    a.bridge.rpc.notify(session, AGAIN, {"name": "no name", "node": 7})
+    await until(lambda: [s.link for s in a.bridge.sessions.linked()] not in ([], [link]))
+    await until(lambda: transport(b)[0] == "direct")
 
 
-async def test_silence_ends_direct_lookups_at_once_and_the_next_link_restores_them(
-    pair: tuple[Settings, Settings],
-) -> None:
-    async with running(*pair) as (a, b), serving(a) as server:
-        await until(lambda: transport(b)[0] == "direct")
-        register(b)
-        (proxy,) = b.core.state().services["/add"].values()
-        links = fall_silent(a, b)
-        assert lookup(b) == proxy
-        come_back(links)
-        await until(lambda: lookup(b) == own_uri(server))
+async def test_silence_ends_direct_lookups_at_once_and_the_next_link_restores_them(direct: Served) -> None:
+    a, b, server = direct
+    register(b)
+    (proxy,) = b.core.state().services["/add"].values()
+    links = fall_silent(a, b)
+    assert lookup(b) == proxy
+    come_back(links)
+    await until(lambda: lookup(b) == own_uri(server))
 
 
 def crash(agent: Agent) -> None:

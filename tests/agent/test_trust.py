@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import time
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -102,9 +102,10 @@ class Fleet:
         await until(lambda: all(peers_of(self.agents[name]) == set(names) - {name} for name in names))
 
 
-@asynccontextmanager
-async def a_fleet(folder: Path) -> AsyncIterator[Fleet]:
-    fleet = Fleet(folder)
+@pytest.fixture
+async def fleet(tmp_path: Path) -> AsyncIterator[Fleet]:
+    """Modules of which the first one, base, is the authority and runs."""
+    fleet = Fleet(tmp_path)
     fleet.found()
     try:
         await fleet.start("base")
@@ -114,8 +115,8 @@ async def a_fleet(folder: Path) -> AsyncIterator[Fleet]:
             await fleet.stop(name)
 
 
-async def test_modules_that_joined_are_linked_over_tls_also_while_the_group_key_changes(tmp_path: Path) -> None:
-    async with a_fleet(tmp_path) as fleet, AsyncExitStack() as stack:
+async def test_modules_that_joined_are_linked_over_tls_also_while_the_group_key_changes(fleet: Fleet) -> None:
+    async with AsyncExitStack() as stack:
         arm = await fleet.add("arm")
         await fleet.linked("base", "arm")
         base = fleet.agents["base"]
@@ -137,8 +138,8 @@ async def test_modules_that_joined_are_linked_over_tls_also_while_the_group_key_
         assert [session.link for session in arm.bridge.sessions.linked()] == links
 
 
-async def test_a_revoked_module_is_gone_everywhere_within_a_second_until_it_has_a_new_token(tmp_path: Path) -> None:
-    async with a_fleet(tmp_path) as fleet, AsyncExitStack() as stack:
+async def test_a_revoked_module_is_gone_everywhere_within_a_second_until_it_has_a_new_token(fleet: Fleet) -> None:
+    async with AsyncExitStack() as stack:
         for name in ("arm", "stick", "thief"):
             await fleet.add(name)
         await fleet.linked("base", "arm", "stick", "thief")
@@ -170,145 +171,138 @@ def _refusals(agent: Agent, word: str) -> int:
     return agent.snapshots.build().counters.get(f"link.refused.{word}", 0)
 
 
-async def test_a_module_that_was_away_learns_of_a_revocation_from_any_member(tmp_path: Path) -> None:
-    async with a_fleet(tmp_path) as fleet:
-        for name in ("arm", "stick", "thief"):
-            await fleet.add(name)
-        await fleet.linked("base", "arm", "stick", "thief")
-        await fleet.stop("stick")
-        await fleet.command("base", "revoke", name="thief")
-        await fleet.linked("base", "arm")
-        await fleet.stop("base")  # the authority is off: arm tells stick
-        stick = await fleet.start("stick")
-        await until(lambda: "arm" in peers_of(stick))
-        member = trust_of(stick).membership
-        await until(lambda: member.deny.number == 1)
-        await until(lambda: "thief" not in peers_of(stick))
-        assert member.ring.newest.number == 2
+async def test_a_module_that_was_away_learns_of_a_revocation_from_any_member(fleet: Fleet) -> None:
+    for name in ("arm", "stick", "thief"):
+        await fleet.add(name)
+    await fleet.linked("base", "arm", "stick", "thief")
+    await fleet.stop("stick")
+    await fleet.command("base", "revoke", name="thief")
+    await fleet.linked("base", "arm")
+    await fleet.stop("base")  # the authority is off: arm tells stick
+    stick = await fleet.start("stick")
+    await until(lambda: "arm" in peers_of(stick))
+    member = trust_of(stick).membership
+    await until(lambda: member.deny.number == 1)
+    await until(lambda: "thief" not in peers_of(stick))
+    assert member.ring.newest.number == 2
 
 
-async def test_a_certificate_is_renewed_over_the_link_by_itself_in_time_and_not_too_often(tmp_path: Path) -> None:
-    async with a_fleet(tmp_path) as fleet:
-        arm = await fleet.add("arm")
-        await fleet.linked("base", "arm")
-        trust = trust_of(arm)
-        await until(lambda: trust.authority_name() == "base")
-        before = trust.membership.certificate
-        await fleet.command("arm", "renew")
-        assert trust.membership.certificate.serial != before.serial
-        await fleet.command("base", "renew")
-        # After half of its time it is renewed without a command.
-        serial = trust.membership.certificate.serial
-        past = {"issued": before.issued - 4 * 86_400, "expires": before.expires - 4 * 86_400}
-        trust.membership.certificate = replace(trust.membership.certificate, **past)  # type: ignore[arg-type]
-        trust.look_now()
-        await until(lambda: trust.membership.certificate.serial not in (serial, before.serial))
-        assert peers_of(arm) == {"base"}
+async def test_a_certificate_is_renewed_over_the_link_by_itself_in_time_and_not_too_often(fleet: Fleet) -> None:
+    arm = await fleet.add("arm")
+    await fleet.linked("base", "arm")
+    trust = trust_of(arm)
+    await until(lambda: trust.authority_name() == "base")
+    before = trust.membership.certificate
+    await fleet.command("arm", "renew")
+    assert trust.membership.certificate.serial != before.serial
+    await fleet.command("base", "renew")
+    # After half of its time it is renewed without a command.
+    serial = trust.membership.certificate.serial
+    past = {"issued": before.issued - 4 * 86_400, "expires": before.expires - 4 * 86_400}
+    trust.membership.certificate = replace(trust.membership.certificate, **past)  # type: ignore[arg-type]
+    trust.look_now()
+    await until(lambda: trust.membership.certificate.serial not in (serial, before.serial))
+    assert peers_of(arm) == {"base"}
 
-        async def renew_often() -> None:
-            for _ in range(limits.RENEWALS_BURST + 1):
-                await fleet.command("arm", "renew")
+    async def renew_often() -> None:
+        for _ in range(limits.RENEWALS_BURST + 1):
+            await fleet.command("arm", "renew")
 
-        with pytest.raises(RmpaError, match="asks for certificates too often"):
-            await renew_often()
+    with pytest.raises(RmpaError, match="asks for certificates too often"):
+        await renew_often()
 
 
 async def test_a_member_that_says_it_is_the_authority_is_not_believed_and_does_not_fill_the_log(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    fleet: Fleet, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async with a_fleet(tmp_path) as fleet:
-        arm, thief = await fleet.add("arm"), await fleet.add("thief")
-        await fleet.linked("base", "arm", "thief")
-        trust = trust_of(arm)
-        await until(lambda: trust.authority_name() == "base")
-        await fleet.stop("base")
-        await fleet.linked("arm", "thief")
-        [session] = [each for each in thief.bridge.sessions.linked() if each.link.name == "arm"]
-        for _ in range(50):
-            thief.bridge.rpc.notify(session, "trust.deny", {"document": "{}"})
-            thief.bridge.rpc.notify(session, HAVE, {"deny": 0, "keys": 1, "authority": True})
-        with pytest.raises(RmpaError, match="not the authority"):  # behind this answer the lie was heard
-            await thief.bridge.rpc.request(session, RENEW, {"request": ""}, DEADLINE)
-        assert trust.authority_name() == ""
-        place = trust.membership.store.load_authority()
-        assert place is not None
-        assert place.name == "base"
-        counted = (arm.bridge.counters["trust.no_authority"], arm.bridge.counters["trust.document_refused"])
-        assert counted == (50, 50)
-        lines = [text for text in caplog.messages if "does not hold" in text or "it is not" in text]
-        assert 2 <= len(lines) < 20
+    arm, thief = await fleet.add("arm"), await fleet.add("thief")
+    await fleet.linked("base", "arm", "thief")
+    trust = trust_of(arm)
+    await until(lambda: trust.authority_name() == "base")
+    await fleet.stop("base")
+    await fleet.linked("arm", "thief")
+    [session] = [each for each in thief.bridge.sessions.linked() if each.link.name == "arm"]
+    for _ in range(50):
+        thief.bridge.rpc.notify(session, "trust.deny", {"document": "{}"})
+        thief.bridge.rpc.notify(session, HAVE, {"deny": 0, "keys": 1, "authority": True})
+    with pytest.raises(RmpaError, match="not the authority"):  # behind this answer the lie was heard
+        await thief.bridge.rpc.request(session, RENEW, {"request": ""}, DEADLINE)
+    assert trust.authority_name() == ""
+    place = trust.membership.store.load_authority()
+    assert place is not None
+    assert place.name == "base"
+    counted = (arm.bridge.counters["trust.no_authority"], arm.bridge.counters["trust.document_refused"])
+    assert counted == (50, 50)
+    lines = [text for text in caplog.messages if "does not hold" in text or "it is not" in text]
+    assert 2 <= len(lines) < 20
 
 
 async def test_a_module_that_missed_changes_of_the_group_key_is_linked_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async with a_fleet(tmp_path) as fleet:
-        await fleet.add("arm")
-        await fleet.linked("base", "arm")
-        await fleet.stop("arm")
-        monkeypatch.setattr(limits, "KEY_SPREAD", 0.0)
-        monkeypatch.setattr(limits, "KEY_OVERLAP", 0.0)
-        for _ in range(3):
-            await fleet.command("base", "rotate")
-        arm = await fleet.start("arm")  # it does not know the key that base signs with
-        await fleet.linked("base", "arm")
-        member = trust_of(arm).membership
-        await until(lambda: member.ring.newest.number == 4)
+    await fleet.add("arm")
+    await fleet.linked("base", "arm")
+    await fleet.stop("arm")
+    monkeypatch.setattr(limits, "KEY_SPREAD", 0.0)
+    monkeypatch.setattr(limits, "KEY_OVERLAP", 0.0)
+    for _ in range(3):
+        await fleet.command("base", "rotate")
+    arm = await fleet.start("arm")  # it does not know the key that base signs with
+    await fleet.linked("base", "arm")
+    member = trust_of(arm).membership
+    await until(lambda: member.ring.newest.number == 4)
 
 
-async def test_the_user_who_invites_is_told_what_came_of_the_token(tmp_path: Path) -> None:
-    async with a_fleet(tmp_path) as fleet:
-        token = await fleet.token(name="arm")
-        asked = asyncio.ensure_future(fleet.command("base", "step", id=token.token_id.hex(), after=0))
-        with pytest.raises(PeerRefused, match=r"\(name\); join with the --name that it is for"):
-            await join_mesh(token, "leg")
-        step = await asked
-        assert (step.step, step.state, step.module, step.reason) == (1, "refused", "leg", "name")  # type: ignore[attr-defined]
-        await join_mesh(token, "arm")
-        step = await fleet.command("base", "step", id=token.token_id.hex(), after=1)
-        assert (step.step, step.state, step.module) == (2, "joined", "arm")  # type: ignore[attr-defined]
+async def test_the_user_who_invites_is_told_what_came_of_the_token(fleet: Fleet) -> None:
+    token = await fleet.token(name="arm")
+    asked = asyncio.ensure_future(fleet.command("base", "step", id=token.token_id.hex(), after=0))
+    with pytest.raises(PeerRefused, match=r"\(name\); join with the --name that it is for"):
+        await join_mesh(token, "leg")
+    step = await asked
+    assert (step.step, step.state, step.module, step.reason) == (1, "refused", "leg", "name")  # type: ignore[attr-defined]
+    await join_mesh(token, "arm")
+    step = await fleet.command("base", "step", id=token.token_id.hex(), after=1)
+    assert (step.step, step.state, step.module) == (2, "joined", "arm")  # type: ignore[attr-defined]
 
 
-async def test_a_module_without_trust_is_not_linked_and_told_why(tmp_path: Path) -> None:
-    async with a_fleet(tmp_path) as fleet:
-        with pytest.raises(StartError, match=r"the module plain: has no keys, .* beside keys of base"):
-            await fleet.start("plain")
-        plain = await fleet.start("plain", trust=TrustSettings(insecure=True))
-        base = fleet.agents["base"]
-        await until(lambda: base.snapshots.build().counters.get("beacon.untagged"))
-        await until(lambda: _refusals(base, "plain"))
-        assert not peers_of(base)
-        assert not peers_of(plain)
-        with pytest.raises(PeerRefused, match="it runs without trust; rmpa trust init, or rmpa trust join TOKEN"):
-            await fleet.command("plain", "invite")
-        status: TrustStatus = await fleet.command("plain", "status")  # type: ignore[assignment]
-        assert (status.on, status.agent, status.problems) == (False, "plain", ())
+async def test_a_module_without_trust_is_not_linked_and_told_why(fleet: Fleet) -> None:
+    with pytest.raises(StartError, match=r"the module plain: has no keys, .* beside keys of base"):
+        await fleet.start("plain")
+    plain = await fleet.start("plain", trust=TrustSettings(insecure=True))
+    base = fleet.agents["base"]
+    await until(lambda: base.snapshots.build().counters.get("beacon.untagged"))
+    await until(lambda: _refusals(base, "plain"))
+    assert not peers_of(base)
+    assert not peers_of(plain)
+    with pytest.raises(PeerRefused, match="it runs without trust; rmpa trust init, or rmpa trust join TOKEN"):
+        await fleet.command("plain", "invite")
+    status: TrustStatus = await fleet.command("plain", "status")  # type: ignore[assignment]
+    assert (status.on, status.agent, status.problems) == (False, "plain", ())
 
 
-async def test_only_the_authority_invites_and_revokes_and_the_snapshot_shows_who_it_is(tmp_path: Path) -> None:
-    async with a_fleet(tmp_path) as fleet:
-        arm = await fleet.add("arm")
-        await fleet.linked("base", "arm")
-        await until(trust_of(arm).authority_name)
-        for what in ("invite", "revoke", "rotate", "sign"):
-            with pytest.raises(PeerRefused, match="not the authority of its mesh; do it at base"):
-                await fleet.command("arm", what, name="base")
-        for name, words in (("base", "is the authority itself"), ("amr", "did you mean arm?")):
-            with pytest.raises(ConfigError, match=words):
-                await fleet.command("base", "revoke", name=name)
-        base = fleet.agents["base"]
-        shown = base.snapshots.build()
-        assert shown.trust is not None
-        assert (shown.trust.module, shown.trust.is_authority, shown.trust.clock_set) == ("base", True, True)
-        assert {member.name: member.linked for member in shown.trust.members} == {"arm": True, "base": True}
-        assert shown.notes == ()
-        member = trust_of(base).membership
-        for changed, note in (
-            ({"expires": time.time() + 3600}, "ends in 1 h, and could not be renewed"),
-            ({"issued": time.time() + 86_400}, "clock is not set"),
-        ):
-            member.certificate = replace(member.certificate, **changed)  # type: ignore[arg-type]
-            assert note in " ".join(base.snapshots.build().notes)
+async def test_only_the_authority_invites_and_revokes_and_the_snapshot_shows_who_it_is(fleet: Fleet) -> None:
+    arm = await fleet.add("arm")
+    await fleet.linked("base", "arm")
+    await until(trust_of(arm).authority_name)
+    for what in ("invite", "revoke", "rotate", "sign"):
+        with pytest.raises(PeerRefused, match="not the authority of its mesh; do it at base"):
+            await fleet.command("arm", what, name="base")
+    for name, words in (("base", "is the authority itself"), ("amr", "did you mean arm?")):
+        with pytest.raises(ConfigError, match=words):
+            await fleet.command("base", "revoke", name=name)
+    base = fleet.agents["base"]
+    shown = base.snapshots.build()
+    assert shown.trust is not None
+    assert (shown.trust.module, shown.trust.is_authority, shown.trust.clock_set) == ("base", True, True)
+    assert {member.name: member.linked for member in shown.trust.members} == {"arm": True, "base": True}
+    assert shown.notes == ()
+    member = trust_of(base).membership
+    for changed, note in (
+        ({"expires": time.time() + 3600}, "ends in 1 h, and could not be renewed"),
+        ({"issued": time.time() + 86_400}, "clock is not set"),
+    ):
+        member.certificate = replace(member.certificate, **changed)  # type: ignore[arg-type]
+        assert note in " ".join(base.snapshots.build().notes)
 
 
 def test_an_agent_never_starts_without_trust_because_its_files_are_broken(tmp_path: Path) -> None:
@@ -329,7 +323,7 @@ def test_an_agent_never_starts_without_trust_because_its_files_are_broken(tmp_pa
 
 
 async def test_the_certificate_is_for_the_hosts_of_the_page_and_for_no_other_modules(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     addresses = {"base": "10.1.1.1", "arm": "10.1.1.2"}
     web = WebSettings(hosts=("Panel.local", "www.example.com", "base"))
@@ -339,18 +333,18 @@ async def test_the_certificate_is_for_the_hosts_of_the_page_and_for_no_other_mod
         return page_hosts((addresses[settings.name], "10.9.9.9", *settings.web.hosts))
 
     monkeypatch.setattr(AgentTrust, "page_hosts", hosts)
-    async with a_fleet(tmp_path) as fleet:
-        await until(lambda: _hosts(fleet.agents["base"]) >= {"10.1.1.1", "10.9.9.9"})
-        arm = await fleet.add("arm", web=web)
-        await fleet.linked("base", "arm")
-        await until(lambda: "10.1.1.2" in _hosts(arm))
-        own = {"arm", "arm.local", "localhost", "127.0.0.1", "10.1.1.2", "panel.local"}
-        assert _hosts(arm) == own, "neither a host of the Internet nor one of base"
-        # An address that changes is in it when the agent looks next.
-        addresses["arm"] = "10.1.1.3"
-        trust_of(arm).look_now()
-        await until(lambda: "10.1.1.3" in _hosts(arm))
-        assert "10.1.1.2" not in _hosts(arm)
+    trust_of(fleet.agents["base"]).look_now()
+    await until(lambda: _hosts(fleet.agents["base"]) >= {"10.1.1.1", "10.9.9.9"})
+    arm = await fleet.add("arm", web=web)
+    await fleet.linked("base", "arm")
+    await until(lambda: "10.1.1.2" in _hosts(arm))
+    own = {"arm", "arm.local", "localhost", "127.0.0.1", "10.1.1.2", "panel.local"}
+    assert _hosts(arm) == own, "neither a host of the Internet nor one of base"
+    # An address that changes is in it when the agent looks next.
+    addresses["arm"] = "10.1.1.3"
+    trust_of(arm).look_now()
+    await until(lambda: "10.1.1.3" in _hosts(arm))
+    assert "10.1.1.2" not in _hosts(arm)
 
 
 def _hosts(agent: Agent) -> frozenset[str]:
