@@ -41,7 +41,7 @@ from rmpa.web.server.access import token_from
 from tests.bridge import test_messages
 from tests.discovery.test_beacon import BEACON
 from tests.discovery.test_membership import Harness, Speaker, who
-from tests.gateway.sites import test_attachment, test_keys
+from tests.gateway.sites import test_keys
 from tests.mesh import test_frames
 from tests.mesh.worlds import ACCEPTOR, DIALLER, HIGH, LOW, Side, Time, deliver
 from tests.observe.samples import SNAPSHOT
@@ -113,7 +113,7 @@ def samples() -> Iterator[tuple[str, Sample]]:
     yield "token", Sample(token.serialize().encode(), token, lambda data: Token.parse(data.decode()), "join token")
     for each in (test_keys.ARM, test_keys.SCAN, test_keys.FOR_YARD, test_keys.GATEWAY):
         yield f"site {each.token()}", Sample(each.token().encode(), each, lambda d: parse_token(d.decode()), "sites")
-    attachment = 7, 123456789, test_attachment.SOURCE
+    attachment = 7, 123456789, test_keys.SENT
     yield "attachment", Sample(attachment[2].writer()(7, 123456789), attachment, AttachmentReader().read, "sites")
     sonar = describe(test_saved.sonar(), "/sonar")
     yield "descriptor", Sample(sonar.serialize().encode(), sonar, Descriptor.parse, "resource")

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Final, Protocol
 from rmpa.core.counters import TokenBucket
 from rmpa.core.errors import RmpaError
 from rmpa.gateway import limits
+from rmpa.observe.peer_info import OK, WARN, Check
 from rmpa.runtime.tls import after_read
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from rmpa.gateway.foreign import TopicTap
     from rmpa.gateway.own_graph import AgentGraph
@@ -66,6 +67,12 @@ class ExportDialect(Protocol):
 
     def close(self) -> None:
         """Take the announcement back."""
+
+
+def flow(stage: str, text: str, messages: int, losses: Iterable[tuple[int, str]], remedy: str = "") -> Check:
+    """The stage of ``rmpa why`` for messages that have crossed, with losses: how many, and the words for them."""
+    lost = [f"{count} {words}" for count, words in losses if count]
+    return Check(stage, OK if messages and not lost else WARN, "; ".join((text, *lost)), remedy if lost else "")
 
 
 class TopicLimits:

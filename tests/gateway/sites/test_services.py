@@ -1,9 +1,9 @@
-"""Services between sites: calls, the server's errors, time-outs, bounds, what leaves during a call."""
+"""Services between sites: calls, the server's errors, time-outs, bounds, what leaves during a call; and actions."""
 
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
@@ -13,7 +13,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.rules import CrossingRules, ForeignSource, MeshSource, SourceKind
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
 from rmpa.gateway.sites.plans import SiteExport, SiteImport
-from rmpa.gateway.sites.services import SiteServices, asked_type, read_description
+from rmpa.gateway.sites.services import SiteActions, SiteServices, asked_type, read_description
 from rmpa.ros.wire.tcpros import ServiceDescription
 from tests.gateway.memory_graph import MemoryGraph, MemoryService
 from tests.gateway.memory_zenoh import MemoryZenoh
@@ -199,3 +199,49 @@ def test_the_type_of_a_key() -> None:
     for key in ("", "rmpa/1/a/b/t/std_msgs%String/x", "rmpa/2/a/b/s/*/x", "rmpa/1/a/b/s/*"):
         with pytest.raises(RemoteProtocolError):
             asked_type(key)
+
+
+# --- Actions between sites ------------------------------------------------------------------------------------------
+
+GOAL, CANCEL = "arm_msgs/MoveActionGoal", "actionlib_msgs/GoalID"
+
+
+def client(topic: str, type_name: str) -> MeshSource:
+    return MeshSource(SourceKind.TOPIC, "base", "0" * 32, "/client", topic, type_name, topic, "/rmpa/base/client")
+
+
+def server(topic: str, type_name: str = "actionlib_msgs/GoalStatusArray") -> ForeignSource:
+    return ForeignSource(SourceKind.TOPIC, "warehouse", "arm", "/server", topic, type_name)
+
+
+class Heard(set[tuple[str, str]]):
+    """The pairs of a graph's topics and the servers under whose names they are listened to."""
+
+    def attend(self, source: MeshSource, listener: ForeignSource) -> Heard:
+        self.add((source.here, listener.name))
+        tap = Heard()
+        tap.close = lambda: self.remove((source.here, listener.name))  # type: ignore[method-assign]
+        return tap
+
+    def close(self) -> None:
+        raise NotImplementedError
+
+
+def test_goals_and_cancellations_are_listened_to_under_the_servers_name() -> None:
+    heard = Heard()
+    actions = SiteActions(cast("Any", heard))
+    actions.client(client("/move/goal", GOAL), there=True)
+    actions.client(client("/move/goal", GOAL), there=True)  # for another site too
+    actions.client(client("/move/other", "std_msgs/String"), there=True)
+    actions.server(server("/turn/status"), there=True)
+    actions.server(server("/move/feedback", "arm_msgs/MoveActionFeedback"), there=True)
+    assert heard == set()
+    actions.server(server("/move/status"), there=True)
+    actions.client(client("/move/cancel", CANCEL), there=True)
+    assert heard == {("/move/goal", "/move/status"), ("/move/cancel", "/move/status")}
+    actions.client(client("/move/goal", GOAL), there=False)
+    assert len(heard) == 2
+    actions.client(client("/move/goal", GOAL), there=False)
+    assert heard == {("/move/cancel", "/move/status")}
+    actions.server(server("/move/status"), there=False)
+    assert heard == set()

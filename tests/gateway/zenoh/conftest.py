@@ -6,17 +6,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.gateway.zenoh_bed import ZenohBed, bed
-
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from rmpa.gateway.zenoh.session import OpenSession
+    from tests.gateway.zenoh_bed import ZenohBed
 
 
 @pytest.fixture
 async def net() -> AsyncIterator[ZenohBed]:
-    async with bed() as made:
+    async with pytest.importorskip("tests.gateway.zenoh_bed").bed() as made:
         yield made
 
 

@@ -16,6 +16,7 @@ from rmpa.gateway.ros2.graph import SITE
 from rmpa.gateway.ros2.services import Ros2Context, Ros2Services
 from rmpa.gateway.ros2.topics import Ros2Topics
 from rmpa.gateway.rules import CrossingRules, SourceKind
+from rmpa.gateway.topics import flow
 from rmpa.observe.operations import INFO, REPORT, WHY
 from rmpa.observe.peer_info import FAIL, OK, WARN, Check, SiteInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.why.diagnosis import Diagnosis, until_failure
@@ -40,13 +41,6 @@ _log: Final = logging.getLogger(__name__)
 _RULES: Final = "change [[gateway.rule]] in the rmpa.toml of the gateway, and reload it"
 _DROPPED: Final = "were dropped by a full queue"
 _UNCONVERTED: Final = "could not be converted"
-_SENT_LOSSES: Final = (_DROPPED, "were left out for the rule's rate or size", _UNCONVERTED)
-_ARRIVED_LOSSES: Final = (
-    "were lost on the way, by their numbers",
-    _DROPPED,
-    _UNCONVERTED,
-    "came before a node subscribed",
-)
 
 
 class Ros2Neighbour:
@@ -280,8 +274,12 @@ def _out_stages(export: Export, dialect: Ros2Dialect, problems: Mapping[str, str
         return
     yield Check("demand", OK, "a node of ROS 2 subscribes")
     waiting = f", {export.waiting} wait" if export.waiting else ""
-    losses = export.dropped, export.limited, dialect.unconverted
-    yield _flow("sent", f"{export.messages} messages were sent{waiting}", export.messages, losses, _SENT_LOSSES)
+    losses = (
+        (export.dropped, _DROPPED),
+        (export.limited, "were left out for the rule's rate or size"),
+        (dialect.unconverted, _UNCONVERTED),
+    )
+    yield flow("sent", f"{export.messages} messages were sent{waiting}", export.messages, losses)
 
 
 def _in_stages(imported: Ros2Import, publisher: Ros2Publisher) -> Iterator[Check]:
@@ -297,14 +295,13 @@ def _in_stages(imported: Ros2Import, publisher: Ros2Publisher) -> Iterator[Check
         yield Check("demand", WARN, "no node of a module subscribes: it crosses once one does")
         return
     yield Check("demand", OK, "a node of a module subscribes")
-    losses = imported.sequences.lost, publisher.dropped, imported.unconverted, imported.early.dropped
-    messages = publisher.received
-    yield _flow("arrived", f"{messages} messages have come", messages, losses, _ARRIVED_LOSSES)
-
-
-def _flow(stage: str, text: str, messages: int, losses: tuple[int, ...], words: tuple[str, ...]) -> Check:
-    lost = [f"{count} {what}" for count, what in zip(losses, words, strict=True) if count]
-    return Check(stage, OK if messages and not lost else WARN, "; ".join((text, *lost)))
+    losses = (
+        (imported.sequences.lost, "were lost on the way, by their numbers"),
+        (publisher.dropped, _DROPPED),
+        (imported.unconverted, _UNCONVERTED),
+        (imported.early.dropped, "came before a node subscribed"),
+    )
+    yield flow("arrived", f"{publisher.received} messages have come", publisher.received, losses)
 
 
 def make_ros2_neighbour(graph: AgentGraph, session: OpenSession, settings: Settings) -> Ros2Neighbour:

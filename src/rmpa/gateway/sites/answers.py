@@ -28,6 +28,7 @@ from rmpa.gateway.sites.params import SiteParams
 from rmpa.gateway.sites.services import ImportedService
 from rmpa.gateway.sites.site import SiteNeighbour
 from rmpa.gateway.sites.topics import SiteContext
+from rmpa.gateway.topics import flow
 from rmpa.gateway.zenoh.threads import first_answer
 from rmpa.observe.operations import INFO, PARAM, REPORT, WHY
 from rmpa.observe.peer_info import (
@@ -74,15 +75,6 @@ _RULES: Final = "change [[gateway.rule]] in the rmpa.toml of the gateway of {}, 
 _PERMISSIONS: Final = (
     "change [[permission]] in the rmpa.toml of the gateway of {} and of its modules, and reload them"
 )
-_SENT_LOSSES: Final = {
-    "dropped": "were dropped by its queue, for the way is slower than the topic",
-    "limited": "were left out by rate or size of the rule",
-}
-_ARRIVED_LOSSES: Final = {
-    "lost": "were lost between the gateways",
-    "mismatched": "have another md5 sum than their header",
-    "dropped": "were dropped here for slow subscribers",
-}
 
 
 class WhyQuestion(msgspec.Struct, kw_only=True, frozen=True):
@@ -143,11 +135,12 @@ def sent_stages(site: str, export: Export, *, asked: bool) -> list[Check]:
         return [Check(_DEMAND_THERE, WARN if asked else FAIL, text, _NO_DEMAND)]
     waiting = f", {export.waiting} wait" if export.waiting else ""
     text = f"the gateway of {site} has sent {export.messages} messages{waiting}"
-    lost = _lost(export, _SENT_LOSSES)
-    remedy = "rate and size of a [[gateway.rule]] say what may be left out; a contract says what goes first"
-    sent = Check(
-        "sent", OK if export.messages and not lost else WARN, "; ".join((text, *lost)), remedy if lost else ""
+    losses = (
+        (export.dropped, "were dropped by its queue, for the way is slower than the topic"),
+        (export.limited, "were left out by rate or size of the rule"),
     )
+    remedy = "rate and size of a [[gateway.rule]] say what may be left out; a contract says what goes first"
+    sent = flow("sent", text, export.messages, losses, remedy)
     return [Check(_DEMAND_THERE, OK, "another site subscribes"), sent]
 
 
@@ -170,13 +163,13 @@ def here_stages(entry: SiteImport, found: ImportedTopic | ImportedService | None
     stages.append(Check("demand here", OK, "a node of this site subscribes"))
     if not found.messages:
         return [*stages, Check("arrived", WARN, "no message has come since then", "does its publisher publish?")]
-    lost = _lost(found, _ARRIVED_LOSSES)
+    losses = (
+        (found.lost, "were lost between the gateways"),
+        (found.mismatched, "have another md5 sum than their header"),
+        (found.dropped, "were dropped here for slow subscribers"),
+    )
     text = f"{found.messages} messages have come, {found.rate():.1f} Hz"
-    return [*stages, Check("arrived", WARN if lost else OK, "; ".join((text, *lost)))]
-
-
-def _lost(topic: Export | ImportedTopic, losses: Mapping[str, str]) -> list[str]:
-    return [f"{getattr(topic, key)} {words}" for key, words in losses.items() if getattr(topic, key)]
+    return [*stages, flow("arrived", text, found.messages, losses)]
 
 
 def _refused_stage(where: str, refused: str, site: str) -> Check:

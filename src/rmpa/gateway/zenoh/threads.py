@@ -45,15 +45,12 @@ _log = logging.getLogger(__name__)
 
 
 class ZenohPriority(IntEnum):
-    """Zenoh's priorities; a lower number goes first."""
+    """Those of Zenoh's priorities that are used; a lower number goes first."""
 
     REAL_TIME = 1
     INTERACTIVE_HIGH = 2
-    INTERACTIVE_LOW = 3
-    DATA_HIGH = 4
     DATA = 5
     DATA_LOW = 6
-    BACKGROUND = 7
 
 
 # The priority of a topic's messages, by that of its contract.

@@ -1,4 +1,4 @@
-"""Ros2Liveliness tokens and keys of ROS 2: golden texts, and what is no token."""
+"""The formats of rmw_zenoh: golden texts and bytes of tokens, QoS and attachments, and what is none."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa.core.contract import ContractRule, Contracts, Durability, History, Priority, Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.format import (
     EntityKind,
+    Ros2Attachment,
     Ros2Durability,
     Ros2Endpoint,
     Ros2History,
@@ -21,8 +23,11 @@ from rmpa.gateway.ros2.format import (
     dds_type,
     graph_key,
     parse_token,
+    ros2_qos,
     ros_type,
+    zenoh_qos,
 )
+from rmpa.gateway.zenoh.threads import ZenohPriority
 
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 NODE = Ros2Node(2, "a1b2c3", 0, "/robot/talker")
@@ -118,3 +123,70 @@ def test_kinds_that_are_not_known_count_as_the_default_and_transient_local_is_la
 )
 def test_each_qos_is_read_back(qos: Ros2Qos) -> None:
     assert Ros2Qos.parse(qos.serialize()) == qos
+
+
+# --- The attachment of ROS 2's messages -----------------------------------------------------------------------------
+
+GOLDEN_BYTES = bytes.fromhex("0700000000000000 15cd5b0700000000 10 000102030405060708090a0b0c0d0e0f")
+ATTACHMENT = Ros2Attachment(7, 123456789, bytes(range(16)))
+
+
+def test_golden_bytes() -> None:
+    assert ATTACHMENT.serialize() == GOLDEN_BYTES
+    assert len(GOLDEN_BYTES) == 33
+    assert Ros2Attachment.parse(GOLDEN_BYTES) == ATTACHMENT
+
+
+def test_what_later_versions_add_is_ignored() -> None:
+    assert Ros2Attachment.parse(GOLDEN_BYTES + b"more") == ATTACHMENT
+
+
+@pytest.mark.parametrize("length", range(len(GOLDEN_BYTES)))
+def test_a_shorter_one_is_refused(length: int) -> None:
+    with pytest.raises(RemoteProtocolError):
+        Ros2Attachment.parse(GOLDEN_BYTES[:length])
+
+
+@given(st.integers(-(2**63), 2**63 - 1), st.integers(-(2**63), 2**63 - 1), st.binary(max_size=255))
+def test_each_attachment_is_read_back(sequence: int, stamp: int, gid: bytes) -> None:
+    made = Ros2Attachment(sequence, stamp, gid)
+    assert Ros2Attachment.parse(memoryview(made.serialize())) == made
+
+
+def test_the_older_form_with_names_is_read() -> None:
+    raw = (
+        b"\x0fsequence_number" + (7).to_bytes(8, "little") + b"\x10source_timestamp" + (9).to_bytes(8, "little")
+        + b"\x0asource_gid" + b"\x10" + bytes(range(16))
+    )  # fmt: skip
+    assert Ros2Attachment.parse(raw) == Ros2Attachment(7, 9, bytes(range(16)))
+    for end in range(16, len(raw)):
+        with pytest.raises(RemoteProtocolError):
+            Ros2Attachment.parse(raw[:end])
+
+
+# --- The QoS of our topics in ROS 2 and in Zenoh, by contract -------------------------------------------------------
+
+
+def terms(*, latching: bool = False, **values: object) -> tuple[str, bool, ZenohPriority, int, int]:
+    """The QoS in the token; block, priority, bound and cache of Zenoh's publisher."""
+    contracts = Contracts((ContractRule((), (), values),) if values else ())
+    qos = ros2_qos(contracts, "/a", "std_msgs/String", latching=latching)
+    zenoh = zenoh_qos(contracts.of("/a", "std_msgs/String"), qos)
+    assert zenoh.reliable is zenoh.block
+    return qos.serialize(), zenoh.block, zenoh.priority, zenoh.messages, zenoh.cache
+
+
+def test_each_contract_has_its_qos() -> None:
+    plain = terms()
+    assert plain[:3] == ("::,10:,:,:,,", True, ZenohPriority.DATA), "reliable, as TCPROS is"
+    assert plain[4] == 0
+    assert terms(reliability=Reliability.RELIABLE) == plain
+    assert terms(reliability=Reliability.BEST_EFFORT)[:2] == ("2::,10:,:,:,,", False)
+    assert terms(latching=True)[0] == ":1:,1:,:,:,,"
+    assert terms(latching=True)[4] == 1
+    assert terms(durability=Durability.TRANSIENT_LOCAL, depth=7) == (":1:,7:,:,:,,", True, ZenohPriority.DATA, 7, 7)
+    assert terms(history=History.KEEP_ALL)[0] == "::2,10:,:,:,,"
+    assert terms(depth=5)[0] == "::,5:,:,:,,"
+    assert terms(priority=Priority.HIGH)[2] is ZenohPriority.REAL_TIME
+    assert terms(priority=Priority.LOW)[2] is ZenohPriority.DATA_LOW
+    assert terms(deadline=0.5, lifespan=2.0, liveliness_lease=1.5)[0] == "::,10:0,500000000:2,0:,1,500000000"
