@@ -2,30 +2,20 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from rmpa.config.peer_rules import PeerRule, PolicySettings
-from rmpa.config.read import Loaded, load_settings
-from rmpa.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from tests.config.conftest import Load, Refuse
 
 ROOT = Path(__file__).parents[2]
 
 
-def load(tmp_path: Path, text: str) -> Loaded:
-    (tmp_path / "rmpa.toml").write_text(text)
-    return load_settings({}, {}, host_name="pc", cwd=tmp_path)
-
-
-def refused(tmp_path: Path, text: str) -> str:
-    with pytest.raises(ConfigError) as error:
-        load(tmp_path, text)
-    return str(error.value).replace(str(tmp_path) + "/", "")
-
-
-def test_everything_that_a_peer_may_have(tmp_path: Path) -> None:
+def test_everything_that_a_peer_may_have(load: Load) -> None:
     loaded = load(
-        tmp_path,
         """
         [[peer]]
         name = "robot*"
@@ -36,7 +26,7 @@ def test_everything_that_a_peer_may_have(tmp_path: Path) -> None:
         """.replace('["/{pose,scan}".replace]', '["/**/cmd_vel", "/left/**"]')
         + """
         deny_types = ["sensor_msgs/Image"]
-        """,
+        """
     )
     assert loaded.settings.peers == (
         PeerRule(
@@ -75,25 +65,25 @@ PEER = '[[peer]]\nname = "r"\n'
         (PEER + "deny = ['x']", ":3: peer.deny: 'x' matches no topic: topics begin with /; did you mean \"/x\"?"),
     ],
 )
-def test_what_cannot_be_meant_is_refused_with_its_line(tmp_path: Path, text: str, says: str) -> None:
-    assert says in refused(tmp_path, text)
+def test_what_cannot_be_meant_is_refused_with_its_line(refuse: Refuse, text: str, says: str) -> None:
+    assert says in refuse(text)
 
 
-def test_the_documentation_s_examples_load(tmp_path: Path) -> None:
+def test_the_documentation_s_examples_load(load: Load) -> None:
     blocks = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "guides" / "names.md").read_text(), re.DOTALL)
-    assert [load(tmp_path, block).notes for block in blocks] == [()] * 4
+    assert [load(block).notes for block in blocks] == [()] * 4
 
 
-def test_names_that_become_one_or_each_other_s_are_taken(tmp_path: Path) -> None:
+def test_names_that_become_one_or_each_other_s_are_taken(load: Load) -> None:
     """What comes of them shows at run time (tests/bridge/test_rules.py)."""
-    assert load(tmp_path, f"{PEER}remap_in = {{'/a' = '/c', '/b' = '/c', '/x' = '/y', '/y' = '/x'}}").notes == ()
+    assert load(f"{PEER}remap_in = {{'/a' = '/c', '/b' = '/c', '/x' = '/y', '/y' = '/x'}}").notes == ()
 
 
-def test_the_second_spelling_of_renamings_says_what_to_write(tmp_path: Path) -> None:
-    says = refused(tmp_path, PEER + "[[peer.remap]]\ndirection = 'in'\nfrom = '/a'\nto = '/b'")
+def test_the_second_spelling_of_renamings_says_what_to_write(refuse: Refuse) -> None:
+    says = refuse(PEER + "[[peer.remap]]\ndirection = 'in'\nfrom = '/a'\nto = '/b'")
     assert says.startswith('rmpa.toml:3: peer.remap: an unknown key; write remap_in = { "FROM" = "TO" } for')
 
 
-def test_one_prefix_for_many_peers_is_doubtful(tmp_path: Path) -> None:
-    [note] = load(tmp_path, "[[peer]]\nname = 'r*'\nprefix = '/r'\n").notes
+def test_one_prefix_for_many_peers_is_doubtful(load: Load) -> None:
+    [note] = load("[[peer]]\nname = 'r*'\nprefix = '/r'\n").notes
     assert ":3: peer.prefix: /r is one place for every peer that r* fits; /{peer} would keep them apart" in note

@@ -7,26 +7,18 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.config.peer_rules import ServiceRule
-from rmpa.config.read import load_settings
 from rmpa.config.settings import ServiceSettings
 from rmpa.core.contract import Transport
-from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from tests.config.conftest import Load, Refuse
 
 
-def _load(tmp_path: Path, text: str, **environ: str) -> ServiceSettings:
-    path = tmp_path / "rmpa.toml"
-    path.write_text(text)
-    return load_settings({"config": str(path)}, environ, host_name="robot", cwd=tmp_path).settings.services
+def test_defaults_let_all_but_loggers_cross_for_a_minute(load: Load) -> None:
+    assert load("").settings.services == ServiceSettings(("/**",), (), False, 60.0, Transport.RELAY, ())
 
 
-def test_defaults_let_all_but_loggers_cross_for_a_minute(tmp_path: Path) -> None:
-    assert _load(tmp_path, "") == ServiceSettings(("/**",), (), False, 60.0, Transport.RELAY, ())
-
-
-def test_a_file_says_it_all(tmp_path: Path) -> None:
+def test_a_file_says_it_all(load: Load) -> None:
     text = """
         [services]
         allow = ["/arm/**"]
@@ -50,14 +42,9 @@ def test_a_file_says_it_all(tmp_path: Path) -> None:
         ServiceRule(("/ik",), None, Transport.DIRECT),
         ServiceRule(("/**",), 2.0, Transport.RELAY),
     )
-    assert _load(tmp_path, text) == ServiceSettings(("/arm/**",), ("/**/restart",), True, 0.5, Transport.AUTO, rules)
-
-
-def test_variables_outweigh_the_file(tmp_path: Path) -> None:
-    found = _load(tmp_path, "[services]\ntimeout = 3\n", RMPA_SERVICE_TIMEOUT="4 s", RMPA_SERVICE_DENY="/a;/b")
-    assert (found.timeout, found.deny) == (4.0, ("/a", "/b"))
-    found = _load(tmp_path, "[services]\ntransport = 'relay'\n", RMPA_SERVICE_TRANSPORT="direct")
-    assert found.transport is Transport.DIRECT
+    assert load(text).settings.services == ServiceSettings(
+        ("/arm/**",), ("/**/restart",), True, 0.5, Transport.AUTO, rules
+    )
 
 
 @pytest.mark.parametrize(
@@ -82,8 +69,6 @@ def test_variables_outweigh_the_file(tmp_path: Path) -> None:
         ("[[service]]\nname = ['/a']\ntimeout = 1", 2, "did you mean service.names?"),
     ],
 )
-def test_what_cannot_be_is_named_with_its_line(tmp_path: Path, text: str, line: int, words: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        _load(tmp_path, text)
-    assert f"rmpa.toml:{line}: " in str(caught.value)
-    assert words in str(caught.value)
+def test_what_cannot_be_is_named_with_its_line(refuse: Refuse, text: str, line: int, words: str) -> None:
+    said = refuse(text)
+    assert (said.startswith(f"rmpa.toml:{line}: "), words in said) == (True, True), said

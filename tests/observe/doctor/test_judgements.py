@@ -106,10 +106,7 @@ CASES: dict[str, tuple[Callable[[], Iterable[Check]], str]] = {
     "routes": (partial(judge_routes, {"10.1.0.2 (arm)": "Network is unreachable", "10.0.0.2 (base)": ""}), "fail ok"),
     "no routes": (partial(judge_routes, {}), "skipped"),
     "routes to many": (partial(judge_routes, ROUTES), "fail ok"),
-    "a port that another program has": (
-        one(judge_port, "the ROS core", 11311, TAKEN, "roscore (pid 7)"),
-        "fail",
-    ),
+    "a port that another program has": (one(judge_port, "the ROS core", 11311, TAKEN, "roscore (pid 7)"), "fail"),
     "a port of ours": (one(judge_port, "the mesh (TCP)", 40001, TAKEN, "agent base", ours=True), "ok"),
     "a free port": (one(judge_port, "beacons (UDP)", 11411), "ok"),
     "a shared port": (one(judge_port, "beacons (UDP)", 11412, owner="agent base"), "ok"),

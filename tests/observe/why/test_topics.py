@@ -186,27 +186,15 @@ def test_a_flowing_topic_passes_all_stages() -> None:
 FAILURES: dict[str, tuple[str, Case]] = {
     # What is different: the stage that fails, and the facts.
     "unknown peer": ("peer", Case(peer=None)),
-    "conflict": (
-        "peer",
-        Case(peer=peer(state="conflict", conflicts=("shares its address",))),
-    ),
+    "conflict": ("peer", Case(peer=peer(state="conflict", conflicts=("shares its address",)))),
     "shared address": (
         "peer",
         Case(peer=peer(state="conflict", conflicts=("its address is also b's; give one another",))),
     ),
-    "unreachable": (
-        "reachable",
-        Case(source=source(offered=False, unreachable="http://nosuch:1/: no such name")),
-    ),
-    "not linked": (
-        "link",
-        Case(peer=unlinked("linking", last_error="timed out")),
-    ),
+    "unreachable": ("reachable", Case(source=source(offered=False, unreachable="http://nosuch:1/: no such name"))),
+    "not linked": ("link", Case(peer=unlinked("linking", last_error="timed out"))),
     "only beacons": ("link", Case(peer=unlinked("linking", beacon_ago=1.5))),
-    "refused": (
-        "link",
-        Case(peer=unlinked("refused", last_error="domain 4 is not 3")),
-    ),
+    "refused": ("link", Case(peer=unlinked("refused", last_error="domain 4 is not 3"))),
     "nobody publishes": ("publisher", Case(source=None, route=None)),
     "nearly its name": ("publisher", Case(source=None, route=None, there=TopicAtPublisher(similar="/cmd_vel"))),
     "only subscribed there": (
@@ -217,10 +205,7 @@ FAILURES: dict[str, tuple[str, Case]] = {
         "publisher",
         Case(route=None, there=None, refusal="it does not know the question"),
     ),
-    "policy there": (
-        "policy there",
-        Case(source=source(crosses=False, rule="bridge.deny has '/cmd'"), route=None),
-    ),
+    "policy there": ("policy there", Case(source=source(crosses=False, rule="bridge.deny has '/cmd'"), route=None)),
     "built in": (
         "policy there",
         Case(source=source(crosses=False, rule="built in: time does not cross"), route=None),
@@ -255,22 +240,10 @@ FAILURES: dict[str, tuple[str, Case]] = {
     ),
     "not connected": ("subscriber", Case(readers=(), **route(state="idle"))),
     "md5": ("md5", Case(readers=(), mismatches=("/base: wants 1234",), **route(state="idle"))),
-    "publisher does not answer": (
-        "route",
-        Case(
-            **route(state="opening", md5=""),
-            **sources(route="opening"),
-        ),
-    ),
+    "publisher does not answer": ("route", Case(**route(state="opening", md5=""), **sources(route="opening"))),
     "peer does not answer": ("route", Case(**route(state="opening", md5=""))),
     "route closed": ("route", Case(**route(state="waiting", md5="", problem="its publisher refuses: no"))),
-    "nothing published": (
-        "sent",
-        Case(
-            **route(**NOTHING_SENT),
-            **sources(messages=0),
-        ),
-    ),
+    "nothing published": ("sent", Case(**route(**NOTHING_SENT), **sources(messages=0))),
     "too long": (
         "sent",
         Case(
@@ -280,10 +253,7 @@ FAILURES: dict[str, tuple[str, Case]] = {
         ),
     ),
     "nothing arrives": ("arrived", Case(**route(**NOTHING_SENT))),
-    "nothing arrives any more": (
-        "arrived",
-        Case(later=ROUTE, source_later=source(messages=120, dropped=20)),
-    ),
+    "nothing arrives any more": ("arrived", Case(later=ROUTE, source_later=source(messages=120, dropped=20))),
     "silent": ("arrived", Case(**route(age=8.0), source_later=SOURCE)),
     "readers have left": ("reader", Case(readers_later=())),
     "whether it is direct is not decided yet": ("subscriber", direct(transport="", state="asking", endpoint="")),
@@ -326,20 +296,11 @@ def test_every_stage_can_fail_but_transport_and_contract() -> None:
 
 
 WARNINGS: dict[str, tuple[str, Case]] = {
-    "a link that is silent": (
-        "link",
-        Case(peer=silent(0.8)),
-    ),
-    "a link at rest that is silent": (
-        "link",
-        Case(peer=silent(8.2, rests=True)),
-    ),
+    "a link that is silent": ("link", Case(peer=silent(0.8))),
+    "a link at rest that is silent": ("link", Case(peer=silent(8.2, rests=True))),
     "one was refused": ("md5", Case(mismatches=("/old: wants 1234",))),
     "dropped there": ("sent", Case(source_later=source(messages=120, dropped=2))),
-    "some too long": (
-        "sent",
-        Case(source_later=source(messages=120, oversized=1, oversized_bytes=270_000_000)),
-    ),
+    "some too long": ("sent", Case(source_later=source(messages=120, oversized=1, oversized_bytes=270_000_000))),
     "given up": ("sent", Case(source_later=source(messages=120, lost=7046))),
     "few messages": ("arrived", Case(**route(messages=1, age=30.0, rate=None, period=None), source_later=SOURCE)),
     "contract": (
@@ -349,14 +310,8 @@ WARNINGS: dict[str, tuple[str, Case]] = {
     "one reader of two is stuck": (
         "reader",
         Case(
-            readers=(
-                connected("/base"),
-                connected("/slow", waiting=1),
-            ),
-            readers_later=(
-                connected("/base"),
-                connected("/slow", waiting=1),
-            ),
+            readers=(connected("/base"), connected("/slow", waiting=1)),
+            readers_later=(connected("/base"), connected("/slow", waiting=1)),
         ),
     ),
     "a reader was slow": ("reader", Case(readers_later=(connected("/base", dropped=9),))),
@@ -461,9 +416,7 @@ def test_any_answer_of_a_peer_is_judged(
 ) -> None:
     one_, other = Case(there=there, source=None, route=before), Case(there=later, source=None, route=after)
     found = diagnose_topic(
-        one_.ends(before, None, one_.readers),
-        "joystick",
-        other.ends(after, None, one_.readers) if known else None,
+        one_.ends(before, None, one_.readers), "joystick", other.ends(after, None, one_.readers) if known else None
     )
     assert found
     for diagnosis in found:
