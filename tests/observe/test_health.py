@@ -15,7 +15,6 @@ from tests.observe.samples import DIRECT, SNAPSHOT, VIEWER
 if TYPE_CHECKING:
     from rmpa.observe.peer_info import PeerInfo
 
-CMD, OUT, STICK = "rmpa: joystick: /cmd", "rmpa: to joystick: /cmd (/joy_node)", "rmpa: joystick"
 JOYSTICK, _ = SNAPSHOT.peers
 assert JOYSTICK.link is not None
 (ROUTE,) = SNAPSHOT.topics[0].routes
@@ -146,53 +145,3 @@ def test_names_are_unique_and_figures_are_texts(case: Steps) -> None:
         assert {status.hardware_id for status in found} == {"base"}
         assert found[0].name == HERE
         assert all(status.values[key] for status in found for key in status.values)
-
-
-def levels(name: str, status: str = CMD) -> str:
-    """The levels of a status in the snapshots of a case."""
-    health = Health()
-    found = [{check.name: check.level for check in health.judge(shot, now)} for now, shot in CASES[name]]
-    return " ".join(each.get(status, "none") for each in found)
-
-
-@pytest.mark.parametrize(
-    ("name", "status", "expected"),
-    [
-        ("the agent, its peers and topics", HERE, "warn"),
-        ("without notes; what goes out has no status", HERE, "ok"),
-        ("few files", HERE, "warn"),
-        ("no files", HERE, "fail"),
-        ("no subscriber", CMD, "ok"),
-        ("hidden", CMD, "fail"),
-        ("waiting", CMD, "warn"),
-        ("within the deadline", CMD, "ok"),
-        ("beyond the deadline", CMD, "warn"),
-        ("dead", CMD, "fail fail"),
-        ("alive again", CMD, "ok"),
-        ("a subscriber that was refused", CMD, "fail"),
-        ("a subscriber that was refused elsewhere", "rmpa: /cmd", "fail"),
-        ("a node that cannot be reached", "rmpa: node /odd", "warn"),
-        ("new losses warn once", CMD, "ok warn ok ok"),
-        ("an unknown loss", CMD, "ok warn"),
-        ("messages that are too long, at both ends", CMD, "ok warn warn ok"),
-        ("messages that are too long, at both ends", OUT, "none warn warn ok"),
-        ("a reliable route to an absent peer", OUT, "ok warn warn ok"),
-        ("a publisher that ended is forgotten", CMD, "ok none"),
-        ("a direct subscriber", CMD, "ok"),
-        ("relayed", CMD, "ok"),
-        ("relayed although direct is wanted", CMD, "warn"),
-        ("relayed by a rule", CMD, "ok"),
-        ("relayed for a tool", CMD, "ok"),
-        ("direct although it must not be", CMD, "warn"),
-        ("a peer", STICK, "ok ok"),
-        ("a peer that is not linked", STICK, "warn"),
-        ("a peer that refuses", STICK, "fail"),
-        ("a conflict", STICK, "fail"),
-        ("a link that drops", STICK, "ok warn"),
-        ("a lost peer and its topics", STICK, "ok stale stale none ok"),
-        ("a lost peer and its topics", CMD, "ok stale stale none ok"),
-        ("calls", "rmpa: joystick: service /add", "none ok warn ok"),
-    ],
-)
-def test_levels(name: str, status: str, expected: str) -> None:
-    assert levels(name, status) == expected
