@@ -9,6 +9,7 @@ import shlex
 import shutil
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -89,76 +90,70 @@ def _files(root: Path) -> dict[str, str]:
     return {str(path.relative_to(root)): path.read_text() for path in root.rglob("*") if path.is_file()}
 
 
-def test_a_machine_below_a_folder(systemd: Systemd, root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = ""
+@pytest.fixture
+def service(systemd: Systemd, root: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Runs lines of ``rmpa service`` for the other system: what each says and calls."""
+
+    def run(*lines: str) -> str:
+        said = ""
+        for line in lines:
+            code = main(["service", *shlex.split(line), "--root", str(root)])
+            out, err = capsys.readouterr()
+            said += f"$ rmpa service {line}\n{out}{err}exit code {code}\n"
+            said += "".join(f"called {call}\n" for call in systemd.calls()) + "\n"
+        return said.replace(str(root), "ROOT")
+
+    return run
+
+
+Service = Callable[..., str]
+
+
+def test_a_machine_below_a_folder(service: Service, root: Path) -> None:
     before = _files(root)
-    for line in (
-        "install --name base --web --realtime --dry-run",
-        "install --name base --web --realtime",
-        "install --web --realtime",
-        "install --json",
-        "install --name 1base",
-        "uninstall --dry-run",
-        "uninstall",
-        "uninstall --purge --yes --json",
-        "uninstall",
-    ):
-        code = main(["service", *shlex.split(line), "--root", str(root)])
-        out, err = capsys.readouterr()
-        said += f"$ rmpa service {line}\n{out}{err}exit code {code}\n".replace(str(root), "ROOT")
-        said += "".join(f"called {call}\n".replace(str(root), "ROOT") for call in systemd.calls()) + "\n"
-        if line.endswith("--dry-run") and line.startswith("install"):
-            assert _files(root) == before
+    said = service("install --name base --web --realtime --dry-run")
+    assert _files(root) == before
+    said += service(
+        "install --name base --web --realtime", "install --web --realtime", "install --json", "install --name 1base",
+        "uninstall --dry-run", "uninstall", "uninstall --purge --yes --json", "uninstall",
+    )  # fmt: skip
     compare("boot", said)
     assert _files(root) == before
 
 
-def test_the_package_has_units_of_its_own(
-    systemd: Systemd, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["service", "install", "--root", str(root)]) == 0  # by pip
+def test_the_package_has_units_of_its_own(service: Service, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    service("install")  # by pip
     unit = root / "usr/lib/systemd/system/rmpa.service"
     unit.parent.mkdir(parents=True)
     unit.write_text("the package's")
     monkeypatch.setattr(boot, "own_program", lambda: "/usr/bin/rmpa")
-    systemd.calls()
-    assert main(["service", "install", "--root", str(root)]) == 0
-    assert systemd.calls() == [f"systemctl --root {root} enable rmpa.service"]
+    said = service("install")
     assert not list(root.glob("etc/systemd/system/*.service"))
-    assert main(["service", "install", "--user", "pi", "--root", str(root)]) == 2
-    assert main(["service", "uninstall", "--purge", "--yes", "--root", str(root)]) == 1
-    assert "sudo apt purge rmpa" in capsys.readouterr().err
-    assert main(["service", "uninstall", "--root", str(root)]) == 0
+    said += service("install --user pi", "uninstall --purge --yes", "uninstall")
+    compare("boot_package", said)
     assert unit.read_text() == "the package's"
 
 
-def test_a_unit_that_was_written_by_hand_is_kept(systemd: Systemd, root: Path) -> None:
+def test_a_unit_that_was_written_by_hand_is_kept(service: Service, root: Path) -> None:
     unit = root / "etc/systemd/system/rmpa.service"
     unit.parent.mkdir(parents=True)
     unit.write_text("mine")
     for _ in range(2):
-        assert main(["service", "install", "--root", str(root)]) == 0
+        service("install")
         assert unit.with_name("rmpa.service.by-hand").read_text() == "mine"
-    assert main(["service", "uninstall", "--root", str(root)]) == 0
-    assert [path.name for path in unit.parent.iterdir()] == ["rmpa.service"]
-    assert unit.read_text() == "mine"
-    systemd.calls()
-    assert main(["service", "uninstall", "--root", str(root)]) == 0
-    assert systemd.calls() == []  # it is not ours to stop
+    service("uninstall")
+    assert {path.name: path.read_text() for path in unit.parent.iterdir()} == {"rmpa.service": "mine"}
+    assert "called" not in service("uninstall")  # it is not ours to stop
 
 
-def test_a_masked_unit_stays_masked(
-    systemd: Systemd, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_masked_unit_stays_masked(service: Service, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     unit, null = root / "etc/systemd/system/rmpa.service", root / "null"  # not this machine's, should the test fail
     null.touch()
     monkeypatch.setattr(os, "devnull", str(null))
     unit.parent.mkdir(parents=True)
     unit.symlink_to(null)
-    assert main(["service", "install", "--root", str(root)]) == 1
-    unit_is = "rmpa: /etc/systemd/system/rmpa.service: the unit is masked"
-    said = f"{unit_is}; systemctl --root {root} unmask rmpa [service-unit]\n"
-    assert (capsys.readouterr().err, systemd.calls()) == (said, [])
+    problem = "/etc/systemd/system/rmpa.service: the unit is masked; systemctl --root ROOT unmask rmpa [service-unit]"
+    assert service("install") == f"$ rmpa service install\nrmpa: {problem}\nexit code 1\n\n"
 
 
 def test_what_a_link_leads_to_stays_as_it_is(root: Path) -> None:
@@ -171,36 +166,31 @@ def test_what_a_link_leads_to_stays_as_it_is(root: Path) -> None:
     assert (unit.read_text(), unit.is_symlink(), unit.stat().st_mode & 0o777) == ("text", False, 0o644)
 
 
-def test_a_name_that_the_settings_outweigh_is_refused(
-    systemd: Systemd, root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_name_that_the_settings_outweigh_is_refused(service: Service, root: Path) -> None:
     config = root / "etc/rmpa/rmpa.toml"
     config.parent.mkdir()
     config.write_text('domain = 7\nname = "base"\n')
-    assert main(["service", "install", "--name", "arm", "--root", str(root)]) == 2
-    said = f"rmpa: {config}:2: name: base outweighs --name arm; write it there, or remove the line [invalid-value]\n"
-    assert (capsys.readouterr().err, systemd.calls()) == (said, [])
-    assert main(["service", "install", "--name", "base", "--root", str(root)]) == 0
+    problem = "name: base outweighs --name arm; write it there, or remove the line [invalid-value]"
+    said = f"$ rmpa service install --name arm\nrmpa: ROOT/etc/rmpa/rmpa.toml:2: {problem}\nexit code 2\n\n"
+    assert service("install --name arm") == said
+    assert "exit code 0" in service("install --name base")
 
 
-@pytest.mark.usefixtures("systemd")
-def test_another_name_starts_the_units_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_name_starts_the_units_again(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[object] = []
     monkeypatch.setattr(boot, "_start", lambda _, wanted, changed: started.append((wanted, changed)))
-    for name in ("base", "arm", "arm"):
-        assert main(["service", "install", "--name", name, "--root", str(root)]) == 0
+    service("install --name base", "install --name arm", "install --name arm")
     assert started[1:] == [(["rmpa.service"], ["rmpa.service"]), (["rmpa.service"], [])]
 
 
 @pytest.mark.parametrize("sign", ["'", '"', "\\", "\t"])
 def test_a_program_that_systemd_cannot_start_is_refused(
-    systemd: Systemd, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], sign: str
+    service: Service, monkeypatch: pytest.MonkeyPatch, sign: str
 ) -> None:
     monkeypatch.setattr(boot, "own_program", lambda: f"/opt/a{sign}b/rmpa")
-    assert main(["service", "install", "--root", str(root)]) == 1
-    err = capsys.readouterr().err
-    assert err.startswith("rmpa: rmpa service install: systemd cannot start ")
-    assert (err.count("\n"), systemd.calls()) == (1, [])
+    said = service("install")
+    assert "\nrmpa: rmpa service install: systemd cannot start " in said
+    assert said.endswith("[service-unit]\nexit code 1\n\n")
 
 
 def test_purge_removes_a_state_directory_elsewhere(tmp_path: Path) -> None:
@@ -212,6 +202,11 @@ def test_purge_removes_a_state_directory_elsewhere(tmp_path: Path) -> None:
     assert (image.is_symlink(), state.is_dir()) == (False, True)
     machine.remove_folder(place, "")
     assert (place.is_symlink(), state.exists()) == (False, False)
+
+
+def _make_user(root: Path) -> None:
+    (root / "etc/passwd").write_text("rmpa:x:4242:4243::/:/bin/false\n")
+    (root / "etc/group").write_text("rmpa:x:4243:\n")
 
 
 def _former(tmp_path: Path) -> Former:
@@ -228,8 +223,7 @@ def _former(tmp_path: Path) -> Former:
 
 def test_what_a_user_s_agent_has_kept_is_taken_over_once(tmp_path: Path, root: Path) -> None:
     before, changed = _former(tmp_path), Machine(str(root), dry=False)
-    (root / "etc/passwd").write_text("rmpa:x:4242:4243::/:/bin/false\n")
-    (root / "etc/group").write_text("rmpa:x:4243:\n")
+    _make_user(root)
     place = root / "var/lib/rmpa"
     boot._take_over(changed, before, "rmpa", None)
     assert changed.changes == [
@@ -277,8 +271,7 @@ def test_a_copy_that_stops_midway_leaves_nothing(tmp_path: Path, root: Path, mon
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="root alone can give files away")
 def test_what_the_state_directory_has_already_is_not_given_away(tmp_path: Path, root: Path) -> None:
-    (root / "etc/passwd").write_text("rmpa:x:4242:4243::/:/bin/false\n")
-    (root / "etc/group").write_text("rmpa:x:4243:\n")
+    _make_user(root)
     place = root / "var/lib/rmpa"
     place.mkdir(parents=True)
     os.chown(place, 4242, 4243)
@@ -372,7 +365,6 @@ def test_status(systemd: Systemd, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert main(["service", "status", "--json"]) == 1
     unit = json.loads(capsys.readouterr().out)["units"][0]
     assert unit.pop("since") >= 7500
-    log = ["info    agent     = base, domain 0: peers can find it"]
     assert unit == {
         "unit": "rmpa.service",
         "installed": True,
@@ -383,7 +375,7 @@ def test_status(systemd: Systemd, monkeypatch: pytest.MonkeyPatch, capsys: pytes
         "result": "watchdog",
         "pid": None,
         "restarts": 0,
-        "log": log,
+        "log": ["info    agent     = base, domain 0: peers can find it"],
     }
 
 
