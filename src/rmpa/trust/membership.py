@@ -22,7 +22,7 @@ from rmpa.trust import store as files_of
 from rmpa.trust.certificates import CURVE, DenyList, KeyList, ModuleCertificate, read_document, sign
 from rmpa.trust.packets import GroupKey, KeyRing, PacketTrust
 from rmpa.trust.permissions import Document, TrustError, TrustReason, server_names
-from rmpa.trust.store import ALPN_JOIN, ALPN_LINK, Issued, MemberFiles, member_context
+from rmpa.trust.store import ALPN_JOIN, ALPN_LINK, Issued, MemberFiles, member_context, unusable
 from rmpa.trust.tokens import CertificateGrant, Token, fingerprint_of
 
 if TYPE_CHECKING:
@@ -59,9 +59,7 @@ def private_key(data: bytes, where: str) -> ec.EllipticCurvePrivateKey:
     except (ValueError, TypeError):
         key = None
     if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise StartError(
-            where, "is broken: not a private key in PEM", "join again, or take it from a copy", code="keys-unusable"
-        )
+        raise unusable(where, "is broken: not a private key in PEM", "join again, or take it from a copy")
     return key
 
 
@@ -259,7 +257,7 @@ def _named(store: TrustStore, name: str) -> Iterator[None]:
     try:
         yield
     except RemoteProtocolError as error:
-        raise StartError(str(store.path(name)), f"is broken: {error}", _REMEDY, code="keys-unusable") from None
+        raise unusable(store.path(name), f"is broken: {error}", _REMEDY) from None
 
 
 _SERIAL_BITS: Final = 159
@@ -306,12 +304,7 @@ class MeshAuthority:
         self._store = store = membership.store
         self._ca_key = private_key(store.load_ca_key(), str(store.path(files_of.CA_KEY)))
         if self._ca_key.public_key() != certificates.ca_public_key(membership.files.ca):
-            raise StartError(
-                str(store.path(files_of.CA_KEY)),
-                "is not the key of ca.crt",
-                "take it from a copy",
-                code="keys-unusable",
-            )
+            raise unusable(store.path(files_of.CA_KEY), "is not the key of ca.crt", "take it from a copy")
         self._issued = store.load_issued()
         # The tokens.
         self.book = store.load_tokens()

@@ -72,6 +72,11 @@ class MemberFiles:
     deny: bytes = b""
 
 
+def unusable(what: Path | str, problem: str, remedy: str) -> StartError:
+    """The error of a file of trust, or of a module that has none."""
+    return StartError(str(what), problem, remedy, code="keys-unusable")
+
+
 class Issued(msgspec.Struct, frozen=True):
     """One certificate that the authority has issued, the last of its module.
 
@@ -172,9 +177,7 @@ class TrustStore:
         try:
             invitations = msgspec.json.decode(self._read(TOKENS, remedy), type=list[Invitation])
         except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
-            raise StartError(
-                str(self.path(TOKENS)), f"is broken: {error!s:.200}", remedy, code="keys-unusable"
-            ) from None
+            raise unusable(self.path(TOKENS), f"is broken: {error!s:.200}", remedy) from None
         return TokenBook(invitations)
 
     def save_tokens(self, book: TokenBook) -> None:
@@ -266,7 +269,7 @@ class TrustStore:
                 problem = _exposed(os.fstat(file.fileno()), self._owners())
                 data = b"" if problem else file.read(_FILE_MAX + 1)
         except FileNotFoundError:
-            raise StartError(str(path), "is missing", remedy, code="keys-unusable") from None
+            raise unusable(path, "is missing", remedy) from None
         except PermissionError as error:
             raise StartError(
                 str(path), f"cannot be read: {error.strerror}", _USER, code="directory-unusable"
@@ -276,14 +279,9 @@ class TrustStore:
                 str(path), f"cannot be read: {error.strerror}", remedy, code="directory-unusable"
             ) from None
         if problem:
-            raise StartError(
-                str(path),
-                problem,
-                f"if the others are trusted: chmod 600 {path}; else {remedy}",
-                code="keys-unusable",
-            )
+            raise unusable(path, problem, f"if the others are trusted: chmod 600 {path}; else {remedy}")
         if not data or len(data) > _FILE_MAX:
-            raise StartError(str(path), f"is broken: {len(data)} bytes", remedy, code="keys-unusable")
+            raise unusable(path, f"is broken: {len(data)} bytes", remedy)
         return data
 
     def _owners(self) -> set[int]:
@@ -295,9 +293,7 @@ class TrustStore:
         try:
             return ssl.PEM_cert_to_DER_cert(found[name].decode("ascii"))
         except ValueError:
-            raise StartError(
-                str(self.path(name)), "is broken: not a certificate in PEM", _JOIN, code="keys-unusable"
-            ) from None
+            raise unusable(self.path(name), "is broken: not a certificate in PEM", _JOIN) from None
 
 
 def modules_with_keys(state: Path) -> list[str]:
@@ -340,12 +336,7 @@ def is_folder(path: Path) -> bool:
         problem, remedy = f"cannot be searched: {error.strerror}", f"{_USER}; or {_ELSEWHERE}"
     except OSError as error:
         problem, remedy = f"cannot be searched: {error.strerror}", f"mend it, or {_ELSEWHERE}"
-    raise StartError(
-        str(path),
-        f"{problem}, so whether this module has joined a secured mesh is not known",
-        remedy,
-        code="keys-unusable",
-    )
+    raise unusable(path, f"{problem}, so whether this module has joined a secured mesh is not known", remedy)
 
 
 def _is_there(path: Path) -> bool:
@@ -440,9 +431,7 @@ def member_context(certificate: Path, key: Path, ca: bytes, *alpn: str, server_s
         context.load_verify_locations(cadata=ca)
     except (ssl.SSLError, OSError) as error:
         remedy = "join again: rmpa trust invite at the authority, rmpa trust join TOKEN here"
-        raise StartError(
-            str(certificate), f"does not fit {key.name}, or is broken: {error!s:.100}", remedy, code="keys-unusable"
-        ) from None
+        raise unusable(certificate, f"does not fit {key.name}, or is broken: {error!s:.100}", remedy) from None
     return context
 
 
@@ -516,7 +505,7 @@ def _refused(module: str, others: str, start: list[str]) -> StartError:
     problem = f"has no keys, and would start without trust, beside keys of {others}"
     join = f"let {module} join: rmpa trust join TOKEN --name {module}"
     open_word = "start it open: --insecure (insecure = true in [trust])"
-    return StartError(f"the module {module}", problem, "; or ".join((*start, join, open_word)), code="keys-unusable")
+    return unusable(f"the module {module}", problem, "; or ".join((*start, join, open_word)))
 
 
 def _keys_in(place: Path) -> list[str]:
