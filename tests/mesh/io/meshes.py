@@ -167,11 +167,12 @@ def introduce(made: list[Peer]) -> None:
 
 
 @asynccontextmanager
-async def linked_pair() -> AsyncIterator[tuple[Peer, Peer]]:
-    """Two peers with both lanes; the first one dialled."""
+async def linked_pair(*, lanes: bool = True) -> AsyncIterator[tuple[Peer, Peer]]:
+    """Two peers with a link, and with both lanes if ``lanes``; the first one dialled."""
     async with peers(2) as made:
         one, other = sorted(made, key=lambda peer: peer.identity.guid)
-        await until(lambda: one.both_lanes(other) and other.both_lanes(one), "both lanes")
+        up = Peer.both_lanes if lanes else Peer.linked
+        await until(lambda: up(one, other) and up(other, one), "a link")
         yield one, other
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mesh.io.meshes import Peer, peers, until
+from tests.mesh.io.meshes import Peer, linked_pair, until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -34,8 +34,7 @@ def references(one: Peer, other: Peer) -> list[weakref.ref[PeerLink] | weakref.r
 
 @pytest.mark.parametrize("way", ["close", "abort", "end"])
 async def test_an_ended_link_is_gone_with_what_waited(way: str) -> None:
-    async with peers(2) as (one, other):
-        await until(lambda: one.linked(other) and other.linked(one), "a link")
+    async with linked_pair(lanes=False) as (one, other):
         one.link(other).bulk._on_wanted()
         await until(lambda: one.link(other).bulk_connection is not None, "a bulk lane")
         await until(lambda: other.link(one).bulk_connection is not None, "a bulk lane")

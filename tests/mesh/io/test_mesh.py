@@ -35,7 +35,7 @@ from rmpa.mesh.io.link import PeerLink
 from rmpa.mesh.peering import DIAL_FALLBACK
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import DESCRIPTORS
-from tests.mesh.io.meshes import DEADLINE, Peer, peers, raw, until
+from tests.mesh.io.meshes import DEADLINE, Peer, linked_pair, peers, raw, until
 from tests.runtime.descriptors_left import descriptors_left
 
 _SIOCOUTQNSD = 0x894B  # linux/sockios.h: bytes that were not sent yet
@@ -94,9 +94,7 @@ async def test_link_that_ends_during_its_redial_leaks_no_socket(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The race of addresses ends after the silent link and its socket were closed."""
-    async with peers(2) as made:
-        one, other = sorted(made, key=lambda peer: peer.identity.guid)
-        await until(lambda: one.linked(other) and other.linked(one), "a link")
+    async with linked_pair(lanes=False) as (one, other):
         link = one.link(other)
         racing, ended = asyncio.Event(), asyncio.Event()
         sockets: list[socket.socket] = []
@@ -173,8 +171,7 @@ async def test_a_dial_that_fails_of_a_bug_is_logged(
 
 
 async def test_messages_arrive_in_order_and_byte_exact() -> None:
-    async with peers(2) as (one, other):
-        await until(lambda: one.linked(other) and other.linked(one), "a link")
+    async with linked_pair(lanes=False) as (one, other):
         link = one.link(other)
         sent: list[tuple[int, int, int, bytes]] = []
         for i in range(10_000):
@@ -216,8 +213,7 @@ async def test_killed_peer_comes_back_as_a_new_instance() -> None:
 
 async def test_a_restarted_peer_has_the_link_at_rest_of_its_former_run_checked() -> None:
     """The former run's host lost its power: no connection ended, and at rest the silence is noticed late."""
-    async with peers(2) as (one, other):
-        await until(lambda: one.linked(other) and other.linked(one), "a link")
+    async with linked_pair(lanes=False) as (one, other):
         successor = replace(other.identity, guid=Guid.of("127.0.0.1", other.port, 1), instance=b"s" * 16)
 
         async def answer() -> int:
@@ -388,8 +384,7 @@ async def test_a_bye_says_why() -> None:
 
 
 async def test_what_waits_for_a_link_that_ends_is_counted() -> None:
-    async with peers(2) as (one, other):
-        await until(lambda: one.linked(other) and other.linked(one), "a link")
+    async with linked_pair(lanes=False) as (one, other):
         lane = one.link(other).express
         dropped = sum(lane.send(1, number, 0, bytes(MIB // 8)) for number in range(200))
         waiting = lane.outbox.waiting_entries

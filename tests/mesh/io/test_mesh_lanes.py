@@ -477,9 +477,7 @@ async def test_first_message_for_the_lane_dials_it_from_either_side(*, dialler: 
 
 
 async def test_a_wish_for_the_lane_before_the_link_is_used_is_kept() -> None:
-    async with peers(2) as made:
-        one, other = sorted(made, key=lambda peer: peer.identity.guid)
-        await until(lambda: one.linked(other) and other.linked(one), "a link")
+    async with linked_pair(lanes=False) as (one, other):
         link = one.link(other)
         link.use(used=False)
         other.link(one).bulk.send(7, 1, 0, b"x")
