@@ -1,11 +1,10 @@
-"""What a neighbour has in the gateway's graph, taps that listen to the gateway's own, and answers to its queries."""
+"""What a neighbour has in the gateway's graph, and answers to its queries."""
 
 from __future__ import annotations
 
 import asyncio
 import hashlib
 import logging
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rmpa.bridge import limits as bridge_limits
@@ -18,26 +17,23 @@ from rmpa.core.identity import peer_name_problem
 from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.service_server import ServiceEndpoint
-from rmpa.ros.node.subscription import InProcessConnection, PublisherConnection
 from rmpa.ros.wire.tcpros import LENGTH, TopicDescription, printable
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Mapping
 
     from rmpa.agent.agent import Agent
-    from rmpa.gateway.rules import MeshSource, SourceKey
+    from rmpa.gateway.rules import SourceKey
     from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
-    from rmpa.ros.node.subscription import TopicConnection
-    from rmpa.ros.wire.tcpros import Buffer, Header, ServiceDescription
+    from rmpa.ros.wire.tcpros import Buffer, ServiceDescription
 
     Respond = Callable[[ArrivedQuery], Awaitable[tuple[bytes, bytes]]]
 
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 _INSTANCE_LABEL: Final = b"rmpa site 1"
-_PREFIX: Final = LENGTH.size
 
 
 class OwnedTasks:
@@ -441,88 +437,3 @@ class ProxiedService(ProxiedSource):
     def _detach(self, node: SlaveNode) -> None:
         self._unregister(node)
         node.remove_service(self.source.name)
-
-
-@dataclass(eq=False, slots=True)
-class TopicTap:
-    """A subscription to one topic of one node; it reconnects until it is closed or the source is gone.
-
-    Args:
-        source: The topic.
-        caller_id: The subscribing node.
-        number: Returns the connection's number within that node.
-        find: ``(node, slave API, topic)``: the topic of a proxy of this process; ``None`` for other publishers.
-        on_message: ``(body)``.
-        on_described: ``(description)``.
-        on_lost: ``(reason)``.
-        on_closed: Called once it is closed.
-        connection: The connection to the publisher; ``None`` while its address is not known.
-    """
-
-    source: MeshSource
-    caller_id: str
-    number: Callable[[], int]
-    find: Callable[[str, str, str], Publication | None]
-    on_message: Callable[[memoryview], None]
-    on_described: Callable[[TopicDescription], None]
-    on_lost: Callable[[str], None]
-    on_closed: Callable[[TopicTap], None]
-    connection: TopicConnection | None = None
-    _description: TopicDescription | None = field(default=None, init=False)
-    _closed: bool = field(default=False, init=False)
-
-    @property
-    def description(self) -> TopicDescription | None:
-        """The publisher's header; ``None`` until it is connected."""
-        connected = self.connection is not None and self.connection.connected
-        return self._description if connected else None
-
-    def follow(self, uri: str) -> None:
-        """Connect to the publisher at this slave API, unless it is connected there already.
-
-        Args:
-            uri: The publisher's address; empty: it is not in the graph.
-        """
-        connection = self.connection
-        if self._closed or (connection is not None and connection.uri == uri and connection.refused is None):
-            return
-        if connection is not None:
-            connection.close()
-            self.connection = None
-            if connection.uri != uri:
-                self.on_lost("its node is at another address now" if uri else "its node has gone")
-        if uri and not self._closed:
-            self._connect(uri)
-
-    def close(self) -> None:
-        """Disconnect; no callback is called afterwards."""
-        if not self._closed:
-            self._closed = True
-            if self.connection is not None:
-                self.connection.close()
-            self.on_closed(self)
-
-    def _connect(self, uri: str) -> None:
-        on_message, source = self.on_message, self.source
-
-        def find() -> Callable[[InProcessConnection], None] | None:
-            publication = self.find(source.proxy, uri, source.here)
-            return publication.attach if publication is not None else None
-
-        kind = PublisherConnection if find() is None else InProcessConnection
-        self.connection = kind(
-            source.here,
-            uri,
-            self.caller_id,
-            on_message=lambda framed: on_message(framed[_PREFIX:]),
-            on_header=self._described,
-            on_refused=lambda text: self.on_lost(f"its publisher refuses: {text}"),
-            on_lost=self.on_lost,
-            number=self.number(),
-            find=find,
-        )
-        self.connection.start()
-
-    def _described(self, fields: Header) -> None:
-        self._description = TopicDescription.from_header(fields)
-        self.on_described(self._description)

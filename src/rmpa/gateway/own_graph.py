@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits as bridge_limits
@@ -21,10 +22,12 @@ from rmpa.bridge.topics.local import LocalSources
 from rmpa.core.counters import logged_failure
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.core.identity import OWN_NODE, is_own
-from rmpa.gateway.foreign import ForeignSite, ProxiedService, ProxiedTopic, TopicTap
+from rmpa.gateway.foreign import ForeignSite, ProxiedService, ProxiedTopic
 from rmpa.gateway.rules import MeshSource, SourceKind
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.node.subscription import InProcessConnection, PublisherConnection
+from rmpa.ros.wire.tcpros import LENGTH, TopicDescription
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
@@ -35,7 +38,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.rules import ForeignSource, SourceKey
     from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.node.subscription import TopicConnection
-    from rmpa.ros.wire.tcpros import Buffer, ServiceDescription, TopicDescription
+    from rmpa.ros.wire.tcpros import Buffer, Header, ServiceDescription
 
 _log = logging.getLogger(__name__)
 # The node that subscribes to what neighbours want.
@@ -171,6 +174,7 @@ class AgentGraph(Part):
     Attributes:
         name: The gateway's name among its peers.
         reloaded: Called with other rules, after the graph has taken them.
+        node: The node that taps topics.
         sources: The local sources by kind, name here and node here. What came from a neighbour is not among
             them.
     """
@@ -187,7 +191,7 @@ class AgentGraph(Part):
         self._taps: dict[str, set[TopicTap]] = {}
         self._pools: dict[str, ServicePool] = {}
         self._sites: dict[str, ForeignSite] = {}
-        self._node = SlaveNode(
+        self.node: Final = SlaveNode(
             TAP_NODE,
             agent.core.node_host,
             agent.core.uri,
@@ -223,16 +227,7 @@ class AgentGraph(Part):
             listener: The node that the publisher sees; by default one of the gateway. Clients of actions want the one
                 that publishes the status.
         """
-        tap = TopicTap(
-            source,
-            listener or TAP_NODE,
-            self._node.next_number,
-            self.agent.bridge.proxy_nodes.publication,
-            on_message,
-            on_described,
-            on_lost,
-            self._tap_closed,
-        )
+        tap = TopicTap(self, source, listener or TAP_NODE, on_message, on_described, on_lost)
         taps = self._taps.setdefault(source.here, set())
         taps.add(tap)
         if len(taps) == 1:
@@ -315,8 +310,8 @@ class AgentGraph(Part):
 
     async def begin(self) -> None:
         """Begin to follow the graph, once the agent has started and its place in the network is known."""
-        self._node.master_uri = self._core.uri
-        await self._node.start()
+        self.node.master_uri = self._core.uri
+        await self.node.start()
         self._sources.begin()
 
     def unwatch(self) -> None:
@@ -337,7 +332,7 @@ class AgentGraph(Part):
             pool.close("the gateway ends")
             await pool.closed()
         self._pools.clear()
-        await self._node.close()
+        await self.node.close()
 
     def reload(self) -> None:
         """Take other rules."""
@@ -379,14 +374,15 @@ class AgentGraph(Part):
         return self._sites[source.site]
 
     def _register_subscriber(self, topic: str) -> None:
-        self._core.call("registerSubscriber", TAP_NODE, topic, _ANY, self._node.uri)
+        self._core.call("registerSubscriber", TAP_NODE, topic, _ANY, self.node.uri)
 
-    def _tap_closed(self, tap: TopicTap) -> None:
+    def tap_closed(self, tap: TopicTap) -> None:
+        """A tap is closed; the gateway subscribes no more with the last one of a topic."""
         topic = tap.source.here
         taps = self._taps.get(topic, set())
         taps.discard(tap)
         if not taps and self._taps.pop(topic, None) is not None:
-            self._core.call("unregisterSubscriber", TAP_NODE, topic, self._node.uri)
+            self._core.call("unregisterSubscriber", TAP_NODE, topic, self.node.uri)
 
     def _follow(self, topic: str) -> None:
         publishers = self._core.publishers(topic)
@@ -429,3 +425,84 @@ class AgentGraph(Part):
             pool = ServicePool(source.here, server, lambda: self._core.suspect(source.proxy))
             self._pools[source.here] = pool
         return pool
+
+
+@dataclass(eq=False, slots=True)
+class TopicTap:
+    """A subscription to one topic of one node; it reconnects until it is closed or the source is gone.
+
+    Args:
+        graph: Is told once it is closed, and finds publishers in this process.
+        source: The topic.
+        caller_id: The subscribing node.
+        on_message: ``(body)``.
+        on_described: ``(description)``.
+        on_lost: ``(reason)``.
+        connection: The connection to the publisher; ``None`` while its address is not known.
+    """
+
+    graph: AgentGraph
+    source: MeshSource
+    caller_id: str
+    on_message: Callable[[memoryview], None]
+    on_described: Callable[[TopicDescription], None]
+    on_lost: Callable[[str], None]
+    connection: TopicConnection | None = None
+    _description: TopicDescription | None = field(default=None, init=False)
+    _closed: bool = field(default=False, init=False)
+
+    @property
+    def description(self) -> TopicDescription | None:
+        """The publisher's header; ``None`` until it is connected."""
+        connected = self.connection is not None and self.connection.connected
+        return self._description if connected else None
+
+    def follow(self, uri: str) -> None:
+        """Connect to the publisher at this slave API, unless it is connected there already.
+
+        Args:
+            uri: The publisher's address; empty: it is not in the graph.
+        """
+        connection = self.connection
+        if self._closed or (connection is not None and connection.uri == uri and connection.refused is None):
+            return
+        if connection is not None:
+            connection.close()
+            self.connection = None
+            if connection.uri != uri:
+                self.on_lost("its node is at another address now" if uri else "its node has gone")
+        if uri and not self._closed:
+            self._connect(uri)
+
+    def close(self) -> None:
+        """Disconnect; no callback is called afterwards."""
+        if not self._closed:
+            self._closed = True
+            if self.connection is not None:
+                self.connection.close()
+            self.graph.tap_closed(self)
+
+    def _connect(self, uri: str) -> None:
+        on_message, source = self.on_message, self.source
+
+        def find() -> Callable[[InProcessConnection], None] | None:
+            publication = self.graph.agent.bridge.proxy_nodes.publication(source.proxy, uri, source.here)
+            return publication.attach if publication is not None else None
+
+        kind = PublisherConnection if find() is None else InProcessConnection
+        self.connection = kind(
+            source.here,
+            uri,
+            self.caller_id,
+            on_message=lambda framed: on_message(framed[LENGTH.size :]),
+            on_header=self._described,
+            on_refused=lambda text: self.on_lost(f"its publisher refuses: {text}"),
+            on_lost=self.on_lost,
+            number=self.graph.node.next_number(),
+            find=find,
+        )
+        self.connection.start()
+
+    def _described(self, fields: Header) -> None:
+        self._description = TopicDescription.from_header(fields)
+        self.on_described(self._description)

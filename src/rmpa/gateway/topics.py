@@ -16,8 +16,7 @@ from rmpa.runtime.tls import after_read
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from rmpa.gateway.foreign import TopicTap
-    from rmpa.gateway.own_graph import AgentGraph
+    from rmpa.gateway.own_graph import AgentGraph, TopicTap
     from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.zenoh.session import OpenSession
     from rmpa.gateway.zenoh.threads import QueuedPublisher, ZenohQos

@@ -48,6 +48,7 @@ GATEWAY = SiteGateway("warehouse", 10, RUN)
         (FOR_YARD, f"rmpa/1/warehouse/arm/to/{RUN}/yard/t/sensor_msgs%LaserScan/%lidar%driver/%base%scan"),
         (GATEWAY, f"rmpa/1/warehouse/-gateway/010/{RUN}"),
         (SiteModule("home", "gateway", RUN), f"rmpa/1/home/gateway/up/{RUN}"),  # a module may be called so
+        (SiteModule("s" * 63, "arm", RUN), f"rmpa/1/{'s' * 63}/arm/up/{RUN}"),
     ],
 )
 def test_golden_tokens(each: SiteModule | SiteSource | SiteGateway, token: str) -> None:
@@ -90,6 +91,7 @@ def test_what_a_later_version_announces_is_ignored(more: str) -> None:
         f"rmpa/2/home/arm/up/{RUN}",
         f"rmpa/1/ho-me/arm/up/{RUN}",
         f"rmpa/1/home/4rm/up/{RUN}",
+        f"rmpa/1/{'s' * 64}/arm/up/{RUN}",
         f"rmpa/1/home/arm/up/{RUN[:-1]}",
         f"rmpa/1/home/arm/up/{RUN.upper()}",
         f"rmpa/1/home/-gateway/first/{RUN}",

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import sys
-from subprocess import PIPE
 from typing import TYPE_CHECKING
 
 import pytest
@@ -176,22 +173,3 @@ async def test_a_session_that_cannot_be_opened_says_where_why_and_what_to_do(net
     session = await net.session()
     with pytest.raises(ValueError, match="not a key expression"):
         session.subscribe("a//b", lambda _: None)
-
-
-async def test_the_process_ends_after_close() -> None:
-    program = """
-import asyncio
-from tests.gateway.zenoh_bed import bed
-from rmpa.gateway.zenoh.threads import ZenohQos
-async def main():
-    async with bed() as net:
-        session = await net.session()
-        session.publisher("t/x", ZenohQos(cache=1), lambda _: None)
-        session.subscribe("t/*", lambda _: None, history=True)
-        session.queryable("t/*", lambda _: None)
-asyncio.run(main())
-print("ended")
-"""
-    process = await asyncio.create_subprocess_exec(sys.executable, "-c", program, stdout=PIPE, stderr=PIPE)
-    out, err = await asyncio.wait_for(process.communicate(), 40)
-    assert (process.returncode, out, err) == (0, b"ended\n", b"")

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
     from rosbags.typesys.store import Typestore
 
-    from rmpa.gateway.foreign import ProxiedTopic, TopicTap
+    from rmpa.gateway.foreign import ProxiedTopic
+    from rmpa.gateway.own_graph import TopicTap
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint
     from rmpa.gateway.ros2.services import Ros2Context

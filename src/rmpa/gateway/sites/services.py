@@ -34,8 +34,7 @@ from rmpa.ros import limits as ros_limits
 from rmpa.ros.wire.tcpros import ServiceDescription
 
 if TYPE_CHECKING:
-    from rmpa.gateway.foreign import TopicTap
-    from rmpa.gateway.own_graph import AgentGraph
+    from rmpa.gateway.own_graph import AgentGraph, TopicTap
     from rmpa.gateway.rules import ForeignSource, MeshSource
     from rmpa.gateway.sites.keys import SiteSource
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
