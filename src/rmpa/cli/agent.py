@@ -134,11 +134,11 @@ def explain(code: str | None, options: Options) -> None:
     Examples:
       rmpa explain port-in-use
     """
-    wanted = (code or "").strip("[]")
-    if wanted and wanted not in codes.CODES:
-        remedy = suggestion(wanted, codes.CODES, "`rmpa explain` shows all")
+    wanted, known = (code or "").strip("[]"), codes.texts()
+    if wanted and wanted not in known:
+        remedy = suggestion(wanted, known, "`rmpa explain` shows all")
         raise ConfigError("CODE", f"there is no code {wanted!r}", remedy, code="unknown-name")
-    found = [(one, *map(codes.plain, codes.CODES[one])) for one in codes.CODES if wanted in ("", one)]
+    found = [(one, *map(codes.plain, about)) for one, about in known.items() if wanted in ("", one)]
     fields = ("code", "meaning", "remedy")
     texts = ((one, *(click.wrap_text(text, 78, "  ", "  ").splitlines() for text in about)) for one, *about in found)
     options.show([dict(zip(fields, each, strict=True)) for each in found], texts)
