@@ -102,7 +102,7 @@ async def test_publish_refuses_a_message_of_another_type(speaker: Resource) -> N
     words = speaker.outputs["words"]
     with pytest.raises(MessageError, match="date"):
         words.publish(date="x")
-    with pytest.raises(MessageError, match="words: data is a string, not <object"):
+    with pytest.raises(MessageError, match="words: data: is a string, not <object"):
         words.publish(object())
     with pytest.raises(MessageError, match="words: std_msgs/String: a message and fields"):
         words.publish(words.type.make({"data": "x"}), data="y")

@@ -13,9 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rmpa.core.limits import MIB
-from rmpa.ros.types.codec import WRITTEN_MAX, MessageCodec, codec_for
+from rmpa.ros.types.codec import MessageCodec, codec_for
 from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, known_specifications, known_types, parse_definition
 from rmpa.ros.types.messages import MessageError, MessageType
+from rmpa.ros.types.values import WRITTEN_MAX
 from tests.ros.types.filled import filled
 from tests.ros.types.genmsg_cases import VALUES, VALUES_OF
 

@@ -16,10 +16,7 @@ from rmpa.ros.types.definitions import (
     DiagnosticLevel,
     DiagnosticStatus,
     frame_array,
-    known_description,
     known_types,
-    md5sum,
-    parse_definition,
 )
 from rmpa.ros.types.messages import MessageError, MessageType, Plain
 from tests.ros.types.genmsg_cases import VALUES, VALUES_OF
@@ -71,7 +68,7 @@ def test_received_type_with_all_features() -> None:
     }
     raw = kind.serialize(kind.make(values))
     assert kind.to_plain(kind.deserialize(raw)) == values
-    assert kind.to_plain(kind.make())["flags"] == [False, False]
+    assert kind.to_plain(kind.make())["flags"] == [False, False], "a fixed array has its size"
 
 
 @pytest.mark.parametrize(
@@ -98,14 +95,16 @@ def test_times_may_be_seconds_and_byte_arrays_text() -> None:
 @pytest.mark.parametrize(
     ("values", "error"),
     [
+        ({"axes": [10**5000]}, "axes[0]: does not fit float32: an integer of 16610 bits"),
+        ({"header": {"frame_id": 10**5000}}, "header.frame_id: is a string, not an integer of 16610 bits"),
         ({"axs": []}, "sensor_msgs/Joy has no field 'axs'; it has header, axes, buttons"),
-        ({"header": {"stmp": 1}}, "header has no field 'stmp'"),
-        ({"axes": 1}, "axes is a list of float32, not 1"),
-        ({"axes": ["x"]}, "axes is a float32, not 'x'"),
-        ({"buttons": [1.5]}, "buttons is a int32, not 1.5"),
-        ({"buttons": [1 << 31]}, "buttons: 2147483648 does not fit int32"),
-        ({"header": {"stamp": "now"}}, "header.stamp is a time"),
-        ({"header": {"frame_id": [1]}}, "header.frame_id is a string, not [1]"),
+        ({"header": {"stmp": 1}}, "header: std_msgs/Header has no field 'stmp'; it has seq, stamp, frame_id"),
+        ({"axes": 1}, "axes: is a list (float32[]), not 1"),
+        ({"axes": ["x"]}, "axes[0]: is a float32, not 'x'"),
+        ({"buttons": [1.5]}, "buttons[0]: is a int32, not 1.5"),
+        ({"buttons": [1 << 31]}, "buttons[0]: does not fit int32: 2147483648"),
+        ({"header": {"stamp": "then"}}, "header.stamp: is a time ({secs, nsecs}), not 'then'"),
+        ({"header": {"frame_id": [1]}}, "header.frame_id: is a string, not a list of 1"),
         ([1, 2], "sensor_msgs/Joy has 3 fields, not 2"),
         (7, "sensor_msgs/Joy is made of the fields header, axes, buttons, not of 7"),
     ],
@@ -139,12 +138,21 @@ def test_a_program_may_give_arrays_bytes_and_messages() -> None:
 @pytest.mark.parametrize(
     ("kind", "values", "error"),
     [
-        ("sensor_msgs/Image", {"data": np.array([256])}, "data: 256 to 256 do not fit uint8"),
-        ("sensor_msgs/Image", {"data": np.array([1.0])}, "data is a list of uint8, not of float64"),
-        ("sensor_msgs/LaserScan", {"ranges": b"abcd"}, "ranges is a list of float32, not b'abcd'"),
-        ("sensor_msgs/LaserScan", {"ranges": np.array(["a"])}, "ranges is a list of float32, not of <U1"),
-        ("geometry_msgs/PoseWithCovariance", {"covariance": np.eye(5)}, "covariance has 36 elements, not 25"),
-        ("sensor_msgs/LaserScan", {"ranges": bytes(500_000)}, "…"),
+        ("sensor_msgs/Image", {"data": np.array([256])}, "data: does not fit uint8: 256 to 256"),
+        ("sensor_msgs/Image", {"data": np.array([1.0])}, "data: is a list (uint8[]), not one of float64"),
+        ("sensor_msgs/LaserScan", {"ranges": b"abcd"}, "ranges: is a list (float32[]), not 4 bytes"),
+        ("sensor_msgs/LaserScan", {"ranges": np.array(["a"])}, "ranges: is a list (float32[]), not one of <U1"),
+        (
+            "geometry_msgs/PoseWithCovariance",
+            {"covariance": np.eye(5)},
+            "has 36 elements (float64[36]), not 25",
+        ),
+        (
+            "geometry_msgs/PoseWithCovariance",
+            {"covariance": [1.0]},
+            "has 36 elements (float64[36]), not 1",
+        ),
+        ("sensor_msgs/LaserScan", {"ranges": bytes(500_000)}, "not 500000 bytes"),
     ],
 )
 def test_what_a_program_gives_that_does_not_fit(kind: str, values: Any, error: str) -> None:
@@ -154,13 +162,6 @@ def test_what_a_program_gives_that_does_not_fit(kind: str, values: Any, error: s
     assert len(str(caught.value)) < 300
 
 
-def test_fixed_arrays_have_their_size() -> None:
-    kind = MessageType("geometry_msgs/PoseWithCovariance")
-    assert kind.to_plain(kind.make())["covariance"] == [0.0] * 36
-    with pytest.raises(MessageError, match="covariance has 36 elements, not 1"):
-        kind.make({"covariance": [1.0]})
-
-
 @pytest.mark.parametrize("raw", [b"", JOY_BYTES[:-1], JOY_BYTES + b"x", b"\xff" * 40])
 def test_bytes_that_are_no_message(raw: bytes) -> None:
     with pytest.raises(MessageError, match="bytes are not a sensor_msgs/Joy"):
@@ -168,7 +169,7 @@ def test_bytes_that_are_no_message(raw: bytes) -> None:
 
 
 def test_an_object_that_is_no_message() -> None:
-    with pytest.raises(MessageError, match="sensor_msgs/Joy is a message of sensor_msgs/Joy, not 'joy'"):
+    with pytest.raises(MessageError, match="Joy is made of the fields header, axes, buttons, not of 'joy'"):
         MessageType("sensor_msgs/Joy").serialize("joy")
 
 
@@ -176,7 +177,7 @@ def test_an_object_that_is_no_message() -> None:
 def test_values_have_the_bytes_of_genpy(values: dict[str, Any], raw: str) -> None:
     kind = MessageType.learn("my_msgs/Case", VALUES_OF)
     if not raw:
-        with pytest.raises(MessageError, match=f"^{min(values)}.* does not fit "):
+        with pytest.raises(MessageError, match=f"^{min(values)}.*: does not fit "):
             kind.make(values)
         return
     assert kind.serialize(kind.make(values)).hex() == raw
@@ -187,18 +188,18 @@ def test_values_have_the_bytes_of_genpy(values: dict[str, Any], raw: str) -> Non
 @pytest.mark.parametrize(
     ("field", "value", "error"),
     [
-        ("small", 200, "small: 200 does not fit byte (-128 to 127)"),
-        ("small", "x", "small is a byte, not 'x'"),
-        ("many", [200], "many: 200 does not fit byte (-128 to 127)"),
-        ("many", np.array([200]), "many: 200 to 200 do not fit byte (-128 to 127)"),
-        ("two", np.zeros(1, np.int8), "two has 2 elements, not 1"),
-        ("short", 10**400, f"short: 1{'0' * 79}… does not fit float32"),
-        ("short", -1e39, "short: -1e+39 does not fit float32"),
-        ("at", 1e300, "at is a time, {secs: 0, nsecs: 0} or seconds, not 1e+300"),
-        ("at", float("nan"), "at is a time, {secs: 0, nsecs: 0} or seconds, not nan"),
-        ("at", -1, "at.secs: -1 does not fit time (0 to 4294967295)"),
-        ("text", "\ud800", "text has half of a surrogate pair, which is no character"),
-        ("reals", np.array([1e39]), "reals: 1e+39 to 1e+39 do not fit float32"),
+        ("small", 200, "small: does not fit byte: 200"),
+        ("small", "x", "small: is a byte, not 'x'"),
+        ("many", [200], "many[0]: does not fit byte: 200"),
+        ("many", np.array([200]), "many: does not fit byte: 200 to 200"),
+        ("two", np.zeros(1, np.int8), "two: has 2 elements (byte[2]), not 1"),
+        ("short", 10**400, "short: does not fit float32: an integer of 1329 bits"),
+        ("short", -1e39, "short: does not fit float32: -1e+39"),
+        ("at", 1e300, "at: is a time ({secs, nsecs}), not 1e+300"),
+        ("at", float("nan"), "at: is a time ({secs, nsecs}), not nan"),
+        ("at", -1, "at: does not fit a time: -1 s, 0 ns"),
+        ("text", "\ud800", "text: has half of a surrogate pair, which is no character"),
+        ("reals", np.array([1e39]), "reals: does not fit float32: 1e+39 to 1e+39"),
     ],
 )
 def test_a_wrong_value_is_named_when_it_is_given_and_when_it_was_set(field: str, value: Any, error: str) -> None:
@@ -211,13 +212,6 @@ def test_a_wrong_value_is_named_when_it_is_given_and_when_it_was_set(field: str,
         assert str(caught.value) == error
 
 
-def test_a_number_of_thousands_of_digits_is_refused_like_any_other() -> None:
-    with pytest.raises(MessageError, match="data: a number of too many digits does not fit byte"):
-        MessageType("std_msgs/ByteMultiArray").make({"data": [10**5000]})
-    with pytest.raises(MessageError, match="data is a string, not a number of too many digits"):
-        MessageType("std_msgs/String").make({"data": 10**5000})
-
-
 def test_a_program_may_set_lists_and_seconds() -> None:
     kind = MessageType("sensor_msgs/Joy")
     made = kind.make()
@@ -226,10 +220,10 @@ def test_a_program_may_set_lists_and_seconds() -> None:
     header = {"seq": 0, "stamp": {"secs": 2, "nsecs": 500_000_000}, "frame_id": ""}
     assert plain == {"header": header, "axes": [0.5, 1.0], "buttons": [1]}
     made.header.seq = -1
-    with pytest.raises(MessageError, match=r"^header.seq: -1 does not fit uint32"):
+    with pytest.raises(MessageError, match=r"^header.seq: does not fit uint32: -1"):
         kind.serialize(made)
     made.header = "map"
-    with pytest.raises(MessageError, match=r"^header is made of the fields seq, stamp, frame_id, not of 'map'"):
+    with pytest.raises(MessageError, match=r"^header: std_msgs/Header is made of the fields .*, not of 'map'"):
         kind.serialize(made)
 
 
@@ -294,19 +288,6 @@ def test_golden_bytes() -> None:
     framed = frame_array(7, 5_000_000_006, [status.serialize()])
     assert framed.hex() == GOLDEN
     assert struct.unpack_from("<I", framed)[0] == len(framed) - 4
-
-
-@pytest.mark.parametrize(
-    ("name", "md5"),
-    [
-        (ARRAY_TYPE, "60810da900de1dd6ddd437c3503511da"),
-        ("rosgraph_msgs/Log", "acffd30cd6b6de30f120938c17c593fb"),
-    ],
-)
-def test_the_definitions_are_those_of_ros(name: str, md5: str) -> None:
-    about = known_description(name)
-    assert (about.type, about.md5sum) == (name, md5)
-    assert md5sum(name, parse_definition(name, about.definition)) == md5
 
 
 TEXT = st.text(max_size=20)

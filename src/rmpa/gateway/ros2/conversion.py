@@ -20,9 +20,10 @@ from rmpa.core.errors import RmpaError
 from rmpa.core.limits import UINT32_MAX
 from rmpa.gateway.ros2.transcoder import HEAD, LayoutPart, Transcoder
 from rmpa.gateway.ros2.types import EMPTY_MEMBER, TIMES, Ros2Field, check_size, snake_case
-from rmpa.ros.types.codec import CODES, SIZES, MessageCodec
+from rmpa.ros.types.codec import MessageCodec
 from rmpa.ros.types.definitions import Specification
 from rmpa.ros.types.messages import MessageType
+from rmpa.ros.types.values import CODES, SIZES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence

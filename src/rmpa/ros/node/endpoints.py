@@ -21,8 +21,9 @@ from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.subscription import Subscription
+from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.find import type_of_header
-from rmpa.ros.types.messages import HeaderNumbers
+from rmpa.ros.types.messages import HeaderNumbers, given_values
 from rmpa.ros.wire.tcpros import ANY, LENGTH, frame_message, printable
 
 if TYPE_CHECKING:
@@ -310,7 +311,7 @@ class ServiceClient:
 
 
 def _serialize(kind: MessageType, value: object) -> Buffer:
-    return kind.serialize(kind.given(value))
+    return kind.serialize(given_values(kind.name, value, None))
 
 
 async def probe(uri: str, service: str, caller_id: str, timeout: float) -> ServiceConnection:  # noqa: ASYNC109
@@ -362,7 +363,7 @@ class Received:
     @property
     def plain(self) -> dict[str, Plain]:
         """The message as plain values; the errors are those of ``message``."""
-        return self.kind.to_plain(self.message)
+        return codec_for(self.kind).plain_values(memoryview(self.raw))
 
     @property
     def caller_id(self) -> str:
@@ -429,7 +430,7 @@ class Publisher(PublicationEvents):
         kind = self._known()
         if self._closed:
             raise RmpaError(_CLOSED.format(self.topic))
-        payload: Buffer = kind.serialize(kind.given(message, fields))
+        payload: Buffer = kind.serialize(given_values(kind.name, message, fields))
         return self.publish_raw(self.numbers.stamp(payload) if self.numbers is not None else payload)
 
     def publish_raw(self, payload: Buffer) -> int:

@@ -9,7 +9,6 @@ numbers. A writer is made of closures: what it costs is checking the values.
 
 from __future__ import annotations
 
-import binascii
 import functools
 import struct
 import sys
@@ -18,16 +17,12 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import msgspec
 
-from rmpa.core.limits import MIB, UINT32_MAX
-from rmpa.ros.types.definitions import DefinitionError, parse_definition
-from rmpa.ros.types.messages import MessageError, shown
+from rmpa.core.limits import MIB
+from rmpa.ros.types.definitions import DefinitionError, MessageError, parse_definition
+from rmpa.ros.types.values import CODES, SIZES, TAGS, TIMES, Written, WrongValueError, encoded, shown
 
 if TYPE_CHECKING:
-    from rmpa.ros.types.definitions import Field, Specification
-    from rmpa.ros.types.messages import MessageType
-
-# Bytes of a message that is written from values.
-WRITTEN_MAX: Final = 64 * MIB
+    from rmpa.ros.types.definitions import DefinedType, Field, Specification
 
 # Compiled types in the cache of the process; a module has some 50 types. The least recently used is dropped.
 _CODECS_MAX: Final = 512
@@ -44,29 +39,8 @@ _INLINE_MAX: Final = 64
 # Fields that were not given and are named to the client.
 _MISSING_NAMED: Final = 8
 
-# The ``struct`` code of each number.
-CODES: Final = {
-    "bool": "?",
-    "int8": "b",
-    "byte": "b",
-    "uint8": "B",
-    "char": "B",
-    "int16": "h",
-    "uint16": "H",
-    "int32": "i",
-    "uint32": "I",
-    "int64": "q",
-    "uint64": "Q",
-    "float32": "f",
-    "float64": "d",
-}
-SIZES: Final = {kind: struct.calcsize(f"<{code}") for kind, code in CODES.items()}
-TIMES: Final = {"time": "II", "duration": "ii"}
 # Bytes of the default of each primitive.
 _DEFAULTS: Final = {**SIZES, "string": 4, "time": 8, "duration": 8}
-# Little-endian typed arrays (RFC 8746), by ``struct`` code.
-_TAGS: Final = {"H": 69, "I": 70, "Q": 71, "b": 72, "h": 77, "i": 78, "q": 79, "f": 85, "d": 86}
-_TAG_CODES: Final = {tag: code for code, tag in _TAGS.items()} | {64: "B"}
 _HEADER: Final = "std_msgs/Header"
 _SHORT: Final = "they end too early"
 _LENGTH: Final = struct.Struct("<I")
@@ -79,42 +53,8 @@ Read: TypeAlias = Callable[[memoryview], Values]
 _Write: TypeAlias = Callable[[Any, "Written"], None]
 
 
-class Written:
-    """A message that is written from values.
-
-    Args:
-        now_ns: The present time (UTC) in nanoseconds, for stamps that are not given and for ``"now"``.
-
-    Attributes:
-        missing: The first fields that were not given; a header and its fields do not count.
-    """
-
-    def __init__(self, now_ns: int) -> None:
-        seconds, nanoseconds = divmod(now_ns, 1_000_000_000)
-        self.now = {"secs": max(0, min(seconds, UINT32_MAX)), "nsecs": nanoseconds}
-        self.out = bytearray()
-        self.missing: list[str] = []
-
-    @property
-    def payload(self) -> bytes:
-        """The ROS 1 bytes."""
-        return bytes(self.out)
-
-
 class _MalformedError(Exception):
     """Bytes are not a message; the text says why."""
-
-
-class _WrongValueError(Exception):
-    """A value does not fit; each level around it puts its field's name in front of ``path``."""
-
-    def __init__(self, problem: str) -> None:
-        super().__init__(problem)
-        self.path: list[str] = []
-
-    def __str__(self) -> str:
-        where = ".".join(reversed(self.path)).replace(".[", "[")
-        return f"{where}: {self.args[0]}" if where else str(self.args[0])
 
 
 class MessageCodec:
@@ -180,7 +120,12 @@ class MessageCodec:
         """Makes values for cbor2, with arrays of numbers as tagged bytes (RFC 8746)."""
         from cbor2 import CBORTag  # noqa: PLC0415 - of the extra "web"
 
-        return self._reader(lambda view, code: bytes(view) if code == "B" else CBORTag(_TAGS[code], bytes(view)))
+        return self._reader(lambda view, code: bytes(view) if code == "B" else CBORTag(TAGS[code], bytes(view)))
+
+    @functools.cached_property
+    def plain_values(self) -> Read:
+        """Makes values with lists in place of arrays."""
+        return self._reader(lambda view, code: _cast(view, code).tolist())
 
     @functools.cached_property
     def views(self) -> Read:
@@ -225,8 +170,8 @@ class MessageCodec:
         """
         written = Written(now_ns)
         try:
-            self._top(values, written)
-        except _WrongValueError as error:
+            self.fill(values, written)
+        except WrongValueError as error:
             raise MessageError(f"{self.name}: {error}") from None
         return written
 
@@ -242,40 +187,42 @@ class MessageCodec:
         return self.write(values or {}, now_ns)
 
     @functools.cached_property
-    def _top(self) -> _Write:
+    def fill(self) -> _Write:
+        """Writes values; it raises ``WrongValueError``."""
         return self._message(self.name, top=True)
 
     def _message(self, name: str, *, top: bool = False) -> _Write:
         """The closure of a message type; ``top`` fills in a header that is not given."""
+        specification = self.known[name]
         fields = [
             (each.name, self._field(each), self._default(each), self._filled(name, each, top=top))
-            for each in self.known[name].fields
+            for each in specification.fields
         ]
         known = frozenset(label for label, *_ in fields)
 
         def write(values: Any, written: Written) -> None:
             if not isinstance(values, Mapping):
-                raise _WrongValueError(f"is a {name} (an object), not {shown(values)}")
+                values = written.fields(specification, values)
             if not known.issuperset(values):
                 unknown = next(key for key in values if key not in known)
                 has = ", ".join(label for label, *_ in fields) or "none"
-                raise _WrongValueError(f"{name} has no field {shown(unknown)}; it has {has}")
-            label = ""
+                raise WrongValueError(f"{name} has no field {shown(unknown)}; it has {has}")
+            label, absent = "", written.absent
             try:
                 for label, write_field, default, filled in fields:
-                    if label in values:
-                        write_field(values[label], written)
-                    elif filled is not None:
+                    if label in values and (value := values[label]) is not absent:
+                        write_field(value, written)
+                    elif filled is not None and written.stamps:
                         write_field(filled, written)
                     else:
                         written.out += bytes(default)
                         if name != _HEADER and len(written.missing) < _MISSING_NAMED:
                             written.missing.append(label)
-            except _WrongValueError as error:
+            except WrongValueError as error:
                 error.path.append(label)
                 raise
-            if len(written.out) > WRITTEN_MAX:
-                raise _WrongValueError(f"the message is longer than {WRITTEN_MAX} bytes")
+            if len(written.out) > written.size_max:
+                raise WrongValueError(f"the message is longer than {written.size_max} bytes")
 
         return write
 
@@ -300,7 +247,8 @@ class MessageCodec:
         item = self._item(field.type)
 
         def write(values: Any, written: Written) -> None:
-            _count(field, len(_list(field, values)), written)
+            values = written.array(field, values)
+            _count(field, len(values), written)
             _each(item, values, written)
 
         return write
@@ -317,7 +265,7 @@ class MessageCodec:
         return self._writers[kind]
 
 
-def codec_for(kind: MessageType) -> MessageCodec:
+def codec_for(kind: DefinedType) -> MessageCodec:
     """The codec of a type; the last ``_CODECS_MAX`` are kept. Errors as for ``MessageCodec``."""
     return _codec(kind.name, kind.definition)
 
@@ -462,15 +410,9 @@ class _ReaderText:
 # --- what writers are made of -------------------------------------------------------------------------------------
 
 
-def _list(field: Field, values: Any) -> Sequence[Any]:
-    if not isinstance(values, list | tuple):
-        raise _WrongValueError(f"is a list ({field}), not {shown(values)}")
-    return values
-
-
 def _count(field: Field, count: int, written: Written) -> None:
     if field.size is not None and count != field.size:
-        raise _WrongValueError(f"has {field.size} elements ({field}), not {count}")
+        raise WrongValueError(f"has {field.size} elements ({field}), not {count}")
     if field.size is None:
         written.out += _LENGTH.pack(count)
 
@@ -480,18 +422,14 @@ def _each(write: _Write, values: Sequence[Any], written: Written) -> None:
     try:
         for index, value in enumerate(values):  # noqa: B007 - the error has it
             write(value, written)
-    except _WrongValueError as error:
+    except WrongValueError as error:
         error.path.append(f"[{index}]")
         raise
 
 
 def _text(value: Any, written: Written) -> None:
-    if not isinstance(value, str):
-        raise _WrongValueError(f"is a string, not {shown(value)}")
-    try:
-        raw = value.encode()
-    except UnicodeEncodeError:
-        raise _WrongValueError("has half of a surrogate pair, which is no character") from None
+    text = value if isinstance(value, str) else written.text(value)
+    raw = text.encode() if text.isascii() else encoded(text)
     written.out += _LENGTH.pack(len(raw))
     written.out += raw
 
@@ -500,17 +438,17 @@ def _time(kind: str) -> _Write:
     pack = struct.Struct(f"<{TIMES[kind]}").pack
 
     def write(value: Any, written: Written) -> None:
-        if value == "now" and kind == "time":
-            value = written.now
-        if not isinstance(value, Mapping) or not value.keys() <= _TIME_KEYS.keys():
-            raise _WrongValueError(f"is a {kind} ({{secs, nsecs}}), not {shown(value)}")
+        if not isinstance(value, Mapping):
+            value = written.time(kind, value)
+        elif not value.keys() <= _TIME_KEYS.keys():
+            raise WrongValueError(f"is a {kind} ({{secs, nsecs}}), not {shown(value)}")
         parts = [0, 0]
         for key, part in value.items():
             parts[_TIME_KEYS[key]] = _integer(part, kind)
         try:
             written.out += pack(*parts)
         except struct.error:
-            raise _WrongValueError(f"does not fit a {kind}: {shown(parts[0])} s, {shown(parts[1])} ns") from None
+            raise WrongValueError(f"does not fit a {kind}: {shown(parts[0])} s, {shown(parts[1])} ns") from None
 
     return write
 
@@ -518,7 +456,7 @@ def _time(kind: str) -> _Write:
 def _boolean(value: Any, kind: str) -> bool:
     if isinstance(value, bool) or (isinstance(value, int) and value in (0, 1)):
         return bool(value)
-    raise _WrongValueError(f"is a {kind}, not {shown(value)}")
+    raise WrongValueError(f"is a {kind}, not {shown(value)}")
 
 
 def _real(value: Any, kind: str) -> float:
@@ -529,7 +467,7 @@ def _real(value: Any, kind: str) -> float:
             return float(value)
         except OverflowError:
             pass
-    raise _WrongValueError(f"is a {kind}, not {shown(value)}")
+    raise WrongValueError(f"is a {kind}, not {shown(value)}")
 
 
 def _integer(value: Any, kind: str) -> int:
@@ -537,7 +475,7 @@ def _integer(value: Any, kind: str) -> int:
         return int(value)  # some languages write 3.0 for 3
     if isinstance(value, int) and not isinstance(value, bool):
         return value
-    raise _WrongValueError(f"is a {kind}, not {shown(value)}")
+    raise WrongValueError(f"is a {kind}, not {shown(value)}")
 
 
 def _number(kind: str) -> _Write:
@@ -547,9 +485,12 @@ def _number(kind: str) -> _Write:
 
     def write(value: Any, written: Written) -> None:
         try:
-            written.out += pack(convert(value, kind))
+            try:
+                written.out += pack(convert(value, kind))
+            except WrongValueError:
+                written.out += pack(written.number(kind, value))
         except (struct.error, OverflowError):
-            raise _WrongValueError(f"does not fit {kind}: {shown(value)}") from None
+            raise WrongValueError(f"does not fit {kind}: {shown(value)}") from None
 
     return write
 
@@ -559,7 +500,7 @@ def _numbers(field: Field) -> _Write:
     item = _number(field.type)
 
     def write(values: Any, written: Written) -> None:
-        values = _untyped(field, values, code)
+        values = written.numbers(field, values)
         if isinstance(values, bytes | memoryview):
             _count(field, len(values) // size, written)
             written.out += values
@@ -576,23 +517,3 @@ def _numbers(field: Field) -> _Write:
         _each(item, values, written)
 
     return write
-
-
-def _untyped(field: Field, values: Any, code: str) -> Any:
-    """An array of numbers as bytes where its elements are of ``code``, else as a list."""
-    if code == "B" and isinstance(values, str):
-        try:
-            return binascii.a2b_base64(values, strict_mode=True)
-        except ValueError:
-            raise _WrongValueError(f"is base64 ({field}), not {shown(values)}") from None
-    if code == "B" and isinstance(values, bytes | bytearray):
-        return bytes(values)
-    if isinstance(values, memoryview):
-        return values.cast("B") if values.format == code and sys.byteorder == "little" else values.tolist()
-    if (tag := getattr(values, "tag", None)) is None:
-        return _list(field, values)
-    given = _TAG_CODES.get(tag) if isinstance(tag, int) else None
-    raw = values.value
-    if given is None or not isinstance(raw, bytes) or len(raw) % struct.calcsize(f"<{given}"):
-        raise _WrongValueError("is a typed array of little-endian numbers (RFC 8746), not another tag")
-    return raw if given == code else [value for (value,) in struct.iter_unpack(f"<{given}", raw)]

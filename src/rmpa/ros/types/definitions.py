@@ -63,6 +63,19 @@ class UnknownTypeError(DefinitionError):
     fetchable: bool = True
 
 
+class MessageError(RmpaError):
+    """A value does not fit a message type, or bytes are not a message of it."""
+
+    code = "invalid-message"
+
+
+class DefinedType:
+    """What codecs of a message type are made of: its name and its full text."""
+
+    name: str
+    definition: str
+
+
 @dataclass(frozen=True, slots=True)
 class Field:
     """One field of a message type.
