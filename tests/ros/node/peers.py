@@ -5,14 +5,17 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, ClassVar, Final, Self
 
+from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.server import XmlRpcServer
+from rmpa.ros.node.node import Node
 from rmpa.ros.wire.tcpros import LENGTH, TopicDescription, encode_header, parse_header, publisher_header
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from rmpa.ros.core.embedded import RosCore
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 MD5: Final = "992ce8a1687cec8c8bd883ec73ca41d1"
@@ -28,10 +31,23 @@ async def until(condition: Callable[[], object]) -> None:
             await asyncio.sleep(0.001)
 
 
+def node(core: RosCore, name: str, **options: object) -> Node:
+    """A node at a core of a test."""
+    return Node(name, master_uri=core.uri, environment=RosEnvironment(), **options)  # type: ignore[arg-type]
+
+
 class RawSubscriber:
-    """A bare connection to a TCPROS server."""
+    """A bare connection to a TCPROS server.
+
+    Attributes:
+        made: Those that are closed at the end of a test of this folder.
+    """
+
+    made: ClassVar[list[RawSubscriber] | None] = None
 
     def __init__(self, sock: socket.socket) -> None:
+        if self.made is not None:
+            self.made.append(self)
         self.sock = sock
         self.data = b""
 
@@ -100,17 +116,39 @@ class RawSubscriber:
         self.sock.close()
 
 
-class RawPublisher:
-    """A publisher's slave API and listening socket; its connections are accepted by hand."""
+class RawServer:
+    """A listening socket whose connections are accepted by hand."""
+
+    def __init__(self) -> None:
+        self._socket = socket.create_server(("127.0.0.1", 0))
+        self._socket.setblocking(False)
+        self.port: int = self._socket.getsockname()[1]
+        self.links: list[RawSubscriber] = []
+
+    async def accept(self) -> RawSubscriber:
+        """The next connection."""
+        async with asyncio.timeout(DEADLINE):
+            sock, _ = await asyncio.get_running_loop().sock_accept(self._socket)
+        sock.setblocking(False)
+        self.links.append(RawSubscriber(sock))
+        return self.links[-1]
+
+    def close(self) -> None:
+        """Close the port and all connections."""
+        self._socket.close()
+        for link in self.links:
+            link.close()
+
+
+class RawPublisher(RawServer):
+    """A publisher's slave API, with its listening socket."""
 
     def __init__(self, description: TopicDescription = STRING) -> None:
+        super().__init__()
         self.description = description
         self.answer: XmlRpcValue = None
         self.asked: list[tuple[XmlRpcValue, ...]] = []
-        self._links: list[RawSubscriber] = []
         self._server = XmlRpcServer(self._call)
-        self._socket = socket.create_server(("127.0.0.1", 0))
-        self._socket.setblocking(False)
 
     async def __aenter__(self) -> Self:
         await self._server.start()
@@ -118,33 +156,17 @@ class RawPublisher:
 
     async def __aexit__(self, *_: object) -> None:
         await self._server.close()
-        self._socket.close()
-        for link in self._links:
-            link.close()
+        self.close()
 
     @property
     def uri(self) -> str:
         """The slave API."""
         return f"http://127.0.0.1:{self._server.port}/"
 
-    @property
-    def address(self) -> tuple[str, int]:
-        """The TCPROS socket."""
-        address: tuple[str, int] = self._socket.getsockname()
-        return address
-
     def _call(self, method: str, params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
         assert method == "requestTopic"
         self.asked.append(params)
-        return self.answer if self.answer is not None else [1, "ready", ["TCPROS", *self.address]]
-
-    async def accept(self) -> RawSubscriber:
-        """The next connection."""
-        async with asyncio.timeout(DEADLINE):
-            sock, _ = await asyncio.get_running_loop().sock_accept(self._socket)
-        sock.setblocking(False)
-        self._links.append(RawSubscriber(sock))
-        return self._links[-1]
+        return self.answer if self.answer is not None else [1, "ready", ["TCPROS", "127.0.0.1", self.port]]
 
     async def serve(self) -> tuple[RawSubscriber, Mapping[str, str]]:
         """The next connection and its header, answered."""

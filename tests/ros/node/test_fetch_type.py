@@ -7,22 +7,20 @@ import pytest
 
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.ros import limits
-from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.fetch_type import fetch_type, find_or_fetch
-from rmpa.ros.node.node import Node
 from rmpa.ros.types import installed
 from rmpa.ros.types.definitions import DefinitionError, UnknownTypeError
 from rmpa.ros.types.installed import ServiceType, packages_below
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import TopicDescription
-from tests.ros.node.peers import until
+from tests.ros.node.peers import node, until
 from tests.ros.types.workspaces import package
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
 
+    from rmpa.ros.core.embedded import RosCore
     from rmpa.ros.node.endpoints import Received
 
 NAME: Final = "my_msgs/Foo"
@@ -36,21 +34,8 @@ def nothing_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
     monkeypatch.setattr(installed, "_DISTRIBUTIONS", tmp_path / "opt")
     monkeypatch.setattr(installed, "_SYSTEM", ())
     monkeypatch.delenv("PYTHONPATH", raising=False)
-    FOO.deserialize(FOO.serialize(FOO.make()))  # imports numpy and rosbags outside of any loop
     yield
     packages_below.cache_clear()
-
-
-@pytest.fixture
-async def core() -> AsyncIterator[RosCore]:
-    made = RosCore("127.0.0.1", 0)
-    await made.start()
-    yield made
-    await made.close()
-
-
-def node(core: RosCore, name: str) -> Node:
-    return Node(name, master_uri=core.uri, environment=RosEnvironment())
 
 
 async def learnt(core: RosCore, topic: str = "", *, elsewhere: bool = True) -> tuple[str, str, str] | None:

@@ -9,15 +9,14 @@ from rmpa.core import limits as core_limits
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.subscription import InProcessConnection
 from rmpa.ros.wire.tcpros import LENGTH, TopicDescription
+from tests.ros.node.peers import LATCHED, STRING
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.ros.wire.tcpros import Header
 
-STRING = TopicDescription("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n")
 OTHER = TopicDescription("std_msgs/Int8", "27ffa0c9c4b8fb8492252bcad9e5c57b", "int8 data\n")
-LATCHED = TopicDescription(STRING.type, STRING.md5sum, STRING.definition, latching=True)
 LARGE = core_limits.CUT_THROUGH_BYTES * 3
 
 

@@ -13,36 +13,11 @@ from rmpa.ros.http.rpc import call
 from rmpa.ros.node.endpoints import NODE_UNREGISTER_AT_ONCE
 from rmpa.ros.node.node import NODE_MASTER_CHECK, Node
 from rmpa.ros.types.definitions import DefinitionError
-from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageError, MessageType
-from tests.ros.node.peers import DEADLINE, STRING, until
+from tests.ros.node.peers import DEADLINE, STRING, node, until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
     from rmpa.ros.node.node import Received
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _warm() -> None:
-    """Import numpy and rosbags outside of any loop: that takes a while, and a test's time is not for it."""
-    kind = MessageType("std_msgs/String")
-    kind.deserialize(kind.serialize(kind.make()))
-    for service in ("rospy_tutorials/AddTwoInts", "roscpp/GetLoggers", "roscpp/SetLoggerLevel", "std_srvs/SetBool"):
-        for half in (ServiceType(service).request, ServiceType(service).response):
-            half.deserialize(half.serialize(half.make()))
-
-
-@pytest.fixture
-async def core() -> AsyncIterator[RosCore]:
-    made = RosCore("127.0.0.1", 0)
-    await made.start()
-    yield made
-    await made.close()
-
-
-def node(core: RosCore, name: str, **options: object) -> Node:
-    return Node(name, master_uri=core.uri, environment=RosEnvironment(), **options)  # type: ignore[arg-type]
 
 
 async def test_messages_go_from_one_node_to_another(core: RosCore) -> None:

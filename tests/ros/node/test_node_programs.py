@@ -13,34 +13,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import UnreachableError
-from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node
-from rmpa.ros.types.messages import MessageType
-from tests.ros.node.peers import DEADLINE, until
+from tests.ros.node.peers import DEADLINE, node, until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _warm() -> None:
-    """Import numpy and rosbags outside of any loop: that takes a while, and a test's time is not for it."""
-    for name in ("std_msgs/String", "rosgraph_msgs/Log"):
-        kind = MessageType(name)
-        kind.deserialize(kind.serialize(kind.make()))
-
-
-@pytest.fixture
-async def core() -> AsyncIterator[RosCore]:
-    made = RosCore("127.0.0.1", 0)
-    await made.start()
-    yield made
-    await made.close()
-
-
-def node(core: RosCore, name: str, *, handle_signals: bool = False) -> Node:
-    return Node(name, master_uri=core.uri, environment=RosEnvironment(), handle_signals=handle_signals)
+    from rmpa.ros.core.embedded import RosCore
 
 
 async def test_a_rate_does_not_drift_and_leaves_out_what_is_past(core: RosCore) -> None:

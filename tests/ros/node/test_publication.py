@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
 import struct
 from typing import TYPE_CHECKING
@@ -10,11 +11,11 @@ import pytest
 from rmpa.ros import limits
 from rmpa.ros.node.listeners import TcprosServer
 from rmpa.ros.node.publication import AcceptedConnection, Publication, PublicationEvents
-from rmpa.ros.wire.tcpros import TopicDescription, frame_message
+from rmpa.ros.wire.tcpros import TopicDescription, frame_message, publisher_header
 from tests.ros.node.peers import LATCHED, STRING, RawSubscriber, until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Mapping
+    from collections.abc import AsyncIterator, Callable, Mapping
 
 OTHER = TopicDescription("std_msgs/Int32", "da5909fbe378aeaf85e547e830cc1bb7", "int32 data\n")
 
@@ -24,14 +25,7 @@ class Owner(PublicationEvents):
 
     def __init__(self, description: TopicDescription | None, **options: int) -> None:
         self.said: list[str] = []
-        self.links: list[RawSubscriber] = []
-        self.publication = Publication(
-            "/t",
-            "/p",
-            description,
-            events=self,
-            **options,
-        )
+        self.publication = Publication("/t", "/p", description, events=self, **options)
         self.server = TcprosServer("/p", {"/t": self.publication})
         self.server.start()
 
@@ -47,48 +41,39 @@ class Owner(PublicationEvents):
     async def subscriber(self, *, buffer: int = 0, **fields: str) -> RawSubscriber:
         before = self.publication.subscribers
         link = await RawSubscriber.connect(self.server.address, buffer=buffer, **fields)
-        self.links.append(link)
         await until(lambda: self.publication.subscribers > before)
         return link
 
     def close(self) -> None:
-        for link in self.links:
-            link.close()
         self.publication.withdraw()
         self.server.close()
 
 
 @pytest.fixture
-async def held() -> AsyncIterator[Owner]:
-    owner = Owner(None)
-    yield owner
-    owner.close()
+async def make() -> AsyncIterator[Callable[..., Owner]]:
+    """Makes owners, which end with the test."""
+    with contextlib.ExitStack() as stack:
+        yield lambda *args, **options: stack.enter_context(contextlib.closing(Owner(*args, **options)))
 
 
 @pytest.fixture
-async def known() -> AsyncIterator[Owner]:
-    owner = Owner(STRING)
-    yield owner
-    owner.close()
+async def held(make: Callable[..., Owner]) -> Owner:
+    return make(None)
 
 
 @pytest.fixture
-async def latched() -> AsyncIterator[Owner]:
-    owner = Owner(LATCHED)
-    yield owner
-    owner.close()
+async def known(make: Callable[..., Owner]) -> Owner:
+    return make(STRING)
+
+
+@pytest.fixture
+async def latched(make: Callable[..., Owner]) -> Owner:
+    return make(LATCHED)
 
 
 async def test_a_subscriber_gets_the_header_and_then_every_message(known: Owner) -> None:
     link = await known.subscriber()
-    assert await link.header() == {
-        "callerid": "/p",
-        "latching": "0",
-        "md5sum": STRING.md5sum,
-        "message_definition": "string data\n",
-        "topic": "/t",
-        "type": "std_msgs/String",
-    }
+    assert await link.header() == publisher_header("/t", "/p", STRING)
     for payload in (b"one", b"", b"x" * 3_000_000, b"last"):
         known.publication.publish_framed(frame_message(payload))
     for payload in (b"one", b"", b"x" * 3_000_000, b"last"):
@@ -226,8 +211,8 @@ async def test_junk_from_a_subscriber_is_read_away(known: Owner) -> None:
 
 
 @pytest.mark.trap(19)
-async def test_slow_subscriber_loses_the_oldest_and_delays_no_other() -> None:
-    owner = Owner(STRING, queue_messages=10, queue_bytes=1 << 30)
+async def test_slow_subscriber_loses_the_oldest_and_delays_no_other(make: Callable[..., Owner]) -> None:
+    owner = make(STRING, queue_messages=10, queue_bytes=1 << 30)
     slow = await owner.subscriber(callerid="/slow", buffer=4096)
     fast = await owner.subscriber(callerid="/fast")
     await slow.header()
@@ -250,18 +235,16 @@ async def test_slow_subscriber_loses_the_oldest_and_delays_no_other() -> None:
     fast.close()
     await until(lambda: owner.publication.subscribers == 0)
     assert owner.publication.dropped == dropped
-    owner.close()
 
 
 @pytest.mark.trap(19)
-async def test_a_slow_subscriber_holds_no_more_than_its_bytes() -> None:
-    owner = Owner(STRING, queue_messages=1000, queue_bytes=1_000_000)
+async def test_a_slow_subscriber_holds_no_more_than_its_bytes(make: Callable[..., Owner]) -> None:
+    owner = make(STRING, queue_messages=1000, queue_bytes=1_000_000)
     await owner.subscriber(buffer=4096)
     for _ in range(200):
         owner.publication.publish_framed(frame_message(bytes(100_000)))
     (inbound,) = owner.publication._connections
     assert inbound.pending_bytes <= 1_000_000 + 100_004
-    owner.close()
 
 
 @pytest.mark.trap(16)
@@ -359,8 +342,8 @@ async def test_messages_without_subscribers_are_counted(known: Owner) -> None:
     assert (known.publication.messages, known.publication.bytes) == (2, 2 * (4 + len(WHOLE)))
 
 
-async def test_a_slow_subscriber_among_fast_ones_gets_whole_messages_or_none() -> None:
-    owner = Owner(STRING, queue_messages=2, queue_bytes=1 << 30)
+async def test_a_slow_subscriber_among_fast_ones_gets_whole_messages_or_none(make: Callable[..., Owner]) -> None:
+    owner = make(STRING, queue_messages=2, queue_bytes=1 << 30)
     slow = await owner.subscriber(callerid="/slow", buffer=4096)
     fast = [await owner.subscriber(callerid=f"/fast{n}") for n in range(2)]
     for link in (slow, *fast):
@@ -379,7 +362,6 @@ async def test_a_slow_subscriber_among_fast_ones_gets_whole_messages_or_none() -
     assert got == [message for message in sent if message in got], "in order, none torn, none twice"
     # The one that was on its way when the rest came may be one of the two that the queue holds.
     assert got[-1] == sent[-1]
-    owner.close()
 
 
 async def test_who_comes_in_the_middle_begins_with_the_next_one(known: Owner) -> None:
@@ -410,8 +392,8 @@ async def test_late_subscriber_gets_latched_message_whole(latched: Owner) -> Non
         assert [await link.message() for _ in range(len(messages) + 1)] == [*messages, b"next"]
 
 
-async def test_abort_disconnects_only_subscribers_with_the_beginning() -> None:
-    owner = Owner(STRING, queue_messages=100)
+async def test_abort_disconnects_only_subscribers_with_the_beginning(make: Callable[..., Owner]) -> None:
+    owner = make(STRING, queue_messages=100)
     half = await owner.subscriber(callerid="/half")
     stuck = await owner.subscriber(callerid="/stuck", buffer=4096)
     await stuck.header()
@@ -436,7 +418,6 @@ async def test_abort_disconnects_only_subscribers_with_the_beginning() -> None:
     assert [len(await stuck.message()) for _ in range(fills + 2)] == [100_000] * fills + [4, 4]
     await late.header()
     assert await late.message() == b"next"
-    owner.close()
 
 
 async def test_abort_of_the_last_subscriber_ends_the_demand(known: Owner) -> None:
@@ -506,8 +487,8 @@ def test_no_contract_keeps_more_than_the_limit() -> None:
 
 
 @pytest.mark.trap(19)
-async def test_contract_depth_bounds_each_subscribers_queue() -> None:
-    owner = Owner(STRING)
+async def test_contract_depth_bounds_each_subscribers_queue(make: Callable[..., Owner]) -> None:
+    owner = make(STRING)
     await owner.subscriber(callerid="/early", buffer=4096)
     owner.publication.bound(3)
     await owner.subscriber(callerid="/late", buffer=4096)
@@ -518,7 +499,6 @@ async def test_contract_depth_bounds_each_subscribers_queue() -> None:
     assert all(link.dropped > 50 and link.outbox.waiting_entries <= 4 for link in links)
     owner.publication.bound(10**6)
     assert owner.publication._queue_messages == limits.SUBSCRIBER_QUEUE_MESSAGES
-    owner.close()
 
 
 async def test_a_held_subscriber_counts_as_connected_while_others_are_served(

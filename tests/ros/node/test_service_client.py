@@ -2,8 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import socket
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -14,43 +13,29 @@ from rmpa.ros.node.service_server import ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import ServiceDescription, encode_header, error_header, server_header
 from rmpa.runtime import limits
-from tests.ros.node.peers import DEADLINE, RawSubscriber, until
+from tests.ros.node.peers import DEADLINE, RawServer, until
 from tests.runtime.descriptors_left import descriptors_left
 
 if TYPE_CHECKING:
+    import socket
     from collections.abc import AsyncIterator
+
+    from tests.ros.node.peers import RawSubscriber
 
 
 MD5 = "6a2e34150c00229791cc89ff309fff21"
-
-
 ADD = ServiceDescription("rospy_tutorials/AddTwoInts", MD5)
+GET = ServiceDescription("roscpp/GetLoggers", "32e97e85527d4678a8f9279894bb64b0")
+HEADER = server_header("/talker", GET)
+SERVICE = "/talker/get_loggers"
 
 
-class RawServer:
-    """A listening socket whose connections are accepted by hand."""
+class Server(RawServer):
+    """A service's server, and a program at a TCP port that is no part of rmpa."""
 
-    def __init__(self) -> None:
-        self._socket = socket.create_server(("127.0.0.1", 0))
-        self._socket.setblocking(False)
-        self._links: list[RawSubscriber] = []
-        self.uri = f"rosrpc://127.0.0.1:{self._socket.getsockname()[1]}"
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._socket.close()
-        for link in self._links:
-            link.close()
-
-    async def accept(self) -> RawSubscriber:
-        """The next connection."""
-        async with asyncio.timeout(DEADLINE):
-            sock, _ = await asyncio.get_running_loop().sock_accept(self._socket)
-        sock.setblocking(False)
-        self._links.append(RawSubscriber(sock))
-        return self._links[-1]
+    @property
+    def uri(self) -> str:
+        return f"rosrpc://127.0.0.1:{self.port}"
 
     async def serve(self, header: dict[str, str] | None = None) -> tuple[ServiceConnection, RawSubscriber]:
         """A connection of ours, and its other side behind the headers."""
@@ -61,14 +46,28 @@ class RawServer:
         await link.send(encode_header(header if header is not None else server_header("/server", ADD)))
         return await opening, link
 
+    async def asked(self, *answers: bytes, node: str = "/talker", close: bool = False) -> str:
+        """The result of a probe of this program, which sends these bytes behind the header that it gets."""
+        asking = asyncio.create_task(probe("127.0.0.1", self.port, SERVICE, timeout=DEADLINE, node=node))
+        link = await self.accept()
+        fields = await link.header()
+        assert fields == {"probe": "1", "service": SERVICE, "md5sum": "*", "callerid": "/rmpa"}
+        for answer in answers:
+            await link.send(answer)
+            await asyncio.sleep(0)
+        if close:
+            link.close()
+        return await asking
+
 
 @pytest.fixture
-async def server() -> AsyncIterator[RawServer]:
-    with RawServer() as made:
-        yield made
+async def server() -> AsyncIterator[Server]:
+    made = Server()
+    yield made
+    made.close()
 
 
-async def test_servers_description_is_read(server: RawServer) -> None:
+async def test_servers_description_is_read(server: Server) -> None:
     connection, _link = await server.serve()
     assert connection.description.type == ADD.type
     assert connection.description.md5sum == MD5
@@ -77,7 +76,7 @@ async def test_servers_description_is_read(server: RawServer) -> None:
     assert connection.closed
 
 
-async def test_a_reply_in_pieces(server: RawServer) -> None:
+async def test_a_reply_in_pieces(server: Server) -> None:
     connection, link = await server.serve()
     answer = asyncio.create_task(connection.call(b"12"))
     assert await link.message() == b"12"
@@ -90,7 +89,7 @@ async def test_a_reply_in_pieces(server: RawServer) -> None:
     connection.close()
 
 
-async def test_one_call_at_a_time(server: RawServer) -> None:
+async def test_one_call_at_a_time(server: Server) -> None:
     connection, link = await server.serve()
     answer = asyncio.create_task(connection.call(b"1"))
     assert await link.message() == b"1"
@@ -101,7 +100,7 @@ async def test_one_call_at_a_time(server: RawServer) -> None:
     connection.close()
 
 
-async def test_a_server_that_dies_in_the_middle_of_a_call(server: RawServer) -> None:
+async def test_a_server_that_dies_in_the_middle_of_a_call(server: Server) -> None:
     connection, link = await server.serve()
     answer = asyncio.create_task(connection.call(b"1"))
     assert await link.message() == b"1"
@@ -115,7 +114,7 @@ async def test_a_server_that_dies_in_the_middle_of_a_call(server: RawServer) -> 
     assert connection.closed
 
 
-async def test_server_that_closed_before_the_call_is_distinguished(server: RawServer) -> None:
+async def test_server_that_closed_before_the_call_is_distinguished(server: Server) -> None:
     told: list[bool] = []
     connection, link = await server.serve()
     connection._on_closed = lambda: told.append(True)
@@ -133,14 +132,14 @@ async def test_server_that_closed_before_the_call_is_distinguished(server: RawSe
     assert not error.value.sent
 
 
-async def test_a_late_answer_closes_the_connection(server: RawServer) -> None:
+async def test_a_late_answer_closes_the_connection(server: Server) -> None:
     connection, _link = await server.serve()
     with pytest.raises(ServiceFailed, match=r"no answer within 0\.02 s"):
         await connection.call(b"1", 0.02)
     assert connection.closed
 
 
-async def test_who_does_not_wait_for_the_answer_closes_the_connection(server: RawServer) -> None:
+async def test_who_does_not_wait_for_the_answer_closes_the_connection(server: Server) -> None:
     connection, link = await server.serve()
     answer = asyncio.create_task(connection.call(b"1"))
     assert await link.message() == b"1"
@@ -149,7 +148,7 @@ async def test_who_does_not_wait_for_the_answer_closes_the_connection(server: Ra
     assert await link.ended()
 
 
-async def test_close_fails_the_call(server: RawServer) -> None:
+async def test_close_fails_the_call(server: Server) -> None:
     connection, _link = await server.serve()
     answer = asyncio.create_task(connection.call(bytes(10_000_000)))
     await until(lambda: connection.busy)
@@ -158,28 +157,22 @@ async def test_close_fails_the_call(server: RawServer) -> None:
         await answer
 
 
-@pytest.mark.parametrize(
-    ("sent", "problem"),
-    [
-        (b"\x01\xff\xff\xff\xff", "broke the protocol: service response of 4294967295 bytes exceeds the limit"),
-    ],
-)
-async def test_a_server_that_breaks_the_protocol(server: RawServer, sent: bytes, problem: str) -> None:
+async def test_a_server_that_breaks_the_protocol(server: Server) -> None:
     connection, link = await server.serve()
     answer = asyncio.create_task(connection.call(b"1"))
     await link.message()
-    await link.send(sent)
-    with pytest.raises(ServiceFailed, match=problem):
+    await link.send(b"\x01\xff\xff\xff\xff")
+    with pytest.raises(ServiceFailed, match="broke the protocol: service response of 4294967295 bytes exceeds the"):
         await answer
 
 
-async def test_unrequested_bytes_break_the_protocol(server: RawServer) -> None:
+async def test_unrequested_bytes_break_the_protocol(server: Server) -> None:
     connection, link = await server.serve()
     await link.send(b"\x01\x00\x00\x00\x00")
     await until(lambda: connection.closed)
 
 
-async def test_refusals(server: RawServer) -> None:
+async def test_refusals(server: Server) -> None:
     with pytest.raises(PeerRefused, match="service /add: its server refused: no such service"):
         await server.serve({"error": "no such service"})
     with pytest.raises(PeerRefused, match="'md5sum' is missing"):
@@ -192,113 +185,57 @@ async def test_refusals(server: RawServer) -> None:
         await opening
 
 
-async def test_nobody_there() -> None:
-    with RawServer() as server:
-        with pytest.raises(
-            UnreachableError, match=r"no server of service /add answers at rosrpc://.* within 0\.05 s"
-        ):
-            await ServiceConnection.open(server.uri, "/add", "/c", timeout=0.05)
-        uri = server.uri
+async def test_nobody_there(server: Server) -> None:
+    with pytest.raises(UnreachableError, match=r"no server of service /add answers at rosrpc://.* within 0\.05 s"):
+        await ServiceConnection.open(server.uri, "/add", "/c", timeout=0.05)
+    server.close()
     with pytest.raises(UnreachableError, match="Connect call failed"):
-        await ServiceConnection.open(uri, "/add", "/c")
+        await ServiceConnection.open(server.uri, "/add", "/c")
 
 
-GET = ServiceDescription("roscpp/GetLoggers", "32e97e85527d4678a8f9279894bb64b0")
-
-
-HEADER = server_header("/talker", GET)
-
-
-SERVICE = "/talker/get_loggers"
-
-
-class Program:
-    """A program at a TCP port that is no part of rmpa."""
-
-    def __init__(self) -> None:
-        self._socket = socket.create_server(("127.0.0.1", 0))
-        self._socket.setblocking(False)
-        self.port: int = self._socket.getsockname()[1]
-        self.links: list[RawSubscriber] = []
-
-    async def accept(self) -> RawSubscriber:
-        """The next connection."""
-        async with asyncio.timeout(DEADLINE):
-            sock, _ = await asyncio.get_running_loop().sock_accept(self._socket)
-        sock.setblocking(False)
-        self.links.append(RawSubscriber(sock))
-        return self.links[-1]
-
-    async def asked(self, *answers: bytes, node: str = "/talker", close: bool = False) -> str:
-        """The result of a probe of this program, which sends these bytes behind the header that it gets."""
-        asking = asyncio.create_task(probe("127.0.0.1", self.port, SERVICE, timeout=DEADLINE, node=node))
-        link = await self.accept()
-        fields = await link.header()
-        assert fields == {"probe": "1", "service": SERVICE, "md5sum": "*", "callerid": "/rmpa"}
-        for answer in answers:
-            await link.send(answer)
-            await asyncio.sleep(0)
-        if close:
-            link.close()
-        return await asking
-
-    def close(self) -> None:
-        """Close the port and all connections."""
-        self._socket.close()
-        for link in self.links:
-            link.close()
-
-
-@pytest.fixture
-async def program() -> AsyncIterator[Program]:
-    made = Program()
-    yield made
-    made.close()
-
-
-async def test_an_answer_of_the_expected_node_is_a_success(program: Program) -> None:
+async def test_an_answer_of_the_expected_node_is_a_success(server: Server) -> None:
     answer = encode_header(HEADER)
-    assert await program.asked(answer) == ""
-    assert await program.asked(answer, node="") == "", "any node will do"
-    assert await program.asked(*(answer[at : at + 1] for at in range(len(answer)))) == ""
+    assert await server.asked(answer) == ""
+    assert await server.asked(answer, node="") == "", "any node will do"
+    assert await server.asked(*(answer[at : at + 1] for at in range(len(answer)))) == ""
     without_name = {key: value for key, value in HEADER.items() if key != "callerid"}
-    assert await program.asked(encode_header(without_name)) == ""
-    for link in program.links:
+    assert await server.asked(encode_header(without_name)) == ""
+    for link in server.links:
         assert await link.ended(), "the probe leaves nothing behind, and sends nothing more"
 
 
-async def test_another_node_at_that_port_is_a_failure(program: Program) -> None:
+async def test_another_node_at_that_port_is_a_failure(server: Server) -> None:
     answer = encode_header({**HEADER, "callerid": "/camera\n"})
-    assert await program.asked(answer) == "another node listens there: /camera�"
+    assert await server.asked(answer) == "another node listens there: /camera�"
 
 
-async def test_an_error_counts_only_if_it_names_the_node(program: Program) -> None:
+async def test_an_error_counts_only_if_it_names_the_node(server: Server) -> None:
     of_rospy = "[{}] is not a provider of  [/talker/get_loggers]"
     of_roscpp = "received a tcpros connection for a nonexistent service [/talker/get_loggers]."
-    assert await program.asked(encode_header(error_header(of_rospy.format("/talker")))) == ""
-    assert await program.asked(encode_header({**error_header(of_roscpp), "callerid": "/talker"})) == ""
+    assert await server.asked(encode_header(error_header(of_rospy.format("/talker")))) == ""
+    assert await server.asked(encode_header({**error_header(of_roscpp), "callerid": "/talker"})) == ""
     for text in (of_rospy.format("/talker2"), of_roscpp):
-        problem = await program.asked(encode_header(error_header(text)))
+        problem = await server.asked(encode_header(error_header(text)))
         assert problem == f"a ROS node listens there, but not the expected one: {text}"
-    assert "not the expected one" in await program.asked(encode_header(error_header(of_roscpp)), node="")
+    assert "not the expected one" in await server.asked(encode_header(error_header(of_roscpp)), node="")
 
 
-async def test_what_is_no_ros_node_is_a_failure(program: Program) -> None:
+async def test_what_is_no_ros_node_is_a_failure(server: Server) -> None:
     no_node = "the program that listens there is no ROS node"
-    assert await program.asked(b"HTTP/1.1 400 Bad Request\r\n\r\n") == no_node
-    assert await program.asked(b"\x05\0\0\0\x01\0\0\0x") == no_node
-    assert "closed the connection without an answer" in await program.asked(b"\x05\0", close=True)
+    assert await server.asked(b"HTTP/1.1 400 Bad Request\r\n\r\n") == no_node
+    assert await server.asked(b"\x05\0\0\0\x01\0\0\0x") == no_node
+    assert "closed the connection without an answer" in await server.asked(b"\x05\0", close=True)
 
 
-async def test_silence_ends_with_the_timeout(program: Program) -> None:
-    assert await probe("127.0.0.1", program.port, SERVICE, timeout=0.1) == "connected, but no answer within 0.1 s"
-    assert await (await program.accept()).header(), "its header was sent all the same"
+async def test_silence_ends_with_the_timeout(server: Server) -> None:
+    assert await probe("127.0.0.1", server.port, SERVICE, timeout=0.1) == "connected, but no answer within 0.1 s"
+    assert await (await server.accept()).header(), "its header was sent all the same"
 
 
-async def test_a_port_where_nothing_listens(program: Program) -> None:
-    program.close()
-    assert await probe("127.0.0.1", program.port, SERVICE, timeout=DEADLINE) == "connection refused"
-    assert await probe("127.0.0.1", program.port, "", timeout=DEADLINE) == "connection refused"
+async def test_a_port_where_nothing_listens(server: Server) -> None:
+    server.close()
+    assert await probe("127.0.0.1", server.port, SERVICE, timeout=DEADLINE) == "connection refused"
+    assert await probe("127.0.0.1", server.port, "", timeout=DEADLINE) == "connection refused"
 
 
 @pytest.mark.parametrize(
@@ -307,32 +244,28 @@ async def test_a_port_where_nothing_listens(program: Program) -> None:
         (OSError(errno.EHOSTUNREACH, "x"), "no route to host"),
         (OSError(errno.ENETUNREACH, "x"), "network is unreachable"),
         (OSError("odd"), "odd"),
+        (None, "no answer within 0.05 s"),
     ],
 )
-async def test_reasons_are_those_of_the_network(monkeypatch: pytest.MonkeyPatch, error: OSError, reason: str) -> None:
-    async def fail(*_: object) -> socket.socket:
-        raise error
+async def test_reasons_are_those_of_the_network(
+    monkeypatch: pytest.MonkeyPatch, error: OSError | None, reason: str
+) -> None:
+    async def connect(*_: object) -> socket.socket:
+        if error is None:
+            await asyncio.Event().wait()
+        raise error or AssertionError
 
-    monkeypatch.setattr(module, "connect", fail)
-    assert await probe("192.0.2.1", 1, SERVICE, timeout=DEADLINE) == reason
-
-
-async def test_a_host_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def hang(*_: object) -> socket.socket:
-        await asyncio.Event().wait()
-        raise AssertionError
-
-    monkeypatch.setattr(module, "connect", hang)
-    assert await probe("192.0.2.1", 1, SERVICE, timeout=0.05) == "no answer within 0.05 s"
+    monkeypatch.setattr(module, "connect", connect)
+    assert await probe("192.0.2.1", 1, SERVICE, timeout=0.05) == reason
 
 
 async def test_a_name_that_does_not_resolve_is_a_reason() -> None:
     assert "does not resolve here" in await probe("no-such-host.invalid", 1, SERVICE, timeout=DEADLINE)
 
 
-async def test_without_a_service_a_connection_is_enough(program: Program) -> None:
-    assert await probe("127.0.0.1", program.port, "", timeout=DEADLINE) == ""
-    assert await (await program.accept()).ended()
+async def test_without_a_service_a_connection_is_enough(server: Server) -> None:
+    assert await probe("127.0.0.1", server.port, "", timeout=DEADLINE) == ""
+    assert await (await server.accept()).ended()
 
 
 async def test_a_node_of_ours_answers() -> None:
@@ -350,7 +283,7 @@ async def test_a_node_of_ours_answers() -> None:
         await node.close()
 
 
-async def test_the_last_file_descriptors_are_not_taken(program: Program) -> None:
+async def test_the_last_file_descriptors_are_not_taken(server: Server) -> None:
     with descriptors_left(limits.DESCRIPTORS_RESERVED):
-        problem = await probe("127.0.0.1", program.port, SERVICE, timeout=DEADLINE)
+        problem = await probe("127.0.0.1", server.port, SERVICE, timeout=DEADLINE)
     assert problem == "no file descriptor is left for the attempt; `rmpa doctor` says what to do"

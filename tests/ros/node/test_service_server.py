@@ -3,7 +3,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import struct
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -12,11 +12,10 @@ from rmpa.ros import limits
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.wire.tcpros import ServiceDescription, encode_header
+from rmpa.ros.wire.tcpros import ServiceDescription, encode_header, server_header
 from tests.ros.node.peers import DEADLINE, RawSubscriber, until
 
 if TYPE_CHECKING:
-    import socket
     from collections.abc import AsyncIterator, Mapping
 
 MD5 = "6a2e34150c00229791cc89ff309fff21"
@@ -28,8 +27,8 @@ async def node() -> AsyncIterator[SlaveNode]:
     made = SlaveNode("/server", "127.0.0.1", "http://127.0.0.1:11311/")
     await made.start()
     yield made
-    while RawClient.made:
-        RawClient.made.pop().close()
+    while OPENED:
+        OPENED.pop().close()
     await made.close()
 
 
@@ -52,18 +51,18 @@ def serve(node: SlaveNode, *args: object, **kwargs: object) -> ServiceEndpoint:
 class RawClient(RawSubscriber):
     """A bare client."""
 
-    made: ClassVar[list[RawClient]] = []
-
-    def __init__(self, sock: socket.socket) -> None:
-        super().__init__(sock)
-        self.made.append(self)
-
     @classmethod
     async def call(cls, node: SlaveNode, **fields: str) -> RawClient:
         """Connect and send a header."""
-        address = ("127.0.0.1", int(node.service_uri.rpartition(":")[2]))
         header = {"topic": "", "type": "", "service": "/add", "md5sum": "*", **fields}
-        return await cls.connect(address, buffer=0, **header)
+        return await cls.connect(address_of(node), buffer=0, **header)
+
+    @classmethod
+    async def early(cls, node: SlaveNode, md5sum: str = MD5, *, buffer: int = 0, **fields: str) -> RawClient:
+        """Connect and send header and request at once."""
+        made = await cls.dial(address_of(node), buffer=buffer)
+        await made.send(encode_header({"service": "/add", "callerid": "/c", "md5sum": md5sum, **fields}) + TWO)
+        return made
 
     async def reply(self) -> tuple[int, bytes]:
         """The next reply."""
@@ -74,6 +73,11 @@ class RawClient(RawSubscriber):
         return ok, body
 
 
+def address_of(node: SlaveNode) -> tuple[str, int]:
+    """Where the node's services are."""
+    return "127.0.0.1", int(node.service_uri.rpartition(":")[2])
+
+
 def framed(body: bytes) -> bytes:
     return struct.pack("<I", len(body)) + body
 
@@ -82,21 +86,23 @@ TWO = framed(struct.pack("<qq", 20, 22))
 FORTY_TWO = (1, struct.pack("<q", 42))
 
 
+OPENED: list[ServiceConnection] = []
+
+
+async def connect(node: SlaveNode, caller: str = "/c", service: str = "/add") -> ServiceConnection:
+    """A connection of ours, which ends with the test."""
+    OPENED.append(await ServiceConnection.open(node.service_uri, service, caller))
+    return OPENED[-1]
+
+
 async def test_a_call_is_answered_and_the_connection_closed(node: SlaveNode) -> None:
     endpoint = serve(node, add)
     client = await RawClient.call(node)
     header = await client.header()
-    assert header == {
-        "callerid": "/server",
-        "md5sum": MD5,
-        "request_type": "rospy_tutorials/AddTwoIntsRequest",
-        "response_type": "rospy_tutorials/AddTwoIntsResponse",
-        "type": "rospy_tutorials/AddTwoInts",
-    }
+    assert header == server_header("/server", ADD)
     await client.send(TWO)
     assert await client.reply() == FORTY_TWO
     assert await client.ended()
-    client.close()
     assert (endpoint.calls, endpoint.failed, len(endpoint._clients)) == (1, 0, 0)
 
 
@@ -121,10 +127,7 @@ async def test_byte_by_byte_and_all_in_one_segment(node: SlaveNode) -> None:
     assert await client.reply() == FORTY_TWO
     await client.send(TWO * 3)  # no client of ROS does so: each is answered, in order
     assert [await client.reply() for _ in range(3)] == [FORTY_TWO] * 3
-    client.close()
-    hasty = await RawClient.dial(("127.0.0.1", int(node.service_uri.rpartition(":")[2])))
-    header = {"service": "/add", "callerid": "/c", "md5sum": MD5}
-    await hasty.send(encode_header(header) + TWO)
+    hasty = await RawClient.early(node)
     await hasty.header()
     assert await hasty.reply() == FORTY_TWO
 
@@ -139,16 +142,12 @@ async def test_a_request_that_came_before_the_description_waits_for_it(node: Sla
         return await asyncio.shield(known)
 
     serve(node, add, describe, description=None)
-    address = ("127.0.0.1", int(node.service_uri.rpartition(":")[2]))
-    clients = [await RawClient.dial(address) for _ in range(3)]
-    for client in clients:
-        await client.send(encode_header({"service": "/add", "callerid": "/c", "md5sum": MD5}) + TWO)
+    clients = [await RawClient.early(node) for _ in range(3)]
     await until(lambda: asked)
     known.set_result(ADD)
     for client in clients:
         assert (await client.header())["type"] == ADD.type
         assert await client.reply() == FORTY_TWO
-        client.close()
     assert asked == 1
 
 
@@ -208,7 +207,6 @@ async def test_a_refused_description_is_asked_for_again(node: SlaveNode) -> None
     client = await RawClient.call(node)
     assert await client.header() == {"error": "the peer is away"}
     assert await client.ended()
-    client.close()
     client = await RawClient.call(node)
     assert (await client.header())["md5sum"] == MD5
 
@@ -253,15 +251,14 @@ async def test_an_unknown_service_is_a_clear_error(node: SlaveNode) -> None:
     with pytest.raises(
         PeerRefused, match=r"service /none: its server refused: \[/server\] does not offer .*\[/none\]"
     ):
-        await ServiceConnection.open(node.service_uri, "/none", "/c")
+        await connect(node, service="/none")
 
 
 async def test_the_servers_own_error_text_comes_through(node: SlaveNode) -> None:
     endpoint = serve(node, lambda call: call.reply(False, b"division by zero"))
-    connection = await ServiceConnection.open(node.service_uri, "/add", "/c")
+    connection = await connect(node)
     assert await connection.call(b"") == (False, b"division by zero")
     assert await connection.call(b"") == (False, b"division by zero")  # an error ends the call, not the connection
-    connection.close()
     assert (endpoint.calls, endpoint.failed) == (2, 2)
 
 
@@ -272,27 +269,24 @@ async def test_a_server_that_raises_is_an_error_to_the_client(
         raise RmpaError("no link to base") if call.request else ZeroDivisionError
 
     serve(node, fails)
-    connection = await ServiceConnection.open(node.service_uri, "/add", "/c")
+    connection = await connect(node)
     assert await connection.call(b"1") == (False, b"no link to base")
     assert not caplog.records
     ok, text = await connection.call(b"")
     assert (ok, text) == (False, b"service [/add]: [/server] failed at this call; its log says why")
     assert "ZeroDivisionError" in caplog.text
-    connection.close()
 
 
 async def test_many_connections_are_served_at_once(node: SlaveNode) -> None:
     calls: list[ServiceCall] = []
     serve(node, calls.append)
-    connections = [await ServiceConnection.open(node.service_uri, "/add", f"/c{i}") for i in range(50)]
+    connections = [await connect(node, f"/c{i}") for i in range(50)]
     answers = [asyncio.create_task(c.call(struct.pack("<q", i))) for i, c in enumerate(connections)]
     await until(lambda: len(calls) == 50)
     for call in reversed(calls):
         call.reply(True, call.request + call.caller_id.encode())
     for i, answer in enumerate(answers):
         assert await answer == (True, struct.pack("<q", i) + f"/c{i}".encode())
-    for connection in connections:
-        connection.close()
 
 
 async def test_the_deadline_answers_for_a_silent_server(node: SlaveNode) -> None:
@@ -304,13 +298,12 @@ async def test_the_deadline_answers_for_a_silent_server(node: SlaveNode) -> None
         calls.append(call)
 
     endpoint = serve(node, silent, timeout=0.05)
-    connection = await ServiceConnection.open(node.service_uri, "/add", "/c")
+    connection = await connect(node)
     assert await connection.call(b"1") == (False, b"service [/add] did not answer within 0.05 s")
     assert gone == [True]
     calls[0].reply(True, b"late")  # must not become the answer to the next call
     endpoint.serve = echo
     assert await connection.call(b"2") == (True, b"2")
-    connection.close()
     assert (endpoint.calls, endpoint.failed) == (2, 1)
 
 
@@ -335,13 +328,12 @@ async def test_a_client_that_leaves_in_the_middle_of_a_call_ends_it(node: SlaveN
 @pytest.mark.parametrize("size", [0, 65_536, 65_537, 300_000, 5_000_000])
 async def test_bodies_of_every_size_come_back(node: SlaveNode, size: int) -> None:
     serve(node, echo)
-    connection = await ServiceConnection.open(node.service_uri, "/add", "/c")
+    connection = await connect(node)
     body = bytes(range(251)) * (size // 251 + 1)
     for end in (size, size // 2):
         ok, answer = await connection.call(body[:end], DEADLINE)
         assert ok
         assert answer == body[:end]
-    connection.close()
 
 
 async def test_oversized_request_is_refused_and_connection_goes_on(
@@ -355,21 +347,18 @@ async def test_oversized_request_is_refused_and_connection_goes_on(
     text = b"request of 300000 bytes to service [/add] exceeds the limit of 100000"
     assert await client.reply() == (0, text)
     assert await client.reply() == FORTY_TWO
-    client.close()
     assert (endpoint.calls, endpoint.failed) == (2, 1)
     once = await RawClient.call(node)
     await once.header()
     await once.send(framed(bytes(300_000)))
     assert await once.reply() == (0, text)
     assert await once.ended()
-    once.close()
     endpoint.serve = lambda call: call.reply(True, bytes(100_001))
-    connection = await ServiceConnection.open(node.service_uri, "/add", "/c")
+    connection = await connect(node)
     ok, answer = await connection.call(b"")
     assert (ok, answer) == (False, b"response of 100001 bytes of service [/add] exceeds the limit of 100000")
     with pytest.raises(ServiceFailed, match="request of 100001 bytes exceeds the limit of 100000"):
         await connection.call(bytes(100_001))
-    connection.close()
 
 
 async def test_a_client_that_sends_ahead_without_end_is_closed(
@@ -383,7 +372,6 @@ async def test_a_client_that_sends_ahead_without_end_is_closed(
         async with asyncio.timeout(DEADLINE):
             while True:
                 await client.send(TWO * 1000)
-    client.close()
     assert "/flood: what was sent ahead of a reply" in caplog.text
 
 
@@ -405,11 +393,9 @@ async def test_a_silent_client_is_closed(node: SlaveNode, monkeypatch: pytest.Mo
 
 async def test_a_client_that_does_not_read_is_served_no_further(node: SlaveNode) -> None:
     endpoint = serve(node, lambda call: call.reply(True, bytes(200_000)))
-    address = ("127.0.0.1", int(node.service_uri.rpartition(":")[2]))
-    client = await RawClient.dial(address, buffer=4096)
-    await client.send(encode_header({"service": "/add", "callerid": "/c", "md5sum": "*", "persistent": "1"}))
+    client = await RawClient.early(node, "*", buffer=4096, persistent="1")
     await client.header()
-    await client.send(TWO * 500)
+    await client.send(TWO * 499)
     calls = -1
     while calls != endpoint.calls:
         calls = endpoint.calls
@@ -436,7 +422,7 @@ async def test_withdrawn_service_answers_waiting_clients(node: SlaveNode) -> Non
     assert await idle.ended()
     assert gone == [True]
     with pytest.raises(PeerRefused, match="does not offer the service"):
-        await ServiceConnection.open(node.service_uri, "/add", "/c")
+        await connect(node)
 
 
 async def test_a_node_that_ends_answers_what_is_under_way() -> None:
@@ -444,29 +430,25 @@ async def test_a_node_that_ends_answers_what_is_under_way() -> None:
     await node.start()
     large = bytes(3_000_000)
     endpoint = serve(node, lambda call: call.reply(True, large) if call.request else None)
-    busy = await ServiceConnection.open(node.service_uri, "/add", "/c")
-    reading = await ServiceConnection.open(node.service_uri, "/add", "/c")
+    busy = await connect(node)
+    reading = await connect(node)
     answers = [asyncio.create_task(busy.call(b"")), asyncio.create_task(reading.call(b"1"))]
     await until(lambda: endpoint.calls == 2)
     await node.close()
     assert await answers[0] == (False, b"service [/add] is no longer offered by [/server]")
     assert await answers[1] == (True, large)
-    busy.close()
-    reading.close()
 
 
 async def test_junk_instead_of_a_request_harms_no_other(node: SlaveNode) -> None:
     serve(node, echo)
-    good = await ServiceConnection.open(node.service_uri, "/add", "/c")
+    good = await connect(node)
     junk = await RawClient.call(node)
     await junk.header()
     await junk.send(b"GET / HTTP/1.0\r\n\r\n")  # a length of 542 MB
     ok, text = await junk.reply()
     assert not ok
     assert b"exceeds the limit" in text
-    junk.close()
     assert await good.call(b"x") == (True, b"x")
-    good.close()
 
 
 async def test_the_server_that_does_not_speak_is_an_error() -> None:

@@ -6,11 +6,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import StartError
-from rmpa.ros.http.rpc import call, call_api
+from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.node.subscription import Subscription
-from rmpa.ros.wire.tcpros import frame_message
 from rmpa.ros.wire.xmlrpc import RosReply
 from tests.ros.node.peers import STRING, RawSubscriber, until
 
@@ -24,25 +22,6 @@ async def node() -> AsyncIterator[SlaveNode]:
     await made.start()
     yield made
     await made.close()
-
-
-async def test_a_topic_is_found_and_served(node: SlaveNode) -> None:
-    publication = Publication("/t", "/p", STRING)
-    node.add_publication(publication)
-    reply = await call_api(node.uri, "requestTopic", "/s", "/t", [["UDPROS"], ["TCPROS"]])
-    assert reply.code == 1
-    assert isinstance(reply.value, list)
-    protocol, host, port = reply.value
-    assert (protocol, host) == ("TCPROS", "127.0.0.1")
-    assert isinstance(port, int)
-    link = await RawSubscriber.connect(("127.0.0.1", port))
-    await link.header()
-    assert await call(node.uri, "getBusInfo", "/s") == [
-        1,
-        "bus info",
-        [[1, "/s", "o", "TCPROS", "/t", True, publication.connections()[0].info]],
-    ]
-    link.close()
 
 
 async def test_the_uri_bears_the_advertised_host() -> None:
@@ -63,44 +42,6 @@ async def test_a_removed_topic_is_closed_and_unknown(node: SlaveNode) -> None:
     node.remove_publication("/t")
     assert await link.ended()
     assert (await call_api(node.uri, "requestTopic", "/s", "/t", [["TCPROS"]])).code == -1
-    link.close()
-
-
-async def test_updates_reach_subscriptions_and_owner() -> None:
-    told: list[object] = []
-
-    def follow(key: str, value: object) -> bool:
-        told.append((key, value))
-        return True
-
-    node = SlaveNode(
-        "/s",
-        "127.0.0.1",
-        "",
-        on_shutdown=told.append,
-        on_param_update=follow,
-    )
-    source = SlaveNode("/p", "127.0.0.1", "")
-    await node.start()
-    await source.start()
-    publication = Publication("/t", "/p", STRING)
-    source.add_publication(publication)
-    got: list[bytes] = []
-    subscription = Subscription("/t", "/s", on_message=lambda _, framed: got.append(bytes(framed)))
-    node.add_subscription(subscription)
-    await call(node.uri, "publisherUpdate", "/master", "/t", [source.uri])
-    await until(lambda: publication.subscribers)
-    publication.publish_framed(frame_message(b"hello"))
-    await until(lambda: got == [b"\x05\x00\x00\x00hello"])
-    assert node.subscriptions() == {"/t": "*"}
-    assert [c.direction for c in node.connections()] == ["i"]
-    assert await call(node.uri, "paramUpdate", "/master", "/a/", 1) == [1, "", 0]
-    assert await call(node.uri, "shutdown", "/master", "replaced") == [1, "shutdown", 0]
-    assert told == [("/a", 1), "replaced"]
-    node.remove_subscription(subscription)
-    await until(lambda: not publication.subscribers)
-    await node.close()
-    await source.close()
 
 
 async def test_two_hundred_nodes_in_one_process() -> None:

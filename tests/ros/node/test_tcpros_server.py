@@ -57,7 +57,6 @@ async def test_a_header_may_come_byte_by_byte(served: Served) -> None:
     for byte in encode_header({"topic": "/t", "callerid": "/s", "md5sum": "*"}):
         await link.send(bytes([byte]))
     assert (await link.header())["callerid"] == "/p"
-    link.close()
 
 
 @pytest.mark.trap(4, 5, 23)
@@ -76,7 +75,6 @@ async def test_what_is_refused(served: Served, fields: dict[str, str], error: st
     link = await RawSubscriber.connect(served.server.address, buffer=0, **fields)
     assert await link.header() == {"error": error}
     assert await link.ended()
-    link.close()
 
 
 @pytest.mark.trap(6, 7)
@@ -99,7 +97,6 @@ async def test_malformed_headers_are_counted_and_closed(
     assert await link.ended()
     await until(lambda: served.counters["tcpros.refused.malformed"] == 1)
     assert "a connection from 127.0.0.1" in caplog.text
-    link.close()
 
 
 @pytest.mark.trap(7)
@@ -107,7 +104,6 @@ async def test_an_empty_header_is_refused_instead_of_held(served: Served) -> Non
     link = await RawSubscriber.dial(served.server.address)
     await link.send(bytes(4))
     assert "error" in await link.header()
-    link.close()
 
 
 @pytest.mark.trap("16a")
@@ -134,8 +130,6 @@ async def test_silent_connection_blocks_no_other_and_is_closed(
     assert await silent.ended()
     assert served.counters["tcpros.refused.silent"] == 1
     assert served.publication.subscribers == 1
-    silent.close()
-    other.close()
 
 
 async def test_connections_without_a_header_are_bounded(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,7 +168,6 @@ async def test_an_address_in_use_is_a_clear_error(served: Served) -> None:
 async def test_a_subscriber_may_or_may_not_send_its_definition(served: Served, definition: str) -> None:
     link = await RawSubscriber.connect(served.server.address, message_definition=definition)
     assert (await link.header())["message_definition"] == "string data\n"
-    link.close()
 
 
 @pytest.mark.trap(8)
@@ -185,7 +178,6 @@ async def test_what_comes_in_one_segment_with_the_header_does_no_harm(served: Se
     assert (await link.header())["callerid"] == "/p"
     served.publication.publish_framed(frame_message(b"served"))
     assert await link.message() == b"served"
-    link.close()
 
 
 @pytest.mark.trap(23)
@@ -200,7 +192,6 @@ async def test_a_probe_for_a_service_that_is_gone_is_answered_and_not_logged(
     patient = await RawSubscriber.connect(served.server.address, buffer=0, **probe)
     assert await patient.header() == {"error": "[/p] does not offer the service [/add]"}
     assert await patient.ended()
-    patient.close()
     await until(lambda: not served.server._waiting)
     assert served.counters.as_dict() == {}
     assert caplog.records == []
@@ -235,11 +226,7 @@ def listening() -> int:
 
 async def connect(address: tuple[str, int]) -> str:
     """Subscribe to /t at an address; who answers."""
-    link = await RawSubscriber.connect(address)
-    try:
-        return (await link.header())["callerid"]
-    finally:
-        link.close()
+    return (await (await RawSubscriber.connect(address)).header())["callerid"]
 
 
 async def request_topic(uri: str) -> XmlRpcValue:
@@ -300,8 +287,6 @@ async def test_open_connections_end_with_their_node_and_no_other(listener: Share
     assert await links[0].ended()
     other._publications["/t"].publish_framed(b"\x02\0\0\0hi")
     assert await links[1].message() == b"hi"
-    for link in links:
-        link.close()
     await other.close()
 
 
@@ -325,7 +310,6 @@ async def test_a_call_under_way_when_its_node_closes_is_not_left_open(listener: 
     await until(lambda: made._http._arriving or made._http._connections)
     await made.close()
     assert await link.ended()
-    link.close()
 
 
 async def test_missing_right_to_bind_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -146,21 +146,6 @@ def test_a_connection_is_read_as_far_as_it_can_be(written: XmlRpcValue, read: li
     assert read_bus_info([1, "", [5, written, None, row(number=8)]]) == [*read, link(number=8)]
 
 
-SCALARS = (
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary() | st.sampled_from(["i", "o"])
-)
-VALUES: st.SearchStrategy[XmlRpcValue] = st.recursive(
-    SCALARS, lambda inner: st.lists(inner, max_size=8) | st.dictionaries(st.text(), inner, max_size=3)
-)
-
-
-@given(VALUES)
-def test_whatever_is_answered_is_read(answer: XmlRpcValue) -> None:
-    for found in read_bus_info(answer):
-        assert found.local_port is None or 0 < found.local_port < 65536
-        assert found.remote is None or 0 < found.remote[1] < 65536
-
-
 HOSTS = st.from_regex(r"[a-z0-9.:-]{1,30}[a-z0-9]", fullmatch=True)
 PORTS = st.integers(1, 65535)
 

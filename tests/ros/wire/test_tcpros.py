@@ -23,7 +23,6 @@ from rmpa.ros.wire.tcpros import (
     client_header,
     decode_header,
     encode_header,
-    error_header,
     frame_message,
     frame_reply,
     is_persistent,
@@ -88,16 +87,6 @@ def test_any_header_survives_the_wire(fields: dict[str, str]) -> None:
     assert parse_header(wire) == (fields, len(wire), 4)
 
 
-@given(st.binary(max_size=200))
-def test_arbitrary_bytes_are_a_header_or_an_error(data: bytes) -> None:
-    try:
-        fields = decode_header(data)
-    except RemoteProtocolError:
-        return
-    again = decode_header(encode_header(fields)[4:])
-    assert again == fields
-
-
 @pytest.mark.trap(7)
 def test_a_value_may_hold_equal_signs() -> None:
     assert decode_header(header(b"message_definition=int32 X=1\n")[4:]) == {"message_definition": "int32 X=1\n"}
@@ -145,15 +134,6 @@ def test_a_header_of_half_a_gigabyte_is_refused_from_its_length_alone() -> None:
 
 def test_an_empty_header_has_no_fields() -> None:
     assert parse_header(bytes(4)) == ({}, 4, 4)
-
-
-@given(st.lists(st.binary(max_size=20), max_size=8), st.integers(0, 200))
-def test_messages_come_out_however_the_stream_is_cut(payloads: list[bytes], cut: int) -> None:
-    wire = b"".join(map(frame_message, payloads))
-    first, consumed, wanted = split_messages(memoryview(wire[:cut]))
-    rest, _, _ = split_messages(memoryview(wire[consumed:]))
-    assert [bytes(m[4:]) for m in (*first, *rest)] == payloads
-    assert cut >= len(wire) or wanted > min(cut, len(wire)) - consumed
 
 
 def test_a_message_beyond_the_limit_is_refused_behind_those_before_it() -> None:
@@ -259,10 +239,6 @@ def test_requests_for_services_may_be_answered() -> None:
 
 def test_what_a_peer_sends_is_safe_to_print() -> None:
     assert printable("a\nb\x1b\udcff" + "x" * 300) == "a�b��" + "x" * 195 + "…"
-
-
-def test_the_error_header_has_one_field() -> None:
-    assert error_header("no") == {"error": "no"}
 
 
 SERVICE_MD5 = "6a2e34150c00229791cc89ff309fff21"
