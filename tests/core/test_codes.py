@@ -19,32 +19,28 @@ from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 SRC = Path(rmpa.__path__[0])
 CODES = codes.texts()
 TREES = {path.relative_to(SRC): ast.parse(path.read_text()) for path in sorted(SRC.rglob("*.py"))}
-# The constant texts that variables are set to, by module and name.
+# All calls, and the constant texts that variables are set to, by module and name.
+CALLS: list[tuple[Path, ast.Call]] = []
 VARIABLES: dict[tuple[Path, str], list[str]] = {}
 for file, tree in TREES.items():
     for each in ast.walk(tree):
-        target = (
-            each.targets[0]
-            if isinstance(each, ast.Assign)
-            else each.target
-            if isinstance(each, ast.AnnAssign)
-            else None
-        )
-        if isinstance(target, ast.Name) and isinstance(each.value, ast.Constant):  # type: ignore[attr-defined]
-            VARIABLES.setdefault((file, target.id), []).append(str(each.value.value))  # type: ignore[attr-defined]
+        if isinstance(each, ast.Call):
+            CALLS.append((file, each))
+        if isinstance(each, ast.Assign | ast.AnnAssign) and isinstance(each.value, ast.Constant):
+            target = each.targets[0] if isinstance(each, ast.Assign) else each.target
+            if isinstance(target, ast.Name):
+                VARIABLES.setdefault((file, target.id), []).append(str(each.value.value))
 # Methods that take the name of a counter first, or second behind the time.
 REFUSALS = {"refuse", "warn", "_on_warning", "_refuse"}
 
 
 def calls(*names: str) -> Iterator[tuple[Path, ast.Call, str]]:
     """All calls of methods or functions of these names, each with what it is called on."""
-    for path, tree in TREES.items():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Call):
-                of = node.func
-                name = of.attr if isinstance(of, ast.Attribute) else of.id if isinstance(of, ast.Name) else ""
-                if name in names:
-                    yield path, node, ast.unparse(of.value) if isinstance(of, ast.Attribute) else ""
+    for path, node in CALLS:
+        of = node.func
+        name = of.attr if isinstance(of, ast.Attribute) else of.id if isinstance(of, ast.Name) else ""
+        if name in names:
+            yield path, node, ast.unparse(of.value) if isinstance(of, ast.Attribute) else ""
 
 
 def texts(path: Path, node: ast.expr) -> list[str]:
@@ -127,9 +123,7 @@ def test_each_error_has_a_code_of_the_table() -> None:
     assert not {kind.__name__ for kind in kinds if kind.code not in CODES and kind.code}
     given = {
         str(keyword.value.value)
-        for tree in TREES.values()
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Call)
+        for _, node in CALLS
         for keyword in node.keywords
         if keyword.arg == "code" and isinstance(keyword.value, ast.Constant) and isinstance(keyword.value.value, str)
     }

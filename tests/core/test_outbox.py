@@ -9,7 +9,6 @@ import time
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST, Outbox, QueuedMessage
 
@@ -75,6 +74,8 @@ def test_out_of_turn_is_our_own_fault() -> None:
     box.push(b"x", 1)
     with pytest.raises(LocalProtocolError):
         box.push_rest(b"y", 1)
+    with pytest.raises(LocalProtocolError, match="9 bytes"):
+        box.extend(QueuedMessage(2, 9), bytes(10))
 
 
 def test_clear_lets_go_and_keeps_the_counts() -> None:
@@ -98,25 +99,8 @@ def flags_of(parcel: QueuedMessage, length: int, flags: int) -> bytes:
     return f"<{parcel.key}:{length}{letters}>".encode()
 
 
-def framed(**bounds: int) -> Outbox:
-    return Outbox(bounds.get("entries", 10), bounds.get("max_bytes", 1000), frame=flags_of, fragment=4)
-
-
-def test_message_without_bytes_does_not_block_others() -> None:
-    box = framed()
-    growing = QueuedMessage(1, 9)
-    box.extend(growing, b"abc")
-    assert drain(box) == b"<1:3F>abc"
-    assert not box
-    box.push(b"other", 2)
-    box.push(b"later", 1)
-    assert drain(box) == b"other", "the next of its key waits for the rest"
-    with pytest.raises(LocalProtocolError, match="9 bytes"):
-        box.extend(growing, b"defghij")
-
-
 def test_small_pieces_are_joined_into_full_fragments() -> None:
-    box = framed()
+    box = Outbox(10, 1000, frame=flags_of, fragment=4)
     parcel = QueuedMessage(1, 10)
     for byte in b"0123456789":
         box.extend(parcel, bytes([byte]))
@@ -140,49 +124,6 @@ def test_without_a_framer_nobody_can_be_told() -> None:
     drain(box)
     assert box.abandon(parcel) is True
     assert box.abandon(parcel) is False
-
-
-# --- terms of a key -----------------------------------------------------------------------------------------------
-
-
-def test_expired_entries_are_dropped_but_the_newest_is_sent() -> None:
-    box = Outbox(10, 1000)
-    box.set_terms(1, 10, 0.5)
-    for tenth in range(4):
-        box.push(b"%d" % tenth, 1, now=1.0 + tenth / 10)
-    assert b"".join(box.head(now=1.55)) == b"123"
-    box.push(b"x", 2, now=9.0)
-    box.clear()
-    for tenth in range(4):
-        box.push(b"%d" % tenth, 1, now=1.0 + tenth / 10)
-    assert b"".join(box.head(now=99.0)) == b"3"
-    assert box.expired == {1: 4}
-    assert not box.dropped
-
-
-# --- another connection -------------------------------------------------------------------------------------------
-
-
-def test_reset_drops_begun_entries_and_keeps_the_rest(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(limits, "COMMIT_BYTES", 1)
-    box = framed()
-    torn, whole = QueuedMessage(1, 8), QueuedMessage(2, 8)
-    box.extend(torn, b"01234567")
-    box.head()
-    box.extend(whole, b"abcdefgh")
-    box.push(b"one", 1)
-    box.push(b"[]", 2, pinned=True)
-    box.push_urgent(b"bye of the old one")
-    box.consumed(3)
-    assert box.reset() == 1
-    assert torn.dropped
-    assert not whole.dropped
-    assert box.pending_bytes == len(b"one") + len(b"abcdefgh") + len(b"[]")
-    box.prepend(b"hello ")
-    assert drain(box) in (b"hello <2:4F>abcdone<2:4L>efgh[]", b"hello one<2:4F>abcd<2:4L>efgh[]")
-    assert box.reset() == 0
 
 
 def test_a_spared_key_loses_nothing_to_the_bound_of_all_keys() -> None:

@@ -41,6 +41,18 @@ def echo(call: ServiceCall) -> None:
     call.reply(True, call.request)
 
 
+class Later:
+    """Describes the service when ``known`` is set."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+        self.known: asyncio.Future[ServiceDescription | str] = asyncio.get_running_loop().create_future()
+
+    async def __call__(self) -> ServiceDescription | str:
+        self.asked += 1
+        return await asyncio.shield(self.known)
+
+
 def serve(node: SlaveNode, *args: object, **kwargs: object) -> ServiceEndpoint:
     kwargs.setdefault("description", ADD)
     endpoint = ServiceEndpoint("/add", "/server", *args, **kwargs)  # type: ignore[arg-type] # handed through
@@ -133,34 +145,21 @@ async def test_byte_by_byte_and_all_in_one_segment(node: SlaveNode) -> None:
 
 
 async def test_a_request_that_came_before_the_description_waits_for_it(node: SlaveNode) -> None:
-    asked = 0
-    known: asyncio.Future[ServiceDescription | str] = asyncio.get_running_loop().create_future()
-
-    async def describe() -> ServiceDescription | str:
-        nonlocal asked
-        asked += 1
-        return await asyncio.shield(known)
-
-    serve(node, add, describe, description=None)
+    serve(node, add, later := Later(), description=None)
     clients = [await RawClient.early(node) for _ in range(3)]
-    await until(lambda: asked)
-    known.set_result(ADD)
+    await until(lambda: later.asked)
+    later.known.set_result(ADD)
     for client in clients:
         assert (await client.header())["type"] == ADD.type
         assert await client.reply() == FORTY_TWO
-    assert asked == 1
+    assert later.asked == 1
 
 
 @pytest.mark.trap(23)
 async def test_callers_behind_probes_that_have_just_left_are_answered(
     node: SlaveNode, caplog: pytest.LogCaptureFixture
 ) -> None:
-    known: asyncio.Future[ServiceDescription | str] = asyncio.get_running_loop().create_future()
-
-    async def describe() -> ServiceDescription | str:
-        return await asyncio.shield(known)
-
-    endpoint = serve(node, add, describe, description=None)
+    endpoint = serve(node, add, later := Later(), description=None)
     probes = [await RawClient.call(node, probe="1") for _ in range(3)]
     await until(lambda: len(endpoint._clients) == 3)
     caller = await RawClient.call(node)
@@ -168,7 +167,7 @@ async def test_callers_behind_probes_that_have_just_left_are_answered(
     await caller.send(TWO)
     for probe in probes:
         probe.close()
-    known.set_result(ADD)  # the probes' ends are read in the turn of the loop before the one that opens them
+    later.known.set_result(ADD)  # the probes' ends are read in the turn of the loop before the one that opens them
     assert (await caller.header())["type"] == ADD.type
     assert await caller.reply() == FORTY_TWO
     caller.close()
@@ -177,21 +176,16 @@ async def test_callers_behind_probes_that_have_just_left_are_answered(
 
 
 async def test_callers_behind_one_that_fails_are_answered(node: SlaveNode, caplog: pytest.LogCaptureFixture) -> None:
-    known: asyncio.Future[ServiceDescription | str] = asyncio.get_running_loop().create_future()
-
-    async def describe() -> ServiceDescription | str:
-        return await asyncio.shield(known)
-
     def broken(*_: object) -> None:
         raise ZeroDivisionError
 
-    endpoint = serve(node, add, describe, description=None, on_mismatch=broken)
+    endpoint = serve(node, add, later := Later(), description=None, on_mismatch=broken)
     await RawClient.call(node, md5sum="0" * 32)
     await until(lambda: len(endpoint._clients) == 1)
     caller = await RawClient.call(node)
     await until(lambda: len(endpoint._clients) == 2)
     await caller.send(TWO)
-    known.set_result(ADD)
+    later.known.set_result(ADD)
     await caller.header()
     assert await caller.reply() == FORTY_TWO
     assert "could not be answered" in caplog.text

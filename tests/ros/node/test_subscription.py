@@ -88,10 +88,14 @@ async def test_header_and_messages_in_one_segment_or_byte_by_byte(publisher: Raw
 
 
 @pytest.mark.trap(14, 17)
-async def test_a_lost_publisher_is_found_again_and_half_a_message_is_dropped(publisher: RawPublisher) -> None:
+@pytest.mark.parametrize("half", [b"\x10\x00\x00\x00half", (1001).to_bytes(4, "little") + bytes(500)])
+async def test_a_lost_publisher_is_found_again_and_half_a_message_is_dropped(
+    publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch, half: bytes
+) -> None:
+    monkeypatch.setattr(limits, "TCPROS_MESSAGE_MAX", 1000)
     said = Said(publisher.uri)
     link, _ = await publisher.serve()
-    await link.send(frame_message(b"whole") + b"\x10\x00\x00\x00half")
+    await link.send(frame_message(b"whole") + half)
     link.close()
     again, _ = await publisher.serve()
     await again.send(frame_message(b"after"))
@@ -169,15 +173,17 @@ async def test_a_malformed_reply_is_a_loss(publisher: RawPublisher, junk: bytes)
 
 
 @pytest.mark.trap(17)
-async def test_what_cannot_be_a_length_ends_the_connection(publisher: RawPublisher) -> None:
-    said = Said(publisher.uri)
+@pytest.mark.parametrize("parts", [False, True])
+async def test_what_cannot_be_a_length_ends_the_connection(publisher: RawPublisher, parts: bool) -> None:
+    said = InParts(publisher.uri) if parts else Said(publisher.uri)
     link, _ = await publisher.serve()
-    await link.send(frame_message(b"before") + b"\xff\xff\xff\xff")
+    before = LARGE if parts else b"before"
+    await link.send(frame_message(before) + b"\xff\xff\xff\xff")
     await until(lambda: said.lost)
     assert "a message's length of 4294967295 bytes cannot be" in said.lost[0]
-    assert [m[4:] for m in said.messages] == [b"before"]
-    assert said.oversized == []
-    assert said.link.malformed
+    assert [m[4:] for m in said.messages] == [before]
+    assert (said.oversized, said.link.malformed) == ([], True)
+    assert not isinstance(said, InParts) or (said.aborts, said.half) == (0, b"")
 
 
 @pytest.mark.trap(17)
@@ -215,22 +221,6 @@ async def test_a_message_beyond_the_limit_takes_no_memory(
     await link.send(frame_message(b"behind"))
     await until(lambda: said.messages)
     assert len(said.link._stream._buffer) <= 8 << 20  # type: ignore[union-attr] # it is connected
-
-
-@pytest.mark.trap(17)
-async def test_publisher_lost_within_an_oversized_message_is_found_again(
-    publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(limits, "TCPROS_MESSAGE_MAX", 1000)
-    said = Said(publisher.uri)
-    link, _ = await publisher.serve()
-    await link.send((1001).to_bytes(4, "little") + bytes(500))
-    await until(lambda: said.oversized)
-    link.close()
-    again, _ = await publisher.serve()
-    await again.send(frame_message(b"after"))
-    await until(lambda: said.messages)
-    assert [m[4:] for m in said.messages] == [b"after"]
 
 
 @pytest.mark.trap(18)
@@ -468,13 +458,3 @@ async def test_closed_from_within_a_part_no_other_comes(publisher: RawPublisher,
     assert said.messages == ([wire] if when == "end" else [])
     assert said.parts == {"begin": [], "part": [5000], "end": [5000, len(wire) - 5000]}[when]
     assert said.aborts == (when != "end")
-
-
-@pytest.mark.trap(17)
-async def test_a_claim_beyond_the_limit_begins_no_parts(publisher: RawPublisher) -> None:
-    said = InParts(publisher.uri)
-    link, _ = await publisher.serve()
-    await link.send(frame_message(LARGE) + b"\xff\xff\xff\xff")
-    await until(lambda: said.lost)
-    assert said.sizes in ([], [len(LARGE) + 4])
-    assert (said.aborts, said.half) == (0, b"")

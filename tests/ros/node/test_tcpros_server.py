@@ -208,15 +208,20 @@ async def listener() -> AsyncIterator[SharedListener]:
     made = SharedListener(SALT, counters=Counters())
     await made.start()
     yield made
+    while NODES:
+        await NODES.pop().close()
     await made.close()
 
 
+NODES: list[SlaveNode] = []
+
+
 async def node(listener: SharedListener, name: str) -> SlaveNode:
-    """A node that publishes /t at the listener."""
-    made = SlaveNode(name, "127.0.0.1", SALT, listener=listener)
-    await made.start()
-    made.add_publication(Publication("/t", name, STRING))
-    return made
+    """A node that publishes /t at the listener, and ends with it."""
+    NODES.append(SlaveNode(name, "127.0.0.1", SALT, listener=listener))
+    await NODES[-1].start()
+    NODES[-1].add_publication(Publication("/t", name, STRING))
+    return NODES[-1]
 
 
 def listening() -> int:
@@ -272,7 +277,6 @@ async def test_the_address_of_a_closed_node_is_refused_and_not_given_again(liste
     assert counters["address.unknown.xmlrpc"] >= 2
     assert counters["address.unknown.tcpros"] == 1
     assert (await call_api(second.uri, "getName", "/s")).value == "/n"
-    await second.close()
 
 
 async def test_open_connections_end_with_their_node_and_no_other(listener: SharedListener) -> None:
@@ -287,13 +291,11 @@ async def test_open_connections_end_with_their_node_and_no_other(listener: Share
     assert await links[0].ended()
     other._publications["/t"].publish_framed(b"\x02\0\0\0hi")
     assert await links[1].message() == b"hi"
-    await other.close()
 
 
 async def test_other_addresses_of_this_machine_are_no_nodes(listener: SharedListener) -> None:
-    made = await node(listener, "/n")
+    await node(listener, "/n")
     assert await request_topic(f"http://127.0.0.1:{listener.ports[0]}/") == [-1, 0]
-    await made.close()
 
 
 async def test_a_burst_of_connections_is_accepted(listener: SharedListener) -> None:
@@ -301,7 +303,6 @@ async def test_a_burst_of_connections_is_accepted(listener: SharedListener) -> N
     addresses = [address for one in nodes if (address := one.address_of("/t"))]
     found = await asyncio.gather(*(connect(address) for address in addresses for _ in range(10)))
     assert found == [one.name for one in nodes for _ in range(10)]
-    await asyncio.gather(*(one.close() for one in nodes))
 
 
 async def test_a_call_under_way_when_its_node_closes_is_not_left_open(listener: SharedListener) -> None:
