@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from pathlib import Path
 from typing import Final
@@ -13,6 +14,7 @@ NOT_YET: Final[dict[str, str]] = {}
 """Traps without a test, and why."""
 
 
+@functools.cache
 def _marked() -> dict[str, set[str]]:
     """The tests of each trap, as ``file::name``, by the marks in the sources."""
     found: dict[str, set[str]] = {}

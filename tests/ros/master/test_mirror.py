@@ -29,6 +29,7 @@ class Pair:
     def __init__(self) -> None:
         self.master = MasterApi("http://m:1/", 1, lambda _: None)
         self.mirror = Mirror()
+        self.graph = self.mirror.registrations
         self.writes: list[Call] = []
         self.nodes: tuple[str, ...] = ()
 
@@ -72,7 +73,7 @@ class Pair:
 
     def changes(self) -> set[tuple[str, str, str]]:
         """What has changed: ``+`` or ``-``, the topic or service, the node."""
-        return {("+" if c.added else "-", c.name, c.node) for c in self.mirror.registrations.take()[1]}
+        return {("+" if c.added else "-", c.name, c.node) for c in self.graph.take()[1]}
 
     def _many(self, calls: list[XmlRpcValue]) -> XmlRpcValue:
         return self.master.answer("system.multicall", [calls])
@@ -88,17 +89,14 @@ def test_registrations_of_others_come_with_types_and_uris(pair: Pair) -> None:
     pair.theirs("registerSubscriber", "/s", "/t", "*", MOVED)
     pair.theirs("registerService", "/p", "/srv", "rosrpc://h:9", THEIRS)
     assert pair.look() == []
-    assert (
-        GraphChange(RegistrationKind.PUBLISHER, True, "/t", "/p", THEIRS, STRING)
-        in pair.mirror.registrations.take()[1]
-    )
-    state = pair.mirror.registrations.state()
+    assert GraphChange(RegistrationKind.PUBLISHER, True, "/t", "/p", THEIRS, STRING) in pair.graph.take()[1]
+    state = pair.graph.state()
     assert state == pair.master.registrations.state()
     assert state.services == {"/srv": {"/p": "rosrpc://h:9"}}
-    assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {"/p": THEIRS}
-    assert pair.mirror.registrations.types()["/t"] == STRING
+    assert pair.graph.at(RegistrationKind.PUBLISHER, "/t") == {"/p": THEIRS}
+    assert pair.graph.types()["/t"] == STRING
     pair.look()
-    assert pair.mirror.registrations.state() is state, "nothing is new"
+    assert pair.graph.state() is state, "nothing is new"
     assert pair.changes() == set()
 
 
@@ -111,7 +109,7 @@ def test_a_node_that_restarts_between_two_looks_went_and_came(pair: Pair) -> Non
     pair.theirs("registerService", "/p", "/srv", "rosrpc://h:10", MOVED)
     pair.look()
     assert pair.changes() == {(sign, name, "/p") for sign in "+-" for name in ("/t", "/srv")}
-    assert pair.mirror.registrations.state() == pair.master.registrations.state()
+    assert pair.graph.state() == pair.master.registrations.state()
 
 
 def test_later_type_is_a_change_but_publishers_keep_theirs(pair: Pair) -> None:
@@ -119,13 +117,13 @@ def test_later_type_is_a_change_but_publishers_keep_theirs(pair: Pair) -> None:
     pair.look()
     pair.theirs("registerSubscriber", "/s2", "/t", STRING, MOVED)
     pair.look()
-    assert pair.mirror.registrations.types()["/t"] == STRING
+    assert pair.graph.types()["/t"] == STRING
     pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
     pair.look()
-    pair.mirror.registrations.take()[1]
+    pair.graph.take()[1]
     pair.theirs("registerPublisher", "/other", "/t", "std_msgs/Int8", THEIRS)
     pair.look()
-    changes = pair.mirror.registrations.take()[1]
+    changes = pair.graph.take()[1]
     assert [(change.node, change.type) for change in changes] == [("/other", "std_msgs/Int8")]
 
 
@@ -133,13 +131,13 @@ def test_other_type_of_a_topic_is_a_change(pair: Pair) -> None:
     pair.theirs("registerPublisher", "/p", "/t", "*", THEIRS)
     pair.theirs("registerSubscriber", "/s", "/u", "*", MOVED)
     pair.look()
-    pair.mirror.registrations.take()[1]
+    pair.graph.take()[1]
     pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
     pair.theirs("registerSubscriber", "/s", "/u", STRING, MOVED)
     pair.look()
-    changes = {(change.name, change.node, change.type) for change in pair.mirror.registrations.take()[1]}
+    changes = {(change.name, change.node, change.type) for change in pair.graph.take()[1]}
     assert changes == {("/t", "/p", STRING), ("/u", "/s", STRING)}
-    assert pair.mirror.registrations.state() == pair.master.registrations.state()
+    assert pair.graph.state() == pair.master.registrations.state()
 
 
 def test_a_provider_that_a_look_from_before_saw_does_not_take_ours(pair: Pair) -> None:
@@ -149,7 +147,7 @@ def test_a_provider_that_a_look_from_before_saw_does_not_take_ours(pair: Pair) -
     pair.call("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:10", OURS)
     pair.flush()
     pair.mirror.update(survey, seen)
-    assert pair.mirror.registrations.state().services == {"/srv": {"/rmpa/b/n": "rosrpc://h:10"}}
+    assert pair.graph.state().services == {"/srv": {"/rmpa/b/n": "rosrpc://h:10"}}
     assert pair.look() == []
 
 
@@ -159,16 +157,16 @@ def test_ours_counts_at_once_and_a_look_from_before_takes_nothing_back(pair: Pai
     seen, survey = pair.mirror.asked, pair.survey()
     assert pair.call("registerPublisher", "/rmpa", "/t", STRING, OURS) == [THEIRS]
     assert pair.call("registerSubscriber", "/rmpa", "/t", STRING, OURS) == [OURS]
-    assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {"/rmpa": OURS}
+    assert pair.graph.at(RegistrationKind.PUBLISHER, "/t") == {"/rmpa": OURS}
     assert pair.mirror.update(survey, seen) == []
-    assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {"/rmpa": OURS}
+    assert pair.graph.at(RegistrationKind.PUBLISHER, "/t") == {"/rmpa": OURS}
     pair.flush()
     assert pair.look() == []
     seen, survey = pair.mirror.asked, pair.survey()
     assert pair.call("unregisterPublisher", "/rmpa", "/t", OURS) == 1
     assert pair.call("unregisterPublisher", "/rmpa", "/t", OURS) == 0
     assert pair.mirror.update(survey, seen) == []
-    assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {}
+    assert pair.graph.at(RegistrationKind.PUBLISHER, "/t") == {}
 
 
 def test_what_the_master_lacks_of_ours_is_registered_again(pair: Pair) -> None:
@@ -187,7 +185,7 @@ def test_what_the_master_lacks_of_ours_is_registered_again(pair: Pair) -> None:
     assert sorted(pair.look()) == sorted(calls)
     pair.flush()
     assert pair.look() == []
-    assert pair.mirror.registrations.state() == pair.master.registrations.state()
+    assert pair.graph.state() == pair.master.registrations.state()
     for method, params in pair.mirror.unregister_calls():
         pair.call(method, *params)
     pair.flush()
@@ -200,12 +198,12 @@ def test_nodes_of_a_former_master_stay_until_they_die_or_return(pair: Pair) -> N
     pair.look()
     pair.restart()
     pair.look()
-    assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {"/dies": THEIRS, "/returns": MOVED}
+    assert pair.graph.at(RegistrationKind.PUBLISHER, "/t") == {"/dies": THEIRS, "/returns": MOVED}
     pair.theirs("registerPublisher", "/returns", "/other", STRING, "http://127.0.0.1:4/")
     pair.mirror.mark_dead("/dies", THEIRS)
     pair.look()
-    assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {}
-    assert pair.mirror.registrations.state().nodes == {"/returns": "http://127.0.0.1:4/"}
+    assert pair.graph.at(RegistrationKind.PUBLISHER, "/t") == {}
+    assert pair.graph.state().nodes == {"/returns": "http://127.0.0.1:4/"}
 
 
 def test_dead_node_is_ignored_until_it_moves_or_revives(pair: Pair) -> None:
@@ -217,11 +215,11 @@ def test_dead_node_is_ignored_until_it_moves_or_revives(pair: Pair) -> None:
     assert pair.changes() == {("-", "/t", "/p")}
     del pair.mirror.dead["/p"]
     pair.look()
-    assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {"/p": THEIRS}
+    assert pair.graph.at(RegistrationKind.PUBLISHER, "/t") == {"/p": THEIRS}
     pair.mirror.mark_dead("/p", THEIRS)
     pair.theirs("registerPublisher", "/p", "/t", STRING, MOVED)
     pair.look()
-    assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {"/p": MOVED}
+    assert pair.graph.at(RegistrationKind.PUBLISHER, "/t") == {"/p": MOVED}
     assert not pair.mirror.dead
 
 
@@ -233,13 +231,13 @@ def test_local_provider_replaces_our_service_for_good(pair: Pair) -> None:
     pair.changes()
     assert pair.look() == []
     assert pair.changes() == {("-", "/srv", "/rmpa/b/n"), ("+", "/srv", "/local")}
-    assert pair.mirror.registrations.state().services == {"/srv": {"/local": "rosrpc://h:10"}}
+    assert pair.graph.state().services == {"/srv": {"/local": "rosrpc://h:10"}}
 
 
 def test_what_the_master_does_not_take_is_none(pair: Pair) -> None:
     pair.call("registerPublisher", "/rmpa", "/t", STRING, OURS)
     pair.mirror.forget(("registerPublisher", ("/rmpa", "/t", STRING, OURS)))
-    assert pair.mirror.registrations.state().publishers == {}
+    assert pair.graph.state().publishers == {}
     assert pair.look() == []
     assert pair.mirror.apply("registerPublisher", ["/rmpa", "/t"]).code == -1
     assert pair.mirror.apply("registerPublisher", ["/rmpa", "/t", STRING, 5]).code == -1
@@ -287,11 +285,7 @@ def test_what_a_survey_shows_of_a_node_between_two_of_its_registrations_goes_aga
     pair.look()
     pair.flush()
     assert pair.look() == []
-    assert (
-        set(pair.mirror.registrations.state().publishers)
-        == set(pair.master.registrations.state().publishers)
-        == {"/a"}
-    )
+    assert set(pair.graph.state().publishers) == set(pair.master.registrations.state().publishers) == {"/a"}
 
 
 NAMES: Final = st.sampled_from(["/a", "/b"])
@@ -329,7 +323,7 @@ def test_whatever_happened_the_next_look_shows_what_the_master_has(steps: list[t
     pair.look()
     pair.flush()
     assert pair.look() == []
-    mirror, master = pair.mirror.registrations.state(), pair.master.registrations.state()
+    mirror, master = pair.graph.state(), pair.master.registrations.state()
     assert (mirror.publishers, mirror.subscribers, mirror.nodes) == (
         master.publishers,
         master.subscribers,

@@ -8,12 +8,12 @@ import pytest
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.node.fetch_type import fetch_type, find_or_fetch
-from rmpa.ros.types import installed
 from rmpa.ros.types.definitions import DefinitionError, UnknownTypeError
 from rmpa.ros.types.installed import ServiceType, packages_below
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import TopicDescription
 from tests.ros.node.peers import node, until
+from tests.ros.types import workspaces
 from tests.ros.types.workspaces import package
 
 if TYPE_CHECKING:
@@ -31,9 +31,7 @@ SET_BOOL: Final = ServiceType("std_srvs/SetBool")
 
 @pytest.fixture(autouse=True)
 def nothing_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(installed, "_DISTRIBUTIONS", tmp_path / "opt")
-    monkeypatch.setattr(installed, "_SYSTEM", ())
-    monkeypatch.delenv("PYTHONPATH", raising=False)
+    workspaces.nothing_installed(tmp_path, monkeypatch)
     yield
     packages_below.cache_clear()
 

@@ -32,6 +32,17 @@ def filled(known: Mapping[str, Specification], name: str, seed: int) -> dict[str
     return values
 
 
+def read_as(message: Any, values: Any) -> Any:
+    """What another serializer has read, an object of rosbags, in the form of some values."""
+    if isinstance(values, list):
+        return [read_as(*each) for each in zip(message, values, strict=True)]
+    if not isinstance(values, dict):
+        return message.item() if hasattr(message, "item") else message
+    if values.keys() == {"secs", "nsecs"}:
+        return {"secs": message.sec, "nsecs": message.nanosec}
+    return {name: read_as(getattr(message, name), value) for name, value in values.items()}
+
+
 def filled_message(name: str, seed: int = 1) -> bytes:
     """A message of a shipped type, serialized by rosbags."""
     kind = MessageType(name)

@@ -17,7 +17,7 @@ from rmpa.ros.types.codec import MessageCodec, codec_for
 from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, known_specifications, known_types, parse_definition
 from rmpa.ros.types.messages import MessageError, MessageType
 from rmpa.ros.types.values import WRITTEN_MAX
-from tests.ros.types.filled import filled
+from tests.ros.types.filled import filled, read_as
 from tests.ros.types.genmsg_cases import VALUES, VALUES_OF
 
 if TYPE_CHECKING:
@@ -61,6 +61,7 @@ def test_bytes_of_another_serializer_are_read_and_written_alike(name: str) -> No
     codec = codec_for(kind)
     assert _json(codec, raw) == _with_base64(values, known, name)
     assert codec.write(values, 0).payload == raw
+    assert read_as(kind.deserialize(raw), values) == values
     empty = kind.serialize(kind.make())
     for message in (raw, empty):
         for value in (_json(codec, message), _cbor(codec, message), codec.views(memoryview(message))):

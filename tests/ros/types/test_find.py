@@ -13,7 +13,7 @@ from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, UnknownTypeEr
 from rmpa.ros.types.find import TYPE_MISSING, find_message_type, find_service_type, type_of_header
 from rmpa.ros.types.installed import ServiceType, packages_below
 from rmpa.ros.types.messages import MessageType
-from tests.ros.types.workspaces import package
+from tests.ros.types.workspaces import nothing_installed, package
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -24,10 +24,7 @@ STRING: Final = "992ce8a1687cec8c8bd883ec73ca41d1"
 @pytest.fixture(autouse=True)
 def no_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Nothing is installed but what a test puts to ``opt``."""
-    monkeypatch.setattr(installed, "_DISTRIBUTIONS", tmp_path / "opt")
-    monkeypatch.setattr(installed, "_SYSTEM", ())
-    monkeypatch.delenv("PYTHONPATH", raising=False)
-    packages_below.cache_clear()
+    nothing_installed(tmp_path, monkeypatch)
     header_types._missing.clear()
     yield
     packages_below.cache_clear()

@@ -4,8 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rmpa.ros.types import installed
+
 if TYPE_CHECKING:
     from pathlib import Path
+
+    import pytest
+
+
+def nothing_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No ROS is found but what a test puts to ``opt``, and no package is known yet."""
+    monkeypatch.setattr(installed, "_DISTRIBUTIONS", tmp_path / "opt")
+    monkeypatch.setattr(installed, "_SYSTEM", ())
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    installed.packages_below.cache_clear()
 
 
 def package(folder: Path, name: str = "", **files: str) -> Path:

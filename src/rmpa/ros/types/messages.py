@@ -25,7 +25,7 @@ from rmpa.ros.types.definitions import (
     md5sum,
     parse_definition,
 )
-from rmpa.ros.types.values import Given, WrongValueError, ros2_name
+from rmpa.ros.types.values import GivenMessage, WrongValueError, ros2_name
 from rmpa.ros.wire.tcpros import TopicDescription
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ class MessageType(DefinedType):
 
     def _from(self, values: Any) -> memoryview:
         """The bytes of what a program or the command line gives."""
-        written = Given(time.time_ns())
+        written = GivenMessage(time.time_ns())
         try:
             codec_for(self).fill(values, written)
         except WrongValueError as error:

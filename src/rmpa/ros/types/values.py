@@ -157,7 +157,7 @@ class Written:
         return raw if given == code else [value for (value,) in struct.iter_unpack(f"<{given}", raw)]
 
 
-class Given(Written):
+class GivenMessage(Written):
     """A message from what programs and the command line give, such as other messages, numpy's arrays and seconds."""
 
     absent = None
