@@ -45,6 +45,14 @@ def stack() -> Iterator[ExitStack]:
         yield made
 
 
+@pytest.fixture
+def untried() -> Iterator[None]:
+    """It is not known, nor afterwards, whether connections can be ended."""
+    try_to_end.cache_clear()
+    yield
+    try_to_end.cache_clear()
+
+
 def listen(stack: ExitStack, address: str = "127.0.0.1", port: int = 0) -> socket.socket:
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     return stack.enter_context(socket.create_server((address, port), family=family, backlog=4096))
@@ -163,10 +171,10 @@ def test_a_kernel_that_does_not_tell(monkeypatch: pytest.MonkeyPatch) -> None:
     assert connections() is None
 
 
+@pytest.mark.usefixtures("untried")
 async def test_all_may_be_called_in_the_event_loop(stack: ExitStack) -> None:
     """``no_blocking`` of tests/conftest.py raises where one blocks."""
     port = listen(stack).getsockname()[1]
-    try_to_end.cache_clear()
     may_end_connections()
     assert listening_addresses(port) == frozenset({"127.0.0.1"})
     assert seen(local_port=port) == []
@@ -271,26 +279,25 @@ def test_without_the_capability_those_of_the_same_user_are_ended(stack: ExitStac
 
 
 @ends
+@pytest.mark.usefixtures("untried")
 def test_without_the_capability_those_of_others_are_not_ended(stack: ExitStack) -> None:
     client, server = pair(stack, listen(stack))
     found = [replace(of, uid=of.uid + 1) for of in seen(remote=client.getsockname())]
     with pytest.raises(PermissionError):
         without(NET_ADMIN, lambda: end_connections(found))
-    try_to_end.cache_clear()
-    try:
-        problem, _, remedy = without(NET_ADMIN, may_end_connections).partition("; ")
-        assert may_end_connections().partition("; ")[0] == problem, "it is tried once"
-    finally:
-        try_to_end.cache_clear()
+    problem, _, remedy = without(NET_ADMIN, may_end_connections).partition("; ")
+    assert may_end_connections().partition("; ")[0] == problem, "it is tried once"
     assert problem.startswith("this process has no CAP_NET_ADMIN")
     assert "AmbientCapabilities=CAP_NET_ADMIN" in remedy
     assert "setcap" in remedy
+    try_to_end.cache_clear()
     assert may_end_connections() == ""
     server.send(b"x")
     assert client.recv(1) == b"x"
 
 
 @pytest.mark.parametrize("number", [errno.EOPNOTSUPP, errno.EINVAL])
+@pytest.mark.usefixtures("untried")
 def test_a_kernel_that_cannot_end_connections(stack: ExitStack, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     def refuse(*_: object) -> None:
         raise OSError(number, os.strerror(number))
@@ -300,22 +307,16 @@ def test_a_kernel_that_cannot_end_connections(stack: ExitStack, monkeypatch: pyt
     with pytest.raises(OSError, match="CONFIG_INET_DIAG_DESTROY") as raised:
         end_connections(seen(remote=client.getsockname()))
     assert raised.value.errno == errno.EOPNOTSUPP
-    try_to_end.cache_clear()
-    try:
-        assert "CONFIG_INET_DIAG_DESTROY" in may_end_connections()
-    finally:
-        try_to_end.cache_clear()
+    assert "CONFIG_INET_DIAG_DESTROY" in may_end_connections()
 
 
+@pytest.mark.usefixtures("untried")
 def test_a_kernel_that_only_pretends_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernel_tcp, "end_connections", len)
-    try_to_end.cache_clear()
-    try:
-        assert "did not end a connection" in may_end_connections()
-    finally:
-        try_to_end.cache_clear()
+    assert "did not end a connection" in may_end_connections()
 
 
+@pytest.mark.usefixtures("untried")
 def test_a_lack_of_file_descriptors_is_not_the_last_word(monkeypatch: pytest.MonkeyPatch) -> None:
     before = may_end_connections()
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import ssl
 from dataclasses import replace
-from datetime import UTC, datetime
 
 import pytest
 from hypothesis import given
@@ -30,6 +28,7 @@ from rmpa.trust.certificates import (
 )
 from rmpa.trust.permissions import TrustError, TrustReason
 from rmpa.trust.tokens import fingerprint_of
+from tests.runtime.secure_pairs import make_context, shake
 from tests.trust.authority import WALL, Authority, new_key
 
 LAB, OTHER = Authority(), Authority()
@@ -74,51 +73,10 @@ def test_browsers_find_the_hosts_that_follow_from_the_modules_name() -> None:
     assert [str(each) for each in names.get_values_for_type(x509.IPAddress)] == ["127.0.0.1"]
 
 
-def test_tls_accepts_members_and_refuses_others(tmp_path: object) -> None:
-    assert _tls(LAB, LAB) == ("", "")
-    here, there = _tls(LAB, OTHER)
-    assert "CERTIFICATE_VERIFY_FAILED" in here
-    assert there == ""
-
-
-def _tls(server_ca: Authority, client_ca: Authority) -> tuple[str, str]:
-    """A TLS 1.3 handshake of two members, each with the CA of its own mesh: the reasons of client and server."""
-    now = datetime.now(UTC).timestamp()
-    contexts = []
-    for authority, protocol in ((client_ca, ssl.PROTOCOL_TLS_CLIENT), (server_ca, ssl.PROTOCOL_TLS_SERVER)):
-        key = new_key()
-        context = ssl.SSLContext(protocol)
-        context.minimum_version = ssl.TLSVersion.TLSv1_3
-        context.check_hostname = False
-        context.verify_mode = ssl.CERT_REQUIRED
-        context.load_verify_locations(cadata=authority.certificate)
-        _load(context, authority.module("arm", now, key), key)
-        contexts.append(context)
-    to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
-    client = contexts[0].wrap_bio(to_client, to_server)
-    server = contexts[1].wrap_bio(to_server, to_client, server_side=True)
-    for _ in range(4):
-        for end in (client, server):
-            try:
-                end.do_handshake()
-            except ssl.SSLWantReadError:
-                continue
-            except ssl.SSLError as error:
-                return (error.reason or "", "") if end is client else ("", error.reason or "")
-    assert client.getpeercert()["subjectAltName"][0] == ("URI", "urn:rmpa:arm")  # type: ignore[index] # there is one
-    return "", ""
-
-
-def _load(context: ssl.SSLContext, certificate: bytes, key: ec.EllipticCurvePrivateKey) -> None:
-    import tempfile
-
-    pem = key.private_bytes(
-        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    )
-    with tempfile.NamedTemporaryFile() as file:
-        file.write(pem + ssl.DER_cert_to_PEM_cert(certificate).encode())
-        file.flush()
-        context.load_cert_chain(file.name)
+def test_tls_accepts_members() -> None:
+    """And no others: ``tests/runtime/test_record_layer.py``."""
+    client, _ = shake((make_context(LAB, server_side=False), make_context(LAB, server_side=True)))
+    assert client.tls.getpeercert()["subjectAltName"][0] == ("URI", "urn:rmpa:arm")  # type: ignore[index] # there is one
 
 
 def test_each_other_certificate_has_its_reason() -> None:
