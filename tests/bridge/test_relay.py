@@ -14,7 +14,7 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.context import Names
 from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, Source, decode, encode
-from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy, Relay, RelayPaths, may_have
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy, Relay, RelayPaths
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.config.peer_rules import PolicySettings
@@ -272,12 +272,6 @@ def test_any_map_settles_with_each_source_once_everywhere(seed: int) -> None:
             world.check()
     world.settle()
     world.check()
-
-
-def test_nothing_goes_back_where_it_came_from() -> None:
-    assert not may_have(instance(1), origin(1, 2))
-    assert not may_have(instance(2), origin(1, 2))
-    assert may_have(instance(3), origin(1, 2))
 
 
 def test_the_way_is_told_and_what_came_round_is_not_shown() -> None:

@@ -56,22 +56,6 @@ def test_priority_outweighs_message_size(priority: Priority) -> None:
     assert switch.lane is (EXPRESS if priority is Priority.HIGH else BULK)
 
 
-def test_only_the_answer_to_the_present_fence_counts() -> None:
-    switch = LaneSwitch(Contract(), large=True)
-    assert not switch.fenced(0)
-    assert not switch.fenced(1)
-    first = switch.fence()
-    switch.restart()
-    assert not switch.fenced(first), "it was sent over the link before"
-    second = switch.fence()
-    assert second != first
-    assert not switch.fenced(first)
-    assert not switch.fenced(second + 1)
-    assert switch.fenced(second)
-    assert not switch.fenced(second), "answered twice"
-    assert switch.lane is BULK
-
-
 def test_bulk_loss_answers_only_a_bulk_fence() -> None:
     there = LaneSwitch(Contract(), large=True)
     assert not there.lane_lost()
@@ -86,15 +70,6 @@ def test_bulk_loss_answers_only_a_bulk_fence() -> None:
     assert back.lane_lost()
     assert (back.lane, back.fencing) == (EXPRESS, False)
     assert not back.fenced(number), "an answer that came too late"
-
-
-def test_new_link_begins_on_the_express_lane() -> None:
-    switch = on_bulk()
-    switch.restart()
-    assert (switch.lane, switch.target, switch.fencing) == (EXPRESS, BULK, False)
-    switch.fence()
-    switch.restart()
-    assert (switch.lane, switch.target, switch.fencing) == (EXPRESS, BULK, False)
 
 
 @settings(deadline=None)

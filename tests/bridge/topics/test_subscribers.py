@@ -311,9 +311,6 @@ def test_nodes_are_named_once_in_order_and_nobody_else() -> None:
     caller_ids = ("/b", "/a", "/b", "/rmpa", "/rmpa/peer/node", "no name", "", "/line\nfeed", "/" + "x" * 2000)
     # What stands for other modules is named where we relay: nothing else of theirs listens to a proxy.
     assert audience(caller_ids) == ("/a", "/b", "/rmpa/peer/node")
-
-
-def test_no_more_are_named_than_a_message_may_hold() -> None:
     assert len(audience(f"/n{number}" for number in range(1000))) == limits.AUDIENCE_MAX
 
 
@@ -364,27 +361,16 @@ def reports() -> Reports:
     return Reports()
 
 
-def test_a_refused_subscriber_is_shown_here_and_told_to_the_peer(reports: Reports) -> None:
+def test_a_refused_subscriber_is_told_to_the_peer_until_it_registers_again(reports: Reports) -> None:
     reports.refused(BASE, CMD, "/viewer", "other md5")
-    assert reports.texts(CMD) == ("other md5",)
+    reports.registration_changed("/cmd", "/recorder")
+    assert (reports.texts(CMD), reports.warnings) == (("other md5",), ["other md5"])
     assert reports.done == [Send(BASE, Mismatch("/cmd", "/joy", "/viewer", "other md5"))]
-    assert reports.warnings == ["other md5"]
-
-
-def test_a_subscriber_that_registers_again_is_mended_at_the_peer_too_and_once(reports: Reports) -> None:
-    reports.refused(BASE, CMD, "/viewer", "other md5")
     reports.done.clear()
     for _ in range(2):
         reports.registration_changed("/cmd", "/viewer")
     assert reports.texts(CMD) == ()
     assert reports.done == [Send(BASE, Mismatch("/cmd", "/joy", "/viewer", ""))]
-
-
-def test_another_subscriber_of_the_topic_mends_nothing(reports: Reports) -> None:
-    reports.refused(BASE, CMD, "/viewer", "other md5")
-    reports.done.clear()
-    reports.registration_changed("/cmd", "/recorder")
-    assert (reports.texts(CMD), reports.done) == (("other md5",), [])
 
 
 def test_a_peers_report_is_a_warning_that_names_the_peer(reports: Reports) -> None:

@@ -358,18 +358,6 @@ def test_later_acknowledgement_outweighs_the_position() -> None:
     assert new.numbers == [3]
 
 
-def test_a_peer_cannot_go_on_where_it_never_was() -> None:
-    new, (_, sender) = Link(), fresh(reliable)
-    sender.message(0, SMALL)
-    sender.suspend()
-    with pytest.raises(RemoteProtocolError):
-        sender.resume(new, 8, 2)
-    assert not new.log
-    sender.resume(new, 9, 1)
-    sender.message(0, SMALL)
-    assert new.numbers == [2]
-
-
 def test_downsampled_route_keeps_the_newest_over_a_link_loss(clock: Clock) -> None:
     old, new = Link(), Link()
     sender = reliable(old, Contract(reliability=Reliability.RELIABLE, max_rate=10.0))
