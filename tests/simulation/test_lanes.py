@@ -58,7 +58,6 @@ def test_failure_at_every_byte_leaves_no_half_message(trouble: str) -> None:
             PointScenario(COURSES[(point // len(TROUBLES) + turn) % len(COURSES)], trouble, point).run()
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_one_seed_gives_one_run(seed: int) -> None:
-    first, second = (LanesScenario(seed, 3).play() for _ in range(2))
+def test_one_seed_gives_one_run() -> None:
+    first, second = (LanesScenario(1, 3).play() for _ in range(2))
     assert first == second

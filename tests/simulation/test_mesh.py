@@ -65,7 +65,6 @@ def test_crossing_dials_leave_one_link(seed: int, monkeypatch: pytest.MonkeyPatc
     assert all("replaced" in line or "linked already" in line for line in fell), fell
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_one_seed_gives_one_run(seed: int) -> None:
-    first, second = (MeshScenario(seed, 4).play() for _ in range(2))
+def test_one_seed_gives_one_run() -> None:
+    first, second = (MeshScenario(1, 4).play() for _ in range(2))
     assert first == second

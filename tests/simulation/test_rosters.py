@@ -30,7 +30,7 @@ def test_networks_of_thirty_agree_after_healing(seed: int) -> None:
     Scenario(seed, 30).play()
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_one_seed_gives_one_run(seed: int) -> None:
     first, second = (Scenario(seed, 4).play() for _ in range(2))
     assert first == second
