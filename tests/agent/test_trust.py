@@ -138,7 +138,7 @@ async def test_modules_that_joined_are_linked_over_tls_also_while_the_group_key_
         assert [session.link for session in arm.bridge.sessions.linked()] == links
 
 
-async def test_a_revoked_module_is_gone_everywhere_within_a_second_until_it_has_a_new_token(fleet: Fleet) -> None:
+async def test_a_revoked_module_is_gone_everywhere_at_once_until_it_has_a_new_token(fleet: Fleet) -> None:
     async with AsyncExitStack() as stack:
         for name in ("arm", "stick", "thief"):
             await fleet.add(name)
@@ -151,7 +151,7 @@ async def test_a_revoked_module_is_gone_everywhere_within_a_second_until_it_has_
         await fleet.command("base", "revoke", name="thief")
         await until(lambda: all("thief" not in peers_of(agent) for agent in honest))
         await until(lambda: not any("/cmd_vel" in agent.core.state().publishers for agent in honest))
-        assert time.monotonic() - began < 1.0
+        assert time.monotonic() - began < 5.0  # some 50 ms, but for a busy machine; without the notice it is hours
         await fleet.linked("base", "arm", "stick")  # … and nothing else has fallen
         await until(lambda: all(trust_of(agent).membership.keys.number == 2 for agent in honest))
         assert trust_of(fleet.agents["thief"]).membership.keys.number == 1  # it did not get the new key
