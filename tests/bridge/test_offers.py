@@ -384,6 +384,14 @@ def test_another_peer_provides_what_one_has_no_place_for() -> None:
     assert made.advertised(2, provided("/b")) == [Provide(2, "/b", "/n")]
 
 
+def test_the_services_limits_are_reloaded() -> None:
+    made = services(nodes=1, count=2)
+    made.advertised(1, provided("/a", node="/first"))
+    made.advertised(1, provided("/b", "/c", node="/second"))
+    changed = [a for some in made.apply_rules(rules(), LimitSettings(nodes=2, services=3)) for a in some]
+    assert changed == [Provide(1, "/b", "/second"), Provide(1, "/c", "/second")]
+
+
 def reload_services(made: ServiceImports, nodes: int, *denied: str) -> Iterator[list[Any]]:
     settings = ServiceSettings(deny=tuple(f"{node}/*" for node in denied))
     return made.apply_rules(rules(settings), LimitSettings(nodes=nodes))

@@ -12,7 +12,7 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.direct import grants
 from rmpa.bridge.direct.conditions import Condition, DirectAsk, Grant, Unmet, Want
-from rmpa.bridge.direct.grants import NodePorts, TopicGrants
+from rmpa.bridge.direct.grants import NodePorts, ServiceGrants, TopicGrants
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import PermissionGate
 from rmpa.config.settings import TrustSettings
@@ -379,6 +379,22 @@ async def test_a_secured_peer_learns_no_more_of_a_topic_after_it_was_withdrawn(m
     module.sut.judge_again(refused=False)
     module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
     assert (module.granted, module.told) == ([], [])
+
+
+@pytest.mark.parametrize("secured", [True, False])
+async def test_a_secured_peer_does_not_learn_of_a_service_that_it_may_not_have(
+    module: Module, *, secured: bool
+) -> None:
+    if secured:
+        module.permit(TrustSettings())
+    module.context.services = SimpleNamespace(transport=lambda _: Transport.AUTO)
+    server = SimpleNamespace(node="/adder", uri=URI, origin=None)
+    exports = SimpleNamespace(offered={"/add": server}, local=lambda *_: None)
+    services = ServiceGrants(module.sut._shared, cast("Any", exports), lambda *_: None)
+    reply = await module.handlers["direct.service"](module.sessions[1], {"name": "/add", "node": "/adder"})
+    assert reply["why"] == Condition.OFFERED
+    services.server_gone("/add")
+    assert [(peer, what) for peer, what, _ in module.told] == ([] if secured else [(1, "direct.service_again")])
 
 
 @pytest.mark.parametrize("secured", [True, False])
