@@ -255,6 +255,12 @@ class Background:
     def do(self, work: Coroutine[object, object, _T]) -> _T:
         return asyncio.run_coroutine_threadsafe(work, self.loop).result(DEADLINE)
 
+    def call(self, function: Callable[..., _T], *args: object) -> _T:
+        async def work() -> _T:
+            return function(*args)
+
+        return self.do(work())
+
     def close(self) -> None:
         self.loop.call_soon_threadsafe(self.loop.stop)
         self._thread.join(DEADLINE)

@@ -27,7 +27,7 @@ from rmpa.observe.snapshot import FollowedInfo, PingReply
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.trust.permissions import TrustReason
 from tests.cli.conftest import compare, with_core
-from tests.cli.test_resource import remote, running
+from tests.cli.test_resource import remote, run, running
 from tests.observe.samples import SNAPSHOT
 from tests.observe.why import test_topics
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from rmpa.ros.core.embedded import RosCore
     from tests.cli.conftest import Place
 
-__all__ = ["remote", "running"]  # fixtures
+__all__ = ["remote", "run", "running"]  # fixtures
 FOLLOWED: Final = (
     FollowedInfo(key="/map/frame", owner="base", owner_key="/map_frame", state="followed", size=12),
     FollowedInfo(key="/c", owner="arm", owner_key="/c", state="refused", problem="it may not be read"),

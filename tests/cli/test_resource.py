@@ -16,14 +16,13 @@ from rmpa.resource.node import ResourceNode
 from rmpa.resource.quality import at_least, at_most
 from rmpa.resource.reconfigure import read_config
 from rmpa.resource.resource import Resource
-from rmpa.ros.environment import RosEnvironment
-from rmpa.ros.node.node import Node
 from tests.resource.test_node import echo
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from rmpa.ros.core.embedded import RosCore
+    from rmpa.ros.node.node import Node
     from tests.cli.conftest import Background, Rmpa
 
 GROUP = ()
@@ -54,24 +53,30 @@ def sonar() -> Resource:
 
 
 @pytest.fixture
-def running(core: RosCore, background: Background) -> Iterator[ResourceNode]:
-    """The resource of this module."""
+def run(core: RosCore, background: Background) -> Iterator[Callable[[Resource], ResourceNode]]:
+    """Runs resources of this module."""
     made: list[ResourceNode] = []
 
-    async def start() -> None:
-        made.append(ResourceNode(sonar(), core.uri))
-        await made[0].start()
+    def start(resource: Resource) -> ResourceNode:
+        made.append(ResourceNode(resource, core.uri))
+        background.do(made[-1].start())
+        return made[-1]
 
-    background.do(start())
-    yield made[0]
-    background.do(made[0].close())
+    yield start
+    for each in reversed(made):
+        background.do(each.close())
 
 
 @pytest.fixture
-def remote(core: RosCore, background: Background) -> Iterator[list[dict[str, Any]]]:
+def running(run: Callable[[Resource], ResourceNode]) -> ResourceNode:
+    """The resource of this module."""
+    return run(sonar())
+
+
+@pytest.fixture
+def remote(node: Callable[..., Node], background: Background) -> list[dict[str, Any]]:
     """What a bridge would show of peer base: another sonar (its services hidden by ours), and a lidar."""
     asked: list[dict[str, Any]] = []
-    nodes: list[Node] = []
 
     def configured(request: Any) -> dict[str, Any]:
         asked.append(read_config(request.config))
@@ -79,30 +84,21 @@ def remote(core: RosCore, background: Background) -> Iterator[list[dict[str, Any
             raise ConfigError("profile fast", "it could not be applied: jammed")
         return {}
 
-    async def start() -> None:
-        for name in ("sonar", "lidar"):
-            node = Node(f"/rmpa/base/{name}", master_uri=core.uri, environment=RosEnvironment())
-            await node.__aenter__()
-            nodes.append(node)
-            decision = {"profile": "fast", "chosen": "", "scores": []}
-            texts = {
-                "descriptor": describe(sonar(), f"/{name}").serialize(), "state": "active", "profile": "fast",
-                "context": "away", "decision": json.dumps(decision),
-            }  # fmt: skip
-            for topic, text in texts.items():
-                publisher = await node.advertise(f"/{name}/{topic}", "std_msgs/String", latch=True)
-                publisher.publish(publisher.make({"data": text}))
-        await nodes[1].advertise_service("/lidar/set_parameters", "dynamic_reconfigure/Reconfigure", configured)
-        strange = await nodes[1].advertise("/strange/descriptor", "std_msgs/String", latch=True)
-        strange.publish(strange.make({"data": "{}"}))
+    def latched(one: Node, topic: str, text: str) -> None:
+        publisher = background.do(one.advertise(topic, "std_msgs/String", latch=True))
+        background.call(publisher.publish, publisher.make({"data": text}))
 
-    async def stop() -> None:
-        for node in nodes:
-            await node.close()
-
-    background.do(start())
-    yield asked
-    background.do(stop())
+    proxies = {name: node(f"/rmpa/base/{name}") for name in ("sonar", "lidar")}
+    for name, proxy in proxies.items():
+        decision = {"profile": "fast", "chosen": "", "scores": []}
+        latched(proxy, f"/{name}/descriptor", describe(sonar(), f"/{name}").serialize())
+        for topic, text in (("state", "active"), ("profile", "fast"), ("context", "away")):
+            latched(proxy, f"/{name}/{topic}", text)
+        latched(proxy, f"/{name}/decision", json.dumps(decision))
+    lidar = proxies["lidar"]
+    background.do(lidar.advertise_service("/lidar/set_parameters", "dynamic_reconfigure/Reconfigure", configured))
+    latched(lidar, "/strange/descriptor", "{}")
+    return asked
 
 
 def as_json(rmpa: Rmpa, *words: str) -> Any:
@@ -181,25 +177,21 @@ def test_a_profile_by_hand(rmpa: Rmpa, running: ResourceNode, remote: list[dict[
     assert "/sonar/set_parameters is served by /sonar, not by peer base" in err
 
 
-def test_a_decision_is_explained(rmpa: Rmpa, core: RosCore, background: Background) -> None:
-    driver = Node("/driver", master_uri=core.uri, environment=RosEnvironment())
-    members: list[ResourceNode] = []
+async def ask(driver: Node, member: ResourceNode | None = None, **wishes: Any) -> None:
+    """Ask the sonar for qualities; with ``member`` until it has decided."""
+    client = await ResourceClient(driver, "sonar").__aenter__()
+    await client.require(**wishes)
+    if member is not None:
+        await member.adapter.settled()
 
-    async def ask() -> None:
-        one = sonar()
-        one.adaptation(window=60)  # nothing is measured meanwhile
-        members.append(ResourceNode(one, core.uri))
-        await members[0].start()
-        await driver.__aenter__()
-        client = await ResourceClient(driver, "sonar").__aenter__()
-        await client.require(rate=at_least("20 Hz", hard=True), accuracy=at_most("2 cm", weight=2))
-        await members[0].adapter.settled()
 
-    async def stop() -> None:
-        await driver.close()
-        await members[0].close()
-
-    background.do(ask())
+def test_a_decision_is_explained(
+    rmpa: Rmpa, run: Callable[[Resource], ResourceNode], node: Callable[..., Node], background: Background
+) -> None:
+    one = sonar()
+    one.adaptation(window=60)  # nothing is measured meanwhile
+    wishes = {"rate": at_least("20 Hz", hard=True), "accuracy": at_most("2 cm", weight=2)}
+    background.do(ask(node("/driver"), run(one), **wishes))
     code, out, _ = rmpa("profile", "explain", "sonar")
     assert code == 0
     lines = [" ".join(line.split()) for line in out.splitlines()]
@@ -210,7 +202,6 @@ def test_a_decision_is_explained(rmpa: Rmpa, core: RosCore, background: Backgrou
     scores = {score["profile"]: score for score in as_json(rmpa, "profile", "explain")["scores"]}
     assert scores["slow"]["feasible"] is False
     assert scores["slow"]["terms"][0]["delta"] == pytest.approx(0.5)
-    background.do(stop())
 
 
 def test_a_context_by_hand(rmpa: Rmpa, running: ResourceNode) -> None:
@@ -225,24 +216,23 @@ def test_a_context_by_hand(rmpa: Rmpa, running: ResourceNode) -> None:
     assert as_json(rmpa, "context", "get")["context"] == ""
 
 
-def test_alarms(rmpa: Rmpa, core: RosCore, running: ResourceNode, background: Background) -> None:
+def test_alarms(
+    rmpa: Rmpa,
+    running: ResourceNode,
+    run: Callable[[Resource], ResourceNode],
+    node: Callable[..., Node],
+    background: Background,
+) -> None:
     assert rmpa("alarm", "list")[1].split() == ["RESOURCE", "LEVEL", "MESSAGE"]
     assert rows(rmpa, "alarm", "list", "--all")[1] == ["/sonar", "OK", "profile"]
-
-    driver = Node("/driver", master_uri=core.uri, environment=RosEnvironment())
-
-    async def disturb() -> None:
-        await driver.__aenter__()
-        client = ResourceClient(driver, "sonar")
-        await client.__aenter__()
-        await client.require(accuracy=at_most("1 mm", hard=True))
+    driver = node("/driver")
 
     def when_heard() -> None:
         """From a thread: the command runs in the main one."""
         deadline = time.monotonic() + 30
         while not running.adapter.publishers["alarms"].subscribers and time.monotonic() < deadline:
             time.sleep(0.02)
-        background.do(disturb())
+        background.do(ask(driver, accuracy=at_most("1 mm", hard=True)))
 
     asking = threading.Thread(target=when_heard)
     asking.start()
@@ -252,19 +242,10 @@ def test_alarms(rmpa: Rmpa, core: RosCore, running: ResourceNode, background: Ba
     alarm = json.loads(out)
     assert (alarm["resource"], alarm["level"]) == ("/sonar", "ERROR")
     assert alarm["message"].startswith("non-adaptable: no profile gives accuracy as asked")
-    others: list[ResourceNode] = []
-
-    async def start() -> None:
-        others.append(ResourceNode(echo(), core.uri))
-        await others[0].start()
-
-    background.do(start())
+    run(echo())
     table = rows(rmpa, "alarm", "list", "-a")
     assert table[1] in (["/echo", "STALE", "no"], ["/echo", "STALE", "it"])
-    assert len(table) == 3, table
-    assert table[2] == ["/sonar", "ERROR", "non-adaptable:"]
-    background.do(driver.close())
-    background.do(others[0].close())
+    assert table[2:] == [["/sonar", "ERROR", "non-adaptable:"]]
 
 
 def test_no_resource(rmpa: Rmpa, core: RosCore) -> None:

@@ -16,16 +16,7 @@ import click
 
 from rmpa.cli.advice import advise, advises
 from rmpa.cli.graph import read_name, suggestion
-from rmpa.cli.options import (
-    Options,
-    agent_verb,
-    argument,
-    config_option,
-    flag,
-    json_verb,
-    setting_options,
-    verb,
-)
+from rmpa.cli.options import Options, agent_verb, argument, config_option, flag, json_verb, setting_options, verb
 from rmpa.cli.output import Painted, Table, paint, print_error, printable, warn
 from rmpa.config.module_name import GATEWAY_SUFFIX, NameSource, choose_name, keep_name, state_dir
 from rmpa.config.read import load_settings

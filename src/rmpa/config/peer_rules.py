@@ -167,9 +167,7 @@ def _make_peer(given: dict[str, Any]) -> PeerRule:
 
 
 PEER_RULES: Final = rules_of(
-    keys_of(PeerRule) | _POLICY_KEYS,
-    _make_peer,
-    'name = "robot*" makes it one for those peers, "*" for all',
+    keys_of(PeerRule) | _POLICY_KEYS, _make_peer, 'name = "robot*" makes it one for those peers, "*" for all'
 )
 
 
@@ -215,10 +213,7 @@ ACTION_CLIENT: Final = "action"
 # The key of a rule about actions of the other module, whose clients are here.
 ACTION_SERVER: Final = "action_serve"
 _GROUP_NAME: Final = values.text_like(
-    "[A-Za-z][A-Za-z0-9_]{0,63}",
-    "a group's name",
-    "one has a letter, then letters, digits and _",
-    "operators",
+    "[A-Za-z][A-Za-z0-9_]{0,63}", "a group's name", "one has a letter, then letters, digits and _", "operators"
 )
 
 

@@ -306,11 +306,7 @@ class Loaded:
 
 
 def load_settings(
-    options: Mapping[str, object],
-    environ: Mapping[str, str],
-    *,
-    host_name: str,
-    cwd: Path | None = None,
+    options: Mapping[str, object], environ: Mapping[str, str], *, host_name: str, cwd: Path | None = None
 ) -> Loaded:
     """Join all sources.
 

@@ -371,10 +371,7 @@ def _make_crossing(values: dict[str, Any]) -> CrossingRule:
 
 
 GATEWAY_RULES: Final = rules_of(
-    keys_of(CrossingRule),
-    _make_crossing,
-    most=limits.GATEWAY_RULES_MAX,
-    instead="one may have several globs",
+    keys_of(CrossingRule), _make_crossing, most=limits.GATEWAY_RULES_MAX, instead="one may have several globs"
 )
 
 

@@ -15,13 +15,7 @@ from rmpa.observe import limits
 from rmpa.observe.peer_info import FAIL, OK, STALE, WARN, Check
 from rmpa.observe.why.diagnosis import BY_RULE, connected_directly, misplaced, subscriber_text
 from rmpa.ros.node.publication import Publication, PublicationEvents
-from rmpa.ros.types.definitions import (
-    ARRAY_TYPE,
-    DiagnosticLevel,
-    DiagnosticStatus,
-    frame_array,
-    known_description,
-)
+from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array, known_description
 from rmpa.runtime.loop import SystemClock, call_at_tick, yield_to_data
 
 if TYPE_CHECKING:

@@ -67,8 +67,7 @@ _SOURCES: Final = Needs(
     "each topic and service; of this site the asking module's own alone. Sites and modules are named to all",
 )
 _PARAM: Final = Needs(
-    (Access.PARAM,),
-    "as `param.get` and its like, by this gateway, the other site's and the owner. None of this site",
+    (Access.PARAM,), "as `param.get` and its like, by this gateway, the other site's and the owner. None of this site"
 )
 _WAYS: Final = Needs(
     (Access.SUBSCRIBE, Access.CALL), "the topic or service, by its name here; what leaves is the asking module's own"

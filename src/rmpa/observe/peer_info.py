@@ -174,12 +174,7 @@ _RESTART: Final = "sudo systemctl restart rmpa if the service runs it, else end 
 
 
 def judge_stranger(
-    name: str,
-    reason: TrustReason | None,
-    problem: str,
-    *,
-    trust: TrustStatus | None,
-    members: Collection[str],
+    name: str, reason: TrustReason | None, problem: str, *, trust: TrustStatus | None, members: Collection[str]
 ) -> tuple[str, str, str] | None:
     """What is shown of a module whose beacons are refused.
 

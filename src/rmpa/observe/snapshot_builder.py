@@ -505,10 +505,7 @@ def _link(link: PeerLink, now: float) -> LinkInfo:
         queued=link.queue_bytes,
         heard_ago=now - link.heard_at,
         lease=link.connection.keepalive.remote_lease,
-        lanes=(
-            _lane(link.express, link.connection.stream),
-            _lane(link.bulk, bulk, unneeded=not link.bulk_wanted),
-        ),
+        lanes=(_lane(link.express, link.connection.stream), _lane(link.bulk, bulk, unneeded=not link.bulk_wanted)),
         **{name: getattr(link, name) for name in _LINK_FIELDS},
     )
 

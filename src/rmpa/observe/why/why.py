@@ -477,12 +477,7 @@ class WhyService:
         return ServiceAtServer(similar=await self._similar(asker, Access.CALL, wire, seen))
 
     async def _ask(
-        self,
-        session: PeerSession,
-        what: str,
-        args: dict[str, Any],
-        kind: type[_T],
-        limit: float = limits.ASK_TIMEOUT,
+        self, session: PeerSession, what: str, args: dict[str, Any], kind: type[_T], limit: float = limits.ASK_TIMEOUT
     ) -> _T:
         value = await self._bridge.rpc.request(session, what, args, limit)
         try:
