@@ -80,29 +80,6 @@ def test_the_words_are_those_of_ros_2() -> None:
     assert [*Transport] == ["relay", "direct", "auto"]
 
 
-@pytest.mark.parametrize(
-    ("rules", "topic", "type_name", "changed"),
-    [
-        ((rule("/cmd/**", depth=1),), "/cmd", "a/B", {"depth": 1}),
-        ((rule("/cmd/**", depth=1),), "/cmdr", "a/B", {}),
-        ((rule("/cmd/**", depth=1), rule("/**", depth=2)), "/cmd/a", "a/B", {"depth": 2}),
-        ((rule("/**", depth=2), rule("/cmd/**", depth=1)), "/cmd/a", "a/B", {"depth": 1}),
-        ((rule("/**", depth=2, deadline=1.0), rule("/cmd", depth=1)), "/cmd", "a/B", {"depth": 1, "deadline": 1.0}),
-        ((rule("/**", deadline=1.0), rule("/cmd", deadline=None)), "/cmd", "a/B", {}),
-        ((rule(types=("a/*",), depth=1),), "/cmd", "a/B", {"depth": 1}),
-        ((rule(types=("a/*",), depth=1),), "/cmd", "", {}),
-        ((rule("/cmd", types=("a/*",), depth=1),), "/cmd", "a/B", {"depth": 1}),
-        ((rule("/cmd", types=("a/*",), depth=1),), "/cmd", "b/B", {}),
-        ((rule("/cmd", types=("a/*",), depth=1),), "/odom", "a/B", {}),
-        ((rule("/x", "/cmd", depth=1),), "/cmd", "a/B", {"depth": 1}),
-    ],
-)
-def test_every_fitting_rule_applies_and_a_later_one_outweighs(
-    rules: tuple[ContractRule, ...], topic: str, type_name: str, changed: dict[str, object]
-) -> None:
-    assert Contracts(rules).of(topic, type_name) == dataclasses.replace(Contract(), **changed)  # type: ignore[arg-type]
-
-
 def test_what_decided_is_explained() -> None:
     contracts = Contracts(
         (rule("/**", depth=2, priority=Priority.LOW), rule("/x", "/cmd/*", types=("a/*",), depth=1))

@@ -178,19 +178,6 @@ def test_the_first_is_known_and_what_is_due_comes_in_order() -> None:
     assert (table.next(), len(table)) == (9.0, 1)
 
 
-def test_moved_or_cancelled_key_is_due_at_its_last_time() -> None:
-    table: TimerQueue[int] = TimerQueue()
-    for at in (5.0, 1.0, 3.0, 3.0):
-        table.set(1, at)
-    table.set(2, 2.0)
-    table.set(2, None)
-    assert table.next() == 3.0
-    assert table.take(10.0) == [1]
-    assert table.take(10.0) == []
-    table.set(1, 3.0)
-    assert table.take(3.0) == [1]
-
-
 def test_queue_agrees_with_a_list_and_stays_small() -> None:
     rng = random.Random(5)
     table: TimerQueue[int] = TimerQueue()

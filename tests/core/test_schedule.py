@@ -14,14 +14,6 @@ def test_times_are_absolute_whatever_the_work_takes() -> None:
     assert not any(missed for _, missed in dues)
 
 
-def test_a_time_that_is_a_whole_period_past_is_left_out() -> None:
-    schedule = Schedule(0.1, 0.0)
-    schedule.next_due(0.0)
-    due, missed = schedule.next_due(0.35)
-    assert due == pytest.approx(0.3)
-    assert missed == 2
-
-
 @given(st.floats(1e-4, 10), st.lists(st.floats(0, 100), max_size=30))
 def test_each_due_time_is_met_or_missed(period: float, works: list[float]) -> None:
     schedule = Schedule(period, 0.0)

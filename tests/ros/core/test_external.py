@@ -14,7 +14,7 @@ from rmpa.core.errors import LocalProtocolError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.core import liveness
 from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.core.external import MASTER_FAREWELL, MASTER_LOOK_IDLE, MASTER_RETRY, ExternalCore
+from rmpa.ros.core.external import MASTER_FAREWELL, MASTER_RETRY, ExternalCore
 from rmpa.ros.core.liveness import Liveness, Unreachable
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
@@ -92,20 +92,6 @@ async def test_what_is_called_arrives_in_order_and_is_gone_at_the_end(master: Ro
         assert (await core.ask("subscribeParam", "/rmpa", OURS, "/key")).value == 5
     assert sorted(seen[len(expected) :]) == [(False, "/srv"), (False, "/t0"), (False, "/t2")]
     assert master.state().nodes == {}
-
-
-async def test_others_are_seen_soon(master: RosCore, core: ExternalCore) -> None:
-    told: list[GraphChange] = []
-    core.on_change(told.append)
-    await asyncio.sleep(MASTER_LOOK_IDLE)  # it looks seldom by now
-    begin = asyncio.get_running_loop().time()
-    async with serving() as api:
-        master.call("registerPublisher", "/n", "/t", STRING, api)
-        await until(lambda: told)
-        assert asyncio.get_running_loop().time() - begin < 2.0, "a second, on a busy machine"
-        assert core.publishers("/t") == {"/n": api}
-        assert (core.type_of("/t"), core.type_of("/u")) == (STRING, "*")
-        assert core.state() == master.state()
 
 
 async def test_a_master_that_is_not_there_yet_is_waited_for() -> None:

@@ -382,18 +382,6 @@ async def test_port_in_use_has_a_remedy(echo: Echo) -> None:
         await XmlRpcServer(echo, host="192.0.2.1").start()
 
 
-async def test_a_request_behind_one_that_waits_is_answered_after_it(server: XmlRpcServer, echo: Echo) -> None:
-    async with client(server) as c:
-        for method in ("wait", "echo"):
-            c.writer.write(post(serialize_call(method, [])))
-            await c.writer.drain()
-            await echo.waiting.wait()
-        await asyncio.sleep(0.01)
-        echo.go.set()
-        assert parse_response((await c.response())[1]) == "waited"
-        assert parse_response((await c.response())[1]) == [1, "127.0.0.1", []]
-
-
 async def test_a_connection_that_shall_end_with_its_answer_does(server: XmlRpcServer) -> None:
     async with client(server) as c:
         c.writer.write(post(serialize_call("echo", []), b"Connection: close"))

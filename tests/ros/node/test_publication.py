@@ -256,19 +256,6 @@ async def test_withdrawal_closes_all_connections_silently(known: Owner) -> None:
     assert known.said == ["first"]
 
 
-async def test_figures(known: Owner) -> None:
-    link = await known.subscriber()
-    await link.header()
-    known.publication.publish_framed(frame_message(b"abc"))
-    await link.message()
-    (connection,) = known.publication.connections()
-    assert (connection.other, connection.direction, connection.topic) == ("/s", "o", "/t")
-    assert (connection.connected, connection.messages, connection.dropped) == (True, 1, 0)
-    assert connection.bytes > 7
-    assert connection.info.startswith("TCPROS connection on port ")
-    assert (known.publication.messages, known.publication.bytes) == (1, 7)
-
-
 async def test_what_was_published_can_be_waited_for(known: Owner) -> None:
     link = await known.subscriber(buffer=4096)
     for _ in range(20):
@@ -451,15 +438,6 @@ async def test_subscriber_leaving_midway_disturbs_no_other(known: Owner) -> None
     extend(known.publication, *PARTS[2:])
     await stays.header()
     assert await stays.message() == WHOLE
-
-
-async def test_withdrawn_in_the_middle_nothing_is_left(latched: Owner) -> None:
-    await latched.subscriber()
-    begin(latched.publication)
-    extend(latched.publication, *PARTS[:2])
-    latched.publication.withdraw()
-    extend(latched.publication, *PARTS[2:])
-    assert latched.publication.latched == ()
 
 
 async def test_new_subscriber_gets_latched_depth_in_order(latched: Owner) -> None:

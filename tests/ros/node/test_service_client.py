@@ -9,8 +9,6 @@ import pytest
 from rmpa.core.errors import LocalProtocolError, PeerRefused, UnreachableError
 from rmpa.ros.node import service_client as module
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed, probe
-from rmpa.ros.node.service_server import ServiceEndpoint
-from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import ServiceDescription, encode_header, error_header, server_header
 from rmpa.runtime import limits
 from tests.ros.node.peers import DEADLINE, RawServer, until
@@ -266,21 +264,6 @@ async def test_a_name_that_does_not_resolve_is_a_reason() -> None:
 async def test_without_a_service_a_connection_is_enough(server: Server) -> None:
     assert await probe("127.0.0.1", server.port, "", timeout=DEADLINE) == ""
     assert await (await server.accept()).ended()
-
-
-async def test_a_node_of_ours_answers() -> None:
-    node = SlaveNode("/ours", "127.0.0.1", "http://127.0.0.1:11311/")
-    await node.start()
-    try:
-        endpoint = ServiceEndpoint("/ours/get_loggers", "/ours", lambda _: None, description=GET)
-        node.add_service(endpoint)
-        port = int(node.service_uri.rpartition(":")[2])
-        assert await probe("127.0.0.1", port, "/ours/get_loggers", timeout=DEADLINE, node="/ours") == ""
-        assert "listens there: /ours" in await probe(
-            "127.0.0.1", port, "/ours/get_loggers", timeout=DEADLINE, node="/talker"
-        )
-    finally:
-        await node.close()
 
 
 async def test_the_last_file_descriptors_are_not_taken(server: Server) -> None:

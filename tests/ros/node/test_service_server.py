@@ -433,18 +433,6 @@ async def test_a_node_that_ends_answers_what_is_under_way() -> None:
     assert await answers[1] == (True, large)
 
 
-async def test_junk_instead_of_a_request_harms_no_other(node: SlaveNode) -> None:
-    serve(node, echo)
-    good = await connect(node)
-    junk = await RawClient.call(node)
-    await junk.header()
-    await junk.send(b"GET / HTTP/1.0\r\n\r\n")  # a length of 542 MB
-    ok, text = await junk.reply()
-    assert not ok
-    assert b"exceeds the limit" in text
-    assert await good.call(b"x") == (True, b"x")
-
-
 async def test_the_server_that_does_not_speak_is_an_error() -> None:
     async def slam(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.read(10)

@@ -44,15 +44,6 @@ async def test_a_removed_topic_is_closed_and_unknown(node: SlaveNode) -> None:
     assert (await call_api(node.uri, "requestTopic", "/s", "/t", [["TCPROS"]])).code == -1
 
 
-async def test_two_hundred_nodes_in_one_process() -> None:
-    nodes = [SlaveNode(f"/n{n}", "127.0.0.1", "") for n in range(200)]
-    for node in nodes:
-        await node.start()
-    assert len({node.uri for node in nodes}) == 200
-    for node in nodes:
-        await node.close()
-
-
 async def test_a_port_in_use_is_a_clear_error_and_leaves_nothing_open(node: SlaveNode) -> None:
     port = int(node.uri.rsplit(":", 1)[1].strip("/"))
     with pytest.raises(StartError, match=f"port {port} is already in use"):

@@ -351,26 +351,6 @@ class InParts(Said):
         self.half = b""
 
 
-async def test_only_above_the_limit_a_message_comes_in_parts(publisher: RawPublisher) -> None:
-    said = InParts(publisher.uri)
-    link, _ = await publisher.serve()
-    payloads = [
-        bytes(core_limits.CUT_THROUGH_BYTES - 4),
-        bytes(core_limits.CUT_THROUGH_BYTES - 3),
-        LARGE,
-        b"",
-        b"small",
-    ]
-    for payload in payloads:
-        await link.send(frame_message(payload))
-    await until(lambda: len(said.messages) == 5)
-    assert said.messages == [frame_message(payload) for payload in payloads]
-    # What came whole with one read is whole; else it is handed on as it comes.
-    assert all(size > core_limits.CUT_THROUGH_BYTES for size in said.sizes)
-    connection = said.link.connection()
-    assert (connection.messages, connection.bytes) == (5, sum(len(payload) + 4 for payload in payloads))
-
-
 async def test_the_first_bytes_are_handed_on_before_the_last_ones_were_sent(publisher: RawPublisher) -> None:
     said = InParts(publisher.uri)
     link, _ = await publisher.serve()
@@ -395,7 +375,8 @@ async def test_any_pieces_make_the_same_messages(publisher: RawPublisher, chunk:
     said = InParts(publisher.uri)
     _link, _ = await publisher.serve()
     await until(lambda: said.headers)
-    payloads = [b"one", b"", LARGE, LARGE[::-1], b"two", bytes(core_limits.CUT_THROUGH_BYTES - 3), b""]
+    edge = [bytes(core_limits.CUT_THROUGH_BYTES - 4), bytes(core_limits.CUT_THROUGH_BYTES - 3)]
+    payloads = [b"one", b"", LARGE, LARGE[::-1], b"two", *edge, b""]
     wire = b"".join(map(frame_message, payloads))
     assert said.link._stream is not None
     if chunk == 1:
@@ -404,6 +385,7 @@ async def test_any_pieces_make_the_same_messages(publisher: RawPublisher, chunk:
     for start in range(0, len(wire), chunk):
         said.link._stream.feed(wire[start : start + chunk])
     assert [m[4:] for m in said.messages] == payloads
+    assert all(size > core_limits.CUT_THROUGH_BYTES for size in said.sizes)
     assert said.link.messages == len(payloads)
     assert said.link.bytes == len(wire)
 

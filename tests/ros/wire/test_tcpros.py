@@ -15,7 +15,6 @@ from rmpa.ros.wire.tcpros import (
     BodyBuffer,
     ServiceDescription,
     TopicDescription,
-    check_client,
     check_publisher,
     check_request,
     check_server,
@@ -276,17 +275,6 @@ def test_persistent_as_rospy_and_roscpp_write_it() -> None:
         assert not is_persistent({"persistent": value})
     assert is_probe(client_header("/add", "/c", probe=True))
     assert not is_probe({})
-
-
-def test_another_md5_sum_does_not_fit() -> None:
-    header = client_header("/add", "/client", md5sum="0" * 32)
-    text = check_client(header, "/add", "/server", ADD)
-    assert text == (
-        f"client [/client] wants service /add to have md5sum [{'0' * 32}], but server [/server] has "
-        f"[rospy_tutorials/AddTwoInts/{SERVICE_MD5}]"
-    )
-    assert check_client(client_header("/add", "/c"), "/add", "/server", ADD) is None
-    assert check_client(client_header("/add", "/c", md5sum=SERVICE_MD5), "/add", "/server", ADD) is None
 
 
 def test_a_servers_header_is_not_believed_unseen() -> None:
