@@ -11,15 +11,12 @@ import subprocess
 import sys
 import urllib.request
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
 from lab.bed.processes import DEADLINE, Process, eventually, run
 from tests.cli.conftest import free_port
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 GIVEN: Final = os.environ.get("RMPA_BUNDLE")
@@ -103,31 +100,23 @@ def program(request: pytest.FixtureRequest) -> tuple[Path, dict[str, str]]:
     return script, request.getfixturevalue("pip_environ")
 
 
-@pytest.fixture
-def up(program: tuple[Path, dict[str, str]]) -> Iterator[Callable[..., Process]]:
-    """Starts ``rmpa up --name a``, with more words."""
-    script, environ = program
-    started: list[Process] = []
-
-    def start(*words: str) -> Process:
-        ports = ["--core-port", str(free_port())]
-        process = Process(
-            [script, "up", "--name", "a", "--interface", "lo", *ports, *words], env=environ, name="agent"
-        )
-        started.append(process)
-        process.wait_for("ROS_MASTER_URI=")
-        return process
-
-    yield start
-    for process in started:
-        process.end()
-
-
-def test_agent_and_page_are_deaf_and_hand_the_variables_on(
-    program: tuple[Path, dict[str, str]], up: Callable[..., Process]
+def test_agent_page_gateway_and_trust_are_deaf_and_hand_the_variables_on(
+    program: tuple[Path, dict[str, str]], tmp_path: Path
 ) -> None:
     script, environ = program
-    agent = up("--web")
+    local = ["--interface", "lo"]
+    site = ["--site", "hall", "--listen", f"tcp/127.0.0.1:{free_port()}", "--insecure", *local]
+    words = ["up", "--name", "a", "--core-port", str(free_port()), "--web", *local]
+    with Process([script, *words], env=environ, name="agent") as agent:
+        core = agent.wait_for("ROS_MASTER_URI=(\\S+)")[1]
+        _page_and_definitions(script, environ, agent, core, tmp_path)
+        with Process([script, "gateway", *site], env=environ, name="gateway") as gateway:
+            gateway.wait_for("leads site hall")
+            assert "poison" not in gateway.output + agent.output
+    run([script, "trust", "init", "--name", "a"], env=environ)
+
+
+def _page_and_definitions(script: Path, environ: dict[str, str], agent: Process, core: str, tmp_path: Path) -> None:
     address = f"http://127.0.0.1:{environ['RMPA_WEB_PORT']}/metrics"
     page = eventually(lambda: _get(address), what="an answer of the page")
     assert "rmpa_" in page
@@ -138,21 +127,11 @@ def test_agent_and_page_are_deaf_and_hand_the_variables_on(
     for name in ("PYTHONPATH", "LD_LIBRARY_PATH", "PYTHONSTARTUP"):
         assert theirs[name] == environ[name]
     assert "/rosout" in run([script, "topic", "list"], env=environ)
-    assert "poison" not in agent.output
-
-
-def test_a_gateway_is_deaf(program: tuple[Path, dict[str, str]], up: Callable[..., Process]) -> None:
-    script, environ = program
-    up()
-    words = ["--site", "hall", "--listen", f"tcp/127.0.0.1:{free_port()}", "--insecure", "--interface", "lo"]
-    with Process([script, "gateway", *words], env=environ, name="gateway") as gateway:
-        gateway.wait_for("leads site hall")
-        assert "poison" not in gateway.output
-
-
-def test_trust_is_deaf(program: tuple[Path, dict[str, str]]) -> None:
-    script, environ = program
-    run([script, "trust", "init", "--name", "a"], env=environ)
+    module = tmp_path / "poison/my_msgs/msg/_Thing.py"
+    module.parent.mkdir(parents=True)
+    module.write_text('class Thing(object):\n  _type = "my_msgs/Thing"\n  _full_text = """int8 x"""\n')
+    words = ["topic", "pub", "--master", core, "-1", "/thing", "my_msgs/Thing", "{x: 1}"]
+    run([script, *words], env=environ)
 
 
 def test_a_file_of_the_user_runs_and_has_the_variables(program: tuple[Path, dict[str, str]], tmp_path: Path) -> None:
@@ -162,18 +141,6 @@ def test_a_file_of_the_user_runs_and_has_the_variables(program: tuple[Path, dict
     with Process([script, "run", tmp_path / "camera.py", "--no-state", *options], env=environ, name="run") as node:
         node.wait_for(f"the file has {re.escape(environ['PYTHONPATH'])}")
         node.wait_for("camera: active")
-
-
-def test_definitions_are_found_by_the_variables(
-    program: tuple[Path, dict[str, str]], up: Callable[..., Process], tmp_path: Path
-) -> None:
-    script, environ = program
-    module = tmp_path / "poison/my_msgs/msg/_Thing.py"
-    module.parent.mkdir(parents=True)
-    module.write_text('class Thing(object):\n  _type = "my_msgs/Thing"\n  _full_text = """int8 x"""\n')
-    core = up().wait_for("ROS_MASTER_URI=(\\S+)")[1]
-    words = ["topic", "pub", "--master", core, "-1", "/thing", "my_msgs/Thing", "{x: 1}"]
-    run([script, *words], env=environ)
 
 
 def test_it_starts_by_a_symlink_in_any_folder_and_writes_nothing(
