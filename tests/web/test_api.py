@@ -38,17 +38,16 @@ def problem(response: rest.RestResponse) -> str:
     return body.detail
 
 
-def test_the_snapshot_comes_whole() -> None:
-    response = get("/snapshot")
-    assert (response.status, response.content_type) == (200, "application/json")
-    assert msgspec.json.decode(response.body, type=Snapshot) == FULL
-
-
-def test_its_parts_come_alone() -> None:
-    assert msgspec.json.decode(get("/peers").body, type=tuple[PeerInfo, ...]) == FULL.peers
-    assert msgspec.json.decode(get("/peers/hand").body, type=PeerInfo) == FULL.peers[1]
-    assert msgspec.json.decode(get("/counters").body) == {"beacon.malformed": 11}
-    assert msgspec.json.decode(get("/notes").body) == ["port taken"]
+def test_the_snapshot_comes_whole_and_its_parts_alone() -> None:
+    assert get("/snapshot").content_type == "application/json"
+    for path, kind, wanted in (
+        ("/snapshot", Snapshot, FULL),
+        ("/peers", tuple[PeerInfo, ...], FULL.peers),
+        ("/peers/hand", PeerInfo, FULL.peers[1]),
+        ("/counters", dict, {"beacon.malformed": 11}),
+        ("/notes", list, ["port taken"]),
+    ):
+        assert msgspec.json.decode(get(path).body, type=kind) == wanted
 
 
 @pytest.mark.parametrize("path", ["/topics/image", "/topics//image", "/topics/%2Fimage", "/topics/%69mage"])
@@ -56,45 +55,36 @@ def test_a_topic_is_found_by_its_name_however_its_slash_is_written(path: str) ->
     assert msgspec.json.decode(get(path).body, type=TopicInfo) == FULL.topics[0]
 
 
-def test_a_name_with_slashes_needs_no_encoding() -> None:
+def test_all_services_of_a_name_come_which_may_have_slashes() -> None:
     body = get("/services/camera/get_loggers").body
     assert [each.node for each in msgspec.json.decode(body, type=list[ServiceInfo])] == ["/camera"]
-
-
-def test_all_services_of_a_name_come() -> None:
     both = (SERVICE, msgspec.structs.replace(SERVICE, peer="hand"))
     body = get("/services/set_bool", Snapshot(agent=AGENT, taken=1.0, services=both)).body
     assert msgspec.json.decode(body, type=tuple[ServiceInfo, ...]) == both
 
 
-def test_a_name_that_is_nearly_right_gets_a_hint() -> None:
-    assert "did you mean /image?" in problem(get("/topics/imgae"))
-    assert f"{API}/peers lists all" in problem(get("/peers/zzzzz"))
-    assert get("/topics/imgae").status == 404
-
-
-@pytest.mark.parametrize("path", ["", "/", "/nothing", "/snapshot/x", "/peers/", "/counters/x", "/topics/%00%ff"])
-def test_what_is_not_there_is_said(path: str) -> None:
-    response = get(path)
-    assert response.status == 404
-    assert "there is no" in problem(response)
-
-
-def test_a_path_outside_of_the_api_is_not_its_business() -> None:
-    assert rest.respond("/metrics", FULL).status == 404
-    assert rest.respond("/api/v2/snapshot", FULL).status == 404
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        (f"{API}/topics/imgae", "did you mean /image?"),
+        (f"{API}/peers/zzzzz", f"{API}/peers lists all"),
+        *((API + path, "there is no") for path in ("", "/", "/nothing", "/snapshot/x", "/peers/", "/counters/x")),
+        *((path, "there is no") for path in (f"{API}/topics/%00%ff", "/metrics", "/api/v2/snapshot")),
+    ],
+)
+def test_what_is_not_there_is_said(path: str, said: str) -> None:
+    response = rest.respond(path, FULL)
+    assert (response.status, said in problem(response)) == (404, True)
 
 
 def test_a_path_that_is_too_long_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "REST_PATH_MAX", len(f"{API}/topics/imag"))
-    assert get("/topics/image").status == 404
-    assert get("/topics").status == 200
+    assert (get("/topics/image").status, get("/topics").status) == (404, 200)
 
 
 def test_without_an_agent_it_says_so_and_what_to_do() -> None:
     response = get("/snapshot", None)
-    assert response.status == 503
-    assert "rmpa up" in problem(response)
+    assert (response.status, "rmpa up" in problem(response)) == (503, True)
 
 
 @given(st.text(max_size=40))
@@ -181,19 +171,12 @@ def test_events_of_a_contract_begin_at_0_so_that_an_alarm_sees_the_first() -> No
         assert shown == expected
 
 
-def test_without_an_agent_there_is_one_metric_that_says_so() -> None:
+def test_what_is_not_known_or_not_used_is_left_out() -> None:
     assert samples(None) == {("rmpa_up", frozenset()): 0.0}
-
-
-def test_what_is_not_known_is_left_out() -> None:
     found = samples(Snapshot(agent=msgspec.structs.replace(AGENT, cpu=None, rss=None, files=None), taken=1.0))
     assert not any("cpu" in name or "fds" in name for name, _ in found)
-
-
-def test_services_that_each_node_has_show_once_they_are_called() -> None:
     names = {dict(labels).get("service") for _, labels in samples(FULL)}
-    assert "/camera/get_loggers" not in names
-    assert "/home" in names
+    assert ("/camera/get_loggers" in names, "/home" in names) == (False, True)  # each node has the first
 
 
 def test_the_number_of_time_series_is_bounded_and_what_is_left_out_is_counted(
@@ -201,13 +184,9 @@ def test_the_number_of_time_series_is_bounded_and_what_is_left_out_is_counted(
 ) -> None:
     monkeypatch.setattr(limits, "METRIC_ROUTES", 3)
     monkeypatch.setattr(limits, "METRIC_PEERS", 2)
-    routes = tuple(route(node=f"/n{number}") for number in range(5))
-    snapshot = Snapshot(
-        agent=AGENT,
-        taken=1.0,
-        peers=tuple(peer(f"p{number}") for number in range(6)),
-        topics=(TopicInfo(name="/t", routes=routes),),
-    )
+    topic = TopicInfo(name="/t", routes=tuple(route(node=f"/n{number}") for number in range(5)))
+    peers = tuple(peer(f"p{number}") for number in range(6))
+    snapshot = Snapshot(agent=AGENT, taken=1.0, peers=peers, topics=(topic,))
     found = samples(snapshot)
     assert found["rmpa_metrics_omitted", frozenset({("kind", "route")})] == 2
     assert found["rmpa_metrics_omitted", frozenset({("kind", "peer")})] == 4
@@ -277,9 +256,14 @@ def test_the_dashboard_uses_metrics_and_labels_that_there_are() -> None:
             assert set(re.findall(r"(\w+)\s*[=!]", inside)) <= labels, expression
 
 
+def check_rules(file: Path) -> None:
+    assert PROMTOOL is not None
+    checked = subprocess.run([PROMTOOL, "check", "rules", str(file)], check=False, capture_output=True, timeout=30)
+    assert checked.returncode == 0, checked.stdout.decode() + checked.stderr.decode()
+
+
 @with_promtool
 def test_each_query_of_the_dashboard_is_valid_promql(tmp_path: Path) -> None:
-    assert PROMTOOL is not None
     queries = [each for each in expressions() if not each.startswith("label_values")]
     rules = [
         {"record": f"check:{number}", "expr": re.sub(r"\$\w+", "x", each.replace("$__rate_interval", "5m"))}
@@ -287,20 +271,16 @@ def test_each_query_of_the_dashboard_is_valid_promql(tmp_path: Path) -> None:
     ]
     file = tmp_path / "rules.json"
     file.write_text(json.dumps({"groups": [{"name": "dashboard", "rules": rules}]}), encoding="utf-8")
-    checked = subprocess.run([PROMTOOL, "check", "rules", str(file)], check=False, capture_output=True, timeout=30)
-    assert checked.returncode == 0, checked.stdout.decode() + checked.stderr.decode()
+    check_rules(file)
 
 
 @with_promtool
 def test_the_alarms_of_the_page_are_valid_rules_about_metrics_that_there_are(tmp_path: Path) -> None:
-    assert PROMTOOL is not None
-    rules = next(
-        block for block in re.findall(r"```yaml\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL) if "expr:" in block
-    )
+    blocks = re.findall(r"```yaml\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
+    rules = next(block for block in blocks if "expr:" in block)
     file = tmp_path / "rules.yaml"
     file.write_text(rules, encoding="utf-8")
-    checked = subprocess.run([PROMTOOL, "check", "rules", str(file)], check=False, capture_output=True, timeout=30)
-    assert checked.returncode == 0, checked.stdout.decode() + checked.stderr.decode()
+    check_rules(file)
     assert set(re.findall(r"rmpa_\w+", rules)) <= {name for name, _ in samples(FULL)}
 
 

@@ -13,6 +13,7 @@ from msgspec import UNSET
 from rmpa.core.errors import RmpaError
 from rmpa.web import limits
 from rmpa.web.foxglove import protocol
+from rmpa.web.foxglove.protocol import FoxgloveParameter as Parameter
 from rmpa.web.foxglove.protocol import from_parameter, to_parameter
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 )
 def test_a_value_comes_back_as_it_went(value: ParamValue) -> None:
     sent = protocol.encode_json(to_parameter("/p", value))
-    received = msgspec.json.decode(sent, type=protocol.FoxgloveParameter)
+    received = msgspec.json.decode(sent, type=Parameter)
     back = from_parameter(received)
     assert back == value
     assert type(back) is type(value)
@@ -46,28 +47,28 @@ json_values = st.recursive(
 @given(json_values)
 def test_any_value_comes_back(value: ParamValue) -> None:
     sent = protocol.encode_json(to_parameter("/p", value))
-    assert from_parameter(msgspec.json.decode(sent, type=protocol.FoxgloveParameter)) == value
+    assert from_parameter(msgspec.json.decode(sent, type=Parameter)) == value
 
 
-def test_numbers_that_json_lacks_become_texts() -> None:
-    assert to_parameter("/p", float("nan")) == protocol.FoxgloveParameter(name="/p", value="nan")
-    assert to_parameter("/p", [1.0, float("-inf")]).value == [1.0, "-inf"]
-    assert to_parameter("/p", [1.0, float("-inf")]).type is UNSET
-
-
-def test_floating_point_numbers_say_so_as_javascript_writes_whole_ones_without_a_point() -> None:
-    assert to_parameter("/p", 1.0).type == "float64"
-    assert to_parameter("/p", [1.0, 2.0]).type == "float64_array"
-    assert to_parameter("/p", [1.0, 2]).type is UNSET
-    assert to_parameter("/p", 1).type is UNSET
+@pytest.mark.parametrize(
+    ("value", "shown", "kind"),
+    [
+        (float("nan"), "nan", UNSET),  # which JSON lacks
+        ([1.0, float("-inf")], [1.0, "-inf"], UNSET),
+        (1.0, 1.0, "float64"),  # JavaScript writes whole ones without a point
+        ([1.0, 2.0], [1.0, 2.0], "float64_array"),
+        ([1.0, 2], [1.0, 2], UNSET),
+        (1, 1, UNSET),
+    ],
+)
+def test_a_value_is_shown_with_its_type_where_json_does_not_tell_it(value: Any, shown: Any, kind: Any) -> None:
+    assert to_parameter("/p", value) == Parameter(name="/p", value=shown, type=kind)
 
 
 def test_a_whole_number_of_type_float64_is_a_double() -> None:
-    value = from_parameter(protocol.FoxgloveParameter(name="/p", type="float64", value=3))
-    assert isinstance(value, float)
-    listed = from_parameter(protocol.FoxgloveParameter(name="/p", type="float64_array", value=[1, 2.5]))
-    assert isinstance(listed, list)
-    assert [type(each) for each in listed] == [float, float]
+    listed: Any = from_parameter(Parameter(name="/p", type="float64_array", value=[1, 2.5]))
+    one = from_parameter(Parameter(name="/p", type="float64", value=3))
+    assert [type(each) for each in (one, *listed)] == [float] * 3
 
 
 def nested(depth: int) -> object:
@@ -80,23 +81,23 @@ def nested(depth: int) -> object:
 @pytest.mark.parametrize(
     "parameter",
     [
-        protocol.FoxgloveParameter(name="relative", value=1),
-        protocol.FoxgloveParameter(name="", value=1),
-        protocol.FoxgloveParameter(name="/a//b", value=1),
-        protocol.FoxgloveParameter(name="/p", value=1 << 31),
-        protocol.FoxgloveParameter(name="/p", value=[None]),
-        protocol.FoxgloveParameter(name="/p", value=nested(40)),
-        protocol.FoxgloveParameter(name="/p", type="float64", value="3"),
-        protocol.FoxgloveParameter(name="/p", type="float64", value=True),
-        protocol.FoxgloveParameter(name="/p", type="float64", value=10**400),
-        protocol.FoxgloveParameter(name="/p", type="float64_array", value=3),
-        protocol.FoxgloveParameter(name="/p", type="float64_array", value=[1, "x"]),
-        protocol.FoxgloveParameter(name="/p", type="byte_array", value="?"),
-        protocol.FoxgloveParameter(name="/p", type="byte_array", value=[1]),
+        Parameter(name="relative", value=1),
+        Parameter(name="", value=1),
+        Parameter(name="/a//b", value=1),
+        Parameter(name="/p", value=1 << 31),
+        Parameter(name="/p", value=[None]),
+        Parameter(name="/p", value=nested(40)),
+        Parameter(name="/p", type="float64", value="3"),
+        Parameter(name="/p", type="float64", value=True),
+        Parameter(name="/p", type="float64", value=10**400),
+        Parameter(name="/p", type="float64_array", value=3),
+        Parameter(name="/p", type="float64_array", value=[1, "x"]),
+        Parameter(name="/p", type="byte_array", value="?"),
+        Parameter(name="/p", type="byte_array", value=[1]),
     ],
     ids=lambda parameter: f"{parameter.name} {parameter.value!r:.20}",
 )
-def test_what_ros_cannot_hold_is_refused(parameter: protocol.FoxgloveParameter) -> None:
+def test_what_ros_cannot_hold_is_refused(parameter: Parameter) -> None:
     with pytest.raises(RmpaError):
         from_parameter(parameter)
 

@@ -7,6 +7,7 @@ import contextlib
 import socket
 import struct
 import tracemalloc
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -151,42 +152,22 @@ async def test_nothing_is_written_to_a_connection_that_was_closed(by_close: bool
         await asyncio.wait_for(draining, DEADLINE)
 
 
-class TlsTransport:
-    """What a frame writer needs of a transport with TLS."""
-
-    def __init__(self) -> None:
-        self.written: list[bytes] = []
-
-    def get_extra_info(self, name: str) -> Any:
-        return object() if name in ("socket", "sslcontext") else None
-
-    def get_write_buffer_size(self) -> int:
-        return 0
-
-    def is_closing(self) -> bool:
-        return False
-
-    def write(self, data: bytes) -> None:
-        self.written.append(bytes(data))
-
-
 async def test_with_tls_the_transport_writes() -> None:
-    transport: Any = TlsTransport()
-    writer = FrameWriter(transport, no_drain)
-    writer.write(Opcode.BINARY, (b"head", memoryview(PAYLOAD)))
-    assert b"".join(transport.written) == frame_header(Opcode.BINARY, len(PAYLOAD) + 4) + b"head" + PAYLOAD
-    assert transport.written[1] == PAYLOAD
+    written: list[bytes] = []
+    transport: Any = SimpleNamespace(
+        get_extra_info=lambda name: name in ("socket", "sslcontext") or None,
+        get_write_buffer_size=lambda: 0,
+        is_closing=lambda: False,
+        write=lambda data: written.append(bytes(data)),
+    )
+    FrameWriter(transport, no_drain).write(Opcode.BINARY, (b"head", memoryview(PAYLOAD)))
+    assert b"".join(written) == frame_header(Opcode.BINARY, len(PAYLOAD) + 4) + b"head" + PAYLOAD
+    assert written[1] == PAYLOAD
 
 
 @pytest.mark.parametrize(
     ("size", "header"),
-    [
-        (0, "8100"),
-        (125, "817d"),
-        (126, "817e007e"),
-        (65535, "817effff"),
-        (65536, "817f0000000000010000"),
-    ],
+    [(0, "8100"), (125, "817d"), (126, "817e007e"), (65535, "817effff"), (65536, "817f0000000000010000")],
 )
 def test_header_of_a_text_frame(size: int, header: str) -> None:
     """The lengths of RFC 6455, section 5.2."""
@@ -218,55 +199,31 @@ def _all(queue: FairQueue[str]) -> list[str]:
     return found
 
 
-def test_subscriptions_take_turns_however_many_messages_one_has() -> None:
-    queue: FairQueue[str] = FairQueue()
-    for number in range(3):
-        queue.push(1, f"map{number}", 10)
-    queue.push(2, "state", 1)
-    assert _all(queue) == ["map0", "state", "map1", "map2"]
-
-
-def test_higher_priorities_go_first_and_what_is_urgent_before_all() -> None:
-    queue: FairQueue[str] = FairQueue()
-    queue.push(1, "low", 1, priority=-1)
-    queue.push(2, "normal", 1)
-    queue.push(3, "high", 1, priority=1)
-    queue.push(None, "answer", 1)
-    assert _all(queue) == ["answer", "high", "normal", "low"]
-
-
-def test_a_full_subscription_drops_its_oldest_and_keeps_its_newest() -> None:
-    queue: FairQueue[str] = FairQueue(total_bytes=100, subscription_bytes=10)
-    for entry, size in (("a", 6), ("b", 6), ("c", 50)):
-        queue.push(1, entry, size)
-    assert queue.dropped == {1: 2}
-    assert _all(queue) == ["c"]
-
-
-def test_images_do_not_push_out_small_state() -> None:
-    queue: FairQueue[str] = FairQueue(total_bytes=100, subscription_bytes=100)
-    queue.push(1, "state", 1)
-    for number in range(10):
-        queue.push(2, f"image{number}", 30)
-    assert queue.bytes <= 100
-    assert queue.dropped == {2: 7}
-    assert _all(queue) == ["state", "image7", "image8", "image9"] or queue.dropped[1] == 0
-
-
-def test_low_priority_gives_way_to_high() -> None:
-    queue: FairQueue[str] = FairQueue(total_bytes=10, subscription_bytes=10)
-    queue.push(1, "low", 8, priority=-1)
-    queue.push(2, "high", 8, priority=1)
-    queue.push(1, "low2", 8, priority=-1)
-    assert _all(queue) == ["high"]
-    assert queue.dropped == {1: 2}
-
-
-def test_one_message_larger_than_the_bound_is_sent() -> None:
-    queue: FairQueue[str] = FairQueue(total_bytes=10, subscription_bytes=5)
-    queue.push(1, "small", 3)
-    queue.push(2, "huge", 100)
-    assert _all(queue) == ["huge"]
+@pytest.mark.parametrize(
+    ("total", "each", "pushed", "left", "dropped"),
+    [
+        # Subscriptions take turns, however many messages one has.
+        (100, 100, [(1, "a", 10, 0), (1, "b", 10, 0), (1, "c", 10, 0), (2, "z", 1, 0)], "azbc", {}),
+        # Higher priorities go first, and what is urgent before all.
+        (100, 100, [(1, "l", 1, -1), (2, "n", 1, 0), (3, "h", 1, 1), (None, "u", 1, 0)], "uhnl", {}),
+        # A full subscription drops its oldest and keeps its newest.
+        (100, 10, [(1, "a", 6, 0), (1, "b", 6, 0), (1, "c", 50, 0)], "c", {1: 2}),
+        # Images do not push out small state.
+        (100, 100, [(1, "s", 1, 0), *((2, str(number), 30, 0) for number in range(10))], "s789", {2: 7}),
+        # A low priority gives way to a high one.
+        (10, 10, [(1, "l", 8, -1), (2, "h", 8, 1), (1, "m", 8, -1)], "h", {1: 2}),
+        # One message that is larger than the bound is sent.
+        (10, 5, [(1, "small", 3, 0), (2, "!", 100, 0)], "!", {1: 1}),
+    ],
+)
+def test_what_waits_goes_in_turn_and_by_priority_and_is_bounded(
+    total: int, each: int, pushed: list[Any], left: str, dropped: dict[int, int]
+) -> None:
+    queue: FairQueue[str] = FairQueue(total, each)
+    for entry in pushed:
+        queue.push(*entry)
+    assert queue.bytes <= total or len(left) == 1
+    assert ("".join(_all(queue)), queue.dropped) == (left, dropped)
 
 
 def test_what_is_urgent_is_never_dropped_and_its_overflow_shows() -> None:
@@ -276,8 +233,7 @@ def test_what_is_urgent_is_never_dropped_and_its_overflow_shows() -> None:
     before = queue.overflow
     queue.push(None, "two", 6)
     assert (before, queue.overflow) == (False, True)
-    assert _all(queue) == ["one", "two"]
-    assert queue.dropped == {1: 1}
+    assert (_all(queue), queue.dropped) == (["one", "two"], {1: 1})
 
 
 def test_what_an_ended_subscription_had_is_not_sent() -> None:
@@ -286,9 +242,7 @@ def test_what_an_ended_subscription_had_is_not_sent() -> None:
     queue.push(2, "b", 1)
     queue.end(1)
     queue.end(7)
-    assert queue.bytes == 1
-    assert _all(queue) == ["b"]
-    assert queue.pop() is None
+    assert (queue.bytes, _all(queue)) == (1, ["b"])
 
 
 def _paced(interval: float, length: int, *times: float) -> FairQueue[float]:

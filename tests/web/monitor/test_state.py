@@ -31,6 +31,9 @@ RECORDED = snapshots()
 RESOURCES = resources()
 
 
+replace = msgspec.structs.replace
+
+
 def build(snapshot: Snapshot, **more: Any) -> Any:
     return StateBuilder(snapshot.agent.name).build(snapshot, **more)
 
@@ -50,20 +53,13 @@ def test_a_state_is_json_without_unknown_members(snapshot: Snapshot) -> None:
 
 def test_the_state_says_who_is_there_and_what_flows() -> None:
     state = build(RECORDED[0], resources=RESOURCES)
-    assert {name: one["state"] for name, one in state["modules"].items()} == {
-        "pc": "here", "base": "up", "joystick": "up", "velocity": "up",
-    }  # fmt: skip
-    assert state["flows"]["base>pc"]["topics"] == ["/odom"]
-    assert state["flows"]["base>pc"]["rate"] == pytest.approx(50, rel=0.05)
-    assert state["topics"]["/odom"]["from"] == ["base"]
-    assert state["topics"]["/odom"]["to"] == ["pc"]
-
-
-def test_flows_between_other_modules_are_known_from_their_resources() -> None:
-    flows = build(RECORDED[0], resources=RESOURCES)["flows"]
-    assert flows["joystick>velocity"]["topics"] == ["/command_information"]
-    assert flows["joystick>velocity"]["rate"] == pytest.approx(10, rel=0.05)
-    assert flows["velocity>base"]["by"] == "resource"
+    states = {name: one["state"] for name, one in state["modules"].items()}
+    assert states == {"pc": "here", "base": "up", "joystick": "up", "velocity": "up"}
+    assert (state["topics"]["/odom"]["from"], state["topics"]["/odom"]["to"]) == (["base"], ["pc"])
+    for flow, topic, rate in (("base>pc", "/odom", 50), ("joystick>velocity", "/command_information", 10)):
+        assert state["flows"][flow]["topics"] == [topic]
+        assert state["flows"][flow]["rate"] == pytest.approx(rate, rel=0.05)
+    assert state["flows"]["velocity>base"]["by"] == "resource"  # what flows between others is known from these alone
 
 
 def test_a_killed_module_shows_in_the_next_state_and_comes_back() -> None:
@@ -81,31 +77,30 @@ def test_what_a_lost_module_said_last_is_no_news() -> None:
     well, lost, back = (
         build(snapshot, resources=[one], alarms=[alarm]) for snapshot in (RECORDED[0], RECORDED[3], RECORDED[4])
     )
-    assert (well["resources"][one.key]["level"], well["resources"][one.key]["state"]) == ("OK", "active")
-    assert (lost["resources"][one.key]["level"], lost["resources"][one.key]["state"]) == ("STALE", "not known")
-    assert (list(well["alarms"]), list(lost["alarms"])) == ([one.key], [])
+    for state, level, word, alarms in ((well, "OK", "active", [one.key]), (lost, "STALE", "not known", [])):
+        shown = state["resources"][one.key]
+        assert (shown["level"], shown["state"], list(state["alarms"])) == (level, word, alarms)
     assert back["resources"] == well["resources"]
 
 
 def test_a_module_that_left_the_roster_is_away_since_nothing_came_of_it() -> None:
     builder = StateBuilder(FULL.agent.name)
     builder.build(FULL)
-    left: Any = builder.build(msgspec.structs.replace(FULL, taken=FULL.taken + 60, peers=()))
-    assert left["modules"]["arm"] == {
-        "state": "away", "since": FULL.taken, "error": "has left the roster: no beacon and no link"
-    }  # fmt: skip
+    left: Any = builder.build(replace(FULL, taken=FULL.taken + 60, peers=()))
+    error = "has left the roster: no beacon and no link"
+    assert left["modules"]["arm"] == {"state": "away", "since": FULL.taken, "error": error}
     assert left["modules"]["hand"]["since"] == FULL.taken - 1  # it had no link before
 
 
 def test_a_module_that_left_long_ago_is_forgotten_and_so_are_the_oldest_of_too_many() -> None:
     builder = StateBuilder(FULL.agent.name)
     builder.build(FULL)
-    later = msgspec.structs.replace(FULL, taken=FULL.taken + limits.FORGET_AFTER + 1, peers=())
+    later = replace(FULL, taken=FULL.taken + limits.FORGET_AFTER + 1, peers=())
     assert list(builder.build(later)["modules"]) == [FULL.agent.name]  # type: ignore[arg-type]
     last: Any = None
     for start in range(2):
         peers = tuple(peer(f"m{start}{number:03}") for number in range(limits.MODULES_SHOWN))
-        last = builder.build(msgspec.structs.replace(later, taken=later.taken + start, peers=peers))
+        last = builder.build(replace(later, taken=later.taken + start, peers=peers))
     assert len(last["modules"]) == limits.MODULES_SHOWN + 1
     assert not [name for name in last["modules"] if name.startswith("m0")]
 
@@ -115,7 +110,7 @@ def test_modules_that_are_not_of_this_mesh_stand_apart_and_can_be_invited_at_the
     arm2 = peer("arm2", state="pending", link=None, last_error="pending: no keys; invite it", invite=invite)
     impostor = peer("arm", state="foreign", link=None, last_error="not of this mesh")
     for trust in (TrustStatus(on=True, module="base", is_authority=True), TrustStatus(on=True, module="base")):
-        state = build(msgspec.structs.replace(FULL, strangers=(arm2, impostor), trust=trust))
+        state = build(replace(FULL, strangers=(arm2, impostor), trust=trust))
         assert state["outside"]["g arm2"] == {
             "name": "arm2", "state": "pending", "address": "g", "since": FULL.taken - 1,
             "text": "pending: no keys; invite it", "invite": invite, **({"here": True} if trust.is_authority else {}),
@@ -129,56 +124,39 @@ def test_to_a_module_without_keys_a_secured_mesh_that_it_met_is_not_away() -> No
     arm, hand = (peer(name, state="pending", link=None, invite="x") for name in ("arm", "hand"))
     for trust, away in ((None, ["hand"]), (TrustStatus(on=True, module="base"), ["arm", "hand"])):
         builder = StateBuilder(FULL.agent.name)
-        builder.build(msgspec.structs.replace(FULL, peers=(arm, hand)))
-        after: Any = builder.build(msgspec.structs.replace(FULL, peers=(), strangers=(arm,), trust=trust))
+        builder.build(replace(FULL, peers=(arm, hand)))
+        after: Any = builder.build(replace(FULL, peers=(), strangers=(arm,), trust=trust))
         assert [name for name, one in after["modules"].items() if one["state"] == "away"] == away
 
 
-def test_a_module_is_silent_since_it_was_heard_last() -> None:
-    mute = peer("arm", link=msgspec.structs.replace(LINK, heard_ago=4.0, up_ago=3600.0))
-    state = build(msgspec.structs.replace(FULL, peers=(mute,)))
-    assert (state["modules"]["arm"]["state"], state["modules"]["arm"]["since"]) == ("silent", FULL.taken - 4)
-
-
-def test_an_agent_that_has_just_started_has_lost_nothing() -> None:
+def test_a_module_is_silent_since_it_was_heard_last_and_a_fresh_agent_has_lost_nothing() -> None:
+    mute = peer("arm", link=replace(LINK, heard_ago=4.0, up_ago=3600.0))
+    arm = build(replace(FULL, peers=(mute,)))["modules"]["arm"]
+    assert (arm["state"], arm["since"]) == ("silent", FULL.taken - 4)
     builder = StateBuilder(FULL.agent.name)
     builder.build(FULL)
-    fresh = msgspec.structs.replace(FULL.agent, uptime=2.0, started=FULL.taken + 8)
-    started: Any = builder.build(msgspec.structs.replace(FULL, agent=fresh, taken=FULL.taken + 10, peers=()))
+    fresh = replace(FULL.agent, uptime=2.0, started=FULL.taken + 8)
+    started: Any = builder.build(replace(FULL, agent=fresh, taken=FULL.taken + 10, peers=()))
     assert {started["modules"][name]["state"] for name in ("arm", "hand")} == {"linking"}
     assert "just started" in started["modules"]["arm"]["error"]
 
 
-def test_byte_rates_come_from_the_links_counters() -> None:
+def test_byte_rates_come_from_the_counters_of_one_link() -> None:
     builder = StateBuilder("pc")
-    builder.build(RECORDED[0])
-    state: Any = builder.build(RECORDED[1])
-    assert state["modules"]["base"]["bytes_in"] == pytest.approx(37_000, rel=0.2)
-
-
-def test_a_link_that_is_new_has_no_rate_yet() -> None:
-    builder = StateBuilder("pc")
-    for snapshot in RECORDED[:2]:
-        builder.build(snapshot)
-    assert "bytes_in" not in builder.build(RECORDED[4])["modules"]["base"]  # type: ignore[operator, index, call-overload]
+    states: list[Any] = [builder.build(RECORDED[number]) for number in (0, 1, 4)]
+    assert states[1]["modules"]["base"]["bytes_in"] == pytest.approx(37_000, rel=0.2)
+    assert "bytes_in" not in states[2]["modules"]["base"]  # a link that is new has none yet
 
 
 def test_noise_changes_nothing() -> None:
     builder = StateBuilder("pc")
     before = builder.build(RECORDED[1], RESOURCES)
-    noisy = msgspec.structs.replace(
-        RECORDED[1],
-        topics=tuple(
-            msgspec.structs.replace(
-                topic,
-                routes=tuple(
-                    msgspec.structs.replace(route, rate=route.rate and route.rate * 1.01, messages=route.messages + 9)
-                    for route in topic.routes
-                ),
-            )
-            for topic in RECORDED[1].topics
-        ),
-    )
+
+    def noise(route: RouteInfo) -> RouteInfo:
+        return replace(route, rate=route.rate and route.rate * 1.01, messages=route.messages + 9)
+
+    topics = (replace(topic, routes=tuple(map(noise, topic.routes))) for topic in RECORDED[1].topics)
+    noisy = replace(RECORDED[1], topics=tuple(topics))
     assert difference(before, builder.build(noisy, RESOURCES)) == {}
 
 
@@ -193,18 +171,17 @@ def test_patches_of_the_recorded_demo_are_small() -> None:
         assert shown == state
         sizes.append(len(json.dumps(patch)))
     assert sizes[0] < 20_000
-    assert sizes[1] < 1_500
-    assert sizes[5] < 1_500
+    assert max(sizes[1], sizes[5]) < 1_500
 
 
 @pytest.mark.parametrize(
     ("given", "word"),
     [
         (peer(), "up"),
-        (peer(link=msgspec.structs.replace(LINK, heard_ago=1.5)), "silent"),
-        (peer(link=msgspec.structs.replace(LINK, heard_ago=6.5, rests=True, lease=16.0)), "up"),
-        (peer(link=msgspec.structs.replace(LINK, heard_ago=8.5, rests=True, lease=16.0)), "silent"),
-        (peer(link=msgspec.structs.replace(LINK, heard_ago=20.0, rests=True, lease=58.0)), "up"),
+        (peer(link=replace(LINK, heard_ago=1.5)), "silent"),
+        (peer(link=replace(LINK, heard_ago=6.5, rests=True, lease=16.0)), "up"),
+        (peer(link=replace(LINK, heard_ago=8.5, rests=True, lease=16.0)), "silent"),
+        (peer(link=replace(LINK, heard_ago=20.0, rests=True, lease=58.0)), "up"),
         (peer(state="linking", link=None, beacon_ago=0.5), "linking"),
         (peer(state="linking", link=None, beacon_ago=8.0), "away"),
         (peer(state="linking", link=None), "away"),
@@ -219,9 +196,9 @@ def test_each_peer_has_a_word(given: PeerInfo, word: str) -> None:
 
 def test_a_state_of_a_huge_mesh_is_bounded_and_says_what_is_left_out() -> None:
     topic = RECORDED[0].topics[0]
-    many = tuple(msgspec.structs.replace(topic, name=f"/t{number}") for number in range(limits.TOPICS_SHOWN + 5))
+    many = tuple(replace(topic, name=f"/t{number}") for number in range(limits.TOPICS_SHOWN + 5))
     peers = tuple(peer(f"m{number:04d}") for number in range(limits.MODULES_SHOWN + 3))
-    state = build(msgspec.structs.replace(RECORDED[0], topics=many, peers=peers))
+    state = build(replace(RECORDED[0], topics=many, peers=peers))
     assert len(state["topics"]) == limits.TOPICS_SHOWN
     assert len(state["modules"]) <= limits.MODULES_SHOWN + 1
     assert state["hidden"] == {"topics": 5, "modules": 3}
@@ -229,15 +206,12 @@ def test_a_state_of_a_huge_mesh_is_bounded_and_says_what_is_left_out() -> None:
 
 def test_without_an_agent_the_last_state_stays_and_says_so() -> None:
     builder = StateBuilder("pc")
+    assert builder.unreachable(5.0, "no agent", "")["agent"] == {"name": "pc"}  # from the start
     known = builder.build(RECORDED[0])
     gone: Any = builder.unreachable(5.0, "no agent", "start one")
     assert gone["reach"] == {"ok": False, "since": 5.0, "error": "no agent", "remedy": "start one"}
     assert gone["modules"] is known["modules"]
     assert builder.build(RECORDED[0])["reach"] == {"ok": True}
-
-
-def test_there_may_be_no_agent_from_the_start() -> None:
-    assert StateBuilder("pc").unreachable(5.0, "no agent", "")["agent"] == {"name": "pc"}
 
 
 FACTS = {one.key: one for one in RESOURCES}
@@ -261,22 +235,17 @@ def test_details_have_all_of_one_thing(kind: str, name: str, has: str) -> None:
     assert not has_null(found)
 
 
-def test_routes_of_a_topic_have_keys_so_that_a_patch_is_small() -> None:
+def test_routes_of_a_topic_have_keys_and_what_is_not_there_has_no_details() -> None:
     found: Any = details(RECORDED[0], {}, "topic", "/odom")
-    assert list(found["routes"]) == ["in base /base"]
-
-
-@pytest.mark.parametrize("kind", ["module", "topic", "service", "resource", "else"])
-def test_what_is_not_there_has_no_details(kind: str) -> None:
-    assert details(RECORDED[0], FACTS, kind, "/nothing") is None
+    assert list(found["routes"]) == ["in base /base"]  # so that a patch is small
+    for kind in ("module", "topic", "service", "resource", "node", "else"):
+        assert details(RECORDED[0], FACTS, kind, "/nothing") is None
 
 
 def test_a_strange_descriptor_of_a_peer_breaks_nothing() -> None:
-    strange = ResourceFacts(
-        name="/x", peer="y", health={"values": {"rate": "much"}}, descriptor={"outputs": [3], "profiles": ["p"]}
-    )
-    state = build(RECORDED[0], resources=[strange])
-    assert state["resources"]["y:/x"]["module"] == "y"
+    declared = {"outputs": [3], "profiles": ["p"]}
+    strange = ResourceFacts(name="/x", peer="y", health={"values": {"rate": "much"}}, descriptor=declared)
+    assert build(RECORDED[0], resources=[strange])["resources"]["y:/x"]["module"] == "y"
 
 
 _PEERS = st.sampled_from(("arm", "base", "gate"))
@@ -311,10 +280,9 @@ def test_a_state_made_of_the_last_one_says_what_one_made_anew_says(history: list
         snapshot = Snapshot(agent=AGENT, taken=1000.0 + number, topics=tuple(topics))
         state: Any = builder.build(snapshot)
         fresh: Any = StateBuilder("pc").build(snapshot)
-        assert state.keys() == fresh.keys()
-        assert state["topics"].keys() == fresh["topics"].keys()
-        assert state["flows"].keys() == fresh["flows"].keys()
-        assert state["nodes"] == fresh["nodes"]
+        assert (state.keys(), state["nodes"]) == (fresh.keys(), fresh["nodes"])
+        for part in ("topics", "flows"):
+            assert state[part].keys() == fresh[part].keys()
         for name, entry in fresh["topics"].items():
             shown = state["topics"][name]
             assert shown.keys() == entry.keys()
@@ -328,23 +296,22 @@ def test_a_state_made_of_the_last_one_says_what_one_made_anew_says(history: list
 
 def test_nodes_of_all_modules_are_listed_and_each_has_its_topics_and_services() -> None:
     nodes = build(RECORDED[0], resources=RESOURCES)["nodes"]
+
+    def details_of(name: str) -> Any:
+        return details(RECORDED[0], {}, "node", name)
+
     assert nodes["base:/base"]["module"] == "base"
-    assert "/odom" in details_of("node", "base:/base")["publishes"]
+    assert "/odom" in details_of("base:/base")["publishes"]
     own = next(name for name, one in nodes.items() if "module" not in one and one.get("subscribes"))
-    assert nodes[own]["subscribes"] == len(details_of("node", own)["subscribes"])
+    assert nodes[own]["subscribes"] == len(details_of(own)["subscribes"])
     served = next(name for name, one in nodes.items() if one.get("serves") and one.get("module") == "base")
-    assert all(each.startswith("base:/") for each in details_of("node", served)["services"])
-    assert details(RECORDED[0], {}, "node", "base:/nothing") is None
-
-
-def details_of(kind: str, name: str) -> Any:
-    return details(RECORDED[0], {}, kind, name)
+    assert all(each.startswith("base:/") for each in details_of(served)["services"])
 
 
 def test_a_node_that_cannot_be_reached_says_so() -> None:
     gone = UnreachableInfo(node="/talker", uri="http://robot:1/", problem="no route", ago=3.0)
     topic = TopicInfo(name="/chatter", publishers=("/talker",))
-    snapshot = msgspec.structs.replace(FULL, topics=(topic,), services=(), unreachable=(gone,))
+    snapshot = replace(FULL, topics=(topic,), services=(), unreachable=(gone,))
     assert build(snapshot)["nodes"]["/talker"]["problem"] == "no route"
     assert "no route" in str((details(snapshot, {}, "node", "/talker") or {})["problem"])
 
@@ -371,10 +338,5 @@ def test_each_state_is_of_a_new_snapshot() -> None:
 
 
 def test_the_page_has_each_question_and_message() -> None:
-    for what in questions.QUESTIONS:
-        assert f"`{what}`" in PAGE
-    for right in session.RIGHTS:
-        assert f"`{right}`" in PAGE
-    for op in session.OPS:
-        assert f"`{op}`" in PAGE
-    assert f"`{messages.SUBPROTOCOL}`" in PAGE
+    for word in (*questions.QUESTIONS, *session.RIGHTS, *session.OPS, messages.SUBPROTOCOL):
+        assert f"`{word}`" in PAGE

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import stat
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -34,137 +34,67 @@ def reason(verdict: Verdict) -> str:
     return verdict.reason if isinstance(verdict, AccessRefused) else verdict
 
 
-@pytest.mark.parametrize(
-    ("host", "expected"),
-    [
-        (("localhost:8480",), "granted"),
-        (("LOCALHOST",), "granted"),
-        (("localhost.:8480",), "granted"),
-        (("127.0.0.1:8480",), "granted"),
-        (("192.168.1.7:8480",), "granted"),  # an address cannot be rebound
-        (("[::1]:8480",), "granted"),
-        (("base",), "granted"),
-        (("base.local:8480",), "granted"),
-        (("evil.example:8480",), "host"),
-        (("localhost.evil.example",), "host"),
-        (("127.0.0.1.evil.example:8480",), "host"),
-        (("0x7f.1",), "host"),
-        (("localhost:8480@evil.example",), "host"),
-        (("localhost, evil.example",), "host"),
-        (("",), "host"),
-        ((), "host"),
-        (("localhost", "evil.example"), "host"),
-    ],
-)
-def test_a_name_that_is_not_ours_is_a_rebound_one(host: tuple[str, ...], expected: str) -> None:
-    assert reason(OPEN.judge(RequestFacts(host))) == expected
+LISTED = AccessPolicy(8480, HOSTS, TOKEN, frozenset({"https://app.example", "*"}))
+ORIGIN = "http://base.local:8480"
+APP = {"origin": "https://app.example", "is_preflight": True}
+# Each: what the request has beside ``Host: base.local:8480``, and what becomes of it.
+WITHOUT_TOKEN: list[tuple[dict[str, object], str]] = [
+    # A name that is not ours is a rebound one; an address cannot be rebound.
+    *(({"host": (f"{name}:8480",)}, "granted") for name in ("localhost", "localhost.", "127.0.0.1", "192.168.1.7")),
+    *(({"host": (name,)}, "granted") for name in ("LOCALHOST", "base", "base.local:8480", "[::1]:8480")),
+    *(({"host": (f"{name}:8480",)}, "host") for name in ("evil.example", "127.0.0.1.evil.example", "0x7f.1")),
+    *(({"host": (name,)}, "host") for name in ("localhost.evil.example", "localhost:8480@evil.example", "")),
+    *(({"host": names}, "host") for names in (("localhost, evil.example",), (), ("localhost", "evil.example"))),
+    # Only our own pages may read.
+    *(({"origin": each}, "granted") for each in (ORIGIN, "https://BASE.local:8480")),
+    *(({"origin": f"http://{each}"}, "origin") for each in ("base.local:8481", "base.local", "evil.example")),
+    *(({"origin": each}, "origin") for each in ("http://evil.example/base.local:8480", "null", "")),
+    *(({"origin": each}, "origin") for each in ("ftp://base.local:8480", "chrome-extension://abc")),
+    # A server of HTTPS takes no page of plain HTTP for its own: what is on the way can forge that page.
+    *(({"origin": f"https://{each}:8480", "secure": True}, "granted") for each in ("base.local", "BASE.local")),
+    *(({"origin": each, "secure": True}, "origin") for each in (ORIGIN, "HTTP://base.local:8480", "null")),
+    # What other sites load is refused without an origin, too; a link on another page may lead here.
+    ({"fetch_site": "same-origin", "fetch_mode": "cors"}, "granted"),
+    ({"fetch_site": "none", "fetch_mode": "navigate", "is_page": True}, "granted"),
+    ({"fetch_site": "cross-site", "fetch_mode": "navigate", "is_page": True}, "granted"),
+    *(({"fetch_site": "cross-site", "fetch_mode": each}, "origin") for each in ("navigate", "no-cors", "websocket")),
+    ({"fetch_site": "same-site", "fetch_mode": "no-cors", "is_page": True}, "origin"),  # another port of this host
+]
+WITH_TOKEN: list[tuple[dict[str, object], str]] = [
+    # It comes as bearer, cookie or query.
+    *(({"authorization": each}, "granted") for each in (f"Bearer {TOKEN}", f"bearer  {TOKEN} ")),
+    *(({"authorization": f"Bearer {each}"}, "token") for each in (f"{TOKEN}x", TOKEN[:-1], "", "\udcff\u00e4")),
+    *(({"cookie": each}, "token") for each in ("old", "", None)),
+    ({"authorization": f"Basic {TOKEN}"}, "token"),
+    ({"cookie": TOKEN}, "granted"),
+    ({"token": TOKEN}, "granted"),
+    ({"token": TOKEN, "is_page": True}, "move token"),
+    ({"token": TOKEN, "is_page": True, "cookie": "old"}, "move token"),
+    ({"token": "wrong", "is_page": True}, "token"),
+    ({"token": "wrong", "cookie": TOKEN}, "granted"),
+    ({"is_open": True}, "granted"),
+    # Only listed sites are told what their pages may send.
+    (APP, "preflight"),
+    (APP | {"origin": "https://APP.example"}, "preflight"),
+    (APP | {"is_preflight": False}, "token"),
+    *((APP | {"origin": each}, "origin") for each in ("http://app.example", "https://app.example:8443", "*", "null")),
+    (APP | {"origin": "https://app.example.evil.example"}, "origin"),
+    *((APP | {"origin": each}, "token") for each in (ORIGIN, None)),  # our own pages ask nothing before
+    (APP | {"host": ("evil.example",)}, "host"),
+]
+
+
+@pytest.mark.parametrize(("given", "expected"), WITHOUT_TOKEN)
+def test_who_may_ask_where_there_is_no_token(given: dict[str, Any], expected: str) -> None:
+    assert reason(OPEN.judge(RequestFacts(**{"host": HERE, **given}))) == expected
     # The right token does not help: a rebound page would have the browser send the cookie.
-    with_token = reason(CLOSED.judge(RequestFacts(host, authorization=f"Bearer {TOKEN}")))
-    assert with_token == expected
+    for token in ({"authorization": f"Bearer {TOKEN}"}, {"cookie": TOKEN}):
+        assert reason(CLOSED.judge(RequestFacts(**{"host": HERE, **token, **given}))) == expected
 
 
-@pytest.mark.parametrize(
-    ("origin", "expected"),
-    [
-        ("http://base.local:8480", "granted"),
-        ("https://BASE.local:8480", "granted"),
-        ("http://base.local:8481", "origin"),
-        ("http://base.local", "origin"),
-        ("http://evil.example", "origin"),
-        ("http://evil.example/base.local:8480", "origin"),
-        ("null", "origin"),
-        ("", "origin"),
-        ("ftp://base.local:8480", "origin"),
-        ("chrome-extension://abc", "origin"),
-    ],
-)
-def test_only_our_own_pages_may_read(origin: str, expected: str) -> None:
-    assert reason(OPEN.judge(RequestFacts(HERE, origin=origin))) == expected
-    assert reason(CLOSED.judge(RequestFacts(HERE, origin=origin, cookie=TOKEN))) == expected
-
-
-@pytest.mark.parametrize(
-    ("origin", "expected"),
-    [
-        ("https://base.local:8480", "granted"),
-        ("https://BASE.local:8480", "granted"),
-        ("http://base.local:8480", "origin"),  # whoever is on the way can forge that page
-        ("HTTP://base.local:8480", "origin"),
-        ("null", "origin"),
-    ],
-)
-def test_a_server_of_https_takes_no_page_of_plain_http_for_its_own(origin: str, expected: str) -> None:
-    assert reason(OPEN.judge(RequestFacts(HERE, origin=origin, secure=True))) == expected
-    assert reason(CLOSED.judge(RequestFacts(HERE, origin=origin, cookie=TOKEN, secure=True))) == expected
-
-
-@pytest.mark.parametrize(
-    ("origin", "is_preflight", "expected"),
-    [
-        ("https://app.example", True, "preflight"),
-        ("https://APP.example", True, "preflight"),
-        ("https://app.example", False, "token"),
-        ("http://app.example", True, "origin"),  # another scheme is another origin
-        ("https://app.example:8443", True, "origin"),
-        ("https://app.example.evil.example", True, "origin"),
-        ("*", True, "origin"),
-        ("null", True, "origin"),
-        ("http://base.local:8480", True, "token"),  # our own pages ask nothing before
-        (None, True, "token"),
-    ],
-)
-def test_only_listed_sites_are_told_what_their_pages_may_send(
-    origin: str | None, is_preflight: bool, expected: str
-) -> None:
-    policy = AccessPolicy(8480, HOSTS, TOKEN, frozenset({"https://app.example", "*"}))
-    assert reason(policy.judge(RequestFacts(HERE, origin=origin, is_preflight=is_preflight))) == expected
-    rebound = RequestFacts(("evil.example",), origin=origin, is_preflight=is_preflight)
-    assert reason(policy.judge(rebound)) == "host"
-
-
-@pytest.mark.parametrize(
-    ("site", "mode", "is_page", "expected"),
-    [
-        ("same-origin", "cors", False, "granted"),
-        ("none", "navigate", True, "granted"),
-        ("cross-site", "navigate", True, "granted"),  # a link in a wiki
-        ("cross-site", "navigate", False, "origin"),
-        ("cross-site", "no-cors", False, "origin"),  # <script src>, <img src>
-        ("cross-site", "websocket", False, "origin"),
-        ("same-site", "no-cors", True, "origin"),  # another port of this host
-    ],
-)
-def test_what_other_sites_load_is_refused_without_an_origin_too(
-    site: str, mode: str, is_page: bool, expected: str
-) -> None:
-    facts = RequestFacts(HERE, fetch_site=site, fetch_mode=mode, is_page=is_page)
-    assert reason(OPEN.judge(facts)) == expected
-
-
-@pytest.mark.parametrize(
-    ("facts", "expected"),
-    [
-        ({}, "token"),
-        ({"authorization": f"Bearer {TOKEN}"}, "granted"),
-        ({"authorization": f"bearer  {TOKEN} "}, "granted"),
-        ({"authorization": f"Basic {TOKEN}"}, "token"),
-        ({"authorization": "Bearer "}, "token"),
-        ({"authorization": f"Bearer {TOKEN}x"}, "token"),
-        ({"authorization": f"Bearer {TOKEN[:-1]}"}, "token"),
-        ({"authorization": "Bearer \udcff\u00e4"}, "token"),
-        ({"cookie": TOKEN}, "granted"),
-        ({"cookie": "old"}, "token"),
-        ({"cookie": ""}, "token"),
-        ({"token": TOKEN}, "granted"),
-        ({"token": TOKEN, "is_page": True}, "move token"),
-        ({"token": TOKEN, "is_page": True, "cookie": "old"}, "move token"),
-        ({"token": "wrong", "is_page": True}, "token"),
-        ({"token": "wrong", "cookie": TOKEN}, "granted"),
-        ({"is_open": True}, "granted"),
-    ],
-)
-def test_the_token_comes_as_bearer_cookie_or_query(facts: dict[str, object], expected: str) -> None:
-    assert reason(CLOSED.judge(RequestFacts(HERE, **facts))) == expected  # type: ignore[arg-type]
+@pytest.mark.parametrize(("given", "expected"), WITH_TOKEN)
+def test_who_may_ask_where_there_is_a_token(given: dict[str, Any], expected: str) -> None:
+    assert reason(LISTED.judge(RequestFacts(**{"host": HERE, **given}))) == expected
 
 
 def test_a_refusal_says_what_to_do() -> None:
@@ -191,29 +121,17 @@ def test_two_servers_of_one_host_have_cookies_of_their_own() -> None:
 def test_a_token_is_made_once_for_its_owner_alone(tmp_path: Path) -> None:
     file = tmp_path / "base" / "web-token"
     token, is_new = token_from(file)
-    assert is_new
+    assert (is_new, stat.S_IMODE(file.stat().st_mode)) == (True, 0o600)
     assert len(token) >= 43  # 256 bits
-    assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert token_from(file) == (token, False)
-
-
-def test_a_token_that_others_can_read_is_refused(tmp_path: Path) -> None:
-    file = tmp_path / "token"
-    token_from(file)
     file.chmod(0o644)
     with pytest.raises(StartError, match=r"other users may use .*644.*chmod 600"):
         token_from(file)
-
-
-@pytest.mark.parametrize(
-    "text", ["", "short", "with spaces in the middle of it", "n" * 20 + "\x00", "\N{SNOWMAN}" * 20]
-)
-def test_a_file_without_a_token_is_refused(tmp_path: Path, text: str) -> None:
-    file = tmp_path / "token"
-    file.write_text(text)
     file.chmod(0o600)
-    with pytest.raises(StartError, match="holds no token"):
-        token_from(file)
+    for text in ("", "short", "with spaces in the middle of it", "n" * 20 + "\x00", "\N{SNOWMAN}" * 20):
+        file.write_text(text)
+        with pytest.raises(StartError, match="holds no token"):
+            token_from(file)
 
 
 def test_loopback_needs_none_unless_a_file_is_given(tmp_path: Path) -> None:

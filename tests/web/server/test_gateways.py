@@ -32,18 +32,15 @@ TOKEN = "secret-" * 6
 
 
 @asynccontextmanager
-async def running(
-    token: str = "", rules: NodeRules = EVERYTHING, **policy: Any
-) -> AsyncIterator[tuple[WebServer, Any]]:
+async def running(token: str = "", rules: NodeRules = EVERYTHING) -> AsyncIterator[tuple[WebServer, Any]]:
     """A server that may control where it has a token, and its core."""
     async with local_core() as core:
         agent = msgspec.structs.replace(SNAPSHOT.agent, core_uri=core.uri)
         watch = AgentWatch(lambda: msgspec.structs.replace(SNAPSHOT, agent=agent))
         hub = make_hub(watch, 8480, rules)
         settings = Settings(web=WebSettings(control=bool(token)))
-        rights = WebSetup(settings, TokenAccess(token), CertificateFiles()).rights
-        gateways = Gateways(hub, "test", rights)
-        access = AccessPolicy(0, own_names(("base",)), token, **policy)
+        gateways = Gateways(hub, "test", WebSetup(settings, TokenAccess(token), CertificateFiles()).rights)
+        access = AccessPolicy(0, own_names(("base",)), token)
         server = WebServer(watch, access, "127.0.0.1", gateways, (0,))
         try:
             async with hub:
@@ -54,54 +51,83 @@ async def running(
             await server.close()
 
 
+@pytest.fixture
+async def server() -> AsyncIterator[WebServer]:
+    async with running() as (made, _):
+        yield made
+
+
+@pytest.fixture
+async def session() -> AsyncIterator[aiohttp.ClientSession]:
+    async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(limit=0)) as made:
+        yield made
+
+
+@asynccontextmanager
+async def handshake(server: WebServer, key: str) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
+    """A connection that has asked for a WebSocket."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+    request = "GET / HTTP/1.1", "Host: localhost", "Upgrade: websocket", "Connection: Upgrade"
+    lines = (*request, "Sec-WebSocket-Version: 13", f"Sec-WebSocket-Key: {key}", "", "")
+    writer.write("\r\n".join(lines).encode())
+    async with asyncio.timeout(DEADLINE):
+        yield reader, writer
+    writer.close()
+
+
+async def refused_for(session: aiohttp.ClientSession, server: WebServer, reason: str) -> bool:
+    """Whether one is counted as refused for that reason."""
+    async with session.get(f"http://127.0.0.1:{server.port}/metrics") as response:
+        return f'rmpa_web_refused_total{{reason="{reason}"}} 1.0' in await response.text()
+
+
 def connect(session: aiohttp.ClientSession, server: WebServer, path: str = "/", **headers: str) -> Any:
     return session.ws_connect(f"ws://127.0.0.1:{server.port}{path}", headers=headers)
 
 
-@pytest.mark.parametrize("path", ["/", "/rosbridge", "/foxglove"])
-async def test_a_token_in_the_url_opens_a_websocket(path: str) -> None:
-    async with running(TOKEN) as (server, core), aiohttp.ClientSession() as session:
-        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
-            await connect(session, server, path)
-        assert refused.value.status == 401
-        async with connect(session, server, f"{path}?token={TOKEN}") as socket:
-            await socket.send_json({"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist"})
-            await until(lambda: core.publishers("/cmd_vel"))
+async def test_a_token_in_the_url_opens_a_websocket(session: aiohttp.ClientSession) -> None:
+    async with running(TOKEN) as (server, core):
+        for path in ("/", "/rosbridge", "/foxglove"):
+            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+                await connect(session, server, path)
+            assert refused.value.status == 401
+            async with connect(session, server, f"{path}?token={TOKEN}") as socket:
+                topic = f"/cmd{path}".rstrip("/")
+                await socket.send_json({"op": "advertise", "topic": topic, "type": "geometry_msgs/Twist"})
+                await until(lambda topic=topic: core.publishers(topic))
 
 
-async def test_a_client_whose_frames_are_not_masked_is_disconnected() -> None:
+async def test_a_client_whose_frames_are_not_masked_is_disconnected(
+    server: WebServer, session: aiohttp.ClientSession
+) -> None:
     """RFC 6455, section 5.1: the server closes the connection, with 1002."""
-    async with running() as (server, _), aiohttp.ClientSession() as session:
-        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
-        request = "GET / HTTP/1.1", "Host: localhost", "Upgrade: websocket", "Connection: Upgrade"
-        key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="
-        writer.write("\r\n".join([*request, "Sec-WebSocket-Version: 13", key, "", ""]).encode())
-        async with asyncio.timeout(DEADLINE):
-            assert (await reader.readuntil(b"\r\n\r\n")).startswith(b"HTTP/1.1 101")
-            writer.write(frame_header(Opcode.TEXT, 2) + b"{}")
-            received = await reader.read()
-        assert received[2:4] == (1002).to_bytes(2, "big")
-        assert b"status" not in received  # the frame itself was not answered
-        writer.close()
-        async with session.get(f"http://127.0.0.1:{server.port}/metrics") as response:
-            assert 'rmpa_web_refused_total{reason="message"} 1.0' in await response.text()
+    async with handshake(server, "dGhlIHNhbXBsZSBub25jZQ==") as (reader, writer):
+        assert (await reader.readuntil(b"\r\n\r\n")).startswith(b"HTTP/1.1 101")
+        writer.write(frame_header(Opcode.TEXT, 2) + b"{}")
+        received = await reader.read()
+    assert received[2:4] == (1002).to_bytes(2, "big")
+    assert b"status" not in received  # the frame itself was not answered
+    assert await refused_for(session, server, "message")
 
 
-async def test_a_client_beyond_the_bound_is_told_so_and_requests_are_served() -> None:
-    async with running() as (server, _), aiohttp.ClientSession(connector=aiohttp.TCPConnector(limit=0)) as session:
-        sockets = [await connect(session, server) for _ in range(limits.CLIENTS_MAX)]
-        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
-            await connect(session, server)
-        assert refused.value.status == 503
-        async with session.get(f"http://127.0.0.1:{server.port}/metrics") as response:
-            assert 'rmpa_web_refused_total{reason="clients"} 1.0' in await response.text()
-        for socket in sockets:
-            await socket.close()
+async def test_a_client_beyond_the_bound_is_told_so_and_requests_are_served(
+    server: WebServer, session: aiohttp.ClientSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "CLIENTS_MAX", 3)
+    sockets = [await connect(session, server) for _ in range(3)]
+    with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+        await connect(session, server)
+    assert refused.value.status == 503
+    assert await refused_for(session, server, "clients")
+    for socket in sockets:
+        await socket.close()
 
 
-async def test_a_websocket_stays_whatever_else_connects(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_websocket_stays_whatever_else_connects(
+    server: WebServer, session: aiohttp.ClientSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(limits, "WEB_CONNECTIONS_MAX", 2)
-    async with running() as (server, _), aiohttp.ClientSession() as session, connect(session, server) as client:
+    async with connect(session, server) as client:
         silent = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(3)]
         async with asyncio.timeout(DEADLINE):
             assert await silent[0][0].read() == b"", "the idlest was not closed"
@@ -112,22 +138,15 @@ async def test_a_websocket_stays_whatever_else_connects(monkeypatch: pytest.Monk
 
 
 async def test_a_failed_handshake_is_counted_and_its_connection_keeps_its_limits(
-    monkeypatch: pytest.MonkeyPatch,
+    server: WebServer, session: aiohttp.ClientSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async with running() as (server, _), aiohttp.ClientSession() as session:
-        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
-        request = "GET / HTTP/1.1", "Host: localhost", "Upgrade: websocket", "Connection: Upgrade"
-        writer.write("\r\n".join([*request, "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: x", "", ""]).encode())
-        async with asyncio.timeout(DEADLINE):
-            assert (await reader.readuntil(b"\r\n\r\n")).startswith(b"HTTP/1.1 400")
-            monkeypatch.setattr(limits, "WEB_REQUEST_TIMEOUT", 0.1)
-            writer.write(b"GET /heal")
-            assert b"handshake" in await reader.read()  # and then it is closed
-        writer.close()
-        async with session.get(f"http://127.0.0.1:{server.port}/metrics") as response:
-            metrics = await response.text()
-        for reason in ("handshake", "slow_request"):
-            assert f'rmpa_web_refused_total{{reason="{reason}"}} 1.0' in metrics
+    async with handshake(server, "x") as (reader, writer):
+        assert (await reader.readuntil(b"\r\n\r\n")).startswith(b"HTTP/1.1 400")
+        monkeypatch.setattr(limits, "WEB_REQUEST_TIMEOUT", 0.1)
+        writer.write(b"GET /heal")
+        assert b"handshake" in await reader.read()  # and then it is closed
+    for reason in ("handshake", "slow_request"):
+        assert await refused_for(session, server, reason)
 
 
 async def test_contracts_give_priorities() -> None:
@@ -146,16 +165,11 @@ def fragment(opcode: int, payload: bytes, *, last: bool = False) -> bytes:
 
 
 async def test_a_message_whose_fragments_never_end_disconnects_its_client_alone(
-    monkeypatch: pytest.MonkeyPatch,
+    server: WebServer, session: aiohttp.ClientSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "PING_INTERVAL", 0.2)
-    monkeypatch.setattr(limits, "MESSAGE_TIMEOUT", 1.0)
-    async with (
-        running() as (server, _),
-        aiohttp.ClientSession() as session,
-        connect(session, server) as other,
-        connect(session, server) as socket,
-    ):
+    monkeypatch.setattr(limits, "PING_INTERVAL", 0.1)
+    monkeypatch.setattr(limits, "MESSAGE_TIMEOUT", 0.4)
+    async with connect(session, server) as other, connect(session, server) as socket:
         reading = asyncio.ensure_future(other.receive())  # answers pings
         transport = socket._writer.transport
         transport.write(fragment(1, b"{"))
