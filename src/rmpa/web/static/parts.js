@@ -86,6 +86,21 @@ export function Facts({ rows }) {
   </dl>`;
 }
 
+// A field by which a list is filtered, and whether a text has what is typed there.
+export function useFilter(by, first = "") {
+  const [text, setText] = useState(first);
+  const field = html`<input
+    class="filter"
+    type="search"
+    placeholder=${`Filter by ${by}`}
+    aria-label=${`Filter by ${by}`}
+    value=${text}
+    onInput=${(event) => setText(event.target.value)}
+  />`;
+  const typed = text.toLowerCase();
+  return { field, typed, matches: (each) => each.toLowerCase().includes(typed) };
+}
+
 const MOST = 200; // entries of a list that are drawn at first, and more with each press of a button
 
 // The first entries of a list, and the button for more of them, where there are more.

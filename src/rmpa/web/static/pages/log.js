@@ -2,7 +2,7 @@
 
 import { html, useState } from "../markup.js";
 import { section } from "../state.js";
-import { Choice, Page, Panel } from "../parts.js";
+import { Choice, Page, Panel, useFilter } from "../parts.js";
 import { Lines, useLog } from "../loglines.js";
 
 const LEVELS = [
@@ -15,12 +15,12 @@ const RANK = { DEBUG: 0, INFO: 1, WARN: 2, ERROR: 3, FATAL: 4 };
 
 export function Log({ state, connection }) {
   const [level, setLevel] = useState("INFO");
-  const [text, setText] = useState("");
+  const filter = useFilter("text or node");
   const [held, hold] = useState(false);
   const own = section(state, "agent").name;
   const lines = useLog(connection, held);
   const shown = lines.filter(
-    (line) => RANK[line.level] >= RANK[level] && `${line.node} ${line.text}`.toLowerCase().includes(text.toLowerCase()),
+    (line) => RANK[line.level] >= RANK[level] && filter.matches(`${line.node} ${line.text}`),
   );
   return html`<${Page}
     title="Log"
@@ -30,14 +30,7 @@ export function Log({ state, connection }) {
     </button>`}
   >
     <div class="row filter-row">
-      <${Choice} label="Least level" value=${level} onChoose=${setLevel} options=${LEVELS} /><input
-        class="filter"
-        type="search"
-        placeholder="Filter by text or node"
-        aria-label="Filter by text or node"
-        value=${text}
-        onInput=${(event) => setText(event.target.value)}
-      />
+      <${Choice} label="Least level" value=${level} onChoose=${setLevel} options=${LEVELS} />${filter.field}
     </div>
     <${Panel}
       ><${Lines}

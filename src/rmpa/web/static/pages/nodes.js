@@ -1,6 +1,6 @@
 // All nodes, and one of them: its module, topics, services, connections and log lines.
 
-import { html, useState } from "../markup.js";
+import { html } from "../markup.js";
 import { count, hertz } from "../format.js";
 import { entries, section } from "../state.js";
 import {
@@ -16,6 +16,7 @@ import {
   Table,
   memo,
   useAnswer,
+  useFilter,
 } from "../parts.js";
 import { Lines, useLog } from "../loglines.js";
 
@@ -38,20 +39,13 @@ export const NodeRow = memo(
 export const NODE_COLUMNS = ["Node", "#Publishes", "#Subscribes", "#Services"];
 
 export function Nodes({ state }) {
-  const [text, setText] = useState("");
+  const filter = useFilter("name or module");
   const own = section(state, "agent").name;
   const all = entries(state, "nodes");
-  const shown = all.filter(([name, one]) => `${name} ${one.module || own}`.toLowerCase().includes(text.toLowerCase()));
+  const shown = all.filter(([name, one]) => filter.matches(`${name} ${one.module || own}`));
   const hidden = section(state, "hidden").nodes;
   return html`<${Page} title="Nodes" kind=${`${all.length} in all modules`}>
-    <input
-      class="filter"
-      type="search"
-      placeholder="Filter by name or module"
-      aria-label="Filter by name or module"
-      value=${text}
-      onInput=${(event) => setText(event.target.value)}
-    />
+    ${filter.field}
     <${Panel}
       ><${Table}
         caption="Nodes"

@@ -2,7 +2,7 @@
 
 import { html, useEffect, useRef, useState } from "../markup.js";
 import { entries, section } from "../state.js";
-import { Choice, Editable, Failure, Page, Panel, useFirst } from "../parts.js";
+import { Choice, Editable, Failure, Page, Panel, useFilter, useFirst } from "../parts.js";
 import { plain } from "../format.js";
 import { another, fresh, kind } from "../typed.js";
 
@@ -30,7 +30,7 @@ export function Params({ name, state, connection }) {
   const [module, setModule] = useState(own);
   const [values, setValues] = useState(null);
   const [failure, setFailure] = useState(null);
-  const [text, setText] = useState(name || "");
+  const filter = useFilter("name", name);
   const shown = useRef({});
   const peer = module === own ? "" : module;
   const take = (answer) => {
@@ -74,20 +74,13 @@ export function Params({ name, state, connection }) {
     </div>
     <${Failure} failure=${failure} />
     <${Panel}
-      ><input
-        class="filter"
-        type="search"
-        placeholder="Filter by name"
-        aria-label="Filter by name"
-        value=${text}
-        onInput=${(event) => setText(event.target.value)}
-      />
+      >${filter.field}
       ${values
         ? html`<div class="tree">
             <${Namespace}
               tree=${grow(values)}
               path=""
-              text=${text.toLowerCase()}
+              text=${filter.typed}
               may=${connection.may("control")}
               ask=${ask}
             />

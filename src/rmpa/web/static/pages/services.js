@@ -17,6 +17,7 @@ import {
   Why,
   memo,
   nodeKey,
+  useFilter,
 } from "../parts.js";
 import { json } from "../typed.js";
 
@@ -39,19 +40,12 @@ const Row = memo(
 );
 
 export function Services({ state }) {
-  const [text, setText] = useState("");
+  const filter = useFilter("name or type");
   const all = entries(state, "services");
   const hidden = section(state, "hidden").services;
-  const shown = all.filter(([name, one]) => `${name} ${one.type || ""}`.toLowerCase().includes(text.toLowerCase()));
+  const shown = all.filter(([name, one]) => filter.matches(`${name} ${one.type || ""}`));
   return html`<${Page} title="Services" kind=${`${all.length} in all modules`}>
-    <input
-      class="filter"
-      type="search"
-      placeholder="Filter by name or type"
-      aria-label="Filter by name or type"
-      value=${text}
-      onInput=${(event) => setText(event.target.value)}
-    />
+    ${filter.field}
     <${Panel}
       ><${Table}
         caption="Services"

@@ -19,6 +19,7 @@ import {
   memo,
   nodeKey,
   useAnswer,
+  useFilter,
 } from "../parts.js";
 import { Lines } from "../plot.js";
 import { Live } from "../live.js";
@@ -65,42 +66,33 @@ const FILTERS = {
   wrong: ["With a problem", (one) => one.problem || one.lost || one.dropped],
 };
 export function Topics({ state }) {
-  const [filter, setFilter] = useState("data");
-  const [text, setText] = useState("");
+  const [which, choose] = useState("data");
+  const filter = useFilter("name or type");
   const all = entries(state, "topics");
-  const fits = FILTERS[filter === "data" && text ? "all" : filter][1]; // what is typed is looked for among all
-  const shown = all.filter(
-    ([name, one]) => fits(one, name, state) && `${name} ${one.type}`.toLowerCase().includes(text.toLowerCase()),
-  );
+  const fits = FILTERS[which === "data" && filter.typed ? "all" : which][1]; // what is typed is looked for among all
+  const shown = all.filter(([name, one]) => fits(one, name, state) && filter.matches(`${name} ${one.type}`));
   const hidden = section(state, "hidden").topics;
   return html`<${Page}
     title="Topics"
     kind=${`${all.filter(([, one]) => one.rate !== undefined).length} of ${all.length} flow between modules`}
     aside=${html`<${Choice}
       label="Which topics"
-      value=${filter}
-      onChoose=${setFilter}
+      value=${which}
+      onChoose=${choose}
       options=${Object.entries(FILTERS).map(([key, [word]]) => [key, word])}
     />`}
   >
-    <input
-      class="filter"
-      type="search"
-      placeholder="Filter by name or type"
-      aria-label="Filter by name or type"
-      value=${text}
-      onInput=${(event) => setText(event.target.value)}
-    />
+    ${filter.field}
     <${Panel}
       ><${Table} caption="Topics" columns=${TOPIC_COLUMNS} empty="No topic matches." list=${shown}>
         ${([name, one]) => html`<${TopicRow} key=${name} name=${name} topic=${one} />`}<//
       >
-      ${filter === "data" &&
+      ${which === "data" &&
       all.length > shown.length &&
-      !text &&
+      !filter.typed &&
       html`<p class="empty">
         ${all.length - shown.length} topics of the log and of Smart Resources about themselves are left
-        out.${" "}<button type="button" onClick=${() => setFilter("all")}>Show all</button>
+        out.${" "}<button type="button" onClick=${() => choose("all")}>Show all</button>
       </p>`}
       ${hidden &&
       html`<p class="empty">${count(hidden)} more topics are not listed: <code>rmpa topic list</code> has them.</p>`}<//
