@@ -38,7 +38,7 @@ LISTED = AccessPolicy(8480, HOSTS, TOKEN, frozenset({"https://app.example", "*"}
 ORIGIN = "http://base.local:8480"
 APP = {"origin": "https://app.example", "is_preflight": True}
 # Each: what the request has beside ``Host: base.local:8480``, and what becomes of it.
-WITHOUT_TOKEN: list[tuple[dict[str, object], str]] = [
+WITHOUT_TOKEN: list[Any] = [
     # A name that is not ours is a rebound one; an address cannot be rebound.
     *(({"host": (f"{name}:8480",)}, "granted") for name in ("localhost", "localhost.", "127.0.0.1", "192.168.1.7")),
     *(({"host": (name,)}, "granted") for name in ("LOCALHOST", "base", "base.local:8480", "[::1]:8480")),
@@ -60,7 +60,7 @@ WITHOUT_TOKEN: list[tuple[dict[str, object], str]] = [
     *(({"fetch_site": "cross-site", "fetch_mode": each}, "origin") for each in ("navigate", "no-cors", "websocket")),
     ({"fetch_site": "same-site", "fetch_mode": "no-cors", "is_page": True}, "origin"),  # another port of this host
 ]
-WITH_TOKEN: list[tuple[dict[str, object], str]] = [
+WITH_TOKEN: list[Any] = [
     # It comes as bearer, cookie or query.
     *(({"authorization": each}, "granted") for each in (f"Bearer {TOKEN}", f"bearer  {TOKEN} ")),
     *(({"authorization": f"Bearer {each}"}, "token") for each in (f"{TOKEN}x", TOKEN[:-1], "", "\udcff\u00e4")),

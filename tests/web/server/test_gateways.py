@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import json
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
@@ -94,7 +95,7 @@ async def test_a_token_in_the_url_opens_a_websocket(session: aiohttp.ClientSessi
             async with connect(session, server, f"{path}?token={TOKEN}") as socket:
                 topic = f"/cmd{path}".rstrip("/")
                 await socket.send_json({"op": "advertise", "topic": topic, "type": "geometry_msgs/Twist"})
-                await until(lambda topic=topic: core.publishers(topic))
+                await until(functools.partial(core.publishers, topic))
 
 
 async def test_a_client_whose_frames_are_not_masked_is_disconnected(

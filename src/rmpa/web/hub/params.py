@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from rmpa.web.hub.topics import ClientSubscription, HubTopics, ReceivedMessage
 
 _log = logging.getLogger(__name__)
-_MISSING = object()
+# In the place of a value that is not there.
+MISSING: Final = object()
 CLOCK: Final = "/clock"
 CLOCK_TYPE: Final = "rosgraph_msgs/Clock"
 _PARAM: Final = "/use_sim_time"
@@ -185,8 +186,10 @@ class ParamMirror:
         for names, changed in [*self._followers.values()]:
             told = differences
             if names:
-                news = {name: new for name in names if not _same(_get(before, name), new := _get(after, name))}
-                told = {name: None if new is _MISSING else cast("ParamValue", new) for name, new in news.items()}
+                news = {
+                    name: new for name in names if not _same(value_at(before, name), new := value_at(after, name))
+                }
+                told = {name: None if new is MISSING else cast("ParamValue", new) for name, new in news.items()}
             if told:
                 changed(told)
 
@@ -202,10 +205,11 @@ def _same(one: object, other: object) -> bool:
     return type(one) is type(other) and one == other
 
 
-def _get(tree: object, name: str) -> object:
+def value_at(tree: object, name: str) -> object:
+    """The value that a name has in a tree of parameters; ``MISSING`` where it has none."""
     for part in filter(None, name.split("/")):
         if not isinstance(tree, Mapping) or part not in tree:
-            return _MISSING
+            return MISSING
         tree = tree[part]
     return tree
 
@@ -219,8 +223,8 @@ def _differences(name: str, before: object, after: object) -> Iterator[tuple[str
     for key in old.keys() - new.keys():
         yield from ((leaf, None) for leaf, _ in leaves(f"{name}/{key}", old[key]))
     for key, value in new.items():
-        yield from _differences(f"{name}/{key}", old.get(key, _MISSING), value)
-    if not isinstance(before, Mapping) and before is not _MISSING and isinstance(after, Mapping):
+        yield from _differences(f"{name}/{key}", old.get(key, MISSING), value)
+    if not isinstance(before, Mapping) and before is not MISSING and isinstance(after, Mapping):
         yield name, None
     if not isinstance(after, Mapping):
         yield name, cast("ParamValue", after)

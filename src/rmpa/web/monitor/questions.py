@@ -154,17 +154,22 @@ class Answers:
         return {
             "type": kind.name,
             "text": f"{kind.request.definition.strip()}\n---\n{kind.response.definition.strip()}".strip(),
-            "request": _json(empty.json(memoryview(example))),
+            "request": msgspec.json.decode(empty.json(memoryview(example))),
         }
 
     # --- parameters -------------------------------------------------------------------------------------------
 
     @question("params", needs="view")
     async def _params(self, args: Args) -> Any:
-        """All parameters that the rules let a page see; a peer's count by their names there."""
+        """All parameters that the rules let a page see, with their digest; none to a page that ``has`` that one.
+
+        A peer's count by their names there.
+        """
         peer = _text(args, "peer")
         tree = await self._of_peer(peer, lambda params: params.get("/")) if peer else await self._own_params()
-        return _with_digest(self._hub.link.rules.visible_tree(_plain(tree)), args.get("has"))
+        values = self._hub.link.rules.visible_tree(_plain(tree))
+        digest = hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()[:16]
+        return {"digest": digest} if args.get("has") == digest else {"values": values, "digest": digest}
 
     async def _own_params(self) -> Mapping[str, ParamValue]:
         self._hub.link.need()
@@ -243,7 +248,7 @@ class Answers:
         response = await self._hub.calls.call(service, kind.md5sum, body, _CALL_TIMEOUT)
         took = time.monotonic() - began
         values = codec_for(kind.response).json(memoryview(response))
-        return {"response": _json(values), "seconds": round(took, 6)}
+        return {"response": msgspec.json.decode(values), "seconds": round(took, 6)}
 
     @question("profile", needs="control")
     async def _profile(self, args: Args) -> Any:
@@ -276,7 +281,7 @@ class Answers:
         kind = self._hub.types.service(SERVICE_TYPE)
         body = codec_for(kind.request).write({"config": config}, time.time_ns()).payload
         response = await self._hub.calls.call(service, kind.md5sum, body, _CALL_TIMEOUT)
-        taken: Args = _json(codec_for(kind.response).json(memoryview(response)))["config"]
+        taken: Args = msgspec.json.decode(codec_for(kind.response).json(memoryview(response)))["config"]
         return taken
 
     async def _choose(self, args: Args, what: str) -> Any:
@@ -359,16 +364,6 @@ def _name(args: Args, key: str) -> str:
     if value != "/" and not is_global_name(value):
         raise ConfigError(key, f"{value[:80]!r} is not a name", "write it as /name")
     return value
-
-
-def _with_digest(values: Mapping[str, ParamValue], has: object) -> Args:
-    """Parameters with their ``digest``; where the page ``has`` that digest they are not repeated."""
-    digest = hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()[:16]
-    return {"digest": digest} if has == digest else {"values": values, "digest": digest}
-
-
-def _json(text: bytes) -> Any:
-    return msgspec.json.decode(text)
 
 
 def _plain(value: object) -> Any:

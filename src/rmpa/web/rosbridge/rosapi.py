@@ -20,6 +20,7 @@ from rmpa.ros.types.definitions import parse_definition
 from rmpa.ros.types.installed import ServiceType
 from rmpa.web import limits
 from rmpa.web.hub.graph import GraphService, GraphTopic
+from rmpa.web.hub.params import MISSING, value_at
 from rmpa.web.rosbridge.protocol import OpError, graph_name, type_name
 
 if TYPE_CHECKING:
@@ -252,14 +253,10 @@ class Rosapi:
 
     # --- parameters -----------------------------------------------------------------------------------------------
 
-    def _parameter(self, name: str) -> tuple[bool, ParamValue]:
+    def _parameter(self, name: str) -> tuple[bool, object]:
         """Whether a global name is there, and its value."""
-        value: ParamValue = dict(self._client.param_tree)
-        for part in filter(None, name.split("/")):
-            if not isinstance(value, Mapping) or part not in value:
-                return False, None
-            value = value[part]
-        return True, value
+        value = value_at(self._client.param_tree, name)
+        return value is not MISSING, None if value is MISSING else value
 
     def _answer_get_param(self, name: str, default: str) -> Values:
         there, value = self._parameter(graph_name(name))

@@ -19,9 +19,7 @@ export function Log({ state, connection }) {
   const [held, hold] = useState(false);
   const own = section(state, "agent").name;
   const lines = useLog(connection, held);
-  const shown = lines.filter(
-    (line) => RANK[line.level] >= RANK[level] && filter.matches(`${line.node} ${line.text}`),
-  );
+  const shown = lines.filter((line) => RANK[line.level] >= RANK[level] && filter.matches(`${line.node} ${line.text}`));
   return html`<${Page}
     title="Log"
     kind=${`Of the nodes of ${own}, newest first. The log of other modules stays there: their own rmpa web shows it.`}
