@@ -32,6 +32,8 @@ _END_AFTER: Final = 4.0
 
 Event = dict[str, object]
 T = TypeVar("T")
+spawn: Callable[..., subprocess.Popen[str]] = subprocess.Popen
+"""What starts a process; tests may put something quicker in its place."""
 
 
 class BedError(RmpaError):
@@ -76,8 +78,8 @@ class Process:
         self._ended = False
         self._log = log.open("w", encoding="utf-8") if log else None
         self.started = time.monotonic()
-        self._child = subprocess.Popen(
-            [*_tied_to_us(), *self.argv],
+        self._child = spawn(
+            [*tied_to_us(), *self.argv],
             env=dict(os.environ if env is None else env),
             stdin=subprocess.PIPE if commands else subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -331,7 +333,7 @@ def _event_of(line: str) -> Event | None:
     return None
 
 
-def _tied_to_us() -> list[str]:
+def tied_to_us() -> list[str]:
     """A prefix that lets the kernel kill the child when we die; only sound for children of the main thread."""
     setpriv = shutil.which("setpriv")
     if setpriv and threading.current_thread() is threading.main_thread():

@@ -247,7 +247,7 @@ def compiled(program: str, nodes: Path = NODES, headers: Path = NODES) -> Path:
     """
     source = nodes / f"{program}.cpp"
     folders = list(dict.fromkeys((headers, NODES)))
-    flags = ["-std=c++17", "-O2", "-Wall", "-Wextra", *(f"-I{folder}" for folder in folders)]
+    flags = ["-std=c++17", "-O2", "-Wall", "-Wextra"]
     packages = ["actionlib", "roscpp"] if "<actionlib/" in source.read_text() else ["roscpp"]
     libraries = subprocess.run(
         ["pkg-config", "--cflags", "--libs", *packages], capture_output=True, text=True, check=True
@@ -263,7 +263,8 @@ def compiled(program: str, nodes: Path = NODES, headers: Path = NODES) -> Path:
             fcntl.flock(lock, fcntl.LOCK_EX)  # parts of the test run start at one time, and want the same programs
             if not binary.exists():
                 unfinished = binary.with_suffix(f".{os.getpid()}")
-                run(["g++", *flags, source, "-o", unfinished, *libraries], timeout=180.0)
+                includes = [f"-I{folder}" for folder in folders]
+                run(["g++", *flags, *includes, source, "-o", unfinished, *libraries], timeout=180.0)
                 unfinished.replace(binary)
     return binary
 

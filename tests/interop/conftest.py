@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from lab.bed import namespaces
+from lab.bed import namespaces, processes
 from lab.bed.agents import Agent
 from lab.bed.namespaces import MACHINE, Host, Lab
+from tests.interop import forks
 from tests.interop.modules import Bed, Module, start_linked
 from tests.interop.ros import Ros, free_port
 
@@ -25,6 +26,13 @@ ModuleFactory = Callable[..., list[Module]]
 WebFactory = Callable[..., "Web"]
 _BEDS: Final = 3
 """Beds that are kept for the next test; agents at rest cost little."""
+
+
+@pytest.fixture(autouse=True, scope="package")
+def _quick_starts() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(processes, "spawn", forks.popen)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -38,7 +38,8 @@ def test_two_networks_of_the_same_addresses_reach_out_behind_nat_and_are_not_rea
 def test_lab_vanishes_with_what_runs_in_it() -> None:
     with Lab() as lab:
         (a,) = lab.hosts("a")
-        process = Process(a.command(["sleep", "1000"]))
+        process = Process(a.command(["sh", "-c", "echo inside; exec sleep 1000"]))
+        process.wait_for("inside")
     assert process.wait() == -9
     process.end()
     assert (
