@@ -366,16 +366,19 @@ async def test_churn_is_gathered_and_a_large_state_is_written_more_rarely(
             core.stored._took = 0.1  # type: ignore[union-attr] # it was set up above
 
         monkeypatch.setattr(core.stored, "_put", slow)
-        for number in range(300):
-            await call(core.uri, "registerPublisher", "/node", f"/t{number}", STRING, "http://127.0.0.1:1/")
-        await until(lambda: saved(core))
-        assert len(writes) <= 2
         rests: list[float] = []
+        over = asyncio.Event()
 
         async def rest(seconds: float) -> None:
             rests.append(seconds)
+            await over.wait()
 
         monkeypatch.setattr(core.stored, "_rest", rest)
+        for number in range(300):
+            await call(core.uri, "registerPublisher", "/node", f"/t{number}", STRING, "http://127.0.0.1:1/")
+        over.set()
+        await until(lambda: saved(core))
+        assert len(writes) <= 2
         core.call("setParam", "/x", "/a", 1)
         await until(lambda: saved(core) and len(rests) >= 2)
         assert rests[-2:] == [CORE_STATE_GATHER, 0.1 * CORE_STATE_SHARE]
