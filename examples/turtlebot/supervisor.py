@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 MODULES = ("joystick", "velocity", "base", "pc")
 GROUP = "239.255.82.77"
 HERE = Path(__file__).parent
-FAREWELL = 6.0
+FAREWELL = 15.0
 """Seconds for a child to end in order before it is killed."""
 STARTING = 3.0
 """An agent that ends within so many seconds of its start because of a port gets another port …"""

@@ -21,6 +21,7 @@ import http.client
 import itertools
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import tempfile
@@ -38,6 +39,8 @@ PYTHON: Final = "/usr/bin/python3"
 """The interpreter that Debian's rospy is installed for."""
 NODES: Final = Path(__file__).parents[1] / "nodes"
 _SYSTEM_PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
+_PARENTS: Final = ("roscore", "roslaunch", "launch")
+"""Programs that end others, which are in sessions of their own."""
 _numbers = itertools.count(1)
 
 
@@ -120,8 +123,16 @@ class Ros:
         """What was started here."""
         return list(self._started)
 
-    def close(self) -> None:
-        """End what was started here, last first."""
+    def close(self, *, orderly: bool = True) -> None:
+        """End what was started here, all at once.
+
+        Args:
+            orderly: Nodes tell their master so. Otherwise they are killed: it ends as well, or does not listen.
+        """
+        for process in self._started:
+            kill = not orderly and not process.name.startswith(_PARENTS)
+            process.thaw()
+            process.send(signal.SIGKILL if kill else signal.SIGTERM)
         while self._started:
             self._started.pop().end()
 

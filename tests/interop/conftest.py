@@ -54,7 +54,8 @@ def shell(tmp_path: Path) -> Iterator[ShellFactory]:
 
         def make(host: Host = MACHINE, port: int = 0) -> Ros:
             port = port or (11311 if host.namespace else free_port())
-            return stack.enter_context(Ros(host, tmp_path, port))
+            stack.callback((made := Ros(host, tmp_path, port)).close, orderly=False)
+            return made
 
         yield make
 
@@ -133,7 +134,9 @@ def modules(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[ModuleFa
                 key, bed = beds.take(names, options)
                 stack.callback(beds.give_back, key, bed)
                 agents = bed.agents
-            shells = [stack.enter_context(Ros(agent.host, tmp_path, agent.core_port)) for agent in agents]
+            shells = [Ros(agent.host, tmp_path, agent.core_port) for agent in agents]
+            for ros in shells:
+                stack.callback(ros.close, orderly=not own_lab and not fresh and linked)
             return [Module(agent.host, agent, ros) for agent, ros in zip(agents, shells, strict=True)]
 
         yield make
