@@ -76,7 +76,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         places: dict[Path, float] = {}
         for waits in (True, False):
             paths = [path for path, _ in sizes.most_common() if (_room(path) in _WAITING) is waits]
-            places |= {path: place / len(paths) for place, path in enumerate(paths)}
+            end = 0.9 if waits else 1.0  # no process waits for long where nothing else is left to do
+            places |= {path: end * place / len(paths) for place, path in enumerate(paths)}
         items.sort(key=lambda item: places[item.path])
 
 

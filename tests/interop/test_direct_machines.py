@@ -43,8 +43,7 @@ def two_on_one(host: Host, agent: AgentFactory, shell: ShellFactory) -> tuple[Mo
     return first, second
 
 
-@pytest.mark.parametrize("bound", [True, False], ids=["loopback", "network"])
-@pytest.mark.parametrize("client", ["roscpp", "rospy"])
+@pytest.mark.parametrize(("client", "bound"), [("roscpp", True), ("rospy", False)])
 def test_modules_of_one_machine_are_direct_over_loopback(
     lab: Lab, agent: AgentFactory, shell: ShellFactory, client: str, *, bound: bool
 ) -> None:

@@ -15,9 +15,11 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 
-def test_a_killed_agent_is_retracted_and_its_nodes_go_on(modules: ModuleFactory) -> None:
+def test_a_killed_agent_is_retracted_and_a_restarted_one_serves_new_nodes_and_its_peer(
+    modules: ModuleFactory,
+) -> None:
     a, b = modules("a", "b")
-    a.ros.roscpp("talker", topic="/chatter", rate=100)
+    a.ros.roscpp("talker", "__name:=before", topic="/chatter", rate=100)
     at_home = a.ros.roscpp("listener", topic="/chatter")
     abroad = b.ros.roscpp("listener", topic="/chatter")
     flows(abroad)
@@ -27,14 +29,6 @@ def test_a_killed_agent_is_retracted_and_its_nodes_go_on(modules: ModuleFactory)
     _wait_no_publisher(b, "/chatter")
     report = flows(at_home, 50)
     assert (report["gaps"], report["doubled"]) == (0, 0)
-
-
-def test_a_restarted_agent_serves_new_nodes_and_its_peer(modules: ModuleFactory) -> None:
-    a, b = modules("a", "b")
-    a.ros.roscpp("talker", "__name:=before", topic="/chatter", rate=100)
-    abroad = b.ros.roscpp("listener", topic="/chatter")
-    flows(abroad)
-    a.agent.kill()
     a.agent.restart()
     a.agent.wait_peer("b")
     a.ros.roscpp("talker", "__name:=after", topic="/chatter", rate=100, source=2)
@@ -55,16 +49,6 @@ def test_killed_agent_of_the_listening_side_comes_back(modules: ModuleFactory) -
     assert (report["gaps"], report["doubled"]) == (0, 0)
 
 
-@pytest.mark.trap(40)
-def test_killed_talker_leaves_every_graph(modules: ModuleFactory) -> None:
-    a, b = modules("a", "b")
-    talker = a.ros.roscpp("talker", topic="/chatter", rate=100)
-    flows(b.ros.roscpp("listener", topic="/chatter"))
-    talker.kill()
-    _wait_no_publisher(a, "/chatter")
-    _wait_no_publisher(b, "/chatter")
-
-
 @pytest.mark.trap(14)
 def test_restarted_talker_is_heard_again_by_the_same_listener(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
@@ -77,7 +61,7 @@ def test_restarted_talker_is_heard_again_by_the_same_listener(modules: ModuleFac
     assert flows(heard)["bad"] == 0
 
 
-def test_killed_listener_ends_the_demand(modules: ModuleFactory) -> None:
+def test_killed_listener_ends_the_demand_and_the_next_one_is_served(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     a.ros.roscpp("talker", topic="/chatter", rate=100)
     heard = b.ros.roscpp("listener", topic="/chatter")
@@ -87,16 +71,18 @@ def test_killed_listener_ends_the_demand(modules: ModuleFactory) -> None:
     eventually(
         lambda: "Subscribers: None" in a.ros.tool("rostopic", "info", "/chatter"), what="the talker has no listener"
     )
+    assert flows(b.ros.rospy("listener", topic="/chatter"))["bad"] == 0
 
 
-def test_cable_out_and_in(modules: ModuleFactory) -> None:
-    a, b = modules("a", "b")
+def test_a_cable_out_and_in_and_an_interface_off_and_on(modules: ModuleFactory) -> None:
+    a, b, c = modules("a", "b", "c")
     a.ros.roscpp("talker", topic="/chatter", rate=100)
     b.ros.roscpp("talker", topic="/local", rate=100)
     at_home = b.ros.roscpp("listener", "__name:=home", topic="/local")
     abroad = b.ros.roscpp("listener", "__name:=abroad", topic="/chatter")
-    flows(abroad)
-    flows(at_home)
+    others = c.ros.roscpp("listener", topic="/chatter")
+    for heard in (abroad, at_home, others):
+        flows(heard)
     b.host.cut()
     b.agent.wait_no_peer("a")
     a.agent.wait_no_peer("b")
@@ -104,33 +90,15 @@ def test_cable_out_and_in(modules: ModuleFactory) -> None:
     b.host.restore()
     report = flows(abroad)
     assert (report["bad"], report["doubled"]) == (0, 0)
-    report = flows(at_home)
-    assert (report["gaps"], report["doubled"]) == (0, 0)
-
-
-def test_interface_switched_off_and_on_inside_the_host(modules: ModuleFactory) -> None:
-    a, b = modules("a", "b")
-    a.ros.roscpp("talker", topic="/chatter", rate=100)
-    abroad = b.ros.roscpp("listener", topic="/chatter")
-    flows(abroad)
     b.host.switch_off()
     b.agent.wait_no_peer("a")
     b.host.switch_on()
     assert flows(abroad)["bad"] == 0
-
-
-def test_cable_out_between_two_of_three(modules: ModuleFactory) -> None:
-    a, b, c = modules("a", "b", "c")
-    a.ros.roscpp("talker", topic="/chatter", rate=100)
-    steady = c.ros.roscpp("listener", topic="/chatter")
-    flows(steady)
-    b.host.cut()
-    a.agent.wait_no_peer("b")
-    b.host.restore()
     for one, other in ((a, "b"), (c, "b"), (b, "a"), (b, "c")):
         one.agent.wait_peer(other)
-    report = flows(steady)
-    assert (report["gaps"], report["doubled"]) == (0, 0)
+    for unhurt in (at_home, others):
+        report = flows(unhurt)
+        assert (report["gaps"], report["doubled"]) == (0, 0)
 
 
 @pytest.mark.trap(18)
@@ -154,18 +122,6 @@ def test_a_peer_that_ends_in_order_leaves_nothing(modules: ModuleFactory) -> Non
     assert a.agent.terminate() == 0
     assert a.agent.sockets() == []
     b.wait_no_topic("/chatter", 3.0)
-
-
-@pytest.mark.trap(38)
-def test_mismatched_types_are_refused_loudly_on_both_sides(modules: ModuleFactory) -> None:
-    a, b = modules("a", "b")
-    a.ros.rospy("talker", topic="/mixed", rate=50, type="String")
-    b.wait_topic("/mixed")
-    heard = b.ros.rospy("listener", topic="/mixed")
-    heard.wait_event("up")
-    for module in (a, b):
-        module.agent.process.wait_for(r"(?i)(warning|error).*(md5|type).*/mixed|/mixed.*(md5|type)")
-    assert heard.events("first") == []
 
 
 def _wait_no_publisher(module: Module, topic: str) -> None:

@@ -40,6 +40,7 @@ def last(listener: Process) -> Event:
     return listener.events("report")[-1]
 
 
+@pytest.mark.trap(10)
 def test_all_latched_sources_reach_each_late_joiner_once(
     modules: ModuleFactory, lab: Lab, agent: AgentFactory, shell: ShellFactory
 ) -> None:

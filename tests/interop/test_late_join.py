@@ -30,8 +30,7 @@ def test_an_agent_that_joins_late_gets_what_flows_already(
     assert (report["gaps"], report["doubled"]) == (0, 0)
 
 
-@pytest.mark.parametrize("client", ["rospy", "roscpp"])
-@pytest.mark.parametrize("role", ["talker", "listener"])
+@pytest.mark.parametrize(("role", "client"), [("talker", "roscpp"), ("listener", "rospy")])
 def test_nodes_that_wait_for_their_master_find_the_agent(
     lab: Lab, agent: AgentFactory, shell: ShellFactory, client: str, role: str
 ) -> None:

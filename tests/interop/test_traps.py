@@ -409,8 +409,7 @@ async def test_every_byte_of_a_message_arrives_unchanged(two: Two) -> None:
 
 
 @pytest.mark.trap(40)
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-@libraries
+@pytest.mark.parametrize(("library", "number"), [("rospy", signal.SIGKILL), ("roscpp", signal.SIGTERM)])
 def test_a_node_that_was_killed_leaves_both_graphs(two: Two, library: str, number: signal.Signals) -> None:
     """roscpp unregisters at no signal but SIGINT; the agent learns it from the connection that breaks."""
     talker = two.at_a.node(library, "talker", "__name:=speaker", rate=100)

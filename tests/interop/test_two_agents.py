@@ -14,12 +14,11 @@ if TYPE_CHECKING:
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize("client", ["rospy", "roscpp"])
-def test_two_agents_on_one_machine_share_topics(agent: AgentFactory, shell: ShellFactory, client: str) -> None:
+def test_two_agents_on_one_machine_share_topics(agent: AgentFactory, shell: ShellFactory) -> None:
     first, second = agent(), agent()
     first.wait_peer(second.name)
-    heard = shell(port=second.core_port).node(client, "listener", topic="/chatter", count=100)
-    shell(port=first.core_port).node(client, "talker", topic="/chatter", rate=200, count=100, wait=1)
+    heard = shell(port=second.core_port).rospy("listener", topic="/chatter", count=100)
+    shell(port=first.core_port).roscpp("talker", topic="/chatter", rate=200, count=100, wait=1)
     whole(heard.wait_event("done"), 100)
 
 
