@@ -38,7 +38,8 @@ def test_sizes_around_every_buffer(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     for size in (20, 21, 65515, 65516, 65517, 65536, 5 * MEGABYTE):
         heard = b.ros.roscpp("listener", topic=f"/any{size}", count=10)
-        a.ros.roscpp("talker", topic=f"/any{size}", rate=20, count=10, size=size, wait=1)
+        rate = 20 if size < MEGABYTE else 3  # best effort: a busy machine drops what comes quicker
+        a.ros.roscpp("talker", topic=f"/any{size}", rate=rate, count=10, size=size, wait=1)
         report = heard.wait_event("done")
         whole(report, 10)
         assert report["bytes"] == 10 * size
