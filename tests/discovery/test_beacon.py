@@ -172,8 +172,8 @@ beacons = st.builds(
     identities,
     u32,
     u32,
-    st.lists(guids, max_size=64).map(tuple),
-    st.lists(st.tuples(unicast.map(str), st.integers(1, 0xFFFF)), max_size=64).map(tuple),
+    st.lists(guids, max_size=6).map(tuple),
+    st.lists(st.tuples(unicast.map(str), st.integers(1, 0xFFFF)), max_size=6).map(tuple),
 )
 
 

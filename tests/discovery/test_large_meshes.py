@@ -85,7 +85,7 @@ def test_a_thousand_agents_that_start_at_once_do_not_answer_each_other() -> None
 
 def test_a_newcomer_gets_the_answers_of_a_large_mesh_spread_over_seconds() -> None:
     times = []
-    for seed in range(8):
+    for seed in range(4):
         agent = Agent()
         agent.run(1.0)
         agent.membership._rng = random.Random(seed).random
@@ -124,13 +124,14 @@ def test_many_newcomers_are_answered_by_one_multicast() -> None:
 def test_heartbeats_come_every_five_seconds_in_a_mesh_of_any_size() -> None:
     agent = Agent()
     agent.run(1.0)
-    agent.meet(MEMBERS, linked=True)
+    agent.meet(300, linked=True)
     beats = [b for b in multicasts(agent.run(60.0)) if b.kind is BeaconKind.HEARTBEAT]
     assert 12 <= len(beats) <= 14
     assert {b.lease_ms for b in beats} == {1000 * core_limits.PEER_LEASE}
 
 
-def test_forged_peers_never_displace_one_that_was_linked() -> None:
+def test_forged_peers_never_displace_one_that_was_linked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "STRANGERS_MAX", 64)
     agent = Agent()
     agent.run(1.0)
     agent.meet(1)
