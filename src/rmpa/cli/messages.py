@@ -279,7 +279,7 @@ def topic_pub(
     try:
         found = find_message_type(kind)
         if not found.source:
-            found.make(fill_stamps(plain, 0))  # a mistake is reported before the master is asked
+            found.serialize(fill_stamps(plain, 0))  # a mistake is reported before the master is asked
     except UnknownTypeError as error:
         if not error.fetchable:
             raise
@@ -288,7 +288,7 @@ def topic_pub(
 
     async def publish(node: Node) -> None:
         kind = await _version(node, wanted.name, found)
-        kind.make(fill_stamps(plain, 0))  # a mistake is reported before the topic is registered
+        kind.serialize(fill_stamps(plain, 0))  # a mistake is reported before the topic is registered
         publisher = await node.advertise(wanted.name, kind, latch=latch or rate is None)
         if rate is not None and not options.as_json:
             print_text(f"publishing on {wanted.name} at {rate:g} Hz; Ctrl-C to end")
@@ -296,7 +296,7 @@ def topic_pub(
         while not node.stopped.is_set():
             number += 1
             now_ns = time.time_ns()
-            publisher.publish(kind.make(fill_stamps(plain, now_ns)))
+            publisher.publish(fill_stamps(plain, now_ns))
             if options.as_json:
                 sent = {"topic": wanted.name, "seq": number, "time": now_ns / 1e9}
                 print_json(sent | {"subscribers": publisher.subscribers})

@@ -16,6 +16,7 @@ from rmpa.cli.output import Table, duration, print_json, printable, warn
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api
+from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.find import find_service_type
 
 if TYPE_CHECKING:
@@ -351,14 +352,14 @@ def service_call(service: str, values: tuple[str, ...], wait: bool, timeout: flo
         connection = await ServiceConnection.open(uri, wanted.name, _CALLER_ID, timeout=timeout)
         try:
             kind = find_service_type(connection.description.type, connection.description.md5sum)
-            request = kind.request.serialize(kind.request.make(fill_stamps(plain, time.time_ns())))
+            request = kind.request.serialize(fill_stamps(plain, time.time_ns()))
             ok, body = await connection.call(request, timeout)
         finally:
             connection.close()
         if not ok:
             text = printable(str(bytes(body), "utf-8", "replace")) or "it gave no reason"
             raise PeerRefused(f"service {wanted.name}", text, code="service-failed")
-        response = kind.response.to_plain(kind.response.deserialize(body))
+        response = codec_for(kind.response).plain_values(memoryview(body))
         if options.as_json:
             print_json({"service": wanted.name, "response": response, "took": time.monotonic() - began})
         elif response:
