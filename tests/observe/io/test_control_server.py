@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import socket
 from typing import TYPE_CHECKING
@@ -19,8 +20,10 @@ from rmpa.observe.snapshot import PingReply, Snapshot
 from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Awaitable, Callable
     from pathlib import Path
+
+    Serve = Callable[..., Awaitable[ControlServer]]
 
 
 async def slow_echo(args: dict[str, object]) -> object:
@@ -47,12 +50,33 @@ HANDLERS: dict[str, Handler] = {
 
 
 @pytest.fixture
-async def server(place: Path) -> AsyncIterator[ControlServer]:
-    server = ControlServer(place, "base", HANDLERS)
-    await server.start()
-    yield server
-    await server.close()
+async def serve(place: Path) -> AsyncIterator[Serve]:
+    servers: list[ControlServer] = []
+
+    async def serve(name: str = "base", handlers: dict[str, Handler] = HANDLERS) -> ControlServer:
+        servers.append(ControlServer(place, name, handlers))
+        await servers[-1].start()
+        return servers[-1]
+
+    yield serve
+    for server in servers:
+        await server.close()
     assert list(place.iterdir()) == []
+
+
+@pytest.fixture
+async def server(serve: Serve) -> ControlServer:
+    return await serve()
+
+
+@contextlib.asynccontextmanager
+async def connected(path: Path) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
+    reader, writer = await asyncio.open_unix_connection(path, limit=limits.CONTROL_REPLY_MAX)
+    try:
+        yield reader, writer
+    finally:
+        writer.close()
+        await asyncio.gather(writer.wait_closed(), return_exceptions=True)
 
 
 async def call(path: Path, op: str, **args: object) -> object:
@@ -70,14 +94,10 @@ def snapshot_of(path: Path) -> Snapshot:
 
 async def raw(path: Path, data: bytes) -> list[ControlReply]:
     """Send bytes, and read all replies until the server hangs up."""
-    reader, writer = await asyncio.open_unix_connection(path, limit=limits.CONTROL_REPLY_MAX)
-    try:
+    async with connected(path) as (reader, writer):
         writer.write(data)
         writer.write_eof()
         return [ControlReply.parse(line) for line in (await reader.read()).splitlines()]
-    finally:
-        writer.close()
-        await writer.wait_closed()
 
 
 async def test_only_this_user_can_open_the_socket(server: ControlServer, place: Path) -> None:
@@ -92,14 +112,12 @@ async def test_calls(server: ControlServer) -> None:
 
 
 async def test_many_requests_on_one_connection_byte_by_byte(server: ControlServer) -> None:
-    reader, writer = await asyncio.open_unix_connection(server.path)
-    for byte in b'{"op":"echo","args":{"n":1}}\n{"op":"echo"}\n':
-        writer.write(bytes([byte]))
-        await writer.drain()
-    assert await reader.readline() == b'{"ok":true,"value":{"n":1}}\n'
-    assert await reader.readline() == b'{"ok":true,"value":{}}\n'
-    writer.close()
-    await writer.wait_closed()
+    async with connected(server.path) as (reader, writer):
+        for byte in b'{"op":"echo","args":{"n":1}}\n{"op":"echo"}\n':
+            writer.write(bytes([byte]))
+            await writer.drain()
+        assert await reader.readline() == b'{"ok":true,"value":{"n":1}}\n'
+        assert await reader.readline() == b'{"ok":true,"value":{}}\n'
 
 
 async def test_errors_reach_the_client_with_their_remedy(server: ControlServer) -> None:
@@ -135,58 +153,44 @@ async def test_half_a_request_is_no_error(server: ControlServer) -> None:
 
 
 async def test_too_large_a_request(server: ControlServer) -> None:
-    reader, writer = await asyncio.open_unix_connection(server.path)
-    writer.write(b"x" * (limits.CONTROL_REQUEST_MAX + 2))
-    assert not ControlReply.parse(await reader.readline()).ok
-    writer.close()
-    await asyncio.gather(writer.wait_closed(), return_exceptions=True)
+    async with connected(server.path) as (reader, writer):
+        writer.write(b"x" * (limits.CONTROL_REQUEST_MAX + 2))
+        assert not ControlReply.parse(await reader.readline()).ok
     assert server.counters["control.refused"] == 1
 
 
 async def test_too_many_clients(server: ControlServer) -> None:
-    held = [await asyncio.open_unix_connection(server.path) for _ in range(limits.CONTROL_CLIENTS_MAX)]
-    for reader, writer in held:
-        writer.write(b'{"op":"echo"}\n')
-        assert (await reader.readline()).startswith(b'{"ok":true')
-    (reply,) = await raw(server.path, b"")
-    assert "too many clients" in reply.error
-    for _, writer in held:
-        writer.close()
-        await writer.wait_closed()
+    async with contextlib.AsyncExitStack() as stack:
+        for _ in range(limits.CONTROL_CLIENTS_MAX):
+            reader, writer = await stack.enter_async_context(connected(server.path))
+            writer.write(b'{"op":"echo"}\n')
+            assert (await reader.readline()).startswith(b'{"ok":true')
+        (reply,) = await raw(server.path, b"")
+        assert "too many clients" in reply.error
 
 
 async def test_an_idle_client_is_closed(server: ControlServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "CONTROL_IDLE_TIMEOUT", 0.05)
-    reader, writer = await asyncio.open_unix_connection(server.path)
-    assert await reader.read() == b""
-    writer.close()
-    await writer.wait_closed()
+    async with connected(server.path) as (reader, _):
+        assert await reader.read() == b""
 
 
-async def test_a_handler_that_hangs_is_ended(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_handler_that_hangs_is_ended(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "CONTROL_HANDLER_TIMEOUT", 0.05)
 
     async def hang(_: dict[str, object]) -> object:
         return await asyncio.get_running_loop().create_future()
 
-    server = ControlServer(place, "base", {"hang": hang})
-    await server.start()
-    (reply,) = await raw(server.path, b'{"op":"hang"}\n')
+    (reply,) = await raw((await serve("base", {"hang": hang})).path, b'{"op":"hang"}\n')
     assert "took more than" in reply.error
-    await server.close()
 
 
-async def test_closing_ends_clients(place: Path) -> None:
-    server = ControlServer(place, "base", HANDLERS)
-    await server.start()
-    reader, writer = await asyncio.open_unix_connection(server.path)
-    writer.write(b'{"op":"echo"}\n')
-    await reader.readline()
-    await server.close()
-    await server.close()
-    assert await reader.read() == b""
-    writer.close()
-    await writer.wait_closed()
+async def test_closing_ends_clients(server: ControlServer) -> None:
+    async with connected(server.path) as (reader, writer):
+        writer.write(b'{"op":"echo"}\n')
+        await reader.readline()
+        await server.close()
+        assert await reader.read() == b""
 
 
 async def test_a_second_agent_of_one_name_is_refused(server: ControlServer, place: Path) -> None:
@@ -197,15 +201,11 @@ async def test_a_second_agent_of_one_name_is_refused(server: ControlServer, plac
     assert await call(server.path, "echo") == {}
 
 
-async def test_a_stale_socket_is_replaced(place: Path) -> None:
-    path = place / "base.sock"
+async def test_a_stale_socket_is_replaced(serve: Serve, place: Path) -> None:
     with socket.socket(socket.AF_UNIX) as left:
-        left.bind(str(path))
+        left.bind(str(place / "base.sock"))
     assert find_agents({"RMPA_RUNTIME_DIR": str(place)}) == []
-    server = ControlServer(place, "base", HANDLERS)
-    await server.start()
-    assert await call(path, "echo") == {}
-    await server.close()
+    assert await call((await serve()).path, "echo") == {}
 
 
 async def test_too_long_a_path_says_what_to_do(place: Path) -> None:
@@ -213,7 +213,8 @@ async def test_too_long_a_path_says_what_to_do(place: Path) -> None:
         await ControlServer(place / ("x" * 100), "base", {}).start()
 
 
-async def test_choosing_an_agent(server: ControlServer, place: Path) -> None:
+@pytest.mark.usefixtures("server")
+async def test_choosing_an_agent(serve: Serve, place: Path) -> None:
     env = {"RMPA_RUNTIME_DIR": str(place)}
 
     async def choose(name: str | None = None, **more: str) -> str:
@@ -225,19 +226,16 @@ async def test_choosing_an_agent(server: ControlServer, place: Path) -> None:
     moved = msgspec.structs.replace(
         SNAPSHOT, agent=msgspec.structs.replace(SNAPSHOT.agent, core_uri="http://127.0.0.1:11312/")
     )
-    second = ControlServer(place, "second", {"snapshot": lambda _: moved})
-    await second.start()
+    second = await serve("second", {"snapshot": lambda _: moved})
     with pytest.raises(RmpaError, match="several agents run on this machine: base, second; name one with --agent"):
         await choose()
     assert await choose("second") == "second"
     assert await choose(RMPA_AGENT="second") == "second"
     assert await choose(ROS_MASTER_URI="http://localhost:11312") == "second"
     await second.close()
-    gateway = ControlServer(place, "gate", {"snapshot": lambda _: moved, ROLE: lambda _: GATEWAY_ROLE})
-    await gateway.start()
+    await serve("gate", {"snapshot": lambda _: moved, ROLE: lambda _: GATEWAY_ROLE})
     assert await choose() == "base", "a gateway beside the agent is asked only by its name"
     assert await choose("gate") == "gate"
-    await gateway.close()
 
 
 def test_no_agent_at_all(place: Path) -> None:
@@ -247,12 +245,10 @@ def test_no_agent_at_all(place: Path) -> None:
         choose_agent({"RMPA_RUNTIME_DIR": str(place), "RMPA_AGENT": "base"})
 
 
-async def test_another_kind_of_answer(place: Path) -> None:
-    server = ControlServer(place, "base", {"snapshot": lambda _: 5})
-    await server.start()
+async def test_another_kind_of_answer(serve: Serve) -> None:
+    server = await serve("base", {"snapshot": lambda _: 5})
     with pytest.raises(RemoteProtocolError, match="is it older"):
         await asyncio.to_thread(snapshot_of, server.path)
-    await server.close()
 
 
 async def test_an_agent_that_does_not_answer(place: Path) -> None:
