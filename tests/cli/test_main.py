@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 import rmpa
 from lab.bed.processes import eventually
-from rmpa.cli import agent
+from rmpa.cli import agent as agent_verbs
 from rmpa.cli.main import MEANT, REMOVED_VERBS, LazyGroup, cli, main
 from tests.cli.conftest import DEADLINE, with_core
 
@@ -196,7 +196,8 @@ def joystick(agent: Callable[..., None], core: RosCore, listening: str) -> Itera
 
 
 @pytest.mark.usefixtures("joystick")
-def test_a_shell_completes_what_the_agent_knows(place: Place) -> None:
+def test_a_shell_completes_what_the_agent_knows(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(agent_verbs, "ANSWER", DEADLINE)
     for line, words in {
         "peer in": ["info"],
         "peer info j": ["joystick"],
@@ -239,6 +240,6 @@ def test_an_agent_that_hangs_does_not_hold_up_the_shell(monkeypatch: pytest.Monk
         end.wait(DEADLINE)
         return ["late"]
 
-    monkeypatch.setitem(agent._FIND, "peer", hang)
-    assert agent.complete_names("peer", click.Context(cli), "") == []
+    monkeypatch.setitem(agent_verbs._FIND, "peer", hang)
+    assert agent_verbs.complete_names("peer", click.Context(cli), "") == []
     end.set()

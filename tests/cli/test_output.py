@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
+import click
 import msgspec
 import pytest
 
 from rmpa.cli.graph import read_name
-from rmpa.cli.main import help_of
+from rmpa.cli.main import PlacedHelp, help_of
 from rmpa.cli.messages import fill_stamps, flatten, pick, read_values, shorten, to_text
 from rmpa.cli.output import Painted, Table, duration, print_error, print_text, printable, size, warn
 from rmpa.cli.topic import facts
@@ -155,9 +156,9 @@ def test_all_that_a_terminal_or_a_log_shows_says_where_pages_are(
     warn(page)
     print_error(page, "failed")
     logged = _Formatter().format(logging.LogRecord("rmpa", 30, "", 0, "see %s", (page,), None))
-    help_ = help_of(f"Do.\n\n---\nSee {page}.")
+    help_ = PlacedHelp("x", **help_of(f"Do.\n\n---\nSee {page}.")).get_help(click.Context(click.Command("x")))
     out, err = capsys.readouterr()
-    for text in (*out.splitlines(), *err.splitlines(), logged, help_["epilog"]):
+    for text in (*out.splitlines(), *err.splitlines(), logged, help_):
         assert f"/usr/share/doc/rmpa/{page}" in text
 
 

@@ -153,12 +153,20 @@ def help_of(docstring: str | None) -> dict[str, Any]:
 
     The paragraphs of the epilog are shown as they are written.
     """
-    text, _, epilog = with_places(inspect.cleandoc(docstring or "")).partition("\n---\n")
+    text, _, epilog = inspect.cleandoc(docstring or "").partition("\n---\n")
     paragraphs = epilog.replace("{master}", _MASTER).strip().split("\n\n") if epilog else ()
     return {"help": text, "epilog": "\n\n".join(f"\b\n{each}" for each in paragraphs)}
 
 
-class LazyGroup(click.Group):
+class PlacedHelp(click.Command):
+    """A command whose help says where the pages are that it names; they are looked for when it is shown."""
+
+    def get_help(self, ctx: click.Context) -> str:
+        """The help as it is printed."""
+        return with_places(super().get_help(ctx))
+
+
+class LazyGroup(PlacedHelp, click.Group):
     """A click group whose commands are imported on use: ``rmpa --help`` stays quick.
 
     Click shows a command's help line by importing it, and suggests the nearest command only since 8.4; this class

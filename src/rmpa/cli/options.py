@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
-from rmpa.cli.main import help_of
+from rmpa.cli.main import PlacedHelp, help_of
 from rmpa.config.settings import SETTINGS
 
 if TYPE_CHECKING:
@@ -38,8 +38,7 @@ def verb(*parameters: Callable[..., Any], **settings: Any) -> Callable[[Callable
         command = function
         for parameter in reversed(parameters):
             command = parameter(command)
-        made: click.Command = click.command(**help_of(function.__doc__), **settings)(command)
-        return made
+        return click.command(cls=PlacedHelp, **help_of(function.__doc__), **settings)(command)
 
     return decorate
 

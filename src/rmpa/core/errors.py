@@ -23,8 +23,10 @@ import re
 import sys
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 _PAGE: Final = re.compile(r"(?<![\w/])docs/[\w/-]+\.md(?:#[\w-]+)?")
 
@@ -185,7 +187,8 @@ def with_places(text: str) -> str:
 @functools.cache
 def _place_of_docs() -> tuple[str, str]:
     """What stands before and behind ``docs/….md``: a folder of this machine, an address, or else in words."""
-    from importlib.metadata import PackageNotFoundError, metadata  # noqa: PLC0415 - it loads the modules of e-mail
+    from importlib.metadata import PackageNotFoundError, metadata  # noqa: PLC0415 - they load 50 modules
+    from pathlib import Path  # noqa: PLC0415
 
     source = Path(__file__).parents[2]
     if source.name == "src" and (source.parent / "docs").is_dir():
