@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from lab.bed.gateways import JoinedSites, Site
+from lab.bed.namespaces import Lab
 from lab.bed.processes import DEADLINE, Process
 from tests.interop.modules import Module
+from tests.interop.ros import Ros
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-    from contextlib import ExitStack
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
-
-    from lab.bed.namespaces import Host, Lab
-    from tests.interop.ros import Ros
 
 MODULES: Final = {"warehouse": "arm", "yard": "base"}
 """The module of each site."""
@@ -45,23 +44,19 @@ class JoinedModules:
         return traffic["rx_bytes"] + traffic["tx_bytes"]
 
 
-def join(
-    lab: Lab,
-    home: Path,
-    shell: Callable[[Host], Ros],
-    stack: ExitStack,
-    config: str = "",
-    secured: Mapping[str, str] | None = None,
-) -> JoinedModules:
-    """Start all, the gateways with this ``rmpa.toml``; return when each module's agent is linked with its gateway.
+@contextmanager
+def joined_modules(home: Path, config: str = "", secured: Mapping[str, str] | None = None) -> Iterator[JoinedModules]:
+    """Start all, the gateways with this ``rmpa.toml``, and wait until each module's agent is linked with its gateway.
 
     ``secured`` is as of ``JoinedSites``.
     """
-    net = JoinedSites(lab, home, stack, MODULES, config=config, secured=secured)
-    made = [Module(site.module.host, site.module, shell(site.module.host)) for site in net.sites]
-    for site in net.sites:
-        site.module.wait_peer(site.gateway.name)
-    return JoinedModules(net, *made)
+    with ExitStack() as stack:
+        net = JoinedSites(stack.enter_context(Lab()), home, stack, MODULES, config=config, secured=secured)
+        hosts = [(site.module.host, site.module) for site in net.sites]
+        made = [Module(host, agent, stack.enter_context(Ros(host, home, 11311))) for host, agent in hosts]
+        for site in net.sites:
+            site.module.wait_peer(site.gateway.name)
+        yield JoinedModules(net, *made)
 
 
 def nodes(module: Module) -> set[str]:

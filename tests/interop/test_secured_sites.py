@@ -8,23 +8,19 @@ from __future__ import annotations
 
 import json
 import sys
-from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
 from lab.bed.gateways import command
-from lab.bed.namespaces import Lab
 from lab.bed.processes import Process, eventually
 from tests.interop.modules import flows, whole
-from tests.interop.ros import Ros
-from tests.interop.sites import JoinedModules, join, nodes
+from tests.interop.sites import JoinedModules, joined_modules, nodes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from lab.bed.agents import Agent
-    from lab.bed.namespaces import Host
 
 pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 pytestmark = [pytest.mark.ros, pytest.mark.nat, pytest.mark.timeout(180)]
@@ -87,14 +83,10 @@ except zenoh.ZError:
 @pytest.fixture(scope="module")
 def joined(tmp_path_factory: pytest.TempPathFactory) -> Iterator[JoinedModules]:
     """Both sites with their modules, gateways and shells."""
-    with ExitStack() as stack:
-        lab = stack.enter_context(Lab())
-        home = tmp_path_factory.mktemp("secured")
-
-        def shell(host: Host) -> Ros:
-            return stack.enter_context(Ros(host, home, 11311))
-
-        yield join(lab, home, shell, stack, secured={"fleet": "", "warehouse": WAREHOUSE, "yard": YARD})
+    with joined_modules(
+        tmp_path_factory.mktemp("secured"), secured={"fleet": "", "warehouse": WAREHOUSE, "yard": YARD}
+    ) as made:
+        yield made
 
 
 def sites(agent: Agent) -> dict[str, dict[str, Any]]:

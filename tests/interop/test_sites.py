@@ -14,18 +14,16 @@ from typing import TYPE_CHECKING, Any, Final
 import pytest
 
 from lab.bed.agents import RMPA
-from lab.bed.namespaces import Lab
 from lab.bed.processes import Process, eventually
 from tests.interop.modules import flows, whole
 from tests.interop.recordings import recorded
-from tests.interop.ros import Ros, lacks
-from tests.interop.sites import JoinedModules, ended, join, nodes
+from tests.interop.ros import lacks
+from tests.interop.sites import JoinedModules, ended, joined_modules, nodes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from lab.bed.agents import Agent
-    from lab.bed.namespaces import Host
 
 pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 pytestmark = [pytest.mark.ros, pytest.mark.nat, pytest.mark.timeout(120)]
@@ -42,14 +40,8 @@ THERE: Final = ("--peer", "warehouse/arm")
 @pytest.fixture(scope="module")
 def joined(tmp_path_factory: pytest.TempPathFactory) -> Iterator[JoinedModules]:
     """Both sites with their modules, gateways and shells."""
-    with ExitStack() as stack:
-        lab = stack.enter_context(Lab())
-        home = tmp_path_factory.mktemp("sites")
-
-        def shell(host: Host) -> Ros:
-            return stack.enter_context(Ros(host, home, 11311))
-
-        yield join(lab, home, shell, stack, config=RULES)
+    with joined_modules(tmp_path_factory.mktemp("sites"), config=RULES) as made:
+        yield made
 
 
 def does(agent: Agent, *words: str, status: int = 0) -> str:

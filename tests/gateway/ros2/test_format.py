@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from rmpa.core.contract import ContractRule, Contracts, Durability, History, Priority, Reliability
 from rmpa.core.errors import RemoteProtocolError
@@ -109,22 +107,6 @@ def test_kinds_that_are_not_known_count_as_the_default_and_transient_local_is_la
     assert [Ros2Qos.parse(text).latched for text in (":1:,1:,:,:,,", "::,10:,:,:,,")] == [True, False]
 
 
-@given(
-    st.builds(
-        Ros2Qos,
-        st.sampled_from(Ros2Reliability),
-        st.sampled_from(Ros2Durability),
-        st.sampled_from(Ros2History),
-        st.integers(0, limits.QOS_NUMBER_MAX),
-        *[st.integers(0, 2**63 - 1)] * 2,
-        st.sampled_from(Ros2Liveliness),
-        st.integers(0, 2**63 - 1),
-    )
-)
-def test_each_qos_is_read_back(qos: Ros2Qos) -> None:
-    assert Ros2Qos.parse(qos.serialize()) == qos
-
-
 # --- The attachment of ROS 2's messages -----------------------------------------------------------------------------
 
 GOLDEN_BYTES = bytes.fromhex("0700000000000000 15cd5b0700000000 10 000102030405060708090a0b0c0d0e0f")
@@ -133,24 +115,11 @@ ATTACHMENT = Ros2Attachment(7, 123456789, bytes(range(16)))
 
 def test_golden_bytes() -> None:
     assert ATTACHMENT.serialize() == GOLDEN_BYTES
-    assert len(GOLDEN_BYTES) == 33
-    assert Ros2Attachment.parse(GOLDEN_BYTES) == ATTACHMENT
-
-
-def test_what_later_versions_add_is_ignored() -> None:
-    assert Ros2Attachment.parse(GOLDEN_BYTES + b"more") == ATTACHMENT
-
-
-@pytest.mark.parametrize("length", range(len(GOLDEN_BYTES)))
-def test_a_shorter_one_is_refused(length: int) -> None:
-    with pytest.raises(RemoteProtocolError):
-        Ros2Attachment.parse(GOLDEN_BYTES[:length])
-
-
-@given(st.integers(-(2**63), 2**63 - 1), st.integers(-(2**63), 2**63 - 1), st.binary(max_size=255))
-def test_each_attachment_is_read_back(sequence: int, stamp: int, gid: bytes) -> None:
-    made = Ros2Attachment(sequence, stamp, gid)
-    assert Ros2Attachment.parse(memoryview(made.serialize())) == made
+    for later in (b"", b"more"):  # what later versions add is ignored
+        assert Ros2Attachment.parse(GOLDEN_BYTES + later) == ATTACHMENT
+    for length in range(33):
+        with pytest.raises(RemoteProtocolError):
+            Ros2Attachment.parse(GOLDEN_BYTES[:length])
 
 
 def test_the_older_form_with_names_is_read() -> None:

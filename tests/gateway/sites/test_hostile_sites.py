@@ -19,7 +19,7 @@ from rmpa.gateway.sites.keys import (
 from rmpa.gateway.sites.plans import SiteImports
 
 RUN = "0123456789abcdef" * 2
-MANY = 5000
+MANY = 2000
 
 
 def source(

@@ -120,17 +120,11 @@ GOLDEN = (
 
 def test_golden_bytes() -> None:
     assert SENT.writer()(7, 123456789) == GOLDEN
-    assert AttachmentReader().read(GOLDEN) == (7, 123456789, SENT)
-
-
-def test_what_later_versions_add_is_ignored() -> None:
-    assert AttachmentReader().read(GOLDEN + b"more")[2] == SENT
-
-
-@pytest.mark.parametrize("length", range(len(GOLDEN)))
-def test_a_shorter_one_is_refused(length: int) -> None:
-    with pytest.raises(RemoteProtocolError):
-        AttachmentReader().read(GOLDEN[:length])
+    for later in (b"", b"more"):  # what later versions add is ignored
+        assert AttachmentReader().read(GOLDEN + later) == (7, 123456789, SENT)
+    for length in range(len(GOLDEN)):
+        with pytest.raises(RemoteProtocolError):
+            AttachmentReader().read(GOLDEN[:length])
 
 
 @pytest.mark.parametrize(
