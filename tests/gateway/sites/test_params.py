@@ -92,7 +92,7 @@ class ParamSites:
         self.session, self.arm, self.rules, self.here = network.session(), ArmParams(), KeptHome(), KeptHome()
         self.exports = SiteParams(site_context("warehouse", None, self.session, self.rules), self.arm.ask)
         self.imports = SiteParams(site_context("office", None, self.session, self.here), self.arm.ask)
-        self.leading = self.session.queryable(*self.exports.question)
+        self.leading = self.exports.answer()
 
     async def ask(self, what: str, asker: str = "desk", **args: str) -> Any:
         return await self.imports.ask(asker, "warehouse", "arm", {"what": what, **args})

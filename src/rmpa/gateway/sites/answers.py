@@ -212,7 +212,8 @@ class SiteAnswers:
         self._rules = sites.context.rules
         self._params = params
         self._site = sites.own.site
-        sites.questions.append((_why_key(self._site), self._take, _NEEDS))
+        session = sites.context.session
+        sites.questions.append(lambda: session.queryable(_why_key(self._site), self._take, _NEEDS))
 
     async def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Any:
         """The reply to one question of ``observe.operations``; raises as that says."""
@@ -546,7 +547,7 @@ def make_site_neighbour(graph: AgentGraph, session: OpenSession, settings: Setti
         raise UnreachableError("module", where, "`rmpa peer list` there shows which are linked to its gateway")
 
     params = SiteParams(context, ask_module)
-    neighbour.questions.append(params.question)
+    neighbour.questions.append(params.answer)
     neighbour.closing.append(params.close)
     agent.sites.serve(SiteAnswers(neighbour, params))
     return neighbour

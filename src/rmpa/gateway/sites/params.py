@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from rmpa.gateway.sites.topics import SiteContext
     from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.zenoh.session import Declaration
     from rmpa.ros.wire.tcpros import Buffer
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
@@ -263,9 +264,6 @@ class SiteParams:
     Args:
         context: What is shared with topics and services.
         ask: Asks a module of this site over the mesh: module, question, arguments; raises ``RmpaError``.
-
-    Attributes:
-        question: What is answered while this gateway leads its site.
     """
 
     def __init__(self, context: SiteContext, ask: Callable[[str, str, dict[str, Any]], Awaitable[object]]) -> None:
@@ -273,8 +271,11 @@ class SiteParams:
         self._ask = ask
         self._answering = Answering("parameters", f"the gateway of site {context.name} ends", _SITE_PARAMS_AT_ONCE)
         self.close: Final = self._answering.close
+
+    def answer(self) -> Declaration:
+        """Answer questions, until that is closed."""
         take = partial(self._answering.take, respond=self._respond)
-        self.question: Final = f"{ROOT}/{context.name}/*/p/**", take, _NEEDS
+        return self._context.session.queryable(f"{ROOT}/{self._context.name}/*/p/**", take, _NEEDS)
 
     # --- questions of other sites ---------------------------------------------------------------------------------
 

@@ -20,12 +20,10 @@ from rmpa.runtime.loop import MachineTimer
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from rmpa.bridge.policy import Needs
     from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.sites.keys import SiteSource
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
     from rmpa.gateway.sites.topics import SiteContext
-    from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import Declaration
 
 _log = logging.getLogger(__name__)
@@ -46,7 +44,7 @@ class SiteNeighbour:
         exports: What this site offers.
         imports: What is shown of the other sites.
         leads: Whether this gateway is the one of its site that exports and imports.
-        questions: The queryables that it has while it leads: key, what answers, and what is needed for an answer.
+        questions: Declare what it answers while it leads.
         closing: Called when it closes.
     """
 
@@ -62,7 +60,7 @@ class SiteNeighbour:
         self.topics = SiteTopics(context)
         self.services = SiteServices(context)
         self.leads = False
-        self.questions: list[tuple[str, Callable[[ArrivedQuery], object], Needs]] = list(self.topics.questions)
+        self.questions: list[Callable[[], Declaration]] = list(self.topics.questions)
         self.closing: list[Callable[[], Awaitable[None]]] = [self.topics.close, self.services.close]
         self._actions = SiteActions(context.graph)
         self._leader = Leader(own, limits.LEADER_PATIENCE, time.monotonic())
@@ -168,7 +166,7 @@ class SiteNeighbour:
     def _lead(self) -> None:
         _log.info("= this gateway leads site %s", self.own.site)
         self.leads = True
-        self._answering = [self.context.session.queryable(*question) for question in self.questions]
+        self._answering = [declare() for declare in self.questions]
         items: list[SiteModule | SiteExport] = [*self.exports.modules, *self.exports.entries]
         for item in items:
             self._own_changed(item, there=True)

@@ -395,7 +395,7 @@ class SiteTopics:
         context: What is shared with services and parameters.
 
     Attributes:
-        questions: What is answered about headers and definitions while this gateway leads its site.
+        questions: Declare what is answered about headers and definitions while this gateway leads its site.
     """
 
     def __init__(self, context: SiteContext) -> None:
@@ -407,10 +407,10 @@ class SiteTopics:
         self._subscriptions: dict[str, _Subscription] = {}
         self._reader = AttachmentReader()
         self._headers = Answering("headers", f"the gateway of site {context.name} ends", limits.SITE_CALLS_WAITING)
-        prefix = f"{ROOT}/{context.name}/*/d"
-        self.questions: Final = (
-            (f"{prefix}/t/**", self._asked_header, _HEADER_NEEDS),
-            (f"{prefix}/m/*", self._asked_definition, _DEFINITION_NEEDS),
+        prefix, session = f"{ROOT}/{context.name}/*/d", context.session
+        self.questions: Final[tuple[Callable[[], Declaration], ...]] = (
+            lambda: session.queryable(f"{prefix}/t/**", self._asked_header, _HEADER_NEEDS),
+            lambda: session.queryable(f"{prefix}/m/*", self._asked_definition, _DEFINITION_NEEDS),
         )
 
     # --- what the neighbour says ----------------------------------------------------------------------------------
