@@ -57,12 +57,8 @@ def doctor() -> bytes:
 
 def why() -> bytes:
     """The lines of a terminal, and what the control socket and the peers carry."""
-    ways = {name: case.walk() for name, case in test_topics.FLOWING.items()}
-    ways |= {
-        name: case.walk()
-        for table in (test_topics.FAILURES, test_topics.WARNINGS)
-        for name, (_, case) in table.items()
-    }
+    cases = test_topics.FLOWING | test_topics.FAILURES | test_topics.WARNINGS
+    ways = {name: case.walk() for name, case in cases.items()}
     for name, (here, there, _) in (test_services.FLOWING | test_services.FAILURES).items():
         ways[f"service: {name}"] = (test_services.walk(here, there),)
     ways |= {f"module: {name}": (found,) for name, (found, _) in test_services.MODULES.items()}
