@@ -12,7 +12,8 @@ from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.discovery.membership import BURST_OFFSETS, MembershipProtocol
+from rmpa.discovery.membership import BURST_OFFSETS
+from tests.discovery.test_membership import Harness
 
 if TYPE_CHECKING:
     from rmpa.discovery.announcing import OutgoingBeacon
@@ -25,36 +26,21 @@ def member(number: int) -> Identity:
     return Identity(guid, number.to_bytes(16, "big"), f"module{number}")
 
 
-class Agent:
+class Agent(Harness):
     """A started membership protocol among members that the test plays."""
 
-    def __init__(self, *, multicast: bool = True) -> None:
-        self.now = 1000.0
-        rng = random.Random(5).random
-        self.membership = MembershipProtocol(member(9999), rng=rng, multicast=multicast)
-        self.membership.start(self.now)
+    def __init__(self) -> None:
+        super().__init__(member(9999), rng=random.Random(5).random)
         self.sequence = 0
 
-    def hear(self, number: int, kind: BeaconKind, *, multicast: bool = True, lease: float = 16.0) -> None:
+    def hears(self, number: int, kind: BeaconKind, *, lease: float = 16.0) -> None:
         self.sequence += 1
-        identity = member(number)
-        beacon = Beacon(kind, identity, round(1000 * lease), self.sequence)
-        self.membership.receive(beacon, identity.guid.endpoint, self.now, multicast=multicast)
-
-    def run(self, seconds: float) -> list[OutgoingBeacon]:
-        sent = self.membership.outputs()
-        end = self.now + seconds
-        while (timer := self.membership.next_timer()) is not None and timer <= end:
-            self.now = max(self.now, timer)
-            self.membership.handle_timer(self.now)
-            sent += self.membership.outputs()
-        self.now = end
-        return sent
+        self.hear(Beacon(kind, member(number), round(1000 * lease), self.sequence))
 
     def meet(self, count: int, *, linked: bool = False) -> None:
         """So many members have been there for long; all had a link, which has ended unless they are ``linked``."""
         for number in range(count):
-            self.hear(number, BeaconKind.HEARTBEAT)
+            self.hears(number, BeaconKind.HEARTBEAT)
             self.membership.link_up(member(number), self.now)
             if not linked:
                 self.membership.link_down(member(number).guid, self.now)
@@ -76,7 +62,7 @@ def test_a_thousand_agents_that_start_at_once_do_not_answer_each_other() -> None
     for offset in BURST_OFFSETS:
         sent += agent.run(1000.0 + offset + 0.01 - agent.now)
         for number in range(MEMBERS):
-            agent.hear(number, BeaconKind.ANNOUNCE)
+            agent.hears(number, BeaconKind.ANNOUNCE)
     sent += agent.run(3.0)
     assert len(agent.membership.peers()) == MEMBERS
     assert len(answers(sent)) <= (limits.MANY_MEMBERS + 1) * len(BURST_OFFSETS)
@@ -91,7 +77,7 @@ def test_a_newcomer_gets_the_answers_of_a_large_mesh_spread_over_seconds() -> No
         agent.membership._rng = random.Random(seed).random
         agent.meet(MEMBERS)
         agent.run(9.2)
-        agent.hear(5000, BeaconKind.ANNOUNCE)
+        agent.hears(5000, BeaconKind.ANNOUNCE)
         began = agent.now
         agent.membership.outputs()
         while not agent.run(0.05):  # its answer, or a multicast that comes before it
@@ -104,7 +90,7 @@ def test_a_newcomer_that_is_linked_meanwhile_is_not_answered() -> None:
     agent = Agent()
     agent.run(1.0)
     agent.meet(MEMBERS)
-    agent.hear(5000, BeaconKind.ANNOUNCE)
+    agent.hears(5000, BeaconKind.ANNOUNCE)
     agent.membership.link_up(member(5000), agent.now)
     assert not answers(agent.run(3.0))
 
@@ -115,7 +101,7 @@ def test_many_newcomers_are_answered_by_one_multicast() -> None:
     agent.meet(MEMBERS)
     agent.run(0.1)
     for number in range(5000, 5300):
-        agent.hear(number, BeaconKind.ANNOUNCE)
+        agent.hears(number, BeaconKind.ANNOUNCE)
     sent = agent.run(MEMBERS / limits.ANSWERS_PER_SECOND + 0.7)
     assert not answers(sent)
     assert 1 <= len(multicasts(sent)) <= 2
@@ -137,12 +123,12 @@ def test_forged_peers_never_displace_one_that_was_linked(monkeypatch: pytest.Mon
     agent.meet(1)
     agent.membership.events()
     for number in range(1, limits.STRANGERS_MAX + 100):
-        agent.hear(number, BeaconKind.ANNOUNCE, lease=120.0)
+        agent.hears(number, BeaconKind.ANNOUNCE, lease=120.0)
     for _ in range(40):
         agent.run(1.0)
-        agent.hear(0, BeaconKind.HEARTBEAT, lease=61.0)
+        agent.hears(0, BeaconKind.HEARTBEAT, lease=61.0)
         for number in range(6000, 6020):
-            agent.hear(number + agent.sequence, BeaconKind.ANNOUNCE, lease=120.0)
+            agent.hears(number + agent.sequence, BeaconKind.ANNOUNCE, lease=120.0)
     lost = [event.identity.name for event in agent.membership.events() if event.change == "lost"]
     assert lost
     assert member(0).name not in lost

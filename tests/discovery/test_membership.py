@@ -19,6 +19,8 @@ from rmpa.discovery.endpoints import GOODBYE_LATE, LEASE_MAX, LEASE_MIN
 from rmpa.discovery.membership import BURST_AGAIN_OFFSETS, BURST_JITTER, BURST_OFFSETS, MembershipProtocol, PeerEvent
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rmpa.discovery.announcing import OutgoingBeacon
 
 T0 = 1000.0
@@ -44,11 +46,13 @@ class Speaker:
 
 
 class Harness:
-    """A started membership protocol of peer 1 with a clock in hand."""
+    """A started membership protocol, that of peer 1 where no other is named, with a clock in hand."""
 
-    def __init__(self, *, multicast: bool = True, name: str = "") -> None:
+    def __init__(
+        self, own: Identity | None = None, *, multicast: bool = True, rng: Callable[[], float] = lambda: 0.0
+    ) -> None:
         self.now = T0
-        self.membership = MembershipProtocol(who(1, name=name), rng=lambda: 0.0, multicast=multicast)
+        self.membership = MembershipProtocol(own or who(1), rng=rng, multicast=multicast)
         self.membership.start(T0)
 
     def hear(self, beacon: Beacon, *, multicast: bool = True, source: tuple[str, int] | None = None) -> None:
@@ -532,7 +536,7 @@ def test_name_conflict_needs_proof_that_both_are_alive(one: Harness) -> None:
 
 
 def test_a_peer_with_our_own_name() -> None:
-    one = Harness(name="base")
+    one = Harness(who(1, name="base"))
     one.hear(Speaker(who(2, name="base"))())
     assert [e.reason for e in one.membership.events() if e.change == "conflict"] == ["name"]
 
