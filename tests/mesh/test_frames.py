@@ -33,7 +33,7 @@ from rmpa.mesh.frames import (
     pong,
     unpack_header,
 )
-from tests.mesh.worlds import ACCEPTOR, HIGH, LOW, AnyRoute, Side, Time, deliver, exchange, pair, pass_time
+from tests.mesh.worlds import HIGH, LOW, AnyRoute, Side, Time, deliver, exchange, pair, pass_time
 
 if TYPE_CHECKING:
     from rmpa.core.identity import Identity
@@ -417,28 +417,6 @@ def test_an_abort_is_handed_on_as_a_part_without_bytes(acceptor: Side, time: Tim
     assert acceptor.messages() == []
 
 
-@pytest.mark.parametrize("flags", [ABORT, FIRST | ABORT, WHOLE | ABORT])
-def test_an_abort_that_is_none_ends_the_link(acceptor: Side, time: Time, flags: int) -> None:
-    with pytest.raises(RemoteProtocolError, match="aborts"):
-        acceptor.receive(memoryview(Frame(FrameKind.DATA, b"", 7, 1, 99, flags).serialize()), time.now)
-    assert acceptor.state is ConnectionState.CLOSED
-    assert acceptor.parts == []
-
-
-@pytest.mark.parametrize("size", [limits.DATA_PAYLOAD_MAX + 1, 0xFFFFFFFF])
-@pytest.mark.parametrize("flags", [0, FIRST, LAST, WHOLE, LAST | ABORT])
-def test_too_long_frame_is_refused_by_its_header(acceptor: Side, time: Time, size: int, flags: int) -> None:
-    header = size.to_bytes(4, "big") + bytes([FrameKind.DATA, flags]) + bytes(18)
-    with pytest.raises(LimitExceeded):
-        acceptor.receive(memoryview(header), time.now)
-
-
-def test_no_fragment_before_the_handshake_is_over(time: Time) -> None:
-    acceptor = Side(ACCEPTOR, HIGH, time)
-    with pytest.raises(RemoteProtocolError, match="data frame while handshaking"):
-        acceptor.receive(memoryview(Frame(FrameKind.DATA, b"x", flags=FIRST).serialize()), time.now)
-
-
 def test_closing_from_within_a_part_stops_the_reading(acceptor: Side, time: Time) -> None:
     got: list[int] = []
 
@@ -489,12 +467,6 @@ def test_marks_come_in_the_order_of_the_messages(
         deliver(wire, link, time.now, chunk)
         assert said == [1, ("mark", kind, 7, 0xFFFFFFFF), 2]
         assert not link.output, "who answers a fence is the driver's business"
-
-
-@pytest.mark.parametrize("kind", [FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED])
-def test_a_mark_has_no_bytes(acceptor: Side, time: Time, kind: FrameKind) -> None:
-    with pytest.raises(LimitExceeded, match=kind.name.lower()):
-        acceptor.receive(memoryview(bytes([0, 0, 0, 1, kind, 3]) + bytes(18)), time.now)
 
 
 def test_bulk_lane_has_its_own_lease(time: Time) -> None:

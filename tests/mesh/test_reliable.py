@@ -106,23 +106,17 @@ def test_a_suspended_sender_keeps_all_and_sends_nothing() -> None:
     assert (machine.pending, machine.in_flight) == (3, 0)
 
 
+@pytest.mark.parametrize("suspended", [True, False])
 @pytest.mark.parametrize(("after", "again"), [(0, [0, 1, 2, 3]), (2, [2, 3]), (3, [3])])
-def test_a_new_link_begins_behind_what_the_receiver_has(after: int, again: list[int]) -> None:
+def test_a_new_link_begins_behind_what_the_receiver_has(after: int, again: list[int], *, suspended: bool) -> None:
     machine = sender()
     fill(machine, 4)
     taken(machine, 3)
-    machine.suspend()
+    if suspended:
+        machine.suspend()
     machine.resume(after)
     assert numbers(machine) == again
     assert machine.pending == len(again)
-
-
-def test_replacing_link_needs_no_suspend() -> None:
-    machine = sender()
-    fill(machine, 4)
-    taken(machine)
-    machine.resume(1)
-    assert numbers(machine) == [1, 2, 3]
 
 
 @pytest.mark.parametrize("after", [0, 1, 4, 5, (1 << 31) + 2])
