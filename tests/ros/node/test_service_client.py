@@ -191,37 +191,45 @@ async def test_nobody_there(server: Server) -> None:
         await ServiceConnection.open(server.uri, "/add", "/c")
 
 
-async def test_an_answer_of_the_expected_node_is_a_success(server: Server) -> None:
-    answer = encode_header(HEADER)
-    assert await server.asked(answer) == ""
-    assert await server.asked(answer, node="") == "", "any node will do"
-    assert await server.asked(*(answer[at : at + 1] for at in range(len(answer)))) == ""
-    without_name = {key: value for key, value in HEADER.items() if key != "callerid"}
-    assert await server.asked(encode_header(without_name)) == ""
-    for link in server.links:
-        assert await link.ended(), "the probe leaves nothing behind, and sends nothing more"
+def refusal(text: str) -> bytes:
+    return encode_header(error_header(text))
 
 
-async def test_another_node_at_that_port_is_a_failure(server: Server) -> None:
-    answer = encode_header({**HEADER, "callerid": "/camera\n"})
-    assert await server.asked(answer) == "another node listens there: /camera�"
+ANSWER = encode_header(HEADER)
+OF_ROSPY = "[{}] is not a provider of  [/talker/get_loggers]"
+OF_ROSCPP = "received a tcpros connection for a nonexistent service [/talker/get_loggers]."
+UNEXPECTED = "a ROS node listens there, but not the expected one: "
+NO_NODE = "the program that listens there is no ROS node"
 
 
-async def test_an_error_counts_only_if_it_names_the_node(server: Server) -> None:
-    of_rospy = "[{}] is not a provider of  [/talker/get_loggers]"
-    of_roscpp = "received a tcpros connection for a nonexistent service [/talker/get_loggers]."
-    assert await server.asked(encode_header(error_header(of_rospy.format("/talker")))) == ""
-    assert await server.asked(encode_header({**error_header(of_roscpp), "callerid": "/talker"})) == ""
-    for text in (of_rospy.format("/talker2"), of_roscpp):
-        problem = await server.asked(encode_header(error_header(text)))
-        assert problem == f"a ROS node listens there, but not the expected one: {text}"
-    assert "not the expected one" in await server.asked(encode_header(error_header(of_roscpp)), node="")
+@pytest.mark.parametrize(
+    ("answer", "node", "says"),
+    [
+        (ANSWER, "/talker", ""),
+        (ANSWER, "", ""),
+        (encode_header({key: value for key, value in HEADER.items() if key != "callerid"}), "/talker", ""),
+        (encode_header({**HEADER, "callerid": "/camera\n"}), "/talker", "another node listens there: /camera�"),
+        # An error counts only if it names the node.
+        (refusal(OF_ROSPY.format("/talker")), "/talker", ""),
+        (encode_header({**error_header(OF_ROSCPP), "callerid": "/talker"}), "/talker", ""),
+        (refusal(OF_ROSCPP), "/talker", UNEXPECTED + OF_ROSCPP),
+        (refusal(OF_ROSCPP), "", UNEXPECTED + OF_ROSCPP),
+        (
+            refusal(OF_ROSPY.format("/talker2")),
+            "/talker",
+            UNEXPECTED + OF_ROSPY.format("/talker2"),
+        ),
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n", "/talker", NO_NODE),
+        (b"\x05\0\0\0\x01\0\0\0x", "/talker", NO_NODE),
+    ],
+)
+async def test_a_probe_says_what_answers(server: Server, answer: bytes, node: str, says: str) -> None:
+    assert await server.asked(answer, node=node) == says
+    assert await server.links[0].ended(), "the probe leaves nothing behind, and sends nothing more"
 
 
-async def test_what_is_no_ros_node_is_a_failure(server: Server) -> None:
-    no_node = "the program that listens there is no ROS node"
-    assert await server.asked(b"HTTP/1.1 400 Bad Request\r\n\r\n") == no_node
-    assert await server.asked(b"\x05\0\0\0\x01\0\0\0x") == no_node
+async def test_an_answer_may_come_in_pieces_or_end_too_early(server: Server) -> None:
+    assert await server.asked(*(ANSWER[at : at + 1] for at in range(len(ANSWER)))) == ""
     assert "closed the connection without an answer" in await server.asked(b"\x05\0", close=True)
 
 
