@@ -44,7 +44,7 @@ CONTRACTS = st.builds(Contract, **VALUES)
 GLOBS = st.lists(st.sampled_from(["/a", "/a/**", "/*", "/**", "/b/?"]), max_size=2, unique=True).map(tuple)
 TYPE_GLOBS = st.lists(st.sampled_from(["m/A", "m/*", "**", "n/B"]), max_size=2, unique=True).map(tuple)
 RULES = st.lists(
-    st.builds(ContractRule, GLOBS, TYPE_GLOBS, st.fixed_dictionaries({}, optional=VALUES)), max_size=5
+    st.builds(ContractRule, GLOBS, TYPE_GLOBS, st.fixed_dictionaries({}, optional=VALUES)), max_size=3
 ).map(tuple)
 TOPICS = st.sampled_from(["/a", "/a/x", "/b", "/b/c", "/c/d/e"])
 TYPES = st.sampled_from(["m/A", "m/B", "n/B", ""])

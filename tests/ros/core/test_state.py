@@ -374,7 +374,7 @@ async def test_churn_is_gathered_and_a_large_state_is_written_more_rarely(
             await over.wait()
 
         monkeypatch.setattr(core.stored, "_rest", rest)
-        for number in range(300):
+        for number in range(100):
             await call(core.uri, "registerPublisher", "/node", f"/t{number}", STRING, "http://127.0.0.1:1/")
         over.set()
         await until(lambda: saved(core))
@@ -537,12 +537,12 @@ scalars = (
 )
 values = st.recursive(
     scalars,
-    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(texts, inner, max_size=5),
-    max_leaves=20,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(texts, inner, max_size=3),
+    max_leaves=8,
 )
 
 
-@given(st.dictionaries(texts, values, max_size=5))
+@given(st.dictionaries(texts, values, max_size=3))
 def test_each_value_of_ros_comes_back_as_it_was(tree: dict[str, Any]) -> None:
     entries = [
         (RegistrationKind.PUBLISHER, "/t", STRING),

@@ -35,8 +35,9 @@ def _links(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.fixture
-async def core() -> AsyncIterator[RosCore]:
-    """A core at a port of its own."""
+async def core(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[RosCore]:
+    """A core at a port of its own; its nodes look soon whether it knows them."""
+    monkeypatch.setattr("rmpa.ros.node.node.NODE_MASTER_CHECK", 0.05)
     made = RosCore("127.0.0.1", 0)
     await made.start()
     yield made

@@ -58,7 +58,7 @@ async def test_type_is_fetched_from_a_publisher(core: RosCore) -> None:
 
 
 async def test_publishers_that_cannot_tell_are_passed_over(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rmpa.ros.node.fetch_type.FETCH_TYPE_TIMEOUT", 0.5)
+    monkeypatch.setattr("rmpa.ros.node.fetch_type.FETCH_TYPE_TIMEOUT", 0.1)
     silent = socket.create_server(("127.0.0.1", 0))  # listens, and never answers
     port = silent.getsockname()[1]
     core.call("registerPublisher", "/a_gone", "/a", NAME, "http://127.0.0.1:9/")
