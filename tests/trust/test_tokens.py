@@ -124,23 +124,18 @@ def test_a_token_lets_one_module_join_once() -> None:
     assert book.use(TOKEN.token_id, "arm", WALL) == ""
     assert book.use(TOKEN.token_id, "arm", WALL) == "used"
     assert [(i.used_by, i.key) for i in book.invitations] == [("arm", b"")]
+    assert TokenBook(book.invitations).use(TOKEN.token_id, "arm", WALL) == "used", "also after a restart"
 
 
 def test_unknown_late_and_other_names_are_told_apart() -> None:
     book = TokenBook()
+    with pytest.raises(ValueError, match="not a ROS base name"):
+        book.invite(TOKEN, "my arm")
     book.invite(TOKEN, "arm")
     assert book.use(bytes(8), "arm", WALL) == "token"
     assert book.use(TOKEN.token_id, "base", WALL) == "name"
     assert book.use(TOKEN.token_id, "arm", TOKEN.expires) == "late"
     assert book.use(TOKEN.token_id, "arm", WALL) == ""
-
-
-def test_a_token_that_was_used_stays_used_over_a_restart() -> None:
-    book = TokenBook()
-    book.invite(TOKEN)
-    book.use(TOKEN.token_id, "arm", WALL)
-    again = TokenBook(book.invitations)
-    assert again.use(TOKEN.token_id, "arm", WALL) == "used"
 
 
 def test_a_token_can_be_withdrawn() -> None:
@@ -158,11 +153,6 @@ def test_a_new_token_for_a_name_replaces_the_open_one() -> None:
         book.invite(token, "arm")
     book.invite(third)
     assert [book.judge(token.token_id, "arm", WALL) for token in (TOKEN, other, third)] == ["token", "", ""]
-
-
-def test_names_are_checked() -> None:
-    with pytest.raises(ValueError, match="not a ROS base name"):
-        TokenBook().invite(TOKEN, "my arm")
 
 
 def test_tokens_are_bounded_and_used_ones_go_first() -> None:

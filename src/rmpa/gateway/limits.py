@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from rmpa.config import limits as config_limits
 from rmpa.core.limits import MIB
 
 # Characters of a key expression or a liveliness token that another site or a ROS 2 node sent. Longer ones are
@@ -44,8 +45,8 @@ SITE_PARAM_BYTES_MAX: Final = 64 * MIB
 # Seconds for a question about a parameter to another site: less than the module that asks waits for this
 # gateway.
 SITE_PARAM_TIMEOUT: Final = 20.0
-# Characters of a site's name, as for a module's name and for a label of DNS.
-SITE_NAME_MAX: Final = 63
+# Characters of a site's name, as settings have it.
+SITE_NAME_MAX: Final = config_limits.SITE_NAME_MAX
 # [ROS 2] Characters of a name
 # At it: it is not shown
 # Told in: `site info ros2`, log
