@@ -35,23 +35,20 @@ class Client:
 
     async def next(self, op: str) -> dict[str, Any]:
         """The next text frame of this op; others are skipped."""
-        async with asyncio.timeout(DEADLINE):
-            while True:
-                message = await self.socket.receive()
-                assert message.type not in (aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.CLOSE), message
-                if message.type == aiohttp.WSMsgType.TEXT:
-                    values: dict[str, Any] = json.loads(message.data)
-                    if values["op"] == op:
-                        return values
+        while (values := json.loads(await self._next(aiohttp.WSMsgType.TEXT)))["op"] != op:
+            pass
+        found: dict[str, Any] = values
+        return found
 
     async def next_bytes(self) -> bytes:
         """The next binary frame."""
+        return bytes(await self._next(aiohttp.WSMsgType.BINARY))
+
+    async def _next(self, kind: aiohttp.WSMsgType) -> Any:
         async with asyncio.timeout(DEADLINE):
-            while True:
-                message = await self.socket.receive()
+            while (message := await self.socket.receive()).type != kind:
                 assert message.type not in (aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.CLOSE), message
-                if message.type == aiohttp.WSMsgType.BINARY:
-                    return bytes(message.data)
+            return message.data
 
 
 class Server:

@@ -31,6 +31,11 @@ ONE, TWO = b"\x03\0\0\0one", b"\x03\0\0\0two"
 SET_BOOL = "std_srvs/SetBool"
 
 
+@pytest.fixture
+def client(hub: Hub) -> FakeClient:
+    return FakeClient(hub)
+
+
 # --- topics ---
 
 
@@ -64,11 +69,10 @@ async def test_beyond_a_bound_only_topics_with_a_publisher_are_subscribed_to(
 
 
 async def test_a_storm_of_subscriptions_leaves_nothing_registered(
-    hub: Hub, talker: Node, monkeypatch: pytest.MonkeyPatch
+    hub: Hub, client: FakeClient, talker: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "SUBSCRIPTION_LINGER", 0.0)
     publisher = await talker.advertise("/t", STRING)
-    client = FakeClient(hub)
     for number in range(1, 300):
         heard = client.hear("/t" if number % 2 else f"/none{number}")
         out = client.talk("/out", latch=bool(number % 2))
@@ -131,11 +135,10 @@ async def test_a_client_that_fails_costs_the_others_no_message(hub: Hub, talker:
 
 
 async def test_what_waits_too_long_for_the_core_is_not_sent(
-    hub: Hub, talker: Node, core: RosCore, monkeypatch: pytest.MonkeyPatch
+    hub: Hub, client: FakeClient, talker: Node, core: RosCore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "EARLY_AGE", 0.0)  # all that waits for the registration is too old
     heard, states = await listen(talker, "/cmd"), await listen(talker, "/state")
-    client = FakeClient(hub)
     command = client.talk("/cmd")
     command.publish(ONE)
     client.talk("/state", latch=True).publish(TWO)
@@ -161,11 +164,10 @@ async def test_a_publisher_that_has_gone_leaves_no_latched_message(hub: Hub, tal
                 return
 
 
-async def test_two_types_and_two_versions_of_one_on_a_topic_are_told_apart(hub: Hub, core: RosCore) -> None:
+async def test_two_types_and_two_versions_of_one_are_told_apart(hub: Hub, client: FakeClient, core: RosCore) -> None:
     old, new = (
         MessageType("std_msgs/Int32", parse_definition("std_msgs/Int32", f"{t} a")) for t in ("int8", "int32")
     )
-    client = FakeClient(hub)
     texts, numbers, all_ = (client.hear("/t", kind) for kind in ("std_msgs/String", "std_msgs/Int32", None))
     async with node(core, "a") as a, node(core, "b") as b, node(core, "c") as c:
         for talker, kind, payload in ((a, STRING, ONE), (b, old, b"\x05"), (c, new, b"\x06\0\0\0")):
@@ -216,12 +218,13 @@ async def test_what_clients_publish_is_numbered_as_rospy_numbers_it(hub: Hub, ta
     assert [point.deserialize(payload).header.seq for payload in listener.payloads] == [1, 2, 3]
 
 
-async def test_what_is_published_before_its_type_is_known_is_numbered_too(hub: Hub, talker: Node) -> None:
+async def test_what_comes_before_its_type_is_known_is_numbered_too(
+    hub: Hub, client: FakeClient, talker: Node
+) -> None:
     text = f"Header header\n{SEPARATOR}\nMSG: std_msgs/Header\n{known_text('std_msgs/Header')}"
     kind = MessageType.learn("my_msgs/Stamped", text)
     publisher = await talker.advertise("/other", kind)
     await until(lambda: "/other" in hub.graph.topics)
-    client = FakeClient(hub)
     heard, out = client.hear("/t"), client.talk("/t", kind.name)
     for _ in range(2):
         out.publish(kind.serialize(kind.make()))
@@ -287,12 +290,11 @@ async def test_another_type_of_a_published_topic_is_refused(hub: Hub) -> None:
 
 
 async def test_a_node_that_was_shut_down_comes_back_with_everything(
-    hub: Hub, talker: Node, monkeypatch: pytest.MonkeyPatch
+    hub: Hub, client: FakeClient, talker: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "NODE_RETRY", 0.05)
     publisher = await talker.advertise("/t", STRING)
     came = await listen(talker, "/cmd_vel")
-    client = FakeClient(hub)
     heard, out = client.hear("/t"), client.talk("/cmd_vel")
     await publisher.wait_for_subscriber()
     out.publish(ONE)
@@ -311,7 +313,7 @@ async def test_a_node_that_was_shut_down_comes_back_with_everything(
 # --- services ---
 
 
-async def test_calls_share_a_connection_and_errors_are_told(hub: Hub, talker: Node) -> None:
+async def test_calls_share_a_connection_and_errors_are_told(hub: Hub, client: FakeClient, talker: Node) -> None:
     def serve(request: object) -> object:
         if not request.data:  # type: ignore[attr-defined]
             raise RmpaError("no")
@@ -320,7 +322,6 @@ async def test_calls_share_a_connection_and_errors_are_told(hub: Hub, talker: No
     service = await talker.advertise_service("/set", SET_BOOL, serve)
     # The first news of a service closes the connections to one that had its name before.
     await until(lambda: "/set" in hub.graph.services)
-    client = FakeClient(hub)
     for _ in range(3):
         assert bytes(await client.call("/set", SET_BOOL, b"\x01")) == b"\x01\x03\0\0\0yes"
     assert len(service.endpoint._clients) == 1
@@ -332,8 +333,7 @@ async def test_calls_share_a_connection_and_errors_are_told(hub: Hub, talker: No
     assert hub.graph.services["/set"].type == SET_BOOL
 
 
-async def test_a_client_that_goes_right_after_its_requests_leaves_no_coroutine_behind(hub: Hub) -> None:
-    client = FakeClient(hub)
+async def test_a_client_that_goes_right_after_its_requests_leaves_nothing(hub: Hub, client: FakeClient) -> None:
     for work in (
         client.get_params(),
         client.find_service("/rosout/get_loggers"),
@@ -436,8 +436,7 @@ async def test_the_newest_client_that_offers_a_service_has_it(hub: Hub, talker: 
 # --- parameters, graph, types ---
 
 
-async def test_changes_of_parameters_are_told_to_followers(hub: Hub, talker: Node) -> None:
-    client = FakeClient(hub)
+async def test_changes_of_parameters_are_told_to_followers(hub: Hub, client: FakeClient, talker: Node) -> None:
     all_: list[Any] = []
     one: list[Any] = []
     kept = client.follow_params((), all_.append), client.follow_params(("/a/x",), one.append)
