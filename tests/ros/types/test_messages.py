@@ -110,6 +110,7 @@ def test_a_program_may_give_arrays_bytes_and_messages() -> None:
     twist, vector = MessageType("geometry_msgs/Twist"), MessageType("geometry_msgs/Vector3")
     assert twist.to_plain(twist.make({"linear": vector.make([1, 2, 3])}))["linear"] == {"x": 1.0, "y": 2.0, "z": 3.0}
     assert MessageType("std_msgs/Int32").make({"data": np.int64(5)}).data == 5
+    assert MessageType("std_msgs/String").make(np.int64(5)).data == "5"
 
 
 @pytest.mark.parametrize(
@@ -153,6 +154,9 @@ def test_bytes_that_are_no_message(raw: bytes) -> None:
 
 
 def test_an_object_that_is_no_message() -> None:
+    older, newer = (MessageType.learn("my_msgs/M", text) for text in ("int8 a", "int8 a\nint8 b"))
+    with pytest.raises(MessageError, match="my_msgs/M has b here, and not in the version given"):
+        newer.serialize(older.make())
     with pytest.raises(MessageError, match="Joy is made of the fields header, axes, buttons, not of 'joy'"):
         MessageType("sensor_msgs/Joy").serialize("joy")
 

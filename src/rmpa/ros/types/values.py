@@ -170,7 +170,10 @@ class GivenMessage(Written):
         if values is None:
             return {}
         if getattr(values, "__msgtype__", None) == ros2_name(known.name):
-            return {name: getattr(values, python_name(name)) for name in names}
+            try:
+                return {name: getattr(values, python_name(name)) for name in names}
+            except AttributeError as error:
+                raise WrongValueError(f"{known.name} has {error.name} here, and not in the version given") from None
         if isinstance(values, list):
             if values and len(values) != len(names):
                 raise WrongValueError(f"{known.name} has {len(names)} fields, not {len(values)}")
@@ -182,6 +185,7 @@ class GivenMessage(Written):
 
     def text(self, value: Any) -> str:
         """Of a number its digits."""
+        value = _scalar(value)
         if value is None:
             return ""
         if isinstance(value, int | float):
@@ -202,8 +206,7 @@ class GivenMessage(Written):
 
     def number(self, kind: str, value: Any) -> float:
         """Of numpy's scalars and booleans, and of the words for what is no number."""
-        if hasattr(value, "item"):
-            value = value.item()
+        value = _scalar(value)
         if value is None:
             return 0
         if isinstance(value, int | float) and (CODES[kind] in "fd" or isinstance(value, int)):
@@ -230,6 +233,10 @@ class GivenMessage(Written):
         values = super().numbers(field, values)
         is_list = isinstance(values, list) and type(None) in set(map(type, values))
         return [0 if each is None else each for each in values] if is_list else values
+
+
+def _scalar(value: Any) -> Any:
+    return value.item() if hasattr(value, "item") else value  # numpy's
 
 
 def _of_numpy(field: Field, given: Any) -> memoryview:
