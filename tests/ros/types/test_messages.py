@@ -110,7 +110,7 @@ def test_a_program_may_give_arrays_bytes_and_messages() -> None:
     twist, vector = MessageType("geometry_msgs/Twist"), MessageType("geometry_msgs/Vector3")
     assert twist.to_plain(twist.make({"linear": vector.make([1, 2, 3])}))["linear"] == {"x": 1.0, "y": 2.0, "z": 3.0}
     assert MessageType("std_msgs/Int32").make({"data": np.int64(5)}).data == 5
-    assert MessageType("std_msgs/String").make(np.int64(5)).data == "5"
+    assert MessageType("std_msgs/String").make({"data": np.int64(5)}).data == "5"
 
 
 @pytest.mark.parametrize(

@@ -122,7 +122,7 @@ class Written:
 
     def time(self, kind: str, value: Any) -> Mapping[str, Any]:
         """A time that is no mapping."""
-        if value == "now" and kind == "time":
+        if isinstance(value, str) and value == "now" and kind == "time":
             return self.now
         raise WrongValueError(f"is a {kind} ({{secs, nsecs}}), not {shown(value)}")
 
@@ -223,15 +223,14 @@ class GivenMessage(Written):
 
     def numbers(self, field: Field, values: Any) -> Any:
         """Of text in arrays of bytes, of bytes, and of numpy's arrays."""
-        is_bytes = SIZES[field.type] == 1 and field.type != "bool"
-        if is_bytes and isinstance(values, str):
+        if CODES[field.type] == "B" and isinstance(values, str):
             return encoded(values)
-        if is_bytes and isinstance(values, bytes | bytearray | memoryview):
-            return bytes(values)
+        if isinstance(values, bytes | bytearray | memoryview):
+            return bytes(values) if CODES[field.type] in "bB" else self.array(field, values)
         if hasattr(values, "dtype") and values.ndim:
             return _of_numpy(field, values)
         values = super().numbers(field, values)
-        is_list = isinstance(values, list) and type(None) in set(map(type, values))
+        is_list = isinstance(values, list | tuple) and type(None) in set(map(type, values))
         return [0 if each is None else each for each in values] if is_list else values
 
 
