@@ -387,12 +387,16 @@ async def test_a_secured_peer_does_not_learn_of_a_service_that_it_may_not_have(
 ) -> None:
     if secured:
         module.permit(TrustSettings())
-    module.context.services = SimpleNamespace(transport=lambda _: Transport.AUTO)
+    transports = iter((Transport.AUTO, Transport.DIRECT))
+    module.context.services = SimpleNamespace(transport=lambda _: next(transports))
     server = SimpleNamespace(node="/adder", uri=URI, origin=None)
     exports = SimpleNamespace(offered={"/add": server}, local=lambda *_: None)
-    services = ServiceGrants(module.sut._shared, cast("Any", exports), lambda *_: None)
-    reply = await module.handlers["direct.service"](module.sessions[1], {"name": "/add", "node": "/adder"})
-    assert reply["why"] == Condition.OFFERED
+    warnings: list[str] = []
+    services = ServiceGrants(module.sut._shared, cast("Any", exports), lambda *words: warnings.append(words[0]))
+    for expected in ([], ["direct.relayed"]):
+        reply = await module.handlers["direct.service"](module.sessions[1], {"name": "/add", "node": "/adder"})
+        assert reply["why"] == Condition.OFFERED
+        assert warnings == expected
     services.server_gone("/add")
     assert [(peer, what) for peer, what, _ in module.told] == ([] if secured else [(1, "direct.service_again")])
 
