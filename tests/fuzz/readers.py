@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 
 _BASE: Final = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")
 _OURS: Final = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
-_MD5: Final = "992ce8a1687cec8c8bd883ec73ca41d1"
-_STRING: Final = TopicDescription("std_msgs/String", _MD5, "string data\n", latching=True)
+MD5: Final = "992ce8a1687cec8c8bd883ec73ca41d1"
+_STRING: Final = TopicDescription("std_msgs/String", MD5, "string data\n", latching=True)
 _ADD: Final = ServiceDescription("rospy_tutorials/AddTwoInts", "6a2e34150c00229791cc89ff309fff21")
 _TOKEN: Final = Token(1_790_000_000, IPv4Address("10.0.0.1"), 40001, bytes(range(16)), bytes(range(16))).serialize()
 _INFO: Final = "TCPROS connection on port 34738 to [127.0.0.1:52309 on socket 13]"
@@ -73,7 +73,7 @@ class Reader(NamedTuple):
     """A function that reads.
 
     Args:
-        read: It; another error than ``RmpaError``, ``ValueError`` and ``OSError`` is found.
+        read: It; another error than the row's is found.
         write: The way back; what is read of that must be the same value.
         check: Raises ``AssertionError`` if a value that was read must not be.
     """
@@ -90,23 +90,24 @@ class Row:
     readers: Sequence[Reader]
     seeds: Sequence[bytes]
     plain: bool = False
+    errors: tuple[type[Exception], ...] = (RmpaError, ValueError, OSError)
 
     def fuzz(self, data: bytes) -> None:
         """Let each read."""
         for reader in self.readers:
             try:
                 value = reader.read(data)
-            except (RmpaError, ValueError, OSError) as error:
-                text = str(error)
+            except self.errors as error:
+                said = str(error)
             else:
                 reader.check(value)
-                text = ""
+                said = ""
                 if reader.write is not None:
                     assert reader.read(reader.write(value)) == value, f"{value} does not survive its round trip"
-            assert not self.plain or text.isprintable(), f"an error's text is not safe to log: {text!r}"
+            assert not self.plain or said.isprintable(), f"an error's text is not safe to log: {said!r}"
 
 
-def _text(read: Callable[[str], Any]) -> Callable[[bytes], Any]:
+def text(read: Callable[[str], Any]) -> Callable[[bytes], Any]:
     return lambda data: read(data.decode("utf-8", "replace"))
 
 
@@ -123,7 +124,7 @@ def _json(read: Callable[[Any], Any]) -> Callable[[bytes], Any]:
     return read_json
 
 
-def _printable(value: object) -> None:
+def printable(value: object) -> None:
     assert str(value).isprintable(), "a value's text is not safe to log"
 
 
@@ -136,9 +137,9 @@ def _ask(value: Any) -> DirectAsk:
 def _check_reply(found: Any) -> None:
     if isinstance(found, Grant):
         assert 0 < found.port < 1 << 16
-        _printable(found.probe)
+        printable(found.probe)
     else:
-        _printable(found.text)
+        printable(found.text)
     assert read_reply(reply_of(found), "/talker") == found
 
 
@@ -151,8 +152,8 @@ def _frame(data: bytes) -> tuple[Frame, int] | None:
 
 def _check_frame(found: tuple[Frame, int] | None) -> None:
     if found is not None:
-        _printable(found[0])
-        _printable(parse_text(found[0].payload))
+        printable(found[0])
+        printable(parse_text(found[0].payload))
 
 
 def _hello(data: bytes) -> Hello:
@@ -167,7 +168,7 @@ def _check_hello(hello: Hello) -> None:
     judge_welcome(hello, _OURS, _BASE.guid)
     assert verdict is not None or hello.identity.guid == hello.guid, "a welcome peer has no identity"
     assert hello.lease > 0
-    _printable(hello.name)
+    printable(hello.name)
 
 
 def _check_reply_value(reply: ControlReply) -> None:
@@ -228,7 +229,7 @@ def _check_header(fields: Any) -> None:
         tcpros.check_server(fields, "/add", _ADD.md5sum),
         ServiceDescription.from_header(fields),
     ):
-        _printable(problem)
+        printable(problem)
 
 
 def _split(data: bytes) -> list[bytes]:
@@ -311,7 +312,7 @@ _PEER: Final = Guid.of("10.0.0.2", 40002)
 
 READERS: Final[dict[str, Row]] = {
     "beacon": Row(
-        [Reader(lambda data: Beacon.parse(data, 0), Beacon.serialize, _printable)],
+        [Reader(lambda data: Beacon.parse(data, 0), Beacon.serialize, printable)],
         [
             b"RMPA",
             Beacon(BeaconKind.ANSWER, _BASE, 16000, 2, (_PEER, Guid.of("10.0.0.3", 1))).serialize(),
@@ -361,7 +362,7 @@ READERS: Final[dict[str, Row]] = {
     ),
     "control": Row(
         [
-            Reader(ControlRequest.parse, ControlRequest.serialize, _printable),
+            Reader(ControlRequest.parse, ControlRequest.serialize, printable),
             Reader(ControlReply.parse, ControlReply.serialize, _check_reply_value),
         ],
         [
@@ -457,8 +458,8 @@ READERS: Final[dict[str, Row]] = {
         [
             Reader(_reply_body),
             Reader(tcpros.parse_request_length),
-            Reader(_text(_address)),
-            Reader(_text(_service_type)),
+            Reader(text(_address)),
+            Reader(text(_service_type)),
         ],
         [
             b"".join(tcpros.frame_reply(True, b"abc")),
@@ -492,7 +493,7 @@ READERS: Final[dict[str, Row]] = {
         ],
     ),
     "token": Row(
-        [Reader(_text(Token.parse), lambda token: token.serialize().encode())],
+        [Reader(text(Token.parse), lambda token: token.serialize().encode())],
         [b"rmpa1-", b"rmpa2-" + b"a" * 85, _TOKEN.encode(), _TOKEN.upper().encode() + b"\r\n"],
     ),
     "trailer": Row([Reader(_trailer)], [bytes(31), bytes(64), _SIGNED, _SIGNED[:-1], _SIGNED + b"x", _SIGNED[32:]]),

@@ -1,10 +1,14 @@
-"""Fuzz target: requests, certificates and signed documents."""
+"""Fuzz target: requests, certificates and signed documents, and the notifications that carry these."""
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.trust.permissions import Have
 
 try:
     from rmpa.trust.certificates import (
@@ -29,7 +33,7 @@ else:
     if TYPE_CHECKING:
         from collections.abc import Callable
 
-    _LAB = Authority()
+    _LAB, _OTHER = Authority(), Authority()
     _ARM = _LAB.module("arm")
     _DENY = sign(DenyList().with_name("arm", WALL), _LAB.key)
     _KEYS = sign(KeyList(1, (GroupKey(1, bytes(32)),)), _LAB.key)
@@ -39,7 +43,16 @@ else:
         read_document(_DENY, _KEY, DenyList),
         read_document(_KEYS, _KEY, KeyList),
     )
-    SEEDS = [b"", make_request(new_key(), "arm"), _ARM, _LAB.certificate, _DENY, _KEYS]
+    SEEDS = [
+        b"",
+        make_request(new_key(), "arm"),
+        *(_ARM, _LAB.certificate, _DENY, _KEYS),
+        sign(DenyList().with_name("base", WALL), _OTHER.key),
+        b"{}",
+        b'{"signed":"{}","signature":"AA=="}',
+        b'{"signed":' + b"[" * 2000,
+        b'{"deny":1,"keys":2,"authority":true}',
+    ]
 
     def fuzz(data: bytes) -> None:
         """Whatever comes in: a documented error, or what the authority has signed."""
@@ -60,3 +73,5 @@ else:
             read_request(data)
         except RemoteProtocolError as error:
             str(error)
+        with contextlib.suppress(msgspec.MsgspecError, UnicodeError, RecursionError):
+            msgspec.convert(msgspec.json.decode(data), Have)

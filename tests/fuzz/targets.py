@@ -1,4 +1,4 @@
-"""Finds the fuzz targets: the rows of ``readers``, and every ``target_*.py`` with ``fuzz`` and ``SEEDS``."""
+"""Finds the fuzz targets: the rows of both ``readers``, and every ``target_*.py`` with ``fuzz`` and ``SEEDS``."""
 
 from __future__ import annotations
 
@@ -6,10 +6,14 @@ import importlib
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from tests.fuzz.gateway_readers import GATEWAY_READERS
 from tests.fuzz.readers import READERS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
+
+_ROWS = READERS | GATEWAY_READERS
 
 
 class Target(NamedTuple):
@@ -22,12 +26,12 @@ class Target(NamedTuple):
 def names() -> list[str]:
     """The targets' names, in order."""
     files = (path.stem.removeprefix("target_") for path in Path(__file__).parent.glob("target_*.py"))
-    return sorted((*files, *READERS))
+    return sorted((*files, *_ROWS))
 
 
 def load(name: str) -> Target:
     """One target."""
-    if (row := READERS.get(name)) is not None:
+    if (row := _ROWS.get(name)) is not None:
         return Target(row.fuzz, row.seeds)
     module = importlib.import_module(f"tests.fuzz.target_{name}")
     return Target(module.fuzz, module.SEEDS)
