@@ -7,7 +7,7 @@ import subprocess
 import time
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import psutil
 import pytest
@@ -64,7 +64,7 @@ def _children() -> set[int]:
 
 
 @of_both_kinds
-def test_messages_flow_and_nothing_is_left_behind(kind: Kind) -> None:
+def test_messages_flow_unless_the_cable_is_cut_and_nothing_is_left_behind(kind: Kind) -> None:
     before, namespaces = _children(), _namespaces()  # beds of other tests may stand yet
     with _system(kind) as (stage, robot):
         assert robot.kind == kind
@@ -74,6 +74,12 @@ def test_messages_flow_and_nothing_is_left_behind(kind: Kind) -> None:
         begun = flow.begin(source, stage.scratch, size=64, rate=100, count=20)
         assert len(flow.sent(begun)) == 20
         assert len(flow.noted(sink, TOPICS, stage.scratch, begun.number)) == 40
+        robot.cut("joystick")
+        begun = flow.begin(source, stage.scratch, size=64, rate=100, count=10)
+        flow.sent(begun)
+        assert flow.noted(sink, TOPICS, stage.scratch, begun.number).empty
+        robot.restore("joystick")
+        flow.wait_flowing(source, sink, TOPICS, stage.scratch, timeout=60.0)
         eventually(lambda: set(robot.pids()) == _running(kind), what="all that the system itself runs")
         assert all(psutil.pid_exists(pid) for pid in robot.pids().values())
         scratch = stage.scratch
@@ -103,6 +109,8 @@ def test_killed_host_ends_all_at_once_and_comes_back(kind: Kind) -> None:
         client = PLAN.clients[0]
         on_host = [process for process in _all(robot, "velocity") if process.returncode is None]
         assert on_host
+        host = robot._place.host("velocity")
+        addresses = host.address, host.ip("-brief", "link", "show", "eth0").split()[2]
         robot.kill("velocity")
         assert all(process.returncode is not None for process in on_host)
         assert not [name for name in robot.pids() if name.endswith("@velocity")]
@@ -112,6 +120,8 @@ def test_killed_host_ends_all_at_once_and_comes_back(kind: Kind) -> None:
         assert (came.count("/cmd"), came.count("/vel")) == (10, 0)
         before = time.monotonic()
         assert before <= robot.start("velocity") <= time.monotonic()
+        assert (host.address, host.ip("-brief", "link", "show", "eth0").split()[2]) == addresses
+        assert host.address in host.ip("address", "show", "eth0")
         robot.linked()
         robot.node("velocity", "velocity", client, nodelay=True)
         flow.wait_flowing(source, sink, TOPICS, stage.scratch)
@@ -138,35 +148,14 @@ def _all(robot: System, host: str) -> list[Process]:
 
 
 class TestCables:
-    @of_both_kinds
-    def test_cut_cable_stops_what_runs_over_it(self, kind: Kind) -> None:
-        with _system(kind) as (stage, robot):
-            source, sink = _nodes(robot, stage)
-            robot.cut("joystick")
-            begun = flow.begin(source, stage.scratch, size=64, rate=100, count=10)
-            flow.sent(begun)
-            assert flow.noted(sink, TOPICS, stage.scratch, begun.number).empty
-            robot.restore("joystick")
-            flow.wait_flowing(source, sink, TOPICS, stage.scratch, timeout=60.0)
-
-    def test_traffic_counts_what_leaves_and_comes(self) -> None:
-        with _system("classic") as (stage, robot):
-            source, sink = _nodes(robot, stage)
-            before = robot.traffic("joystick"), robot.traffic("pc")
-            begun = flow.begin(source, stage.scratch, size=10_000, rate=100, count=20)
-            flow.sent(begun)
-            flow.noted(sink, TOPICS, stage.scratch, begun.number)
-            after = robot.traffic("joystick"), robot.traffic("pc")
-            sent = after[0]["tx_bytes"] - before[0]["tx_bytes"]
-            came = after[1]["rx_bytes"] - before[1]["rx_bytes"]
-            assert sent > 2 * 20 * 10_000  # to pc and to velocity
-            assert came > 2 * 20 * 10_000  # from joystick and from velocity
-            assert after[0]["tx_packets"] > before[0]["tx_packets"]
-            assert after[1]["rx_packets"] > before[1]["rx_packets"]
-
     @pytest.mark.parametrize(("link", "bands"), [("100mbit", True), ("100mbit", False), ("", True)])
     def test_cables_carry_what_was_asked_for_and_still_do_after_a_restart(self, link: str, bands: bool) -> None:
-        with make_stage(PLAN) as stage, stage.system("rmpa", ["a"], link=link, bands=bands) as robot:
+        more: Any = {"config": "domain = 7\n", "flags": ["--realtime"]}
+        with make_stage(PLAN) as stage, stage.system("rmpa", ["a"], link=link, bands=bands, **more) as robot:
+            words = Path(f"/proc/{robot.pids()['agent@a']}/cmdline").read_text(encoding="utf-8").split("\0")
+            assert "--realtime" in words
+            config = Path(words[words.index("--config") + 1])
+            assert config.read_text(encoding="utf-8").startswith("domain = 7\n")
             for _ in range(2):
                 shown = run(robot._place.host("a").command(["tc", "qdisc", "show", "dev", "eth0"]))
                 assert ("tbf" in shown, "100Mbit" in shown) == (bool(link), bool(link))
@@ -174,19 +163,19 @@ class TestCables:
                 robot.kill("a")
                 robot.start("a")
 
-    def test_host_comes_back_with_its_addresses(self) -> None:
-        with make_stage(PLAN) as stage, stage.system("rmpa", ["a", "b"]) as robot:
-            host = robot._place.host("b")
-            before = host.address, host.ip("-brief", "link", "show", "eth0").split()[2]
-            robot.kill("b")
-            robot.start("b")
-            assert (host.address, host.ip("-brief", "link", "show", "eth0").split()[2]) == before
-            assert host.address in host.ip("address", "show", "eth0")
-
-    def test_pulled_plug_tells_nobody(self) -> None:
+    def test_traffic_is_counted_and_a_pulled_plug_tells_nobody(self) -> None:
         """A killed process's kernel closes its connections; a host without power does not, so others keep theirs."""
         with _system("classic") as (stage, robot):
-            source, _ = _nodes(robot, stage)
+            source, sink = _nodes(robot, stage)
+            before = robot.traffic("joystick"), robot.traffic("pc")
+            begun = flow.begin(source, stage.scratch, size=10_000, rate=100, count=20)
+            flow.sent(begun)
+            flow.noted(sink, TOPICS, stage.scratch, begun.number)
+            after = robot.traffic("joystick"), robot.traffic("pc")
+            # To pc and to velocity; from joystick and from velocity.
+            for was, now, way in zip(before, after, ("tx", "rx"), strict=True):
+                assert now[f"{way}_bytes"] - was[f"{way}_bytes"] > 2 * 20 * 10_000
+                assert now[f"{way}_packets"] > was[f"{way}_packets"]
             address = robot._place.host("velocity").address
             standing = _connections(robot, address)
             robot.kill("velocity")
@@ -195,16 +184,6 @@ class TestCables:
             assert standing
             assert _connections(robot, address) == standing
             assert not [event for event in source.events("connected") if event["subscribers"] == 1][1:]
-
-    def test_config_and_flags_reach_each_agent(self) -> None:
-        with (
-            make_stage(PLAN) as stage,
-            stage.system("rmpa", ["a"], config="domain = 7\n", flags=["--realtime"]) as robot,
-        ):
-            words = Path(f"/proc/{robot.pids()['agent@a']}/cmdline").read_text(encoding="utf-8").split("\0")
-            assert "--realtime" in words
-            config = Path(words[words.index("--config") + 1])
-            assert config.read_text(encoding="utf-8").startswith("domain = 7\n")
 
 
 def _connections(robot: System, address: str) -> set[str]:

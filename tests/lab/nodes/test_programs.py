@@ -73,6 +73,8 @@ def test_polled_velocity_takes_the_newest_command_each_period(robot: System, cli
     source = robot.node("pc", "source", client, phase=5)  # of the source's own 100 Hz: 5 ms before each tick
     flow.wait_connected(source)
     eventually(lambda: _velocities(source, sink, tmp_path), what="velocities")
+    start = int(str(source.events("sent")[0]["start_ns"]))
+    assert abs(start % (10 * MILLISECOND) - 5 * MILLISECOND) < 1000  # its phase
     rows = _velocities(source, sink, tmp_path, count=100)
     assert 10 <= len(rows) <= 21  # 20 in a second of 100 commands, and fewer where the machine holds it up
     assert [row[1] for row in rows] == sorted({_int(row[1]) for row in rows})
@@ -97,16 +99,11 @@ def _velocities(
     return list(flow.noted(sink, ["/vel"], scratch, begun.number).itertuples(index=False, name=None))
 
 
-def test_source_keeps_its_phase(robot: System, client: Client, tmp_path: Path) -> None:
-    source = robot.node("pc", "source", client, phase=3)
-    begun = flow.begin(source, tmp_path, size=64, rate=100, count=1)
-    flow.sent(begun)
-    start = int(str(source.events("sent")[0]["start_ns"]))
-    assert abs(start % (10 * MILLISECOND) - 3 * MILLISECOND) < 1000
-
-
-def test_sink_gives_one_round_or_all_and_forgets_them(robot: System, client: Client, tmp_path: Path) -> None:
+def test_sink_gives_rounds_once_says_what_comes_again_and_files_are_of_native_numbers(
+    robot: System, client: Client, tmp_path: Path
+) -> None:
     source, sink = _flowing(robot, client, tmp_path)
+    assert {event["topic"] for event in sink.events("first")} == set(TOPICS)
     rounds = [flow.begin(source, tmp_path, size=64, rate=200, count=count) for count in (3, 4)]
     for begun in rounds:
         flow.sent(begun)
@@ -117,27 +114,15 @@ def test_sink_gives_one_round_or_all_and_forgets_them(robot: System, client: Cli
     flow.sent(begun)
     assert flow.noted(sink, TOPICS, tmp_path, rounds[0].number).empty
     assert flow.noted(sink, TOPICS, tmp_path, begun.number).empty  # the question for another forgot these, too
-
-
-def test_sink_says_what_comes_first_and_what_comes_again(robot: System, client: Client, tmp_path: Path) -> None:
-    source, sink = _flowing(robot, client, tmp_path)
     before = time.monotonic_ns()
-    assert {event["topic"] for event in sink.events("first")} == set(TOPICS)
     time.sleep(0.6)  # the pause itself
     mark = sink.mark_events()
-    begun = flow.begin(source, tmp_path, size=64, rate=100, count=3)
-    flow.sent(begun)
+    source.tell(f"4000000000 64 100 2 {tmp_path / 'late'}")
+    source.wait_event("sent", where=lambda event: event["round"] == 4_000_000_000)
     for topic in TOPICS:
         event = sink.wait_event("again", where=partial(_of, topic), since=mark)
         assert int(str(event["gap_ns"])) > 500 * MILLISECOND
         assert int(str(event["came_ns"])) > before
-
-
-def test_files_are_of_native_numbers(robot: System, client: Client, tmp_path: Path) -> None:
-    source, sink = _flowing(robot, client, tmp_path)
-    mark = sink.mark_events()
-    source.tell(f"4000000000 64 100 2 {tmp_path / 'late'}")
-    source.wait_event("sent", where=lambda event: event["round"] == 4_000_000_000)
     sink.tell(f"4000000000 {tmp_path / 'came'} 0.3")
     assert sink.wait_event("noted", since=mark) == {"event": "noted", "round": 4_000_000_000, "count": 4}
     late, came = array("Q"), array("Q")
