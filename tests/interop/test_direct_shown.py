@@ -19,7 +19,6 @@ pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(150)]
 
 TOPIC: Final = "/chatter"
 RATE: Final = 100
-CLIENTS: Final = ["roscpp", "rospy"]
 
 
 def mesh(module: Module) -> dict[str, Any]:
@@ -54,12 +53,11 @@ def near(value: float | None, wanted: float) -> bool:
     return value is not None and 0.5 * wanted < value < 1.5 * wanted
 
 
-@pytest.mark.parametrize("client", CLIENTS)
-def test_both_ends_say_which_subscriber_is_direct_and_why_another_is_not(modules: ModuleFactory, client: str) -> None:
+def test_both_ends_say_which_subscriber_is_direct_and_why_another_is_not(modules: ModuleFactory) -> None:
     a, b = modules("a", "b", config=AUTO)
     on_the_network(a, b)
-    talker = a.ros.node(client, "talker", topic=TOPIC, rate=RATE, name="talker")
-    wait_direct(b.ros.node(client, "listener", topic=TOPIC, name="viewer"), talker)
+    talker = a.ros.roscpp("talker", topic=TOPIC, rate=RATE, name="talker")
+    wait_direct(b.ros.rospy("listener", topic=TOPIC, name="viewer"), talker)
     here = subscriber(b, "/viewer")
     assert (here["transport"], here["state"], here["condition"]) == ("direct", "direct", "")
     address, _, port = here["endpoint"].partition(":")
@@ -90,7 +88,7 @@ def test_both_ends_say_which_subscriber_is_direct_and_why_another_is_not(modules
 
     # Another subscriber connects within its machine only, so it is relayed: both transports at once.
     b.ros.env["ROS_IP"] = "127.0.0.1"
-    flows(b.ros.node(client, "listener", topic=TOPIC, name="bound"))
+    flows(b.ros.roscpp("listener", topic=TOPIC, name="bound"))
     bound = subscriber(b, "/bound")
     assert (bound["transport"], bound["state"], bound["condition"]) == ("relay", "relayed", "subscriber")
     both = route(b)
@@ -134,12 +132,11 @@ def test_a_relayed_topic_names_the_condition(modules: ModuleFactory, config: str
     assert bool(warned) is (condition == "listening"), warned
 
 
-@pytest.mark.parametrize("client", CLIENTS)
-def test_tools_that_measure_are_relayed_and_leave_the_user_direct(modules: ModuleFactory, client: str) -> None:
+def test_tools_that_measure_are_relayed_and_leave_the_user_direct(modules: ModuleFactory) -> None:
     a, b = modules("a", "b", fresh=True, config='[bridge]\ntransport = "direct"\n')
     on_the_network(a, b)
-    talker = a.ros.node(client, "talker", topic=TOPIC, rate=RATE, name="talker")
-    viewer = b.ros.node(client, "listener", topic=TOPIC, name="viewer")
+    talker = a.ros.rospy("talker", topic=TOPIC, rate=RATE, name="talker")
+    viewer = b.ros.roscpp("listener", topic=TOPIC, name="viewer")
     wait_direct(viewer, talker)
     since = subscriber(b, "/viewer")["since_ago"]
     code, text = b.agent.rmpa("topic", "delay", TOPIC, "-n", str(2 * RATE), "--json")

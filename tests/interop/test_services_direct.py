@@ -211,7 +211,7 @@ def test_calls_go_on_while_the_agent_of_the_server_is_dead(modules: ModuleFactor
     since = client.mark_events()
     client.tell("sleep 3 10 1 persistent")
     a.agent.kill()
-    b.agent.process.wait_for("link down: a")
+    b.agent.wait_no_peer("a")
     assert calls(local, "echo 0 10 1 once")["ok"] == 0, "what would be relayed fails at once"
     assert client.wait_event("done", since=since)["same"] == 1, "a call under way is answered"
     assert calls(client, "echo 0 10 3 once")["same"] == 3

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.interop.modules import flows, whole
+from tests.interop.modules import flows
 
 if TYPE_CHECKING:
     from lab.bed.processes import Event
@@ -15,16 +15,6 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 CLIENTS = ["rospy", "roscpp"]
-
-
-@pytest.mark.parametrize("client", CLIENTS)
-def test_both_directions_at_once(modules: ModuleFactory, client: str) -> None:
-    a, b = modules("a", "b")
-    hears = [m.ros.node(client, "listener", topic=t, count=100) for m, t in ((a, "/to_a"), (b, "/to_b"))]
-    a.ros.node(client, "talker", topic="/to_b", rate=100, count=100, wait=1)
-    b.ros.node(client, "talker", topic="/to_a", rate=100, count=100, wait=1)
-    for heard in hears:
-        whole(heard.wait_event("done"), 100)
 
 
 @pytest.mark.trap(37)
