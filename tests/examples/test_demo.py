@@ -74,7 +74,7 @@ def states(view: dict[str, Any]) -> dict[str, str]:
 
 
 def wait_for_view(
-    demo: Process, holds: Callable[[dict[str, Any]], bool], what: str, within: float = 30.0
+    demo: Process, holds: Callable[[dict[str, Any]], bool], what: str, within: float = 75.0
 ) -> dict[str, Any]:
     """Wait until one of the last views is as wanted, at most so many seconds."""
 
@@ -241,7 +241,7 @@ def test_a_killed_module_is_shown_gone_and_comes_back(tidy: dict[str, str]) -> N
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_it_ends_in_order_when_it_is_told_to(tidy: dict[str, str], number: signal.Signals) -> None:
     with Process([sys.executable, DEMO, "--no-web"], env=tidy, name="demo") as demo:
-        demo.wait_for(r"base:linked.* ODOM [1-9]", 30)
+        demo.wait_for(r"base:linked.* ODOM [1-9]", 75)
         processes = family(demo)
         ports = open_ports(processes)
         os.kill(demo.pid, number)

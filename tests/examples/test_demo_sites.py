@@ -34,7 +34,7 @@ ARGUMENTS: Final[list[str | Path]] = [sys.executable, DEMO, "--no-web", "--sites
 
 def wait_long(demo: Process, holds: Callable[[dict[str, Any]], bool], what: str) -> dict[str, Any]:
     """Wait for a view; seven agents start at once, which takes long on a busy machine."""
-    return wait_for_view(demo, holds, what, 75.0)
+    return wait_for_view(demo, holds, what, 90.0)
 
 
 def all_there(view: dict[str, Any]) -> bool:
