@@ -99,7 +99,7 @@ def said(made: Agent, level: str) -> list[str]:
 @needs_rights
 def test_an_agent_is_scheduled_and_locked_as_the_kernel_says(agent: AgentFactory) -> None:
     plain = agent()
-    made = agent(flags=["--realtime"])
+    made = agent(flags=["--realtime"], prefix=["env"])  # by itself: a fork has more memory
     made.wait_peer(plain.name)
     assert os.sched_getscheduler(made.pid) == FIFO
     assert os.sched_getparam(made.pid).sched_priority == 50
