@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import pytest
 from aiohttp import web
 
-from lab.bed.chromium import BINARY, Chromium
+from lab.bed.chromium import Browser, Chromium
 from tests.web.server.test_server import TOKEN, running
 
 
-async def test_a_link_with_the_token_on_another_site_opens_the_page_for_good() -> None:
-    if BINARY is None:
-        pytest.skip("Chromium is not installed: apt install chromium")
-    async with running(TOKEN) as site, Chromium() as page:
+async def test_a_link_with_the_token_on_another_site_opens_the_page_for_good(browser: Browser) -> None:
+    async with running(TOKEN) as site, Chromium(browser=browser) as page:
         server = f"http://127.0.0.1:{site.server.port}/"
 
         async def links(_request: web.Request) -> web.Response:
