@@ -135,3 +135,12 @@ def test_a_spared_key_loses_nothing_to_the_bound_of_all_keys() -> None:
     assert box.push(bytes(15), 2) == 1
     assert box.dropped == {2: 1}
     assert len(drain(box)) == 115
+
+
+def test_of_a_strict_key_all_that_is_too_old_goes() -> None:
+    box = Outbox(10, 1000)
+    box.set_terms(1, 10, 0.5, strict=True)
+    box.push(b"old", 1, now=1.0)
+    box.push(b"other", 2, now=9.0)
+    assert b"".join(box.head(now=9.0)) == b"other"
+    assert (box.expired, box.waiting(1)) == ({1: 1}, 0)

@@ -375,7 +375,7 @@ async def test_churn_is_gathered_and_a_large_state_is_written_more_rarely(
 
         monkeypatch.setattr(core.stored, "_rest", rest)
         for number in range(100):
-            await call(core.uri, "registerPublisher", "/node", f"/t{number}", STRING, "http://127.0.0.1:1/")
+            core.call("registerPublisher", "/node", f"/t{number}", STRING, "http://127.0.0.1:1/")
         over.set()
         await until(lambda: saved(core))
         assert len(writes) <= 2

@@ -35,6 +35,7 @@ async def test_messages_go_from_one_node_to_another(core: RosCore) -> None:
         assert got[0].header["topic"] == "/chatter"
         assert got[0].stamp_ns > 0
         assert (publisher.subscribers, subscriber.publishers) == (1, 1)
+        assert [each.direction for each in listener.slave.connections()] == ["i"]
         assert ("/chatter", "std_msgs/String") in await listener.get_published_topics()
     state = core.state()
     assert "/chatter" not in state.publishers

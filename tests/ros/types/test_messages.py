@@ -113,6 +113,19 @@ def test_a_program_may_give_arrays_bytes_and_messages() -> None:
     assert MessageType("std_msgs/String").make({"data": np.int64(5)}).data == "5"
 
 
+def test_null_is_a_default_and_words_are_no_numbers() -> None:
+    kind = MessageType.learn("my_msgs/N", "string[] s\ntime[] t\nfloat32[] f\nint8 i\n")
+    values = {"s": [None], "t": [None, {"secs": 1}], "f": [None, "nan", "-.inf", np.True_], "i": None}
+    plain = kind.to_plain(kind.make(values))
+    assert plain | {"f": str(plain["f"])} == {
+        "s": [""],
+        "t": [{"secs": 0, "nsecs": 0}, {"secs": 1, "nsecs": 0}],
+        "f": "[0.0, nan, -inf, 1.0]",
+        "i": 0,
+    }
+    assert kind.make({"s": np.array(["a", "b"], object)}).s == ["a", "b"]
+
+
 @pytest.mark.parametrize(
     ("kind", "values", "error"),
     [
