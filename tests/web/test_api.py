@@ -68,6 +68,7 @@ def test_all_services_of_a_name_come_which_may_have_slashes() -> None:
     [
         (f"{API}/topics/imgae", "did you mean /image?"),
         (f"{API}/peers/zzzzz", f"{API}/peers lists all"),
+        (f"{API}/topics/a%20b", "that is not a ROS name"),
         *((API + path, "there is no") for path in ("", "/", "/nothing", "/snapshot/x", "/peers/", "/counters/x")),
         *((path, "there is no") for path in (f"{API}/topics/%00%ff", "/metrics", "/api/v2/snapshot")),
     ],

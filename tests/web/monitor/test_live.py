@@ -45,7 +45,7 @@ def test_a_value_is_cut_and_says_so() -> None:
 @pytest.mark.parametrize(
     ("path", "number"),
     [
-        ("pose.x", 1.5), ("axes.1", -1.0), ("axes[1]", -1.0), ("axes[9]", None), ("on", 1.0), ("name", None),
+        ("pose.x", 1.5), ("axes.1", -1.0), ("axes[1]", -1.0), ("axes[2]", None), ("on", 1.0), ("name", None),
         ("stamp", 2.5), ("axes.²", None), ("pose", None), ("pose.y.z", None), ("axes.x", None),
     ],
 )  # fmt: skip

@@ -21,7 +21,7 @@ from rmpa.resource.descriptor import describe
 from rmpa.ros.master.parameters import Parameters
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
-from rmpa.trust.permissions import InviteReply
+from rmpa.trust.permissions import InviteReply, TrustStatus
 from rmpa.web.hub.node_link import EVERYTHING, FULL, READ_ONLY, NodeRules, Rights
 from rmpa.web.monitor import questions
 from rmpa.web.monitor.monitor import LogFeed
@@ -161,6 +161,16 @@ def test_a_server_is_made_anew_for_other_rights_rules_or_another_token_alone() -
     assert not setup().serves_as(setup(replace(SETTINGS, trust=TrustSettings())))
     assert not setup().serves_as(setup(access=TokenAccess("another" * 6)))
     assert not setup(trusted=False).serves_as(setup())
+
+
+@pytest.mark.parametrize(
+    ("module", "folder", "fits"), [("base", "/a", True), ("arm", "/a", False), ("base", "/b", False)]
+)
+def test_a_server_fits_the_agent_whose_keys_it_has(module: str, folder: str, fits: bool) -> None:
+    status = TrustStatus(on=True, module=module, folder=folder)
+    for trusted in (True, False):
+        made = WebSetup(SETTINGS, TOKEN, CertificateFiles(), trusted, "base", "/a")
+        assert (made.fits(None), made.fits(status)) == (True, fits and trusted)
 
 
 # --- over sockets -----------------------------------------------------------------------------------------------
