@@ -227,6 +227,25 @@ async def test_a_seed_that_never_resolves_does_not_hold_up_the_end(settings: Set
     stuck.set()
 
 
+async def test_a_link_keeps_and_brings_a_peer(agents: list[Agent], settings: Settings) -> None:
+    base = Agent("base", settings)
+    await start(agents, base)
+    friend = Identity(Guid.of("127.0.0.1", 1), os.urandom(16), "friend")
+    base.discovery.link_up(friend)
+    assert base.view("friend").run.linked
+    base.discovery.link_down(friend.guid)
+    assert not base.view("friend").run.linked
+
+
+async def test_two_of_one_name_are_told(
+    agents: list[Agent], settings: Settings, caplog: pytest.LogCaptureFixture
+) -> None:
+    pair = [Agent("base", settings) for _ in range(2)]
+    await start(agents, *pair)
+    await until(lambda: all(any(e.change == "conflict" for e in agent.events) for agent in pair))
+    assert "rename one: rmpa up --name" in caplog.text
+
+
 async def test_events_may_call_back(agents: list[Agent], settings: Settings) -> None:
     base, pc = Agent("base", settings), Agent("pc", settings)
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import shutil
 import socket
 import ssl
 import tempfile
 import time
-import weakref
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +22,10 @@ from tests.trust.io.member_files import KEYS, pem_of
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+
+
+_FOLDERS = tempfile.TemporaryDirectory(prefix="rmpa-test-")
+"""Removed when the process ends: the garbage collector may run in an event loop, which may not block."""
 
 
 class _Store(TrustStore):
@@ -45,8 +47,7 @@ class Member(Membership):
     """
 
     def __init__(self, ca: Authority, name: str, issued: float = 0.0) -> None:
-        folder = tempfile.mkdtemp(prefix="rmpa-test-")
-        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        folder = tempfile.mkdtemp(dir=_FOLDERS.name)
         self._ca = ca
         key = new_key()
         certificate = ca.module(name, time.time() - issued, key)

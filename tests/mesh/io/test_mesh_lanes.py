@@ -143,6 +143,19 @@ async def test_message_sent_in_parts_arrives_as_one() -> None:
         assert len(other.messages(8)) == 5
 
 
+async def test_abandoned_message_is_not_delivered() -> None:
+    async with linked_pair() as (one, other):
+        lane = one.link(other).bulk
+        parcel = lane.open(7, 300_000, 1, 0)
+        lane.extend(parcel, bytes(100_000))
+        lane.abandon(parcel)
+        lane.extend(parcel, bytes(200_000))
+        lane.send(7, 2, 0, b"next")
+        await until(lambda: bool(other.data), "the next one")
+        assert other.data == [(7, 2, 0, b"next")]
+        assert not other._begun
+
+
 async def test_each_route_has_its_own_bound_and_drops_its_own() -> None:
     async with linked_pair() as (one, other):
         lane = one.link(other).bulk

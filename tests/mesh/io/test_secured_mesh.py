@@ -7,7 +7,6 @@ import contextlib
 import logging
 import socket
 import ssl
-from contextlib import asynccontextmanager
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -32,8 +31,6 @@ from tests.mesh.io.meshes import DEADLINE, Peer, introduce, until
 from tests.trust.authority import Authority
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
     from rmpa.mesh.peering import Peer as KnownPeer
 
 DAY = 86_400.0
@@ -206,49 +203,55 @@ async def test_a_revoked_module_is_gone_at_once_at_both_ends(lab: Authority, dia
         await until(lambda: not judge.mesh.connections(), "both lanes ended")
 
 
-@asynccontextmanager
-async def thief_beside(lab: Authority) -> AsyncIterator[tuple[Peer, Peer, Peer]]:
-    """Two members with both lanes, and another one that claims the instance of the first under its own name."""
+async def test_another_modules_run_cannot_be_taken_over(lab: Authority) -> None:
+    """A member that claims the instance of another one, under its own name."""
     async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
         await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
         thief = Peer(arm.number, name="thief", security=Member(lab, "thief"))
-        assert thief.identity.instance == arm.identity.instance
-        await thief.mesh.start()
         try:
-            yield arm, base, thief
+            assert thief.identity.instance == arm.identity.instance
+            await thief.mesh.start()
+            thief.mesh.peer_found(base.identity)
+            await until(lambda: base.mesh.counters["link.refused.name"] > 0, "refused")
+            assert base.linked(arm)
+            assert not thief.ups or not thief.linked(base)
         finally:
             await thief.mesh.close()
-
-
-async def test_another_modules_run_cannot_be_taken_over(lab: Authority) -> None:
-    async with thief_beside(lab) as (arm, base, thief):
-        thief.mesh.peer_found(base.identity)
-        await until(lambda: base.mesh.counters["link.refused.name"] > 0, "refused")
-        assert base.linked(arm)
-        assert not thief.ups or not thief.linked(base)
 
 
 @pytest.mark.parametrize("lane", [Lane.EXPRESS, Lane.BULK])
 async def test_nor_while_its_link_is_silent(lab: Authority, monkeypatch: pytest.MonkeyPatch, lane: Lane) -> None:
     """A member that claims instance and address of another one, under its own name."""
-    async with thief_beside(lab) as (arm, base, thief):
+    async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
         monkeypatch.setattr(PeerLink, "alive", False)
-        await _claim(thief, arm, base, lane)
-        await until(lambda: base.mesh.counters["link.refused.name"] > 0, "refused")
-        assert base.both_lanes(arm)
-        assert not base.downs
+        thief = Peer(arm.number, name="thief", security=Member(lab, "thief"))
+        try:
+            await thief.mesh.start()
+            await _claim(thief, arm, base, lane)
+            await until(lambda: base.mesh.counters["link.refused.name"] > 0, "refused")
+            assert base.both_lanes(arm)
+            assert not base.downs
+        finally:
+            await thief.mesh.close()
 
 
 async def test_a_bulk_lane_joins_the_link_of_its_own_module_only(
     lab: Authority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also if its link came up after its hello was judged."""
-    async with thief_beside(lab) as (arm, base, thief):
+    async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
         lane = base.link(arm).bulk_connection
         monkeypatch.setattr(base.mesh, "_prove", lambda *_: None)
-        await _claim(thief, arm, base, Lane.BULK)
-        await until(lambda: not thief.mesh.connections(), "closed")
-        assert base.link(arm).bulk_connection is lane
+        thief = Peer(arm.number, name="thief", security=Member(lab, "thief"))
+        try:
+            await thief.mesh.start()
+            await _claim(thief, arm, base, Lane.BULK)
+            await until(lambda: not thief.mesh.connections(), "closed")
+            assert base.link(arm).bulk_connection is lane
+        finally:
+            await thief.mesh.close()
 
 
 async def _claim(thief: Peer, victim: Peer, at: Peer, lane: Lane) -> None:
