@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 import contextlib
 import itertools
 import os
@@ -240,8 +239,3 @@ class Chromium:
         """Release a key."""
         code = KEYS.get(key) or ord(key.upper())
         await self.send("Input.dispatchKeyEvent", type="keyUp", key=key, windowsVirtualKeyCode=code)
-
-    async def screenshot(self, path: Path) -> None:
-        """Write what is seen as PNG."""
-        result = await self.send("Page.captureScreenshot", format="png")
-        path.write_bytes(base64.b64decode(result["data"]))  # noqa: ASYNC240 - a small file

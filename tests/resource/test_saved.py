@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 import pytest
@@ -26,13 +26,15 @@ SECOND = 1_000_000_000
 
 def sonar() -> Resource:
     one = Resource("sonar", role="sensing")
-    one.output("ranges", "std_msgs/String")
+    one.output("words", "std_msgs/String")
     one.attribute("noise", better="min", unit="m")
     one.parameter("gain", 1.0, low=0.0, high=10.0)
     one.parameter("count", 3)
     one.parameter("frame", "base")
-    one.profile(offers={"noise": "1 cm"}, name="fine")(lambda: None)
+    for name, noise, cost in (("fine", 0.01, 3), ("coarse", 0.1, 1)):
+        one.profile(offers={"noise": noise}, cost=cost, name=name)(lambda: None)
     one.context("docked")
+    one.adaptation(window="100 ms")
     return one
 
 
@@ -202,20 +204,8 @@ def test_requirements_wait_for_their_clients_after_a_restart() -> None:
 # --- the file
 
 
-def resource(**more: Any) -> Resource:
-    one = Resource("sonar", role="sensing")
-    one.output("words", "std_msgs/String")
-    one.attribute("noise", better="min", unit="m")
-    one.parameter("gain", 1.0, low=0.0, high=10.0, **more)
-    for name, noise, cost in (("fine", 0.01, 3), ("coarse", 0.1, 1)):
-        one.profile(offers={"noise": noise}, cost=cost, name=name)(lambda: None)
-    one.context("docked")
-    one.adaptation(window="100 ms")
-    return one
-
-
 async def started(core: RosCore, path: Path, one: Resource | None = None) -> ResourceNode:
-    member = ResourceNode(one or resource(), core.uri, state=path)
+    member = ResourceNode(one or sonar(), core.uri, state=path)
     await member.start()
     return member
 
