@@ -114,7 +114,7 @@ async def test_notifications_never_wait_in_the_reply_and_one_goes_at_a_time(core
 
 
 async def test_silent_node_is_notified_again(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rmpa.ros.core.liveness.call", _with_timeout(0.05))
+    monkeypatch.setattr("rmpa.ros.core.liveness.call", _with_timeout(0.5))
     async with Slave() as slave:
         slave.go.clear()
         core.call("registerSubscriber", "/s", "/t", STRING, slave.uri)
