@@ -241,8 +241,6 @@ class Process:
         if self._child.stdin:
             with contextlib.suppress(BrokenPipeError):
                 self._child.stdin.close()
-        if self._child.stdout and not self._reader.is_alive():
-            self._child.stdout.close()
         if self._log:
             self._log.close()
             self._log = None
@@ -251,7 +249,8 @@ class Process:
     # --- inside -------------------------------------------------------------------------------------------------
 
     def _read(self) -> None:
-        for raw in self._child.stdout or ():
+        assert self._child.stdout is not None
+        for raw in self._child.stdout:
             line = raw.rstrip("\n")
             event = _event_of(line)
             with self._news:
@@ -261,6 +260,7 @@ class Process:
                 if self._log:
                     self._log.write(raw)
                 self._news.notify_all()
+        self._child.stdout.close()  # here: a child of its own may keep it open for longer than anything waits
         with self._news:
             self._ended = True
             self._news.notify_all()

@@ -204,7 +204,7 @@ class Machine(Place):
         return {path.stem for path in self.path.glob("*.sock")}
 
     def up(self, *arguments: str, **environ: str) -> subprocess.Popen[str]:
-        """Start an agent on loopback, and wait until it has a control socket."""
+        """Start an agent on loopback, and wait until its control socket can be connected to."""
         net: tuple[str, ...] = ("--multicast", f"239.255.117.117:{20000 + os.getpid() % 20000}", "--interface", "lo")
         if "--core-port" not in arguments:
             net = (*net, "--core-port", str(free_port()))
@@ -213,7 +213,9 @@ class Machine(Place):
 
         def answers() -> bool:
             assert process.poll() is None, self.log()
-            return self.agents() != known
+            new = self.agents() - known
+            with socket.socket(socket.AF_UNIX) as client:
+                return bool(new) and client.connect_ex(str(self.path / f"{new.pop()}.sock")) == 0
 
         until(answers)
         return process

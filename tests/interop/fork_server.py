@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 _CLONE_NEWNS, _CLONE_NEWNET = 0x00020000, 0x40000000
-_MS_REC, _MS_SLAVE, _MNT_DETACH = 0x4000, 0x80000, 2
+_MS_BIND, _MS_REC, _MS_SLAVE, _MNT_DETACH = 0x1000, 0x4000, 0x80000, 2
 _PR_SET_PDEATHSIG, _PR_SET_NAME = 1, 15
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -78,7 +78,7 @@ def _become(request: dict[str, Any], files: list[int]) -> None:
 
 
 def _enter(namespace: str) -> None:
-    """As ``ip netns exec`` does it: with a /sys that shows the interfaces there."""
+    """As ``ip netns exec`` does it: a /sys that shows the interfaces there, and the namespace's files of /etc."""
     place = os.open(f"/run/netns/{namespace}", os.O_RDONLY)
     _checked(_libc.setns(place, _CLONE_NEWNET))
     os.close(place)
@@ -86,6 +86,8 @@ def _enter(namespace: str) -> None:
     _checked(_libc.mount(b"", b"/", b"none", ctypes.c_ulong(_MS_REC | _MS_SLAVE), None))
     _libc.umount2(b"/sys", _MNT_DETACH)
     _checked(_libc.mount(namespace.encode(), b"/sys", b"sysfs", ctypes.c_ulong(0), None))
+    for ours in Path("/etc/netns", namespace).glob("*"):
+        _checked(_libc.mount(bytes(ours), bytes(Path("/etc", ours.name)), b"none", ctypes.c_ulong(_MS_BIND), None))
 
 
 def _checked(result: int) -> None:

@@ -60,11 +60,27 @@ def wait_last(recorder: Process, sequence: int, timeout: float = DEADLINE) -> No
     eventually(there, timeout, what=f"message {sequence} at {recorder.name}")
 
 
-def in_order(rows: Sequence[Came], count: int, source: int = 1) -> None:
-    """Fail unless these are all messages 1 to ``count`` of a source, each once, in order, each byte right."""
+def connected(teller: Process, heard: list[Process]) -> int:
+    """Send one message after the other until each recorder has one; return how many that were."""
+
+    def all_heard() -> bool:
+        since = teller.mark_events()
+        teller.tell("64 1 0")
+        sent.append(int(str(teller.wait_event("told", since=since)["sent"])))
+        return all(listener.events("report") for listener in heard)
+
+    sent: list[int] = []
+    eventually(all_heard, what="the first message at every recorder", every=0.2)
+    for listener in heard:
+        wait_last(listener, sent[-1])
+    return sent[-1]
+
+
+def in_order(rows: Sequence[Came], count: int, source: int = 1, *, after: int = 0) -> None:
+    """Fail unless these are all messages of a source behind ``after`` up to ``count``, in order, each byte right."""
     mine = [row for row in rows if row.source == source]
     assert not any(row.bad for row in rows)
     sequences = [row.sequence for row in mine]
-    if sequences != list(range(1, count + 1)):
-        jumps = [(one, other) for one, other in itertools.pairwise([0, *sequences]) if other != one + 1]
+    if sequences != list(range(after + 1, count + 1)):
+        jumps = [(one, other) for one, other in itertools.pairwise([after, *sequences]) if other != one + 1]
         raise AssertionError(f"{len(sequences)} messages, the last {sequences[-1:]}; jumps: {jumps[:20]}")

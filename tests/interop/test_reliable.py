@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from lab.bed.processes import eventually
-from tests.interop.recordings import recorded, wait_last
+from tests.interop.recordings import connected, recorded, wait_last
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,22 +34,6 @@ def contract(depth: int, more: str = "") -> str:
 def recorders(module: Module) -> list[Process]:
     """A recorder of each kind."""
     return [module.ros.node(kind, "recorder", topic="/chatter", nodelay=True, commands=True) for kind in KINDS]
-
-
-def connected(teller: Process, heard: list[Process]) -> int:
-    """Send one message after the other until each recorder has one; return how many that were."""
-
-    def all_heard() -> bool:
-        since = teller.mark_events()
-        teller.tell("64 1 0")
-        sent.append(int(str(teller.wait_event("told", since=since)["sent"])))
-        return all(listener.events("report") for listener in heard)
-
-    sent: list[int] = []
-    eventually(all_heard, what="the first message at every recorder", every=0.2)
-    for listener in heard:
-        wait_last(listener, sent[-1])
-    return sent[-1]
 
 
 def route(module: Module) -> dict[str, object]:

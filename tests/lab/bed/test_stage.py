@@ -152,7 +152,7 @@ class TestCables:
     def test_cables_carry_what_was_asked_for_and_still_do_after_a_restart(self, link: str, bands: bool) -> None:
         more: Any = {"config": "domain = 7\n", "flags": ["--realtime"]}
         with make_stage(PLAN) as stage, stage.system("rmpa", ["a"], link=link, bands=bands, **more) as robot:
-            words = Path(f"/proc/{robot.pids()['agent@a']}/cmdline").read_text(encoding="utf-8").split("\0")
+            words = robot._own("a")[0].argv
             assert "--realtime" in words
             config = Path(words[words.index("--config") + 1])
             assert config.read_text(encoding="utf-8").startswith("domain = 7\n")

@@ -353,7 +353,7 @@ async def test_the_search_finds_nodes_parameters_and_resources(site: Site) -> No
             await page.press(key)
         await page.wait(f"document.querySelector('.found [aria-selected=true] .kind')?.textContent === '{kind}'")
         await page.press("Enter")
-        await page.wait(f"location.hash === '{address}' && !document.querySelector('dialog')")
+        await page.wait(f"location.hash === '{address}' && document.activeElement.matches('main h1')")
 
 
 @pytest.mark.parametrize(
