@@ -181,6 +181,7 @@ async def test_two_types_and_two_versions_of_one_are_told_apart(hub: Hub, client
         ]  # fmt: skip
         for kind in (old, new):
             assert (await hub.types.find_message(kind.name, kind.md5sum)).definition == kind.definition
+        await until(lambda: "/t" in hub.graph.topics)
         await until(lambda: set(hub.graph.topics["/t"].types) == {"std_msgs/String", "std_msgs/Int32"})
 
 
