@@ -66,10 +66,9 @@ class App extends Component {
     window.rmpa = this.connection; // for the console and for tests
   }
 
-  // The heading of another page gets the focus as soon as there is one: the page may have to be loaded first. A search
-  // that was opened meanwhile keeps it.
+  // The heading of another page gets the focus as soon as there is one: the page may have to be loaded first.
   componentDidUpdate() {
-    const heading = this.arrives && !this.state.overlay && document.querySelector("main h1");
+    const heading = this.arrives && document.querySelector("main h1");
     if (!heading) return;
     this.arrives = false;
     heading.focus({ preventScroll: true });
