@@ -468,7 +468,7 @@ async def test_names_are_looked_at_and_told_in_slices_and_a_failing_one_holds_up
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     part = OnePart()
-    names = [f"/t{number}" for number in range(3 * limits.RESCANNED_AT_ONCE)]
+    names = [f"/t{number}" for number in range(3 * limits.ADVERTISED_AT_ONCE)]
     part.failing = {names[3]}
     part.look(names)
     assert part._changed

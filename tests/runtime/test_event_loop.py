@@ -3,11 +3,12 @@ from __future__ import annotations
 import asyncio
 import selectors
 import socket
+import time
 from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.runtime.loop import AgentLoop, DirectSelector, sorted_yielding, yield_to_data, yielding_to_data
+from rmpa.runtime.loop import AgentLoop, DirectSelector, sorted_yielding, until, yield_to_data, yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator
@@ -270,18 +271,33 @@ async def test_a_socket_that_was_closed_first_is_forgotten(ends: Ends) -> None:
 
 
 @in_agent_loop
-async def test_a_long_iteration_yields_regularly(ends: Ends) -> None:
+async def test_a_long_iteration_yields_by_the_clock_and_not_by_the_number_of_items(ends: Ends) -> None:
     loop, one, other = ends
     got: list[bytes] = []
     loop.add_direct_reader(one.fileno(), lambda: got.append(one.recv(100)))
     seen = []
-    for item in yielding_to_data(range(1000)):
+    for item in yielding_to_data(range(5)):
+        assert len(got) == item  # each item is slow, so data is handled before the next one
         seen.append(item)
-        if item == 100:
-            other.send(b"a")
-        if item == 200:
-            assert got == [b"a"]
-    assert seen == list(range(1000))
+        other.send(b"a")
+        slow = time.monotonic() + 2e-3
+        while time.monotonic() < slow:
+            pass
+    assert seen == list(range(5))
+    loop.remove_reader(one.fileno())
+
+
+@in_agent_loop
+async def test_work_up_to_a_time_gets_on_by_one_item_at_least_and_leaves_the_rest(ends: Ends) -> None:
+    loop, one, other = ends
+    got: list[bytes] = []
+    loop.add_direct_reader(one.fileno(), lambda: got.append(one.recv(100)))
+    other.send(b"a")
+    work = iter(range(4))
+    assert list(until(time.monotonic(), work)) == [0]
+    assert got == [b"a"]
+    assert list(until(time.monotonic() + 60.0, work)) == [1, 2, 3]
+    assert list(until(time.monotonic() + 60.0, work)) == []
     loop.remove_reader(one.fileno())
 
 

@@ -6,7 +6,7 @@ import asyncio
 import logging
 from abc import abstractmethod
 from collections import OrderedDict, deque
-from itertools import chain, islice
+from itertools import chain
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from rmpa.bridge import limits
@@ -15,10 +15,10 @@ from rmpa.bridge.offers import Effects
 from rmpa.bridge.sessions import Part
 from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.runtime.loop import MachineTimer, yield_to_data
+from rmpa.runtime.loop import MachineTimer, turn_end, until, yield_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Collection, Iterable, Iterator
 
     from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.direct.grants import Grants
@@ -35,13 +35,19 @@ _log = logging.getLogger(__name__)
 _END: Final = object()
 
 
+def _while(queue: Collection[object]) -> Iterator[None]:
+    """Yield for as long as something is queued."""
+    while queue:
+        yield
+
+
 class GraphPart(Part, Effects):
     """Offers to peers what the local graph has, and shows in it what they offer.
 
     A graph of thousands of names must not delay a message. Names to look at, advertisements to apply and entries to
-    judge by new rules are therefore queued. A slice of them is done in each turn of the event loop, and data may be
-    handled between any two. Nothing else lets data pass: what ``exports`` and ``imports`` have done here (a message
-    is sent, a topic is published) is done at once, and calls neither of them back in the same turn.
+    judge by new rules are therefore queued. A millisecond of this work is done in each turn of the event loop, and
+    data may be handled between any two items. Nothing else lets data pass: what ``exports`` and ``imports`` have done
+    here (a message is sent, a topic is published) is done at once, and calls neither of them back in the same turn.
 
     Args:
         shared: The core, the peers and the rules.
@@ -258,23 +264,19 @@ class GraphPart(Part, Effects):
                 self.schedule()
 
     def _do_slice(self) -> None:
-        for _ in range(min(len(self._changed), limits.RESCANNED_AT_ONCE)):
-            yield_to_data()
+        """Take one turn of the loop for it; each kind of work gets on by one item at least."""
+        end, told, rejudged = turn_end(), False, False
+        for _ in until(end, _while(self._changed)):
             self._look_at(self._changed.popitem(last=False)[0])
-        told = False
-        for _ in self.exports.advertise(self.now(), self._is_busy):
+        for _ in until(end, self.exports.advertise(self.now(), self._is_busy)):
             told = True
-            yield_to_data()
-        for _ in range(limits.APPLIED_AT_ONCE):
-            if self._advertisements:
-                self._apply_next()
-                yield_to_data()
-        if self._freeing and not tuple(islice(self._freeing[0], limits.APPLIED_AT_ONCE)):
-            self._freeing.popleft()
-        rejudged = False
-        for _ in islice(self._rejudging, limits.APPLIED_AT_ONCE):
+        for _ in until(end, _while(self._advertisements)):
+            self._apply_next()
+        for _ in until(end, _while(self._freeing)):
+            if next(self._freeing[0], _END) is _END:
+                self._freeing.popleft()
+        for _ in until(end, self._rejudging):
             rejudged = True
-            yield_to_data()
         pending = self.exports.pending
         if self._changed or self._advertisements or self._freeing or rejudged or (told and pending):
             self.schedule()

@@ -14,25 +14,23 @@ from rmpa.core.limits import KIB, MIB
 ROUTE_OPEN_TIMEOUT: Final = 5.0
 # Seconds that a topic's route stays open after its last local subscriber left: a reconnecting node finds it open.
 ROUTE_LINGER: Final = 1.0
-# Entries that one advertisement of this module takes from the pending changes; the rest follows in later turns of the
-# event loop.
-ADVERTISED_AT_ONCE: Final = 64
+# Entries that one advertisement of this module takes from the pending changes, which takes a millisecond; the rest
+# follows in later turns of the event loop.
+ADVERTISED_AT_ONCE: Final = 32
 # Seconds until the next attempt to advertise, while the portions sent before still wait on the lane.
 TELL_PAUSE: Final = 0.005
 # Seconds after which a portion is sent although the lane is busy. On a lane that is never empty the graph still
 # advances, at some 0.5 Mbit/s.
-TELL_PATIENCE: Final = 0.1
-# Bytes of one advertisement, which is parsed in one piece. This module's own take 200 KB with the longest names, and
-# 5 KB with usual ones.
+TELL_PATIENCE: Final = 0.05
+# Bytes of one advertisement, which is parsed in one piece. This module's own take 100 KB with the longest names, and
+# 3 KB with usual ones.
 ADVERTISEMENT_MAX: Final = 1 * MIB
 # Bytes of received advertisements, of all peers, that may wait to be parsed: some 40,000 topics. Beyond it the oldest
 # are parsed at once.
 ADVERTISED_WAITING_BYTES: Final = 4 * MIB
-# Sources of a received advertisement that are applied in one turn of the event loop, which takes some 100
-# microseconds; then data goes first.
+# Routes whose timers are due, and parameters of one request, that are handled in one turn of the event loop, which
+# takes some 100 microseconds; then data goes first.
 APPLIED_AT_ONCE: Final = 16
-# Names of the local graph that are examined in one turn of the event loop, after a change or to reconcile.
-RESCANNED_AT_ONCE: Final = 16
 # Topics, and likewise services, of one peer beyond ``[limits]`` that are remembered, some 400 B each; they are taken
 # when there is room. Further ones come with the peer's next link.
 REFUSED_MAX: Final = 32_768

@@ -11,7 +11,7 @@ from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterable
+    from collections.abc import Callable, Hashable, Iterable, Sequence
 
     from rmpa.core.counters import Counters
     from rmpa.core.identity import Guid, Identity
@@ -176,7 +176,7 @@ class BeaconSender:
 
     def send_multicast(self, kind: BeaconKind, now: float) -> None:
         """Send to the group, with gossip about the peers that multicast does not reach."""
-        self.send(kind, None, self.gossip(self.unheard_by_multicast(now), None, now))
+        self.send(kind, None, self.gossip(self.heard_lately(self.unheard_by_multicast(now), now), None))
 
     def send_answer(self, peer: PeerInstance, now: float, gossip: tuple[Guid, ...] | None = None) -> None:
         """Answer a peer at each of its addresses, within the limits of answers; ``gossip``: default: of all peers."""
@@ -184,7 +184,7 @@ class BeaconSender:
             if self._answers.has(now) and self._answered.take(address, now):
                 self._answers.spend()
                 if gossip is None:
-                    gossip = self.gossip(self._endpoints.members.values(), peer, now)
+                    gossip = self.gossip(self.heard_lately(self._endpoints.members.values(), now), peer)
                 self.send(BeaconKind.ANSWER, address, gossip)
             else:
                 self._counters.add("beacon.answer_limited")
@@ -196,30 +196,34 @@ class BeaconSender:
             self.send(BeaconKind.GOODBYE, address)
         self.closed = True
 
-    def gossip(self, peers: Iterable[PeerInstance], to: PeerInstance | None, now: float) -> tuple[Guid, ...]:
+    def gossip(self, known: Sequence[PeerInstance], to: PeerInstance | None) -> tuple[Guid, ...]:
         """What the next beacon says about peers; if they are too many, the one behind it goes on where it ends.
 
-        Peers that have no link and were not heard lately are left out: receivers would send announcements to them for
-        as long as they are mentioned.
-
         Args:
-            peers: Those that are known.
+            known: The peers (``heard_lately``).
             to: The receiver, whose own GUID is left out; ``None``: the group.
-            now: Monotonic seconds.
         """
         loopback = (self.identity if to is None else to.identity).guid.is_loopback
-        known = list(peers)
         start = self._turn % len(known) if len(known) > limits.BEACON_GOSSIP_MAX else 0
         guids: list[Guid] = []
         for number, peer in enumerate((*known[start:], *known[:start]), start + 1):
             guid = peer.identity.guid
-            lately = peer.linked or now - peer.last_seen <= limits.MULTICAST_SILENCE
-            if peer is not to and lately and (loopback or not guid.is_loopback):
+            if peer is not to and (loopback or not guid.is_loopback):
                 guids.append(guid)
                 if len(guids) == limits.BEACON_GOSSIP_MAX:
                     self._turn = number
                     break
         return tuple(guids)
+
+    @staticmethod
+    def heard_lately(peers: Iterable[PeerInstance], now: float) -> list[PeerInstance]:
+        """The peers that gossip mentions: those with a link, and those that were heard lately.
+
+        Receivers would send announcements to the others for as long as they are mentioned.
+        """
+        since = now - limits.MULTICAST_SILENCE
+        # The last two are ``last_seen``, without its calls: there may be a thousand peers that were invented.
+        return [peer for peer in peers if peer.heard >= since or peer.linked_until >= since]
 
     def unheard_by_multicast(self, now: float) -> list[PeerInstance]:
         """Members that get their heartbeats by unicast, because no multicast of theirs was heard lately."""

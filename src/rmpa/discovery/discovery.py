@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.config.settings import Settings
+    from rmpa.core.counters import Yielder
     from rmpa.core.identity import Guid, Identity
     from rmpa.discovery.beacon import Address
     from rmpa.discovery.endpoints import PeerView
@@ -415,9 +416,9 @@ class Discovery:
         self._membership.link_down(guid, time.monotonic(), instance)
         self._flush()
 
-    def peers(self) -> list[PeerView]:
+    def peers(self, yielder: Yielder = iter) -> list[PeerView]:
         """All known peers, in GUID order."""
-        return self._membership.peers()
+        return self._membership.peers(yielder)
 
     def strangers(self) -> tuple[Stranger, ...]:
         """The modules that are heard and are not of this mesh."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from rmpa.core import limits as core_limits
@@ -18,6 +19,7 @@ from rmpa.discovery import limits
 from rmpa.discovery.beacon import BeaconKind
 
 if TYPE_CHECKING:
+    from rmpa.core.counters import Yielder
     from rmpa.core.identity import Identity
     from rmpa.discovery.beacon import Address, Beacon
 
@@ -302,11 +304,11 @@ class EndpointTable(dict[int, Endpoint]):
                 pairs.append((newer, older))
         return pairs
 
-    def views(self) -> list[PeerView]:
+    def views(self, yielder: Yielder = iter) -> list[PeerView]:
         """All peers in GUID order, those included that a conflict keeps from being members; not this agent itself."""
         return [
             PeerView(run, self._conflicts(endpoint, run), endpoint.member is not None and run is endpoint.current)
-            for _, endpoint in sorted(self.items())
+            for _, endpoint in yielder(sorted(self.items(), key=itemgetter(0)))
             for run in (endpoint.current, *(endpoint.others() if endpoint.conflict else ()))
             if run is not None and not (endpoint.own and run is endpoint.current)
         ]

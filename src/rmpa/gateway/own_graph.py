@@ -108,7 +108,7 @@ class MeshSources:
     def _examine(self) -> None:
         self._soon = None
         changed, self._changed = self._changed, {}
-        for kind, name in yielding_to_data(list(changed), every=16):
+        for kind, name in yielding_to_data(list(changed)):
             sources = (self._topic if kind is SourceKind.TOPIC else self._service)(name)
             found = {(kind, name, source.proxy): source for source in sources}
             before = self._by_name.pop((kind, name), {})
@@ -352,10 +352,10 @@ class AgentGraph(Part):
         """Mend what the core has lost, and try again what failed."""
         for site in self._sites.values():
             site.proxies.reconcile()
-            for shown in yielding_to_data([same[0] for same in site.shown.values()], every=16):
+            for shown in yielding_to_data([same[0] for same in site.shown.values()]):
                 shown.reconcile()
         subscribers = self._core.state().subscribers
-        for topic in yielding_to_data(list(self._taps), every=16):
+        for topic in yielding_to_data(list(self._taps)):
             if TAP_NODE not in subscribers.get(topic, {}):
                 self._register_subscriber(topic)
             self._follow(topic)

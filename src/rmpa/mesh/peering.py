@@ -205,6 +205,7 @@ class Peering:
         if fresh and peer.link is None and not peer.dialling:
             self._dial_at(peer, now + self._fallback(peer))
         self._dial_due(peer, now)
+        self._dial_unverified(now)
 
     def peer_gone(self, guid: Guid) -> None:
         """Stop dialling a peer that discovery has given up. A link that is up stays until it ends by itself."""
@@ -538,7 +539,6 @@ class Peering:
             return
         self._dial_queue[peer.run.guid.place] = None
         self._set_timer(peer)
-        self._dial_unverified(now)
 
     def _dial_unverified(self, now: float) -> None:
         """Dial unverified peers of the queue as far as the rate allows.

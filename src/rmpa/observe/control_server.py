@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import grp
 import inspect
 import logging
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
 
 
 _log = logging.getLogger(__name__)
-_yielder: Final = functools.partial(yielding_to_data, every=1)
 # ``struct ucred``: pid, uid, gid (unix(7), SO_PEERCRED).
 _UCRED: Final = struct.Struct("3i")
 # Not in Python's ``socket``; Linux has it since 4.13.
@@ -260,7 +258,7 @@ class ControlServer:
     @staticmethod
     async def _send(writer: asyncio.StreamWriter, reply: ControlReply) -> None:
         try:
-            line = reply.serialize(_yielder)
+            line = reply.serialize(yielding_to_data)
         except RmpaError as error:
             _log.exception("! control reply")
             line = ControlReply(ok=False, error=str(error)).serialize()

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
-    from rmpa.core.counters import Counters
+    from rmpa.core.counters import Counters, Yielder
     from rmpa.core.identity import Identity
     from rmpa.discovery.discovery import Discovery, Stranger
     from rmpa.discovery.endpoints import PeerView
@@ -231,14 +231,14 @@ class SnapshotBuilder:
         """Every peer that is known, and the modules that are not of this mesh; both by name."""
         now, imports = time.monotonic(), self._parts.bridge.topics.imports
         links = {session.link.guid: session for session in self._parts.bridge.sessions.linked()}
-        yield_to_data()  # a millisecond each with a full roster
-        roster = {view.run.identity.guid: view for view in discovery.peers()}
+        roster = {view.run.identity.guid: view for view in discovery.peers(yielding_to_data)}
         yield_to_data()
         statuses = {status.identity.guid: status for status in mesh.peers()}
-        infos, known_guids = [], {*roster, *statuses, *links}
-        for guid in known_guids:
-            yield_to_data()
-            infos.append(self._peer(roster.get(guid), statuses.get(guid), links.get(guid), now))
+        known_guids = {*roster, *statuses, *links}
+        infos = [
+            self._peer(roster.get(guid), statuses.get(guid), links.get(guid), now)
+            for guid in yielding_to_data(known_guids)
+        ]
         shown = {
             (entry.origin.instance, entry.name)
             for _, _, entry in yielding_to_data(list(imports))
@@ -264,7 +264,7 @@ class SnapshotBuilder:
         strange = [*(info for info in infos if info.state in (FOREIGN, PENDING)), *knocking]
         strange.sort(key=lambda info: (info.name, info.guid))
         peers = [info for info in infos if info.state not in (FOREIGN, PENDING)]
-        return mark_shared_addresses(peers, own), tuple(strange)
+        return mark_shared_addresses(peers, own, yielding_to_data), tuple(strange)
 
     def _peer(self, view: PeerView | None, status: Peer | None, session: PeerSession | None, now: float) -> PeerInfo:
         run = view.run if view is not None else None
@@ -537,20 +537,23 @@ def _raise_limit(kind: str) -> str:
 # reply, but connections to the address reach only one machine, and it refuses the other machine's port.
 
 
-def mark_shared_addresses(peers: Sequence[PeerInfo], own: Collection[str]) -> tuple[PeerInfo, ...]:
+def mark_shared_addresses(
+    peers: Sequence[PeerInfo], own: Collection[str], yielder: Yielder = iter
+) -> tuple[PeerInfo, ...]:
     """Set the state ``conflict`` for peers whose address seems to be another machine's too.
 
     Args:
         peers: All peers.
         own: This machine's addresses.
+        yielder: Lets data pass.
 
     Returns:
         The same peers in the same order.
     """
     holders: dict[str, list[PeerInfo]] = {}
-    for peer in peers:
+    for peer in yielder(peers):
         holders.setdefault(peer.guid.rpartition(":")[0], []).append(peer)
-    texts = ((peer, _shared_address(peer, holders, own)) for peer in peers)
+    texts = ((peer, _shared_address(peer, holders, own)) for peer in yielder(peers))
     return tuple(
         msgspec.structs.replace(peer, state="conflict", conflicts=(*peer.conflicts, text)) if text else peer
         for peer, text in texts

@@ -65,7 +65,7 @@ async def write_text(what: str, value: XmlRpcValue) -> str:
     """
     parts: list[str] = []
     size = 0
-    for number, piece in enumerate(yielding_to_data(response_pieces(value), every=1), start=1):
+    for number, piece in enumerate(yielding_to_data(response_pieces(value)), start=1):
         parts.append(piece.decode())  # pieces end between characters
         size += len(piece)
         if size > limits.PARAM_TEXT_MAX:

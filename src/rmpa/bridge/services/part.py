@@ -118,7 +118,7 @@ class Services(GraphPart):
         """As of ``GraphPart``."""
         super().reload()
         self.direct_exports.judge_again()
-        for shown in yielding_to_data(list(self), every=16):
+        for shown in yielding_to_data(list(self)):
             self.direct_imports.shown(shown.remote)
             timeout, endpoint = self.context.services.timeout(shown.remote.name), shown.endpoint
             if endpoint is not None and endpoint.timeout != timeout:
@@ -210,7 +210,7 @@ class Services(GraphPart):
         self.look_again()
         services = self._core.state().services
         before = self.now() - limits.SERVICE_IDLE
-        for shown in yielding_to_data(list(self), every=16):
+        for shown in yielding_to_data(list(self)):
             proxy, caller = shown.proxy, shown.caller
             if proxy is not None and shown.remote.name not in services:
                 self._register(shown, proxy)

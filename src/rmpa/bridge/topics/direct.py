@@ -36,6 +36,7 @@ from rmpa.ros.node.service_client import probe
 from rmpa.ros.wire.slave_api import TCPROS, read_bus_info
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply
 from rmpa.runtime.kernel_tcp import connections
+from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -189,7 +190,7 @@ class TopicPaths(Paths["RemoteTopic"]):
 
     def reload(self) -> None:
         """Judge every subscriber by the new contracts."""
-        for _, _, entry in list(self._imports):
+        for _, _, entry in yielding_to_data(list(self._imports)):
             self.shown(entry)
 
     def graph_changed(self, change: GraphChange) -> None:

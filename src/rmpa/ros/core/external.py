@@ -421,7 +421,7 @@ class ExternalCore(Core):
         seen = self._mirror.asked
         if not self._request:
             calls = mirror.survey_calls(self._own_node, self._nodes, self._services)
-            self._request = b"".join(yielding_to_data(call_pieces(_MULTICALL, [calls]), every=1))
+            self._request = b"".join(yielding_to_data(call_pieces(_MULTICALL, [calls])))
         body = await exchange(self.uri, _MULTICALL, self._request, timeout=MASTER_TIMEOUT, use=Use.CORE)
         if body == self._seen and not self._problem:
             return False

@@ -55,8 +55,6 @@ _DATE: Final = 1
 _OF_A_CORE: Final = frozenset({"/run_id", "/rosdistro", "/rosversion"})
 # Names of nodes or parameters in a text for people.
 _SHOWN: Final = 3
-# Nodes recorded in a row, before other pending data is served; each takes some 25 microseconds.
-_RECORDS: Final = 8
 
 
 # The file's form. A release that changes it reads the earlier ones, from 0.2.0 on (docs/reference/compatibility.md).
@@ -366,7 +364,7 @@ class CoreState:
         self._began = asyncio.get_running_loop().time()
         nodes = {
             name: record
-            for name in yielding_to_data(list(table.nodes()), every=_RECORDS)
+            for name in yielding_to_data(list(table.nodes()))
             if not self._temporary(name) and (record := table.record(name)) is not None
         }
         try:

@@ -195,7 +195,7 @@ async def call(
     """
     if _log.isEnabledFor(logging.DEBUG):
         _log.debug("> %s %s%s", uri, method, brief(params))
-    document = b"".join(yielding_to_data(call_pieces(method, params), every=1))
+    document = b"".join(yielding_to_data(call_pieces(method, params)))
     return await read_response(await exchange(uri, method, document, timeout=timeout, use=use))
 
 
