@@ -112,11 +112,11 @@ def test_silence_at_rest_ends_the_link_by_the_longer_lease(dialler: Side, accept
     pass_time(dialler, time, limits.IDLE_LEASE - 0.01)
     assert dialler.state is ConnectionState.UP
     pass_time(dialler, time, 0.02)
-    assert dialler.last() == ("closed", "high was silent for its lease of 16 s")
+    assert dialler.last() == ("closed", "high was silent for its lease of 46 s")
 
 
 @pytest.mark.parametrize(
-    ("peers", "interval", "lease"), [(3, 5.0, 16.0), (50, 5.0, 16.0), (63, 6.3, 19.9), (999, 19.0, 58.0)]
+    ("peers", "interval", "lease"), [(3, 15.0, 46.0), (150, 15.0, 46.0), (170, 17.0, 52.0), (999, 19.0, 58.0)]
 )
 def test_keepalives_at_rest_are_rarer_with_more_peers(peers: int, interval: float, lease: float) -> None:
     """Three of them and a second fit into the lease."""
@@ -136,7 +136,7 @@ def test_a_link_at_rest_takes_the_pace_of_a_mesh_that_grows_and_shrinks(
     run(dialler, acceptor, time, 20.0)
     assert dialler.keepalive.remote_lease == acceptor.keepalive.remote_lease == 58.0
     many = run(dialler, acceptor, time, 600.0)
-    assert many * 3 < few
+    assert many < few
     assert dialler.state is acceptor.state is ConnectionState.UP
     dialler.need(time.now, needed=True)
     exchange(dialler, acceptor, time)

@@ -55,8 +55,7 @@ def peer_list(
 ) -> None:
     """List the peers, all or those with names like PATTERN, and the state of their links.
 
-    A link is "at rest" while nothing uses it: a lost peer is then noticed after 16 s instead of 1 s
-    (later with more than 50 peers).
+    A link is "at rest" while nothing uses it: a lost peer is then noticed after 16 s instead of 1 s.
 
     A module that is "pending" needs an invitation, and the line below the table has the command that makes it. Its
     name and address are not proved.

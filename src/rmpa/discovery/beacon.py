@@ -14,6 +14,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import lru_cache
 from ipaddress import IPv4Address
 from typing import Final
 
@@ -29,11 +30,15 @@ Address = tuple[str, int]
 MAGIC: Final = b"RMPA"
 VERSION: Final = 2
 
-# Where the instance id stands in a beacon: begin and end.
+# Where the kind stands in a beacon, the instance id (begin and end), and the number.
+KIND_AT: Final = 5
+_SEQUENCE: Final = slice(36, 40)
 INSTANCE_AT: Final = (16, 32)
 MALFORMED: Final = "beacon.malformed"
 OTHER_DOMAIN: Final = "beacon.other_domain"
 OTHER_VERSION: Final = "beacon.version"
+# Contents of packets that need not be parsed again: of a peer at rest only the number differs.
+_CONTENTS_KEPT: Final = 512
 _PREFIX: Final = struct.Struct(">4sBBH")
 _FIXED: Final = struct.Struct(">4sBBHQ16sII")
 _GUID: Final = struct.Struct(">Q")
@@ -129,23 +134,12 @@ class Beacon:
             BeaconRefused: It is of another domain, whatever its version, or of another version, or malformed.
         """
         sender_of(data, domain)
-        _, _, kind, _, guid, instance, lease, sequence = _FIXED.unpack_from(data)
-        name, at = _counted(data, _FIXED.size, 1, "name")
-        addresses, at = _counted(data, at, 4, "addresses")
-        gossip, at = _counted(data, at, _GUID.size, "gossip")
-        observed, _ = _counted(data, at, _ENDPOINT.size, "gossiped addresses")
-        try:
-            others = tuple(IPv4Address(addresses[i : i + 4]) for i in range(0, len(addresses), 4))
-            return cls(
-                BeaconKind(kind),
-                Identity(Guid(guid), instance, name.decode("ascii"), domain, others),
-                lease,
-                sequence,
-                tuple(Guid(value) for (value,) in _GUID.iter_unpack(gossip)),
-                tuple((str(IPv4Address(host)), port) for host, port in _ENDPOINT.iter_unpack(observed)),
-            )
-        except ValueError as error:
-            raise _malformed(str(error)) from error
+        content = _content(data[: _SEQUENCE.start] + bytes(4) + data[_SEQUENCE.stop :])
+        beacon = object.__new__(cls)
+        for name in cls.__slots__:
+            object.__setattr__(beacon, name, getattr(content, name))
+        object.__setattr__(beacon, "sequence", int.from_bytes(data[_SEQUENCE], "big"))
+        return beacon
 
     def serialize(self) -> bytes:
         """The packet; never longer than ``limits.BEACON_MAX_BYTES``."""
@@ -201,6 +195,28 @@ def sender_of(data: bytes, domain: int) -> tuple[Guid, bytes]:
         raise _malformed(f"only {len(data)} bytes")
     _, _, _, _, guid, instance, _, _ = _FIXED.unpack_from(data)
     return Guid(guid), instance
+
+
+@lru_cache(_CONTENTS_KEPT)
+def _content(data: bytes) -> Beacon:
+    """The beacon in a packet of this version, whose number was replaced by zeros."""
+    _, _, kind, domain, guid, instance, lease, _ = _FIXED.unpack_from(data)
+    name, at = _counted(data, _FIXED.size, 1, "name")
+    addresses, at = _counted(data, at, 4, "addresses")
+    gossip, at = _counted(data, at, _GUID.size, "gossip")
+    observed, _ = _counted(data, at, _ENDPOINT.size, "gossiped addresses")
+    try:
+        others = tuple(IPv4Address(addresses[i : i + 4]) for i in range(0, len(addresses), 4))
+        return Beacon(
+            BeaconKind(kind),
+            Identity(Guid(guid), instance, name.decode("ascii"), domain, others),
+            lease,
+            0,
+            tuple(Guid(value) for (value,) in _GUID.iter_unpack(gossip)),
+            tuple((str(IPv4Address(host)), port) for host, port in _ENDPOINT.iter_unpack(observed)),
+        )
+    except ValueError as error:
+        raise _malformed(str(error)) from error
 
 
 def _counted(data: bytes, at: int, size: int, what: str) -> tuple[bytes, int]:

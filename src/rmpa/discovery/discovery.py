@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import math
 import random
@@ -28,7 +29,7 @@ from rmpa.discovery.beacon import (
     sender_of,
 )
 from rmpa.discovery.membership import MembershipProtocol
-from rmpa.runtime.loop import MachineTimer, yield_to_data
+from rmpa.runtime.loop import MachineTimer, call_at_tick, yield_to_data
 from rmpa.trust import limits as trust_limits
 from rmpa.trust.packets import Verdict
 from rmpa.trust.permissions import TrustReason, not_of_this_mesh
@@ -346,8 +347,10 @@ class Discovery:
         self._seed_hosts: dict[str, list[str]] = {}
         self._tasks: list[asyncio.Task[None]] = []
         self._receivers: list[socket.socket] = []
-        self._group_socket: socket.socket | None = None
-        self._joined: set[int] = set()
+        # Those that are in the group, with the interfaces on which they have joined; one may have heartbeats alone.
+        self._joined: dict[socket.socket, set[int]] = {}
+        self._heartbeats: socket.socket | None = None
+        self._heartbeats_tick: asyncio.TimerHandle | None = None
         self._warned: set[str] = set()
         self._timer = MachineTimer(self._membership.next_timer, self._timer_due)
         self._started = False
@@ -363,8 +366,7 @@ class Discovery:
         # Unicasts to the discovery port, the port of seeds without one; one agent of a machine gets them.
         self._open_receiver(_ALL_NETWORKS, multicast=False, lost="seeds of others must name our port")
         if self._settings.multicast.enabled:
-            group, _ = self._group
-            self._group_socket = self._open_receiver(group, multicast=True, lost="no multicast is heard; use --seed")
+            self._open_group()
         self._everything = self._look()
         self._use_interfaces()
         now = time.monotonic()
@@ -396,7 +398,9 @@ class Discovery:
             loop.remove_reader(sock.fileno())
             sock.close()
         self._receivers.clear()
-        self._group_socket = None
+        self._joined.clear()
+        if self._heartbeats_tick is not None:
+            self._heartbeats_tick.cancel()
 
     # --- links and views --------------------------------------------------------------------------------------
 
@@ -438,10 +442,24 @@ class Discovery:
 
     # --- sockets ----------------------------------------------------------------------------------------------
 
-    def _open_receiver(self, host: str, *, multicast: bool, lost: str) -> socket.socket | None:
+    def _open_group(self) -> None:
+        """Receive multicasts: heartbeats by a socket of their own where the kernel can tell them from the others."""
+        with contextlib.suppress(OSError):  # no filters; if it is the port, the other socket says so
+            self._heartbeats = network.open_receiver(*self._group, heartbeats=True)
+        others = None if self._heartbeats is None else False
+        lost = "no multicast is heard; use --seed"
+        sock = self._open_receiver(self._group[0], multicast=True, lost=lost, heartbeats=others)
+        if self._heartbeats is not None:
+            self._receivers.append(self._heartbeats)
+            self._listen(self._heartbeats, multicast=True)
+        self._joined = {each: set() for each in (sock, self._heartbeats) if each is not None}
+
+    def _open_receiver(
+        self, host: str, *, multicast: bool, lost: str, heartbeats: bool | None = None
+    ) -> socket.socket | None:
         _, port = self._group
         try:
-            sock = network.open_receiver(host, port)
+            sock = network.open_receiver(host, port, heartbeats=heartbeats)
         except OSError as error:
             self._warn(
                 f"cannot listen at {host or '*'}:{port} ({error.strerror}): {lost}, or choose another --multicast"
@@ -452,7 +470,16 @@ class Discovery:
         return sock
 
     def _readable(self, sock: socket.socket, *, multicast: bool) -> None:
-        self._take(sock, multicast=multicast)
+        more = False
+        if self._heartbeats is not None and (sock is self._heartbeats or self._heartbeats_tick is not None):
+            more = self._take(self._heartbeats, multicast=True)  # first, as they were sent before what is read now
+        if sock is not self._heartbeats:
+            self._take(sock, multicast=multicast)
+        elif not more and self._membership.size >= limits.HEARTBEATS_WAIT_MEMBERS:
+            self._defer_heartbeats(sock)
+        elif self._heartbeats_tick is not None:
+            self._heartbeats_tick = None
+            self._listen(sock, multicast=True)
         if self._filter.overrun:
             # A flood of forged packets must not take the core: for a while they stay in the kernel's buffer.
             self.counters.add("beacon.paused")
@@ -467,15 +494,27 @@ class Discovery:
         if self._started:
             asyncio.get_running_loop().add_reader(sock.fileno(), partial(self._readable, sock, multicast=multicast))
 
-    def _take(self, sock: socket.socket, *, multicast: bool) -> None:
-        """Handle a bounded number of packets, with pending data between them: a flood must not delay data."""
+    def _defer_heartbeats(self, sock: socket.socket) -> None:
+        """Read the next heartbeats at a common time of the process: it wakes once for those of many members."""
+        asyncio.get_running_loop().remove_reader(sock.fileno())
+        if self._heartbeats_tick is not None:
+            self._heartbeats_tick.cancel()
+        read = partial(self._readable, sock, multicast=True)
+        self._heartbeats_tick = call_at_tick(limits.HEARTBEATS_WAIT, read)
+
+    def _take(self, sock: socket.socket, *, multicast: bool) -> bool:
+        """Handle a bounded number of packets, with pending data between them: a flood must not delay data.
+
+        Returns:
+            Whether there may be more.
+        """
         now = time.monotonic()
         for _ in range(_BEACONS_PER_WAKE):
             yield_to_data()
             try:
                 data, source, index = network.receive(sock)
             except (BlockingIOError, InterruptedError):
-                return
+                return False
             except OSError as error:  # an ICMP error that some earlier packet of ours caused
                 _log.debug("< %s", error)
                 continue
@@ -488,7 +527,8 @@ class Discovery:
                 else:
                     self._membership.recognise(beacon, source, old_key)
             elif self._filter.overrun:
-                return
+                return False
+        return True
 
     # --- interfaces and seeds ---------------------------------------------------------------------------------
 
@@ -526,8 +566,8 @@ class Discovery:
             self._warned.discard(_ALONE)
         else:
             self._warn(_ALONE)
-        if self._group_socket is not None:
-            refused = network.join_group(self._group_socket, self._group[0], self.interfaces, self._joined)
+        for sock, joined in self._joined.items():
+            refused = network.join_group(sock, self._group[0], self.interfaces, joined)
             for name, error in refused.items():
                 self._warn(f"{name}: the group cannot be joined ({error.strerror}); tried again when it changes")
 

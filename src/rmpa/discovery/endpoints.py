@@ -287,6 +287,13 @@ class EndpointTable(dict[int, Endpoint]):
         self[place] = Endpoint()
         self.index(place)
 
+    def is_steady(self, endpoint: Endpoint, beacon: Beacon) -> bool:
+        """Whether a beacon of an endpoint's member decides nothing: no other run or name, doubt, shorter lease."""
+        run = endpoint.current
+        if run is None or endpoint.member is None or len(endpoint.runs) > 1 or run.doubted or run.goodbye is not None:
+            return False
+        return beacon.lease_ms >= run.lease * 1000 and len(self._by_name[run.identity.name]) == 1
+
     def with_name(self, name: str) -> list[Endpoint]:
         """The endpoints whose live run has this name, in order; those in conflict and this agent's own included."""
         return [self[place] for place in sorted(self._by_name.get(name, ()))]

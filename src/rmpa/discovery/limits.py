@@ -26,11 +26,15 @@ MANY_MEMBERS: Final = 64
 ADDRESS_SHARED_AFTER: Final = 5.0
 # The shortest time between two unicast answers to one address.
 ANSWER_INTERVAL: Final = 0.2
-# A peer that was silent for this long (a heartbeat and a second) has missed a heartbeat: of two instances it may be
-# the dead one.
-HEARTBEAT_LATE: Final = 6.0
-# A peer not heard by multicast for this long (two heartbeats and a second) gets its heartbeats by unicast.
-MULTICAST_SILENCE: Final = 11.0
+# Members from which on heartbeats by multicast do not wake this agent, as they come more often than once a second
+# then, and the time that they may wait to be read.
+HEARTBEATS_WAIT_MEMBERS: Final = 8
+HEARTBEATS_WAIT: Final = 1.0
+# A peer that was silent for this long (a heartbeat and two seconds) has missed one: of two instances it may be the
+# dead one.
+HEARTBEAT_LATE: Final = 7.0
+# A peer not heard by multicast for this long (two heartbeats and two seconds) gets its heartbeats by unicast.
+MULTICAST_SILENCE: Final = 12.0
 # Unicast answers a second over all addresses: forged beacons must not turn an agent into an amplifier; a start of 100
 # peers stays below this. In a large mesh it is also the number of answers a second that one newcomer gets: 1,000
 # members answer within 2 s, each at a random time.

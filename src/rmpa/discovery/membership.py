@@ -157,12 +157,15 @@ class MembershipProtocol:
                 return
             endpoint = self._endpoints[place] = Endpoint()
         gossiped = [self._candidates.answered(address) for address in {identity.guid.endpoint, source}]
+        steady = self._endpoints.is_steady(endpoint, beacon)
         run = endpoint.hear(beacon, source, now, multicast=multicast)
         if run is None:
             self.counters.add("beacon.late")
             self._endpoints.index(place)
             return
-        found = self._settle(place, now)
+        # Most heartbeats change nothing but the end of the lease, at which it is settled anyway.
+        steady = steady and run.goodbye is None and run.identity == endpoint.member
+        found = not steady and self._settle(place, now)
         current = endpoint.current
         if run is not current or run.goodbye is not None:
             if current is not None and current.linked and not endpoint.own:
@@ -322,6 +325,11 @@ class MembershipProtocol:
         """The seeds at whose address there is no member."""
         met = {host for peer in self._members() for host, _ in peer.addresses} if self._seeds else ()
         return [seed for seed in self._seeds if seed[0] not in met]
+
+    @property
+    def size(self) -> int:
+        """How many members there are."""
+        return len(self._endpoints.members)
 
     def is_verified(self, guid: Guid, instance: bytes) -> bool:
         """Whether this run of a peer has or had a link; this agent itself counts as linked."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ctypes
 import errno
 import logging
 import random
@@ -19,6 +20,7 @@ import psutil
 from rmpa.core.counters import Backoff
 from rmpa.core.limits import KIB
 from rmpa.discovery import limits
+from rmpa.discovery.beacon import KIND_AT, BeaconKind
 from rmpa.runtime.accept import in_thread
 
 if TYPE_CHECKING:
@@ -41,6 +43,7 @@ _SEED_RETRY_FIRST: Final = 1.0
 # The longest delay between two look-ups after failures.
 _SEED_RETRY_MAX: Final = 30.0
 
+_SO_ATTACH_FILTER: Final = 26  # asm-generic/socket.h; not in Python's socket module
 _RTMGRP_LINK: Final = 0x1
 _RTMGRP_IPV4_IFADDR: Final = 0x10
 _LOOPBACK: Final = IPv4Address("127.0.0.1")
@@ -222,15 +225,16 @@ _IP_MULTICAST_ALL: Final = 49
 _SO_RCVBUFFORCE: Final = 33
 
 
-def open_receiver(host: str, port: int) -> socket.socket:
+def open_receiver(host: str, port: int, *, heartbeats: bool | None = None) -> socket.socket:
     """Open a socket that several agents of one machine may bind at once, and that receives only from joined groups.
 
     Args:
         host: The group, to receive its multicasts; an empty string: unicasts to this port.
         port: The domain's discovery port.
+        heartbeats: Whether the kernel gives it the beacons of this kind alone, or all but them; ``None``: all.
 
     Raises:
-        OSError: Another program has bound the port without SO_REUSEADDR.
+        OSError: Another program has bound the port without SO_REUSEADDR, or the kernel takes no filter.
     """
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
     try:
@@ -239,11 +243,32 @@ def open_receiver(host: str, port: int) -> socket.socket:
         enlarge_buffer(sock)
         # Without this, Linux also delivers the multicasts of groups that other programs of this machine joined.
         sock.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+        if heartbeats is not None:
+            memory = ctypes.create_string_buffer(_heartbeat_filter(passes=heartbeats))  # the kernel copies it
+            program = struct.pack("@HP", len(memory) // 8, ctypes.addressof(memory))
+            sock.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, program)
         sock.bind((host, port))
     except OSError:
         sock.close()
         raise
     return sock
+
+
+def _heartbeat_filter(*, passes: bool) -> bytes:
+    """The program of a packet filter (socket(7), linux/filter.h) that passes heartbeats alone, or all but them."""
+    kind = 8 + KIND_AT  # a filter sees the UDP header in front
+    heartbeat, other = (0xFFFF, 0) if passes else (0, 0xFFFF)
+    return b"".join(
+        struct.pack("@HBBI", *instruction)
+        for instruction in (  # code, instructions to skip if true, if false, operand
+            (0x80, 0, 0, 0),  # the packet's length: a load behind the end would drop it, and nothing would count it
+            (0x35, 0, 3, kind + 1),  # at least
+            (0x30, 0, 0, kind),  # a byte
+            (0x15, 0, 1, BeaconKind.HEARTBEAT),  # equal
+            (0x06, 0, 0, heartbeat),  # the bytes that pass
+            (0x06, 0, 0, other),
+        )
+    )
 
 
 def enlarge_buffer(sock: socket.socket) -> int:

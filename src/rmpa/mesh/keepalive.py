@@ -29,7 +29,7 @@ def rest_lease(peers: int) -> float:
     """Seconds of silence that an agent with so many peers promises on its links at rest: the more, the longer.
 
     Two pings may be late, and the third a second. So an agent with links to all peers of a mesh of 200 has no more
-    keepalives a second than one with 50 peers.
+    keepalives a second than one with 150 peers.
     """
     interval = min(peers / limits.IDLE_KEEPALIVES_PER_SECOND, limits.IDLE_KEEPALIVE_INTERVAL_MAX)
     return max(limits.IDLE_LEASE, 3 * interval + 1)

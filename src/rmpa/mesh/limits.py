@@ -33,12 +33,12 @@ SILENT_GRACE: Final = 5.0
 # Why: The network is often back within seconds, and a longer attempt that began shortly before would wait for TCP's
 #   own repetition.
 PURSUIT: Final = 10.0
-# [Links] Time without a byte on a link at rest: above 50 peers 0.3 s each, at most 58 s
+# [Links] Time without a byte on a link at rest: above 150 peers 0.3 s each, at most 58 s
 # At it: the link is lost, and dialled again
 # Told in: log, `peer list`, `peer info` (*Pace*), diagnostics
-# Why: No route, no call and no request depends on such a link. Its silence is noticed later, and it costs a twentieth
-#   of the packets. Both ends agree on it; an earlier release never does (``mesh.keepalive.rest_lease``).
-IDLE_LEASE: Final = 16.0
+# Why: No route, no call and no request depends on such a link, and the silence of its peer's beacons has it checked
+#   after 16 s. It costs a sixtieth of the packets (``mesh.keepalive.rest_lease``).
+IDLE_LEASE: Final = 46.0
 # [Links] Time between keepalives of a link in use
 # At it: a ping is sent
 # Told in: `peer info` (*Pace*)
@@ -48,9 +48,9 @@ KEEPALIVE_INTERVAL: Final = 0.25
 # At it: a ping is sent
 # Told in: `peer info` (*Pace*)
 # Why: Two of them may be late before the link falls.
-IDLE_KEEPALIVE_INTERVAL: Final = 5.0
+IDLE_KEEPALIVE_INTERVAL: Final = 15.0
 # [Links] Keepalives a second on all links at rest
-# At it: above 50 peers each link has them more rarely
+# At it: above 150 peers each link has them more rarely
 # Told in: `peer info` (*Pace*)
 # Why: Some 3 KB/s.
 IDLE_KEEPALIVES_PER_SECOND: Final = 10.0

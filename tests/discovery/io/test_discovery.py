@@ -105,6 +105,34 @@ async def test_agents_on_one_machine_find_each_other(agents: list[Agent], settin
     assert trio[0].events[-1] == PeerEvent("lost", trio[2].identity, reason=membership.GOODBYE)
 
 
+async def test_heartbeats_of_many_members_wait_to_be_read_together_and_nothing_else_does(
+    agents: list[Agent], settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "HEARTBEATS_WAIT_MEMBERS", 1)
+    monkeypatch.setattr(limits, "HEARTBEATS_WAIT", 3600.0)
+    base = Agent("base", settings)
+    await start(agents, base)
+    counters, to = base.discovery.counters, (settings.multicast.group, settings.discovery_port)
+    other = Identity(Guid.of("127.0.0.1", free_port()), os.urandom(16), "other")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
+
+        def say(kind: BeaconKind, sequence: int) -> None:
+            out.sendto(Beacon(kind, other, 100_000, sequence).serialize(), to)
+
+        say(BeaconKind.HEARTBEAT, 1)  # while there is no member, it is read at once
+        await until(lambda: base.names() == {"other"})
+        heard = counters["beacon.in"]
+        say(BeaconKind.HEARTBEAT, 2)
+        for _ in range(20):
+            await asyncio.sleep(0)
+        assert counters["beacon.in"] == heard
+        say(BeaconKind.GOODBYE, 3)  # what waits is older: read afterwards, it would refute the goodbye
+        await until(lambda: not base.names())
+        assert counters["beacon.in"] == heard + 2
+        assert counters["beacon.late"] == 0
+
+
 async def test_garbage_is_counted_said_once_and_survived(
     agents: list[Agent], settings: Settings, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -314,10 +314,13 @@ class Serving:
         self._servers: dict[tuple[int, int], Server] = {}
         self._pools: dict[str, ServicePool] = {}
         self._tasks: set[asyncio.Task[None]] = set()
+        self._looking = False
 
-    def start(self) -> None:
-        """Begin to check that servers live."""
-        self._spawn(self._look_after(), "servers' liveness")
+    def look_after(self) -> None:
+        """Check that servers live, for as long as services are offered: a module without any sleeps meanwhile."""
+        if self._exports.offered and not self._looking:
+            self._looking = True
+            self._spawn(self._look_after(), "servers' liveness")
 
     async def close(self) -> None:
         """End all calls and all connections to servers."""
@@ -406,14 +409,13 @@ class Serving:
 
     async def _look_after(self) -> None:
         """Find killed servers: a node with an offered service whose port has no listener is suspected."""
-        while True:
-            servers, cost = list(self._exports.offered.items()), 0.0
-            if servers:
-                ports, here, cost = await asyncio.to_thread(_listening)
-                for service, server in yielding_to_data(servers):
-                    if self._exports.offered.get(service) == server and _is_deaf(server, ports, here):
-                        self._core.suspect(server.node)
+        while servers := list(self._exports.offered.items()):
+            ports, here, cost = await asyncio.to_thread(_listening)
+            for service, server in yielding_to_data(servers):
+                if self._exports.offered.get(service) == server and _is_deaf(server, ports, here):
+                    self._core.suspect(server.node)
             await sleep_to_tick(max(limits.SERVER_LOOK, 50 * cost))  # at most 2 % of the processor's time
+        self._looking = False
 
 
 def _listening() -> tuple[set[int] | None, frozenset[str], float]:

@@ -129,10 +129,9 @@ class Services(GraphPart):
 
     # --- the bridge's part -------------------------------------------------------------------------------------
 
-    def start(self) -> None:
-        """Follow the local graph, and check that the servers in it live."""
-        super().start()
-        self.serving.start()
+    def _settled(self) -> None:
+        """As of ``GraphPart``; the servers of what is offered now are looked after."""
+        self.serving.look_after()
 
     async def close(self) -> None:
         """End all calls and all connections to servers."""
