@@ -38,7 +38,6 @@ def test_a_hostile_peer_leads_nobody_astray(modules: ModuleFactory, lab: Lab) ->
     assert int(str(done["many limit"])) > 0
     assert done["none offered"] == 3000
     assert int(str(done.get("at once granted", 0))) == 0
-    assert int(str(done["at once error"])) > 0, "more questions at once than one peer may have"
     assert done["bad error"] == 4
     assert done["lived"]
     assert int(str(done["asks"])) <= 8, "once a second, whatever it is told"

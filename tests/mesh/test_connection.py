@@ -45,6 +45,19 @@ def test_every_split_of_the_handshake_in_two_is_the_same(time: Time) -> None:
         assert acceptor.events[0][0] == "hello"
 
 
+def test_a_peer_that_says_much_at_once_leaves_others_their_turn(acceptor: Side, dialler: Side, time: Time) -> None:
+    said = [b'{"op":"x","n":%d}' % number for number in range(2 * limits.FRAMES_AT_ONCE + 1)]
+    wire = memoryview(b"".join(map(dialler.pack_control, said)))
+    before = len(acceptor.events)
+    for turn in range(3):
+        consumed, wanted = acceptor.receive(wire, time.now)
+        assert wanted == (-1 if turn < 2 else 0)
+        wire = wire[consumed:]
+        assert len(acceptor.events) - before == min((turn + 1) * limits.FRAMES_AT_ONCE, len(said))
+    assert not wire
+    assert [payload for _, payload in acceptor.events[before:]] == said
+
+
 def test_data_arrives_as_a_view_without_a_copy(acceptor: Side, time: Time) -> None:
     seen: list[memoryview] = []
     acceptor.routes = AnyRoute(lambda _r, _s, _t, view: seen.append(view))

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import URGENT, Outbox
-from rmpa.runtime.stream import Stream
+from rmpa.runtime.stream import LATER, Stream
 from rmpa.runtime.tls import CollectedSends, after_read
 from tests.runtime.message_streams import End
 
@@ -105,6 +105,27 @@ async def test_ends_are_told_once_and_not_after_close(sockets: Sockets) -> None:
     assert other.send(b"x") == 0
     other.stream.feed(b"x")
     assert one.ends == []
+
+
+async def test_a_reader_may_leave_bytes_for_later_turns_in_which_nothing_else_is_read(sockets: Sockets) -> None:
+    seen: list[str] = []
+
+    def take_one(view: memoryview) -> tuple[int, int]:
+        seen.append(bytes(view[:1]).decode())
+        asyncio.get_running_loop().call_soon(seen.append, "another")
+        return 1, LATER if len(view) > 1 else 0
+
+    def end(_: Exception | None) -> None:
+        seen.append("end")
+
+    sockets[0].setblocking(False)
+    stream = Stream(sockets[0], on_bytes=take_one, on_close=end, outbox=Outbox(1, KIB))
+    sockets[1].send(b"abc")
+    sockets[1].close()  # what was sent before the end is read before it
+    await until(lambda: "end" in seen)
+    assert [word for word in seen if word != "another"] == ["a", "b", "c", "end"]
+    assert seen.index("another") < seen.index("c")
+    stream.close()
 
 
 async def test_finish_lets_what_waits_leave_and_reads_on(sockets: Sockets) -> None:

@@ -207,7 +207,8 @@ class ConnectionProtocol:
         """Take whole frames from the start of ``view``.
 
         Returns:
-            How many bytes were taken, and how many further bytes the next frame needs (0: a header, or nothing more).
+            How many bytes were taken, and how many further bytes the next frame needs (0: a header, or nothing more;
+            -1: none, but ``limits.FRAMES_AT_ONCE`` frames were handled that are no data, and others have their turn).
 
         Raises:
             RemoteProtocolError: The remote side broke the protocol; the connection is ``CLOSED``.
@@ -217,11 +218,11 @@ class ConnectionProtocol:
         if now - keepalive.sent > keepalive.lease:
             self.abandoned, self._proof = True, None
         size = len(view)
-        offset = 0
+        offset = handled = 0
         try:
             if self._missing:
                 offset = self._take_rest(view)
-            while size - offset >= _HEADER:
+            while size - offset >= _HEADER and handled < limits.FRAMES_AT_ONCE:
                 length, kind, flags, _, route, sequence, stamp_ns = frames.unpack_header(view, offset)
                 if (kind != _DATA or self.state is not ConnectionState.UP) and not self._admit(kind):
                     return size, 0
@@ -241,6 +242,7 @@ class ConnectionProtocol:
                 offset = end
                 if kind != _DATA:
                     self._handle(FrameKind(kind), view[start:end], route, sequence, stamp_ns, now)
+                    handled += 1
                 elif flags == WHOLE and (handler := self.routes.get(route)) is not None:
                     handler.message(sequence, stamp_ns, view[start:end])
                 else:
@@ -253,7 +255,8 @@ class ConnectionProtocol:
             self.malformed = True
             self._end(f"{self.name} broke the protocol: {error}")
             raise
-        return (size if self.state is ConnectionState.CLOSED else offset), 0
+        taken = size if self.state is ConnectionState.CLOSED else offset
+        return taken, -1 if size - taken >= _HEADER else 0
 
     def refuse(self, refuse: Refuse, now: float) -> None:
         """Refuse the connection, in the handshake or because its peer was revoked, and close it."""

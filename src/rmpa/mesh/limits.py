@@ -66,6 +66,9 @@ IDLE_KEEPALIVE_GRID: Final = 1.0
 # At it: the link is lost
 # Told in: log, `peer list`
 WAKE_TIMEOUT: Final = 1.5
+# Frames of one peer, other than data, that are handled before the other connections are served: a peer that sends
+# thousands of requests at once must not let them wait.
+FRAMES_AT_ONCE: Final = 16
 # [Links] Time without use of a link
 # At it: it rests: its keepalives become rare
 # Told in: `peer list` (*at rest*)

@@ -39,6 +39,9 @@ _CORK_BYTES: Final = 512 * KIB
 _PART: Final = MIB
 _NOTHING_COLLECTED: Final = contextlib.nullcontext()
 
+# Further bytes that a reader needs which leaves the rest of them for another turn, so that others get theirs.
+LATER: Final = -1
+
 OnBytes = Callable[[memoryview], tuple[int, int]]
 OnClose = Callable[[Exception | None], None]
 
@@ -49,8 +52,9 @@ class Stream:
     Args:
         sock: Connected, non-blocking; the stream owns and closes it.
         on_bytes: Called with all received bytes that are not consumed yet; returns ``(consumed, wanted)``: how many
-            bytes it took, and how many further bytes it needs before it can take more (0: unknown). The view is only
-            valid during the call. A ``RemoteProtocolError`` raised by it closes the stream with that error; any other
+            bytes it took, and how many further bytes it needs before it can take more (0: unknown; ``LATER``: none;
+            it is called again in another turn of the loop, and nothing is read meanwhile). The view is only valid
+            during the call. A ``RemoteProtocolError`` raised by it closes the stream with that error; any other
             exception is a bug, is logged, and closes the stream too.
         on_close: Called once when the socket is gone, from the loop and never from within a method: with ``None``
             after an orderly end, with the error otherwise. Not called after ``close()``.
@@ -94,6 +98,7 @@ class Stream:
         # Whether the socket is gone.
         self.closed = False
         self._reading_held = False
+        self._later: asyncio.Handle | None = None
         self._drained: asyncio.Future[None] | None = None
         self._report: asyncio.Handle | None = None
         self.bytes_in = 0
@@ -386,6 +391,8 @@ class Stream:
         if self.closed:
             return
         self.closed = True
+        if self._later is not None:
+            self._later.cancel()
         self._loop.remove_reader(self._fd)
         if self._writing:
             self._loop.remove_writer(self._fd)
@@ -426,7 +433,7 @@ class Stream:
             self._view = memoryview(buffer)
 
     def _readable(self, *, held: bool = False) -> None:
-        if self._reading_held and not held:
+        if self._later is not None or (self._reading_held and not held):
             return  # within ``_read_held``, whose handlers yield to data: its bytes come first
         try:
             count = self._sock.recv_into(self._view[self._filled :])
@@ -454,7 +461,7 @@ class Stream:
         """Read the bytes that were received with a record but found no room, as the loop does not see them."""
         self._reading_held = True
         try:
-            while self._secure is not None and self._secure.readable and not self.closed:
+            while self._secure is not None and self._secure.readable and not self.closed and self._later is None:
                 self._readable(held=True)
         finally:
             self._reading_held = False
@@ -488,7 +495,9 @@ class Stream:
             # Forwards within one buffer: memoryview assignment is a memmove, so an overlap is safe.
             self._view[:rest] = self._view[consumed : self._filled]
         self._filled = rest
-        self._wanted = wanted
+        self._wanted = max(0, wanted)
+        if wanted == LATER:
+            self._later = self._loop.call_soon(self._deliver_rest)
         if rest == len(self._buffer) or wanted > len(self._buffer):
             # A size that a peer claims is not allocated at once: the buffer grows with what has really arrived.
             self._reserve(min(max(wanted, 2 * rest), max(4 * rest, _FIRST_BUFFER)))
@@ -497,6 +506,11 @@ class Stream:
             self._buffer = bytearray(_FIRST_BUFFER)
             self._view = memoryview(self._buffer)
             self._view[:rest] = view[:rest]
+
+    def _deliver_rest(self) -> None:
+        self._later = None
+        self._deliver()
+        self._read_held()
 
     def _writable(self) -> None:
         """Send queued entries until the socket takes no more, or ``_WRITES`` system calls were made."""
