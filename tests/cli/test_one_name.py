@@ -11,6 +11,7 @@ import ssl
 import threading
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
+from unittest import mock
 
 import pytest
 
@@ -103,6 +104,33 @@ def test_an_authority_in_a_state_directory_of_its_own_is_not_forgotten(machine: 
     data = str(machine.path / "data")
     machine.says("trust", "init", "--name", "sec", RMPA_STATE_DIR=data)
     assert f"start with RMPA_STATE_DIR={data} --name sec;" in machine.says("up", "--name", "sec", code=1)
+
+
+@pytest.mark.parametrize("variable", ["RMPA_STATE_DIR", "XDG_STATE_HOME", "HOME"])
+@pytest.mark.parametrize("joined_with_it", [True, False])
+def test_no_variable_makes_a_start_miss_the_keys_of_this_user(
+    machine: Machine, variable: str, joined_with_it: bool
+) -> None:
+    pytest.importorskip("aiohttp")
+    pytest.importorskip("zenoh")
+    machine.environ["TEST_HOME"] = str(machine.path)  # the user's home, wherever HOME leads
+    elsewhere = {variable: str(machine.path / "elsewhere")}
+    with mock.patch.dict(machine.environ, elsewhere if joined_with_it else {}):
+        machine.says("trust", "init", "--name", "six")
+        machine.says("trust", "init", "--name", "six_gateway")
+    router = ("gateway", "--router", "--listen", f"tcp/127.0.0.1:{free_port()}")
+    starts = ("up", "--name", "six"), ("up", "--name", "other"), (*router, "--name", "six_gateway"), ("web",)
+    with mock.patch.dict(machine.environ, {} if joined_with_it else elsewhere):
+        for words in starts:
+            assert "would start without trust, beside keys of six, six_gateway in" in machine.says(*words, code=1)
+
+
+def test_a_join_says_where_no_note_of_it_can_be_kept(machine: Machine) -> None:
+    (machine.path / "file").write_text("")
+    machine.environ["TEST_HOME"] = str(machine.path / "file")
+    said = machine.says("trust", "init", "--name", "six")
+    assert f"a start without RMPA_STATE_DIR={machine.state} will miss these keys: {machine.path}/file/" in said
+    assert "write require = true into [trust]" in said
 
 
 def test_a_gateway_is_no_less_secure_than_the_agent_beside_it(machine: Machine) -> None:

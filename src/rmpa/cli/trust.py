@@ -229,6 +229,9 @@ def keep_member_name(module: Module) -> str:
 
     The name of another module that has keys itself stays. A gateway's is none of a module.
     """
+    if unnoted := module_name.note_state_dir(module.place):
+        missed = f"a start without RMPA_STATE_DIR={module.place} will miss these keys: {unnoted}"
+        warn(f"{missed}; write require = true into [trust] of rmpa.toml", "directory-unusable")
     if module.name.endswith(module_name.GATEWAY_SUFFIX):
         return f"rmpa gateway --name {module.name}"
     usual = ""
@@ -236,7 +239,6 @@ def keep_member_name(module: Module) -> str:
         kept = module_name.kept_name(module.place)
         if not kept or kept == module.name or not TrustStore(module.place, kept).exists:
             module_name.keep_name(module.place, module.name, instead=True)
-        module_name.note_state_dir(os.environ, module.place)
         config = {"config": module.loaded.settings.config_file}
         usual = load_settings(config, os.environ, host_name=socket.gethostname()).settings.name
     except RmpaError as error:
