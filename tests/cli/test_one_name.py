@@ -10,8 +10,8 @@ import socket
 import ssl
 import threading
 from typing import TYPE_CHECKING
-from urllib.parse import urlsplit
 from unittest import mock
+from urllib.parse import urlsplit
 
 import pytest
 

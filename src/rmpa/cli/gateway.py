@@ -18,7 +18,7 @@ import click
 from rmpa.cli.main import LazyGroup
 from rmpa.cli.options import Options, agent_verb, config_option, flag, setting_options, verb
 from rmpa.cli.output import print_text, warn
-from rmpa.cli.trust import find_module
+from rmpa.cli.trust import agent_settings, find_module
 from rmpa.config.module_name import GATEWAY_SUFFIX
 from rmpa.config.read import load_settings
 from rmpa.config.settings import WebSettings
@@ -333,10 +333,8 @@ def _setup(module: Module, settings: Settings) -> WebSetup:
     trusted = module.agent == "secured" or (store is not None and store.exists)
     if not trusted and module.socket is None:
         check_open(settings.trust, module.state, module.name, os.environ, "--agent")
-    own_file = str(settings.config_file.absolute()) if settings.config_file is not None else ""
-    if trusted and module.config_file not in ("", own_file):  # the permissions are those that its agent reads
-        theirs = load_settings({"config": module.config_file}, os.environ, host_name=socket.gethostname())
-        settings = replace(settings, trust=theirs.settings.trust)
+    if trusted:
+        settings = replace(settings, trust=agent_settings(module).settings.trust)
     files = certificate_files(settings.web.cert, settings.web.key, store if trusted else None)
     access = access_of(settings.web, module.name, os.environ, settings.state_dir)
     folder = str(store.folder) if store is not None else ""

@@ -18,7 +18,8 @@ from rmpa.cli.output import Table, duration, warn
 from rmpa.cli.units import STATE
 from rmpa.config import module_name
 from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, Access
-from rmpa.config.read import load_settings
+from rmpa.config.read import Loaded, load_settings
+from rmpa.config.settings import Settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError, missing_extra
 from rmpa.core.identity import is_global_name, peer_name_problem
 from rmpa.observe.control_client import ControlClient, find_agents, running_agents
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
     from rmpa.cli.output import Text
     from rmpa.config.module_name import ModuleName
-    from rmpa.config.read import Loaded
     from rmpa.trust.membership import Membership, MeshAuthority
 
 _T = TypeVar("_T")
@@ -198,6 +198,16 @@ def find_module(
     return Module(chosen, loaded, state, path, trust, agent.config_file, agent.pid)
 
 
+def agent_settings(module: Module) -> Loaded:
+    """The settings whose rules the module's agent applies: of its own file, also where this shell finds another."""
+    file = module.loaded.settings.config_file
+    if module.socket is None or module.config_file == (str(file.absolute()) if file is not None else ""):
+        return module.loaded
+    if not module.config_file:
+        return Loaded(Settings())
+    return load_settings({"config": module.config_file}, os.environ, host_name=socket.gethostname())
+
+
 def trust_verb(*parameters: Any) -> Callable[[Callable[..., None]], click.Command]:
     """A ``json_verb`` with ``--name`` and ``--config``, whose function gets the module that they mean."""
     name_option = click.option(
@@ -295,7 +305,8 @@ def grouped(digits: str) -> str:
 def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str | None, options: Options) -> None:
     """Say whether the [[permission]] rules of this module let PEER do something here, and which rule decides.
 
-    The exit code is 0 for yes and 1 for no. [bridge], [[peer]], [services] and [params] must allow it too.
+    PEER is a module, another site, ros2, or web for all clients of rmpa web. Without --config the rules are those that
+    the agent has read. The exit code is 0 for yes and 1 for no. [bridge], [[peer]], [services] and [params] must allow it too.
 
     ---
 
@@ -307,7 +318,8 @@ def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str
         raise ConfigError("PEER", problem)
     if not is_global_name(name):
         raise ConfigError("NAME", f"{name!r} is not a global name", "one looks like /cmd_vel")
-    loaded = load_settings({"config": config}, dict(os.environ), host_name=socket.gethostname())
+    module = find_module(None, {"config": config}, os.environ)
+    loaded = module.loaded if config else agent_settings(module)
     permissions = Permissions(loaded.settings.trust)
     action = what in (ACTION_CLIENT, ACTION_SERVER)  # five accesses in one
     asked = action_topics(what, name) if action else [(Access(what), name)]

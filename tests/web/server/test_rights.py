@@ -47,7 +47,7 @@ RULES = (
     PermissionRule(("web",), effect=Effect.DENY, names={"subscribe": ("/camera/**",), "publish": ("/odom",)}),
     PermissionRule(("tablet",), effect=Effect.DENY, names={"publish": ("/cmd_vel",)}),
 )
-SETTINGS = Settings(web=WebSettings(control=True), trust=TrustSettings(rules=RULES))
+SETTINGS = Settings(web=WebSettings(control=True), trust=TrustSettings(default="allow", rules=RULES))
 TOKEN = TokenAccess("secret-" * 6)
 
 
@@ -58,7 +58,7 @@ def setup(settings: Settings = SETTINGS, access: TokenAccess = TOKEN, *, trusted
 def denying(**names: tuple[str, ...]) -> NodeRules:
     """The rules of a node that may do everything but what ``names`` say."""
     rule = PermissionRule(("*",), effect=Effect.DENY, names=names)
-    return setup(replace(SETTINGS, trust=TrustSettings(rules=(rule,)))).rules
+    return setup(replace(SETTINGS, trust=TrustSettings(default="allow", rules=(rule,)))).rules
 
 
 RULED = setup().rules
