@@ -305,8 +305,9 @@ def grouped(digits: str) -> str:
 def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str | None, options: Options) -> None:
     """Say whether the [[permission]] rules of this module let PEER do something here, and which rule decides.
 
-    PEER is a module, another site, ros2, or web for all clients of rmpa web. Without --config the rules are those that
-    the agent has read. The exit code is 0 for yes and 1 for no. [bridge], [[peer]], [services] and [params] must allow it too.
+    PEER is a module, a site, ros2, or web for the clients of rmpa web. Without --config the rules are those that the
+    agent has read. The exit code is 0 for yes and 1 for no. [bridge], [[peer]], [services] and [params] must allow it
+    too.
 
     ---
 
