@@ -20,7 +20,7 @@ from rmpa.cli.options import Options, agent_verb, config_option, flag, setting_o
 from rmpa.cli.output import print_text, warn
 from rmpa.cli.trust import agent_settings, find_module
 from rmpa.config.module_name import GATEWAY_SUFFIX
-from rmpa.config.read import load_settings
+from rmpa.config.read import INSECURE, load_settings
 from rmpa.config.settings import WebSettings
 from rmpa.config.values import HOST, BadValue
 from rmpa.core.counters import configure_logging
@@ -300,7 +300,8 @@ def web(config: str | None, with_agent: bool, insecure: bool, options: Options, 
     module, setup = make()
     journal = in_journal(os.environ, sys.stderr.fileno())
     configure_logging(setup.settings.log_level, sys.stderr, as_json=setup.settings.log_json, in_journal=journal)
-    for note in module.loaded.notes:
+    said = [f"--insecure: {INSECURE['trust.insecure']}"] if insecure else []
+    for note in (*module.loaded.notes, *said):
         _web_log.warning("! %s [doubtful-setting]", note)
     from rmpa.web.server.process import serve
 

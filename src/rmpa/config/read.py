@@ -20,6 +20,7 @@ from rmpa.config.rules import contract_warnings
 from rmpa.config.schema import REMOVED
 from rmpa.config.settings import SETTINGS, Settings, json_schema
 from rmpa.config.values import BadValue, JsonSchema, Place, did_you_mean, shown, suggestion
+from rmpa.config.writers import other_writer
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_from
 
@@ -230,6 +231,11 @@ def _keys(schema: JsonSchema, table: Key = ()) -> Iterator[Key]:
 FILE_NAME: Final = "rmpa.toml"
 # Every environment variable of this program.
 VARIABLES: Final = ("RMPA_CONFIG", "RMPA_AGENT", *(setting.env for setting in SETTINGS if setting.env))
+# What each setting gives up that turns a protection off: said wherever it is true.
+INSECURE: Final = {
+    "trust.insecure": "true: a module without keys starts open, also beside keys of other modules",
+    "gateway.insecure": "true: endpoints beyond this machine may be plain, and any program there reads and writes",
+}
 _BY_NAME: Final = {setting.name: setting for setting in SETTINGS}
 
 
@@ -323,7 +329,7 @@ def load_settings(
     notes: list[str] = []
     named = options.get("config")
     path = find_config_file(str(named) if named else None, environ, cwd or Path(), notes)
-    from_file = _file_layer(path) if path is not None else {}
+    from_file = _file_layer(path, environ) if path is not None else {}
     for given in from_file.values():
         given.read()  # a mistake in the file is an error even where an option outweighs it
     from_variables, from_options = _variable_layer(environ, notes), _option_layer(options)
@@ -350,6 +356,9 @@ def load_settings(
         ("peers", peer_warnings(settings.peers)),
     ):
         notes += [str(strongest[name].error(text, "", at)) for at, text in warnings]
+    endpoints = (*settings.gateway.connect, *settings.gateway.listen)
+    stands = {"trust.insecure": settings.trust.insecure, "gateway.insecure": settings.gateway.insecure and endpoints}
+    notes += [str(strongest[name].error(text, "", ())) for name, text in INSECURE.items() if stands[name]]
     _check_core(strongest, notes, external=external)
     _check_together(settings, strongest)
     return Loaded(settings, tuple(notes), strongest, names)
@@ -435,8 +444,10 @@ def _named_file(named: str, source: str) -> Path:
     )
 
 
-def _file_layer(path: Path) -> _Layer:
+def _file_layer(path: Path, environ: Mapping[str, str]) -> _Layer:
     try:
+        if (writer := other_writer(path, environ)) is not None:
+            raise ConfigError("the file", f"is not obeyed: {writer[0]}", writer[1], path, code="settings-exposed")
         data = path.read_bytes()
     except OSError as error:
         raise ConfigError(
