@@ -199,3 +199,14 @@ def test_what_turns_a_protection_off_is_said_wherever_it_stands(file: Path, name
     assert said({"config": str(file)}, {}) == []
     gateway.clear()
     assert len(said({"insecure": True}, {})) == (name == "trust.insecure"), "no endpoint, so no plain one"
+
+
+def test_a_variable_that_outweighs_a_protection_of_the_file_is_said(file: Path) -> None:
+    file.write_text('[trust]\nrequire = true\ndefault = "deny"\ndirect = false\n')
+    weaker = {"RMPA_TRUST_REQUIRE": "0", "RMPA_TRUST_DEFAULT": "allow", "RMPA_TRUST_DIRECT": "1"}
+    notes = load_settings({"config": str(file)}, weaker, host_name="h", cwd=file.parents[1]).notes
+    assert notes == tuple(
+        f"{variable}: less secure than {file}:{line}, which it outweighs" for line, variable in enumerate(weaker, 2)
+    )
+    same = {"RMPA_TRUST_REQUIRE": "1", "RMPA_TRUST_DEFAULT": "deny", "RMPA_TRUST_DIRECT": "0"}
+    assert load_settings({"config": str(file)}, same, host_name="h", cwd=file.parents[1]).notes == ()

@@ -236,6 +236,8 @@ INSECURE: Final = {
     "trust.insecure": "true: a module without keys starts open, also beside keys of other modules",
     "gateway.insecure": "true: endpoints beyond this machine may be plain, and any program there reads and writes",
 }
+# The safer value of settings that protect: it is said where the file has it and a variable or option outweighs it.
+_SAFER: Final = {"trust.require": True, "trust.default": "deny", "trust.direct": False}
 _BY_NAME: Final = {setting.name: setting for setting in SETTINGS}
 
 
@@ -356,12 +358,21 @@ def load_settings(
         ("peers", peer_warnings(settings.peers)),
     ):
         notes += [str(strongest[name].error(text, "", at)) for at, text in warnings]
-    endpoints = (*settings.gateway.connect, *settings.gateway.listen)
-    stands = {"trust.insecure": settings.trust.insecure, "gateway.insecure": settings.gateway.insecure and endpoints}
-    notes += [str(strongest[name].error(text, "", ())) for name, text in INSECURE.items() if stands[name]]
+    notes += [str(strongest[name].error(text, "", ())) for name, text in _insecure(settings, strongest, from_file)]
     _check_core(strongest, notes, external=external)
     _check_together(settings, strongest)
     return Loaded(settings, tuple(notes), strongest, names)
+
+
+def _insecure(settings: Settings, strongest: _Layer, from_file: _Layer) -> Iterator[tuple[str, str]]:
+    """The settings that turn a protection off, each with what it gives up."""
+    if settings.trust.insecure:
+        yield "trust.insecure", INSECURE["trust.insecure"]
+    if settings.gateway.insecure and (settings.gateway.connect or settings.gateway.listen):
+        yield "gateway.insecure", INSECURE["gateway.insecure"]
+    for name, safer in _SAFER.items():
+        if name in from_file and from_file[name].read() == safer != strongest[name].read():
+            yield name, f"less secure than {from_file[name]}, which it outweighs"
 
 
 def _name_in(layer: _Layer) -> str:
