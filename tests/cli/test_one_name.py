@@ -194,6 +194,7 @@ def test_the_web_server_is_as_secure_as_the_agent_whatever_their_names(machine: 
     token = (machine.state / "sec/web-token").read_text().strip()
     statuses = asyncio.run(_statuses(ca, urlsplit(url_of(machine)).port or 0, token))
     assert [("web may not" in text) for text in statuses] == [True, True], statuses
+    assert "no [[permission]] lets web do anything: its clients see names alone" in machine.log("web")
     # A browser that knows the CA opens the page by each name and address of this machine.
     addresses = [str(address) for interface in list_interfaces() for address in interface.addresses]
     hosts = page_hosts((*host_names(socket.gethostname()), *sorted(addresses)))

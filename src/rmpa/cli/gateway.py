@@ -28,7 +28,7 @@ from rmpa.core.errors import ConfigError, StartError, UnreachableError, missing_
 from rmpa.core.identity import peer_name_from
 from rmpa.observe.control_client import ControlClient, find_agents
 from rmpa.runtime.process import LogWriter, in_journal
-from rmpa.trust.permissions import TrustStatus
+from rmpa.trust.permissions import Permissions, TrustStatus
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -315,6 +315,8 @@ def web(config: str | None, with_agent: bool, insecure: bool, options: Options, 
         sys.stdout.flush()
 
     while True:
+        if setup.trusted and not Permissions(setup.settings.trust).knows("web"):
+            _web_log.warning("! no [[permission]] lets web do anything: its clients see names alone [not-permitted]")
         pinned = module.name if module.chosen.source.said else None
         if not asyncio.run(serve(setup, pinned, announce, with_agent=with_agent, load=lambda: make()[1])):
             return 0

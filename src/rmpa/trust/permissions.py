@@ -123,6 +123,11 @@ class Permissions:
                 return PermissionDecision(True, f"trust.relays has {glob!r}")
         return PermissionDecision(False, f"trust.relays does not have {module}")
 
+    def knows(self, module: str) -> bool:
+        """Whether a module may do anything, as far as rules say."""
+        found = self._decisions(module).values()
+        return self._settings.default == Effect.ALLOW or any(each.allowed for rules in found for _, each in rules)
+
     def groups_of(self, module: str) -> tuple[str, ...]:
         """The groups that a module is in, in the order of the file."""
         return tuple(name for name, globs in self._groups.items() if _first(globs, module) is not None)
