@@ -199,7 +199,7 @@ def test_a_members_program_at_the_router_hears_nothing_that_no_site_may_have(joi
         keys: set[str] = set()
 
         def hears(topic: str) -> bool:
-            keys.update(event["key"] for event in spy.events("heard"))
+            keys.update(str(event["key"]) for event in spy.events("heard"))
             return any(key.endswith(f"/to/yard/t/std_msgs%UInt8MultiArray{topic}") for key in keys)
 
         eventually(
