@@ -121,6 +121,9 @@ def test_no_variable_makes_a_start_miss_the_keys_of_this_user(
     router = ("gateway", "--router", "--listen", f"tcp/127.0.0.1:{free_port()}")
     starts = ("up", "--name", "six"), ("up", "--name", "other"), (*router, "--name", "six_gateway"), ("web",)
     with mock.patch.dict(machine.environ, {} if joined_with_it else elsewhere):
+        status = machine.says("trust", "status", "--name", "six")
+        assert "trust is off: six" in status
+        assert "six, six_gateway; RMPA_STATE_DIR=" in status
         for words in starts:
             assert "would start without trust, beside keys of six, six_gateway in" in machine.says(*words, code=1)
 

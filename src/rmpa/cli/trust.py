@@ -25,7 +25,7 @@ from rmpa.core.identity import is_global_name, peer_name_problem
 from rmpa.observe.control_client import ControlClient, find_agents, running_agents
 from rmpa.runtime.process import restart_text
 from rmpa.trust.permissions import Permissions, TrustReply, TrustStatus, action_topics
-from rmpa.trust.store import TrustStore, modules_with_keys
+from rmpa.trust.store import TrustStore, keys_elsewhere, modules_with_keys
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -392,7 +392,10 @@ def trust_status(module: Module, options: Options) -> None:
             if others := modules_with_keys(module.place):
                 status = f"rmpa trust status --name {others[0]}"
                 yield f"with keys in {module.place}: {', '.join(others)}; {status}"
-            else:
+            for place, there in keys_elsewhere(module.state, os.environ):
+                others += there
+                yield f"with keys in {place}: {', '.join(there)}; RMPA_STATE_DIR={place} rmpa trust status"
+            if not others:
                 yield "make one: rmpa trust init; or join one: rmpa trust join TOKEN"
         for problem in shown.problems:
             warn(problem, "certificate-trouble")
