@@ -488,9 +488,8 @@ def check_open(
     if here:
         start = [f"start as {name}: {option} {name}" for name in _startable(here, module)]
         raise _refused(module, f"{_listed(here)} here in {state}", start)
-    for place, there in sorted(
-        keys_elsewhere(state, environ), key=lambda each: module not in each[1]
-    ):  # first where its own keys are
+    # First where its own keys are.
+    for place, there in sorted(keys_elsewhere(state, environ), key=lambda each: module not in each[1]):
         names = [module] if module in there else _startable(there, module)
         start = [f"start with RMPA_STATE_DIR={place} {option} {name}" for name in names]
         raise _refused(module, f"{_listed(there)} in {place}", start)

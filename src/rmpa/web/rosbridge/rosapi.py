@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from urllib.parse import urlsplit
 
-from rmpa.core.errors import RmpaError
+from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import parse_definition
 from rmpa.ros.types.installed import ServiceType
@@ -285,8 +285,10 @@ class Rosapi:
         if name.startswith("/"):
             return {"global_name": graph_name(name) if self._is_parameter(graph_name(name)) else ""}
         first = graph_name(name).split("/")[1]
-        found = (each for each in (NAMESPACE, "/") if self._is_parameter(f"{each}{first}"))
-        return {"global_name": next((graph_name(f"{each}{name}") for each in found), "")}
+        with contextlib.suppress(PeerRefused):  # below its name, where rules seldom let anything be read
+            if self._is_parameter(f"{NAMESPACE}{first}"):
+                return {"global_name": graph_name(f"{NAMESPACE}{name}")}
+        return {"global_name": graph_name(f"/{name}") if self._is_parameter(f"/{first}") else ""}
 
     def _answer_delete_param(self, name: str) -> Answer:
         self._client.check_command("delete parameters")
