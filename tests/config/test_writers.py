@@ -13,6 +13,7 @@ import pytest
 from rmpa.config.read import INSECURE, load_settings
 from rmpa.config.writers import other_writer
 from rmpa.core.errors import ConfigError
+from rmpa.gateway.ros2.pairs import TypeMapping
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -116,6 +117,8 @@ def test_a_file_that_another_user_may_write_is_not_obeyed(
     )
     with pytest.raises(ConfigError, match="is not obeyed"):  # found in the folder where root stands
         load_settings({}, {}, host_name="h", cwd=file.parent)
+    with pytest.raises(ConfigError, match=r"ros2\.mapping: is not obeyed"):  # a file that the settings name
+        TypeMapping().read(file)
 
 
 @root

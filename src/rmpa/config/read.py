@@ -20,7 +20,7 @@ from rmpa.config.rules import contract_warnings
 from rmpa.config.schema import REMOVED
 from rmpa.config.settings import SETTINGS, Settings, json_schema
 from rmpa.config.values import BadValue, JsonSchema, Place, did_you_mean, shown, suggestion
-from rmpa.config.writers import other_writer
+from rmpa.config.writers import check_writers
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_from
 
@@ -457,8 +457,7 @@ def _named_file(named: str, source: str) -> Path:
 
 def _file_layer(path: Path, environ: Mapping[str, str]) -> _Layer:
     try:
-        if (writer := other_writer(path, environ)) is not None:
-            raise ConfigError("the file", f"is not obeyed: {writer[0]}", writer[1], path, code="settings-exposed")
+        check_writers(path, environ, "the file")
         data = path.read_bytes()
     except OSError as error:
         raise ConfigError(

@@ -13,9 +13,22 @@ import pwd
 import stat
 from typing import TYPE_CHECKING
 
+from rmpa.core.errors import ConfigError
+
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
     from pathlib import Path
+
+
+def check_writers(path: Path, environ: Mapping[str, str], key: str) -> None:
+    """Refuse a file of settings that another user may write; arguments as for ``other_writer``, and what names it.
+
+    Raises:
+        ConfigError: One may.
+        OSError: A part of the path is gone.
+    """
+    if (found := other_writer(path, environ)) is not None:
+        raise ConfigError(key, f"is not obeyed: {found[0]}", found[1], path, code="settings-exposed")
 
 
 def other_writer(path: Path, environ: Mapping[str, str]) -> tuple[str, str] | None:
