@@ -16,7 +16,9 @@ import pytest
 from blockbuster import blockbuster_ctx
 from hypothesis import HealthCheck, settings
 
+import lab.bed.user.sitecustomize  # noqa: F401 - in these processes too
 from lab.bed import namespaces
+from lab.bed.agents import USER
 from tests import probes
 from tests.interop import ros
 
@@ -162,6 +164,7 @@ def state_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     home = tmp_path_factory.mktemp("state")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(home))
+        patch.setenv("PYTHONPATH", USER)
         yield home
 
 
@@ -172,3 +175,4 @@ def clean_environment(monkeypatch: pytest.MonkeyPatch, state_home: Path) -> None
     for name in list(os.environ):
         if name.startswith(("ROS_", "RMPA_")) or name in _TAKEN:
             monkeypatch.delenv(name)
+    monkeypatch.setenv("PYTHONPATH", USER)

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot import Snapshot
 
 RMPA: Final = Path(sys.executable).with_name("rmpa")
+# In PYTHONPATH: the password database names the home directory of the program's host, as one of a machine of its own.
+USER: Final = str(Path(__file__).with_name("user"))
 _numbers = itertools.count(1)
 
 
@@ -117,7 +119,7 @@ class Agent:
             "RMPA_STATE_DIR": str(self.home / "state" / self.host.name),
             "XDG_STATE_HOME": str(self.home / "state" / self.host.name),  # each host is a machine of its own
         }
-        return {**kept, **places, "PYTHONUNBUFFERED": "1"}
+        return {**kept, **places, "PYTHONUNBUFFERED": "1", "PYTHONPATH": USER}
 
     @property
     def command(self) -> list[str]:

@@ -10,6 +10,7 @@ import socket
 import ssl
 import threading
 from typing import TYPE_CHECKING
+from unittest import mock
 from urllib.parse import urlsplit
 
 import pytest
@@ -105,6 +106,36 @@ def test_an_authority_in_a_state_directory_of_its_own_is_not_forgotten(machine: 
     assert f"start with RMPA_STATE_DIR={data} --name sec;" in machine.says("up", "--name", "sec", code=1)
 
 
+@pytest.mark.parametrize("variable", ["RMPA_STATE_DIR", "XDG_STATE_HOME", "HOME"])
+@pytest.mark.parametrize("joined_with_it", [True, False])
+def test_no_variable_makes_a_start_miss_the_keys_of_this_user(
+    machine: Machine, variable: str, joined_with_it: bool
+) -> None:
+    pytest.importorskip("aiohttp")
+    pytest.importorskip("zenoh")
+    machine.environ["TEST_HOME"] = str(machine.path)  # the user's home, wherever HOME leads
+    elsewhere = {variable: str(machine.path / "elsewhere")}
+    with mock.patch.dict(machine.environ, elsewhere if joined_with_it else {}):
+        machine.says("trust", "init", "--name", "six")
+        machine.says("trust", "init", "--name", "six_gateway")
+    router = ("gateway", "--router", "--listen", f"tcp/127.0.0.1:{free_port()}")
+    starts = ("up", "--name", "six"), ("up", "--name", "other"), (*router, "--name", "six_gateway"), ("web",)
+    with mock.patch.dict(machine.environ, {} if joined_with_it else elsewhere):
+        status = machine.says("trust", "status", "--name", "six")
+        assert "trust is off: six" in status
+        assert "six, six_gateway; RMPA_STATE_DIR=" in status
+        for words in starts:
+            assert "would start without trust, beside keys of six, six_gateway in" in machine.says(*words, code=1)
+
+
+def test_a_join_says_where_no_note_of_it_can_be_kept(machine: Machine) -> None:
+    (machine.path / "file").write_text("")
+    machine.environ["TEST_HOME"] = str(machine.path / "file")
+    said = machine.says("trust", "init", "--name", "six")
+    assert f"a start without RMPA_STATE_DIR={machine.state} will miss these keys: {machine.path}/file/" in said
+    assert "write require = true into [trust]" in said
+
+
 def test_a_gateway_is_no_less_secure_than_the_agent_beside_it(machine: Machine) -> None:
     pytest.importorskip("zenoh")
     machine.says("trust", "init", "--name", "sec")
@@ -166,6 +197,7 @@ def test_the_web_server_is_as_secure_as_the_agent_whatever_their_names(machine: 
     token = (machine.state / "sec/web-token").read_text().strip()
     statuses = asyncio.run(_statuses(ca, urlsplit(url_of(machine)).port or 0, token))
     assert [("web may not" in text) for text in statuses] == [True, True], statuses
+    assert "no [[permission]] lets web do anything: its clients see names alone" in machine.log("web")
     # A browser that knows the CA opens the page by each name and address of this machine.
     addresses = [str(address) for interface in list_interfaces() for address in interface.addresses]
     hosts = page_hosts((*host_names(socket.gethostname()), *sorted(addresses)))

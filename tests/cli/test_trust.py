@@ -7,12 +7,21 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.bridge.policy import PermissionGate
 from rmpa.cli import trust
-from rmpa.core.errors import StartError
+from rmpa.config.peer_rules import Access
+from rmpa.config.read import load_settings
+from rmpa.core.errors import PeerRefused, StartError
+from rmpa.gateway.rules import CrossingRules, ForeignSource, SourceKind
+from rmpa.trust.permissions import Permissions
 from rmpa.trust.store import TrustStore
+from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup
 from tests.cli.conftest import compare
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.config.settings import Settings
     from tests.cli.conftest import Place
 
 FILE = """
@@ -54,3 +63,67 @@ def test_keys_of_the_service_take_sudo(place: Place, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(os, "geteuid", lambda: uid)
     code, _, error = place.run("trust", "join", "rmpa1-secret", "--name", "arm")
     assert (code, words in error, "secret" in error) == (1, True, False)
+
+
+ASKED = """
+[trust]
+default = "{default}"
+[[permission]]
+modules = ["web", "hall", "arm"]
+publish = ["/open/**"]
+subscribe = ["/open/**"]
+call = ["/open/**"]
+serve = ["/open/**"]
+param = ["/open/**"]
+kill = ["/open/**"]
+[[permission]]
+modules = ["*"]
+effect = "deny"
+publish = ["/secret"]
+subscribe = ["/secret"]
+call = ["/secret"]
+serve = ["/secret"]
+param = ["/secret"]
+kill = ["/secret"]
+"""
+
+
+def _web(settings: Settings, access: Access, _asker: str, name: str) -> bool:
+    setup = WebSetup(settings, TokenAccess("secret-" * 6), CertificateFiles(), trusted=True)
+    try:
+        setup.rules.check(access, name)
+    except PeerRefused as error:
+        assert error.code == "not-permitted"  # noqa: PT017 - a yes has no error
+        return False
+    return True
+
+
+def _peer(settings: Settings, access: Access, asker: str, name: str) -> bool:
+    return PermissionGate(Permissions(settings.trust)).admits(access, asker, name)
+
+
+def _site(settings: Settings, access: Access, asker: str, name: str) -> bool:
+    rules = CrossingRules(settings.gateway.rules, gate=PermissionGate(Permissions(settings.trust)))
+    if access in (Access.PUBLISH, Access.SERVE):
+        kind = SourceKind.TOPIC if access is Access.PUBLISH else SourceKind.SERVICE
+        return rules.incoming(ForeignSource(kind, asker, "m", "/n", name, "std_msgs/String")).allowed
+    return not rules.denial(asker, name, access)
+
+
+@pytest.mark.parametrize("default", ["allow", "deny"])
+@pytest.mark.parametrize(
+    ("asker", "enforced"), [("web", _web), ("arm", _peer), ("other", _peer), ("hall", _site), ("ros2", _site)]
+)
+def test_the_check_says_what_is_enforced(
+    place: Place, default: str, asker: str, enforced: Callable[[Settings, Access, str, str], bool]
+) -> None:
+    (place.path / "rmpa.toml").write_text(ASKED.format(default=default))
+    options = {"config": str(place.path / "rmpa.toml")}
+    settings = load_settings(options, {}, host_name="h").settings
+    found = set()
+    for access in Access:
+        for name in ("/open/a", "/secret", "/other"):
+            code, said, error = place.run("trust", "check", asker, str(access), name)
+            assert (code == 0) == enforced(settings, access, asker, name), (access, name, said, error)
+            found.add(code == 0)
+    assert found == {True, False} or (asker in ("other", "ros2") and default == "deny")

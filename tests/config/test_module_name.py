@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import pwd
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from rmpa.config import module_name
 from rmpa.config.module_name import (
     NAME_FILE,
     ModuleName,
@@ -103,13 +105,78 @@ def test_a_name_that_root_keeps_belongs_to_the_user_of_the_agent_wherever_links_
     assert (os.geteuid(), os.getegid(), os.getgroups(), Path.cwd()) == rights
 
 
-def test_a_state_directory_of_its_own_is_noted_in_the_usual_one(tmp_path: Path) -> None:
-    environ = {"HOME": str(tmp_path), "RMPA_STATE_DIR": str(tmp_path / "data")}
-    usual = tmp_path / ".local/state/rmpa"
-    assert usual_state_dirs(environ) == [usual]
+@pytest.fixture
+def users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[int, Path]:
+    """The home directory of each user, as the password database of a test has it."""
+    homes = {os.geteuid(): tmp_path / "home"}
+    homes[os.geteuid()].mkdir()
+
+    def getpwuid(user: int) -> pwd.struct_passwd:
+        return pwd.struct_passwd((str(user), "x", user, 0, "", str(homes[user]), "/bin/sh"))
+
+    monkeypatch.setattr(pwd, "getpwuid", getpwuid)
+    return homes
+
+
+def test_a_state_directory_is_noted_where_no_variable_leads_and_found_by_every_start(
+    tmp_path: Path, users: dict[int, Path]
+) -> None:
+    (data := tmp_path / "data").mkdir()
+    usual = tmp_path / "home/.local/state/rmpa"
     for _ in range(2):
-        note_state_dir(environ, tmp_path / "data")
-    assert other_state_dirs(environ, usual)[:1] == [tmp_path / "data"]
-    assert other_state_dirs(environ, tmp_path / "third")[:2] == [usual, tmp_path / "data"]
-    note_state_dir(environ, usual)
-    assert (usual / "state-directories").read_text() == f"{tmp_path / 'data'}\n"
+        assert note_state_dir(data) == ""
+    assert (usual / "state-directories").read_text() == f"{data}\n"
+    starts: list[dict[str, str]] = [
+        {},
+        {"HOME": str(tmp_path / "elsewhere")},
+        {"XDG_STATE_HOME": str(tmp_path / "xdg"), "HOME": str(tmp_path / "home")},
+        {"RMPA_STATE_DIR": str(tmp_path / "third"), "HOME": "/nonexistent", "SUDO_UID": "99999999999999999999"},
+    ]
+    for environ in starts:
+        assert {usual, data} <= set(other_state_dirs(environ, tmp_path / "third")), environ
+        assert usual not in other_state_dirs(environ, usual)
+        assert usual_state_dirs(environ)[-1] == usual
+    for known in (usual, Path("/var/lib/rmpa")):  # every start looks there
+        assert note_state_dir(known) == ""
+    assert (usual / "state-directories").read_text() == f"{data}\n"
+
+
+def test_a_note_of_an_earlier_release_is_found_where_the_variables_still_lead(
+    tmp_path: Path, users: dict[int, Path]
+) -> None:
+    (tmp_path / "xdg/rmpa").mkdir(parents=True)
+    (tmp_path / "xdg/rmpa/state-directories").write_text("/data\n")
+    assert Path("/data") in other_state_dirs({"XDG_STATE_HOME": str(tmp_path / "xdg")}, None)
+
+
+def test_why_a_state_directory_cannot_be_noted_is_said(
+    tmp_path: Path, users: dict[int, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "home/.local").write_text("")
+    assert "state-directories: Not a directory" in note_state_dir(tmp_path)
+    (tmp_path / "home/.local").unlink()
+    assert note_state_dir(tmp_path) == ""
+    monkeypatch.setattr(module_name, "_READ_MAX", 70)
+    (tmp_path / ("a" * 60)).mkdir()
+    assert note_state_dir(tmp_path / ("a" * 60)).endswith("state-directories is full")
+    users.clear()
+    assert note_state_dir(tmp_path) == f"user {os.geteuid()} has no home directory in the password database"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root writes for another user")
+def test_root_notes_a_directory_of_another_user_for_that_one_too_with_its_rights(
+    tmp_path: Path, users: dict[int, Path]
+) -> None:
+    (data := tmp_path / "data").mkdir()
+    os.chown(data, 65534, 65534)
+    users[65534] = tmp_path / "nobody"
+    users[65534].mkdir()
+    assert note_state_dir(data) == f"{users[65534]} does not belong to user 65534"
+    os.chown(users[65534], 65534, 65534)
+    for folder in (tmp_path, *tmp_path.parents):
+        if folder.stat().st_uid == 0 and folder != Path("/"):
+            folder.chmod(folder.stat().st_mode | 0o011)
+    assert note_state_dir(data) == ""
+    for home, owner in ((users[0], 0), (users[65534], 65534)):
+        note = home / ".local/state/rmpa/state-directories"
+        assert (note.read_text(), note.stat().st_uid) == (f"{data}\n", owner)

@@ -155,6 +155,13 @@ async def test_other_permissions_open_a_session_that_listens_anew(settings: Call
         assert bed.events == ["started in g", "closed", "session closed", "started in g"]
 
 
+async def test_other_permissions_make_the_neighbours_anew_since_they_decide_what_is_offered(bed: Bed) -> None:
+    async with started(bed) as gateway:
+        gateway.agent.apply_settings(replace(bed.settings, trust=TrustSettings(default="allow")))
+        await until(lambda: bed.events == ["started in g", "closed", "started in g"])
+        assert gateway.session is bed.sessions[0]
+
+
 async def test_a_router_that_comes_later_is_joined_then(bed: Bed) -> None:
     bed.failures = 2
     async with started(bed) as gateway:

@@ -58,6 +58,8 @@ def test_what_one_site_may_have_is_offered_and_refused_to_the_others() -> None:
     assert out(rules, "/scan").allowed
     assert rules.refusal("cloud", "arm", "/scan") == ""
     assert "gateway.rule 2" in rules.refusal("yard", "arm", "/scan")
+    assert rules.refusal("", "arm", "/scan").endswith("lets it not go out to a program without a site")
+    assert out(CrossingRules((CrossingRule(crossing=Crossing.NONE),)), "/scan").why.endswith("lets it not go out")
     assert not into(rules, "/scan", "yard").allowed
 
 
@@ -65,7 +67,7 @@ def test_what_one_site_may_not_have_is_offered_to_the_others() -> None:
     rules = CrossingRules((CrossingRule(sites=("cloud",), crossing=Crossing.IN),))
     assert out(rules, "/scan").addressed
     assert out(rules, "/scan").allowed
-    assert "cloud" in rules.refusal("cloud", "arm", "/scan")
+    assert rules.refusal("cloud", "arm", "/scan").endswith("lets it not go out to cloud")
     assert rules.refusal("yard", "arm", "/scan") == ""
 
 
@@ -132,7 +134,8 @@ def test_permissions_stand_above_the_rules_and_what_they_refuse_is_counted() -> 
     assert rules.refusal("cloud", "arm", "/stop", Access.CALL) == ""
     assert "do not let cloud call /off" in rules.refusal("cloud", "arm", "/off", Access.CALL)
     assert rules.refusal("cloud", "arm", "/arm/speed", Access.PARAM) == ""
-    assert rules.refusal("", "arm", "/arm/speed", Access.PARAM), "a program that names no site"
+    nobody = rules.refusal("", "arm", "/arm/speed", Access.PARAM)
+    assert nobody == "the permissions there do not let a program without a site read or set /arm/speed"
     assert (counters["permission.publish"], counters["permission.call"], counters["permission.param"]) == (2, 1, 1)
 
 

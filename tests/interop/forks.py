@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from lab.bed import processes
-from lab.bed.agents import RMPA
+from lab.bed.agents import RMPA, USER
 from lab.bed.ros import PYTHON
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class ForkServer:
         argv = [python, str(Path(__file__).with_name("fork_server.py")), *modules]
         self._child = subprocess.Popen(
             [*processes.tied_to_us(), *argv],
-            env={**kept, "PYTHONUNBUFFERED": "1"},
+            env={**kept, "PYTHONUNBUFFERED": "1", "PYTHONPATH": USER},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             process_group=0,

@@ -80,6 +80,29 @@ except zenoh.ZError:
 """
 
 
+# A member's program that hears all that it can: it says each new key, of messages and of announcements.
+SPY: Final = """
+import sys, json, time, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
+tls = {"root_ca_certificate": "ca.crt", "connect_certificate": "module.crt", "connect_private_key": "module.key"}
+for key, name in tls.items():
+    config.insert_json5("transport/link/tls/" + key, json.dumps(sys.argv[2] + "/" + name))
+config.insert_json5("transport/link/tls/enable_mtls", "true")
+config.insert_json5("transport/link/tls/verify_name_on_connect", "false")
+session, seen = zenoh.open(config), set()
+def heard(sample):
+    key = str(sample.key_expr)
+    if key not in seen:
+        seen.add(key)
+        print("@", json.dumps({"event": "heard", "key": key}), flush=True)
+ears = [session.declare_subscriber("rmpa/1/**", heard)]
+ears += [session.liveliness().declare_subscriber("rmpa/1/**", heard, history=True)]
+time.sleep(1000)
+"""
+
+
 @pytest.fixture(scope="module")
 def joined(tmp_path_factory: pytest.TempPathFactory) -> Iterator[JoinedModules]:
     """Both sites with their modules, gateways and shells."""
@@ -163,6 +186,27 @@ def test_a_parameter_is_had_by_way_of_gateways_only_as_its_owner_permits(joined:
     assert arm.rmpa("param", "get", "/shown")[1].split() == ["secret:", "42", "speed:", "7"]
     code, output = arm.rmpa("param", "get", "/", "--peer", "warehouse/arm")
     assert (code, "of this very site" in output) == (1, True), output
+
+
+def test_a_members_program_at_the_router_hears_nothing_that_no_site_may_have(joined: JoinedModules) -> None:
+    place = joined.warehouse.gateway
+    words = [joined.net.endpoint, str(place.home / "state" / place.host.name / place.name / "trust")]
+    with (
+        joined.arm.ros.roscpp("talker", "__name:=spied", topic="/secret", rate=50),
+        joined.arm.ros.roscpp("talker", "__name:=told", topic="/told", rate=50),
+        Process(joined.arm.host.command([sys.executable, "-u", "-c", SPY, *words]), name="spy") as spy,
+    ):
+        keys: set[str] = set()
+
+        def hears(topic: str) -> bool:
+            keys.update(str(event["key"]) for event in spy.events("heard"))
+            return any(key.endswith(f"/to/yard/t/std_msgs%UInt8MultiArray{topic}") for key in keys)
+
+        eventually(
+            lambda: "/secret" in place.rmpa("topic", "list")[1], LONG, what="the topic at the gateway", every=0.3
+        )
+        eventually(lambda: hears("/told"), LONG, what="what the yard may have", every=0.2)
+        assert not any("secret" in key for key in keys), keys
 
 
 @pytest.mark.parametrize("how", ["plain", "tls", "tls and the CA"])

@@ -236,3 +236,28 @@ def test_a_mistake_is_named_with_its_line(tmp_path: Path, text: str, line: int, 
 def test_too_many_rules_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="4097 rules; at most 4096"):
         _load(tmp_path, "[[permission]]\nmodules = ['*']\ncall = ['/a']\n" * 4097)
+
+
+NAMES = st.sampled_from(["/a", "/a/b", "/m1", "/m1/x"])
+GLOBS = st.sampled_from(["/a", "/*", "/**", "/{peer}/**", "/a/*"])
+SOME_RULES = st.lists(
+    st.builds(
+        lambda modules, effect, glob: PermissionRule((modules,), effect=effect, names={"subscribe": (glob,)}),
+        st.sampled_from(["*", "m1", "m*"]),
+        st.sampled_from(Effect),
+        GLOBS,
+    ),
+    max_size=4,
+)
+
+
+@given(SOME_RULES, st.sampled_from(Effect), NAMES)
+def test_what_is_decided_for_all_is_decided_so_for_each(
+    rules: list[PermissionRule], default: Effect, name: str
+) -> None:
+    permissions = Permissions(TrustSettings(default=str(default), rules=tuple(rules)))
+    decision = permissions.judge_all(Access.SUBSCRIBE, "any other site", name)
+    each = {permissions.judge(Access.SUBSCRIBE, module, name).allowed for module in ("a", "m1", "m2", "other")}
+    assert decision is None or each == {decision.allowed}
+    if not any(glob != "*" for rule in rules for glob in rule.modules) and "{peer}" not in str(rules):
+        assert decision is not None

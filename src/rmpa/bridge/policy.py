@@ -227,6 +227,10 @@ class PermissionGate:
                 return own
         return decision
 
+    def judge_all(self, access: Access, whom: str, name: str) -> PermissionDecision | None:
+        """The decision that holds for all modules and sites alike, as ``Permissions.judge_all`` says."""
+        return _WITHOUT_TRUST if self.permissions is None else self.permissions.judge_all(access, whom, name)
+
     def may_relay(self, relay: str) -> bool:
         """Whether a peer may pass on what others offer."""
         return self.permissions is None or self.permissions.may_relay(relay).allowed

@@ -99,7 +99,7 @@ def former(environ: Mapping[str, str], root: str = "") -> Former:
         return Former("", None, None, "", Settings())
     caller = environ.get("SUDO_UID", "")
     user = pwd.getpwuid(int(caller) if caller.isdecimal() else os.geteuid())
-    home = {"HOME": user.pw_dir}
+    home = {"HOME": user.pw_dir, "SUDO_UID": caller}
     loaded = load_settings({}, home, host_name=socket.gethostname(), cwd=Path("/"))
     chosen = choose_name(loaded.names)
     config = loaded.settings.config_file

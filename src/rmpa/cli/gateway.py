@@ -18,9 +18,9 @@ import click
 from rmpa.cli.main import LazyGroup
 from rmpa.cli.options import Options, agent_verb, config_option, flag, setting_options, verb
 from rmpa.cli.output import print_text, warn
-from rmpa.cli.trust import find_module
+from rmpa.cli.trust import agent_settings, find_module
 from rmpa.config.module_name import GATEWAY_SUFFIX
-from rmpa.config.read import load_settings
+from rmpa.config.read import INSECURE, load_settings
 from rmpa.config.settings import WebSettings
 from rmpa.config.values import HOST, BadValue
 from rmpa.core.counters import configure_logging
@@ -28,7 +28,7 @@ from rmpa.core.errors import ConfigError, StartError, UnreachableError, missing_
 from rmpa.core.identity import peer_name_from
 from rmpa.observe.control_client import ControlClient, find_agents
 from rmpa.runtime.process import LogWriter, in_journal
-from rmpa.trust.permissions import TrustStatus
+from rmpa.trust.permissions import Permissions, TrustStatus
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -300,7 +300,8 @@ def web(config: str | None, with_agent: bool, insecure: bool, options: Options, 
     module, setup = make()
     journal = in_journal(os.environ, sys.stderr.fileno())
     configure_logging(setup.settings.log_level, sys.stderr, as_json=setup.settings.log_json, in_journal=journal)
-    for note in module.loaded.notes:
+    said = [f"--insecure: {INSECURE['trust.insecure']}"] if insecure else []
+    for note in (*module.loaded.notes, *said):
         _web_log.warning("! %s [doubtful-setting]", note)
     from rmpa.web.server.process import serve
 
@@ -314,6 +315,8 @@ def web(config: str | None, with_agent: bool, insecure: bool, options: Options, 
         sys.stdout.flush()
 
     while True:
+        if setup.trusted and not Permissions(setup.settings.trust).knows("web"):
+            _web_log.warning("! no [[permission]] lets web do anything: its clients see names alone [not-permitted]")
         pinned = module.name if module.chosen.source.said else None
         if not asyncio.run(serve(setup, pinned, announce, with_agent=with_agent, load=lambda: make()[1])):
             return 0
@@ -333,10 +336,8 @@ def _setup(module: Module, settings: Settings) -> WebSetup:
     trusted = module.agent == "secured" or (store is not None and store.exists)
     if not trusted and module.socket is None:
         check_open(settings.trust, module.state, module.name, os.environ, "--agent")
-    own_file = str(settings.config_file.absolute()) if settings.config_file is not None else ""
-    if trusted and module.config_file not in ("", own_file):  # the permissions are those that its agent reads
-        theirs = load_settings({"config": module.config_file}, os.environ, host_name=socket.gethostname())
-        settings = replace(settings, trust=theirs.settings.trust)
+    if trusted:
+        settings = replace(settings, trust=agent_settings(module).settings.trust)
     files = certificate_files(settings.web.cert, settings.web.key, store if trusted else None)
     access = access_of(settings.web, module.name, os.environ, settings.state_dir)
     folder = str(store.folder) if store is not None else ""

@@ -18,20 +18,20 @@ from rmpa.cli.output import Table, duration, warn
 from rmpa.cli.units import STATE
 from rmpa.config import module_name
 from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, Access
-from rmpa.config.read import load_settings
+from rmpa.config.read import Loaded, load_settings
+from rmpa.config.settings import Settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError, missing_extra
 from rmpa.core.identity import is_global_name, peer_name_problem
 from rmpa.observe.control_client import ControlClient, find_agents, running_agents
 from rmpa.runtime.process import restart_text
 from rmpa.trust.permissions import Permissions, TrustReply, TrustStatus, action_topics
-from rmpa.trust.store import TrustStore, modules_with_keys
+from rmpa.trust.store import TrustStore, keys_elsewhere, modules_with_keys
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from rmpa.cli.output import Text
     from rmpa.config.module_name import ModuleName
-    from rmpa.config.read import Loaded
     from rmpa.trust.membership import Membership, MeshAuthority
 
 _T = TypeVar("_T")
@@ -198,6 +198,16 @@ def find_module(
     return Module(chosen, loaded, state, path, trust, agent.config_file, agent.pid)
 
 
+def agent_settings(module: Module) -> Loaded:
+    """The settings whose rules the module's agent applies: of its own file, also where this shell finds another."""
+    file = module.loaded.settings.config_file
+    if module.socket is None or module.config_file == (str(file.absolute()) if file is not None else ""):
+        return module.loaded
+    if not module.config_file:
+        return Loaded(Settings())
+    return load_settings({"config": module.config_file}, os.environ, host_name=socket.gethostname())
+
+
 def trust_verb(*parameters: Any) -> Callable[[Callable[..., None]], click.Command]:
     """A ``json_verb`` with ``--name`` and ``--config``, whose function gets the module that they mean."""
     name_option = click.option(
@@ -229,6 +239,9 @@ def keep_member_name(module: Module) -> str:
 
     The name of another module that has keys itself stays. A gateway's is none of a module.
     """
+    if unnoted := module_name.note_state_dir(module.place):
+        missed = f"a start without RMPA_STATE_DIR={module.place} will miss these keys: {unnoted}"
+        warn(f"{missed}; write require = true into [trust] of rmpa.toml", "directory-unusable")
     if module.name.endswith(module_name.GATEWAY_SUFFIX):
         return f"rmpa gateway --name {module.name}"
     usual = ""
@@ -236,7 +249,6 @@ def keep_member_name(module: Module) -> str:
         kept = module_name.kept_name(module.place)
         if not kept or kept == module.name or not TrustStore(module.place, kept).exists:
             module_name.keep_name(module.place, module.name, instead=True)
-        module_name.note_state_dir(os.environ, module.place)
         config = {"config": module.loaded.settings.config_file}
         usual = load_settings(config, os.environ, host_name=socket.gethostname()).settings.name
     except RmpaError as error:
@@ -293,7 +305,9 @@ def grouped(digits: str) -> str:
 def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str | None, options: Options) -> None:
     """Say whether the [[permission]] rules of this module let PEER do something here, and which rule decides.
 
-    The exit code is 0 for yes and 1 for no. [bridge], [[peer]], [services] and [params] must allow it too.
+    PEER is a module, a site, ros2, or web for the clients of rmpa web. Without --config the rules are those that the
+    agent has read. The exit code is 0 for yes and 1 for no. [bridge], [[peer]], [services] and [params] must allow it
+    too.
 
     ---
 
@@ -305,7 +319,8 @@ def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str
         raise ConfigError("PEER", problem)
     if not is_global_name(name):
         raise ConfigError("NAME", f"{name!r} is not a global name", "one looks like /cmd_vel")
-    loaded = load_settings({"config": config}, dict(os.environ), host_name=socket.gethostname())
+    module = find_module(None, {"config": config}, os.environ)
+    loaded = module.loaded if config else agent_settings(module)
     permissions = Permissions(loaded.settings.trust)
     action = what in (ACTION_CLIENT, ACTION_SERVER)  # five accesses in one
     asked = action_topics(what, name) if action else [(Access(what), name)]
@@ -377,7 +392,10 @@ def trust_status(module: Module, options: Options) -> None:
             if others := modules_with_keys(module.place):
                 status = f"rmpa trust status --name {others[0]}"
                 yield f"with keys in {module.place}: {', '.join(others)}; {status}"
-            else:
+            for place, there in keys_elsewhere(module.state, os.environ):
+                others += there
+                yield f"with keys in {place}: {', '.join(there)}; RMPA_STATE_DIR={place} rmpa trust status"
+            if not others:
                 yield "make one: rmpa trust init; or join one: rmpa trust join TOKEN"
         for problem in shown.problems:
             warn(problem, "certificate-trouble")

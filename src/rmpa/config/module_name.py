@@ -26,6 +26,8 @@ from rmpa.core.identity import peer_name_problem
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+# The state directory below a home directory.
+_IN_HOME: Final = Path(".local/state/rmpa")
 # What a gateway's name has behind that of its module.
 GATEWAY_SUFFIX = "_gateway"
 
@@ -126,7 +128,7 @@ def state_dir(environ: Mapping[str, str], setting: str | None = None) -> Path | 
     if environ.get("XDG_STATE_HOME"):
         return Path(environ["XDG_STATE_HOME"]) / "rmpa"
     if environ.get("HOME"):
-        return Path(environ["HOME"]) / ".local" / "state" / "rmpa"
+        return Path(environ["HOME"]) / _IN_HOME
     return None
 
 
@@ -162,7 +164,7 @@ def core_file(environ: Mapping[str, str], port: int, module: str = "", setting: 
 
 # In the state directory: the name of this machine's module. No folder of a module is named so: it has a dash.
 NAME_FILE: Final = "module-name"
-# In the usual state directory: others in which this user's modules have joined a secured mesh, one a line.
+# In the state directory of the user's home: others in which modules have joined a secured mesh, one a line.
 PLACES_FILE: Final = "state-directories"
 _READ_MAX: Final = 64 * 1024
 # The state directory of a systemd unit with ``StateDirectory=rmpa``.
@@ -251,31 +253,36 @@ def keep_name(directory: Path, name: str, *, instead: bool = False) -> bool:
 
 
 def usual_state_dirs(environ: Mapping[str, str]) -> list[Path]:
-    """The state directories where nothing names one (no setting, RMPA_STATE_DIR or STATE_DIRECTORY), our own last.
+    """The state directories where nothing names one (no setting, RMPA_STATE_DIR or STATE_DIRECTORY).
 
-    Without HOME, as a unit of the system has none, it is that of the user's home directory all the same; under
-    ``sudo`` there is also that of the user who called it.
+    Under ``sudo`` that of the user who called it; that of XDG_STATE_HOME or HOME; and, last, that of this user's home
+    directory in the password database, from which no variable leads away.
     """
     said = ("RMPA_STATE_DIR", "STATE_DIRECTORY")
-    usual = state_dir({name: value for name, value in environ.items() if name not in said})
+    by_variable = state_dir({name: value for name, value in environ.items() if name not in said})
     caller = environ.get("SUDO_UID", "")
-    homes = [_home_of(int(caller))] if caller.isdecimal() else []
-    homes.append(usual or _home_of(os.geteuid()))
-    return list(dict.fromkeys(place for place in homes if place is not None))
+    places = [_place_of(int(caller))] if caller.isdecimal() else []
+    places += [by_variable, _place_of(os.geteuid())]
+    return list(dict.fromkeys(place for place in places if place is not None))
 
 
 def _home_of(user: int) -> Path | None:
     try:
-        return Path(pwd.getpwuid(user).pw_dir) / ".local" / "state" / "rmpa"
+        return Path(pwd.getpwuid(user).pw_dir)
     except (KeyError, OverflowError):
         return None
+
+
+def _place_of(user: int) -> Path | None:
+    home = _home_of(user)
+    return home / _IN_HOME if home is not None else None
 
 
 def other_state_dirs(environ: Mapping[str, str], used: Path | None) -> list[Path]:
     """State directories besides the one in use in which modules of this user may have files: as far as it is known.
 
     Args:
-        environ: As for ``state_dir``.
+        environ: As for ``state_dir``. It adds places; none takes one away.
         used: The one in use.
     """
     usual = usual_state_dirs(environ)
@@ -284,18 +291,44 @@ def other_state_dirs(environ: Mapping[str, str], used: Path | None) -> list[Path
     return [place for place in dict.fromkeys(places) if place != used]
 
 
-def note_state_dir(environ: Mapping[str, str], used: Path) -> None:
-    """Note in the usual state directory that there is another one, so that a start without its name is noticed.
+def note_state_dir(used: Path) -> str:
+    """Note a state directory with keys, so that a start by other variables or settings notices them.
 
-    It is of use to the same user alone; where it cannot be written, nothing is noted.
+    The note is in the home directory of the password database, where every start looks; root makes one for the owner
+    of the directory too, with whose rights the agent may run.
+
+    Returns:
+        Why it could not be noted; empty: it is, or every start looks into that directory.
     """
-    usual, used = usual_state_dirs(environ)[-1:], used.absolute()
-    if not usual or usual[0] == used or used in map(Path, _read(usual[0] / PLACES_FILE).splitlines()):
-        return
-    with contextlib.suppress(OSError):
-        usual[0].mkdir(mode=0o700, parents=True, exist_ok=True)
-        with (usual[0] / PLACES_FILE).open("a", encoding="utf-8") as file:
-            file.write(f"{used}\n")
+    used = used.absolute()
+    if used == _SYSTEM:
+        return ""
+    users = dict.fromkeys((os.geteuid(), used.stat().st_uid) if os.geteuid() == 0 else (os.geteuid(),))
+    return next(filter(None, [_note(user, used) for user in users]), "")
+
+
+def _note(user: int, used: Path) -> str:
+    home = _home_of(user)
+    if home is None:
+        return f"user {user} has no home directory in the password database"
+    if used == home / _IN_HOME:
+        return ""
+    try:
+        if home.stat().st_uid != user != os.geteuid():
+            return f"{home} does not belong to user {user}"
+        with as_owner(home) as here:
+            file = here / _IN_HOME / PLACES_FILE
+            text, line = _read(file), f"{used}\n"
+            if line in text.splitlines(keepends=True):
+                return ""
+            if len(text.encode()) + len(line.encode()) > _READ_MAX:
+                return f"{home / _IN_HOME / PLACES_FILE} is full"
+            file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with file.open("a", encoding="utf-8") as opened:
+                opened.write(line)
+    except OSError as error:
+        return f"{home / _IN_HOME / PLACES_FILE}: {error.strerror}"
+    return ""
 
 
 def _read(path: Path) -> str:

@@ -20,6 +20,7 @@ from rmpa.config.rules import contract_warnings
 from rmpa.config.schema import REMOVED
 from rmpa.config.settings import SETTINGS, Settings, json_schema
 from rmpa.config.values import BadValue, JsonSchema, Place, did_you_mean, shown, suggestion
+from rmpa.config.writers import check_writers
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_from
 
@@ -230,6 +231,13 @@ def _keys(schema: JsonSchema, table: Key = ()) -> Iterator[Key]:
 FILE_NAME: Final = "rmpa.toml"
 # Every environment variable of this program.
 VARIABLES: Final = ("RMPA_CONFIG", "RMPA_AGENT", *(setting.env for setting in SETTINGS if setting.env))
+# What each setting gives up that turns a protection off: said wherever it is true.
+INSECURE: Final = {
+    "trust.insecure": "true: a module without keys starts open, also beside keys of other modules",
+    "gateway.insecure": "true: endpoints beyond this machine may be plain, and any program there reads and writes",
+}
+# The safer value of settings that protect: it is said where the file has it and a variable or option outweighs it.
+_SAFER: Final = {"trust.require": True, "trust.default": "deny", "trust.direct": False}
 _BY_NAME: Final = {setting.name: setting for setting in SETTINGS}
 
 
@@ -323,7 +331,7 @@ def load_settings(
     notes: list[str] = []
     named = options.get("config")
     path = find_config_file(str(named) if named else None, environ, cwd or Path(), notes)
-    from_file = _file_layer(path) if path is not None else {}
+    from_file = _file_layer(path, environ) if path is not None else {}
     for given in from_file.values():
         given.read()  # a mistake in the file is an error even where an option outweighs it
     from_variables, from_options = _variable_layer(environ, notes), _option_layer(options)
@@ -350,9 +358,21 @@ def load_settings(
         ("peers", peer_warnings(settings.peers)),
     ):
         notes += [str(strongest[name].error(text, "", at)) for at, text in warnings]
+    notes += [str(strongest[name].error(text, "", ())) for name, text in _insecure(settings, strongest, from_file)]
     _check_core(strongest, notes, external=external)
     _check_together(settings, strongest)
     return Loaded(settings, tuple(notes), strongest, names)
+
+
+def _insecure(settings: Settings, strongest: _Layer, from_file: _Layer) -> Iterator[tuple[str, str]]:
+    """The settings that turn a protection off, each with what it gives up."""
+    if settings.trust.insecure:
+        yield "trust.insecure", INSECURE["trust.insecure"]
+    if settings.gateway.insecure and (settings.gateway.connect or settings.gateway.listen):
+        yield "gateway.insecure", INSECURE["gateway.insecure"]
+    for name, safer in _SAFER.items():
+        if name in from_file and from_file[name].read() == safer != strongest[name].read():
+            yield name, f"less secure than {from_file[name]}, which it outweighs"
 
 
 def _name_in(layer: _Layer) -> str:
@@ -435,8 +455,9 @@ def _named_file(named: str, source: str) -> Path:
     )
 
 
-def _file_layer(path: Path) -> _Layer:
+def _file_layer(path: Path, environ: Mapping[str, str]) -> _Layer:
     try:
+        check_writers(path, environ, "the file")
         data = path.read_bytes()
     except OSError as error:
         raise ConfigError(

@@ -224,7 +224,8 @@ class Gateway:
 
 def _rules(settings: Settings) -> tuple[object, ...]:
     """The settings that neighbours are made with and that may change while they run."""
-    return settings.gateway.rules, settings.policy, settings.peers, settings.services, settings.contracts
+    trust, policy = settings.trust, (settings.policy, settings.peers, settings.services)
+    return settings.gateway.rules, policy, settings.contracts, (trust.default, trust.groups, trust.rules)
 
 
 async def _discard(opening: asyncio.Future[OpenSession]) -> None:

@@ -7,7 +7,7 @@ same core, which the relay offers to the modules (``gateway.own_graph``).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -15,7 +15,7 @@ from rmpa.bridge.policy import OPEN_GATE
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import ROS2, Crossing
 from rmpa.core.identity import is_global_name, matches
-from rmpa.trust.permissions import refusal
+from rmpa.trust.permissions import asker_name, refusal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -147,7 +147,10 @@ class CrossingRules:
         self._gate = gate
 
     def outgoing(self, source: MeshSource) -> CrossingDecision:
-        """Decide whether a source of this site goes out to any other site, and whether to all of them alike."""
+        """Decide whether a source of this site goes out to any other site, and whether to all of them alike.
+
+        Permissions count: what they let no site have never leaves for the router.
+        """
         if why := self._policy(source.kind, source.name, source.type, source.node):
             return CrossingDecision(False, why)
         found = []
@@ -159,9 +162,21 @@ class CrossingRules:
                 break
         else:
             found.append(CrossingDecision(True, _NO_RULE))
-        if len({(each.allowed, each.rate, each.size) for each in found}) == 1:
-            return found[0]
-        return CrossingDecision(True, next(each.why for each in found if each.allowed), addressed=True)
+        alike = len({(each.allowed, each.rate, each.size) for each in found}) == 1
+        why = next((each.why for each in found if each.allowed), "")
+        decision = found[0] if alike else CrossingDecision(True, why, addressed=True)
+        if not decision.allowed:
+            return decision
+        judged = self._gate.judge_all(ACCESS[source.kind], "any other site", source.name)
+        if judged is None:
+            return replace(decision, addressed=True)
+        return decision if judged.allowed else CrossingDecision(False, judged.rule)
+
+    def offered_to(self, site: str, source: MeshSource) -> CrossingDecision:
+        """Decide whether a source that ``outgoing`` addresses goes to one other site, by rules and permissions."""
+        decision = self.outgoing_to(site, source.module, source.name)
+        judged = self._gate.judge(ACCESS[source.kind], site, source.name)
+        return decision if judged.allowed or not decision.allowed else CrossingDecision(False, judged.rule)
 
     def outgoing_to(self, site: str, module: str, name: str) -> CrossingDecision:
         """Decide whether a source that ``outgoing`` lets out goes to one other site; permissions are not asked.
@@ -269,11 +284,13 @@ class CrossingRules:
         return "" if decision.allowed else decision.rule
 
 
-def _outgoing(number: int, rule: CrossingRule, site: str = "") -> CrossingDecision:
-    """What one rule says of a source that it fits; ``site`` is named in the reason."""
+def _outgoing(number: int, rule: CrossingRule, site: str | None = None) -> CrossingDecision:
+    """What one rule says of a source that it fits; the ``site`` that asks, if one does, is named in the reason."""
     if rule.crossing in (Crossing.BOTH, Crossing.OUT):
         return CrossingDecision(True, _named(number, rule), rate=rule.rate, size=rule.size)
-    return CrossingDecision(False, f"{_named(number, rule)} lets it not go out{f' to {site}' if site else ''}")
+    return CrossingDecision(
+        False, f"{_named(number, rule)} lets it not go out{'' if site is None else f' to {asker_name(site)}'}"
+    )
 
 
 def _named(number: int, rule: CrossingRule) -> str:

@@ -67,16 +67,23 @@ class DenyEntry(msgspec.Struct, frozen=True):
     before: int
 
 
-class DenyList(msgspec.Struct, frozen=True):
+class DenyList(msgspec.Struct, frozen=True, omit_defaults=True):
     """The names that were revoked.
 
     Attributes:
         number: Grows with each change; 0: nothing was ever revoked.
         entries: One for each name.
+        members: The modules with certificates: a table of access of Zenoh keeps out only what it does not name.
     """
 
     number: _Number = 0
     entries: Annotated[tuple[DenyEntry, ...], msgspec.Meta(max_length=limits.DENY_MAX)] = ()
+    members: Annotated[tuple[_ModuleName, ...], msgspec.Meta(max_length=limits.ISSUED_MAX)] = ()
+
+    def in_force(self, wall: float) -> tuple[str, ...]:
+        """The names whose certificates from before the revocation may still be valid at ``wall``."""
+        ended = wall - limits.CERTIFICATE_LIFETIME
+        return tuple(sorted(entry.name for entry in self.entries if entry.before > ended))
 
     def denies(self, name: str, issued: float) -> bool:
         """Whether a certificate is refused.
@@ -104,7 +111,7 @@ class DenyList(msgspec.Struct, frozen=True):
         entries = (*(entry for entry in self.entries if entry.name != name), DenyEntry(name, before))
         if len(entries) > limits.DENY_MAX:
             raise ValueError(f"a deny list has at most {limits.DENY_MAX} names; make a new mesh (rmpa trust init)")
-        return DenyList(self.number + 1, entries)
+        return DenyList(self.number + 1, entries, tuple(each for each in self.members if each != name))
 
 
 class KeyList(msgspec.Struct, frozen=True):

@@ -12,6 +12,7 @@ import ssl
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
@@ -389,6 +390,9 @@ class MeshAuthority:
         while len(self._issued) > limits.ISSUED_MAX:
             del self._issued[min(self._issued, key=lambda each: self._issued[each].expires)]
         self._store.save_issued(self.issued)
+        deny = self.membership.deny
+        if asked.name not in deny.members and deny.in_force(self.wall()):
+            self._publish(msgspec.structs.replace(deny, number=deny.number + 1))
         return asked, certificate
 
     def grant(self, request: bytes, name: str = "") -> CertificateGrant:
@@ -497,8 +501,8 @@ class MeshAuthority:
         """
         last = self._issued.get(name)  # later than now, if the clock went back since
         deny = self.membership.deny.with_name(name, max(self.wall(), last.issued if last is not None else 0.0))
-        self.membership.accept_document(Document.DENY, sign(deny, self._ca_key))
         self._issued.pop(name, None)
+        deny = self._publish(deny)
         self.rotate(revoking=True)  # before files are written: a full disk must not leave the old key in use
         unused = [each for each in self.book.invitations if not each.used_by]
         for invitation in unused:
@@ -515,6 +519,14 @@ class MeshAuthority:
             self.save_tokens()
         except StartError as error:
             _log.error("! %s is revoked, but not all files are written: %s [directory-unusable]", name, error)
+        return deny
+
+    def _publish(self, deny: DenyList) -> DenyList:
+        """Sign a newer deny list, with the modules that have certificates now; return it."""
+        wall = self.wall()
+        members = tuple(each.name for each in self.issued if each.expires > wall)
+        deny = msgspec.structs.replace(deny, members=members)
+        self.membership.accept_document(Document.DENY, sign(deny, self._ca_key))
         return deny
 
     def rotate(self, *, revoking: bool = False) -> int:

@@ -98,7 +98,23 @@ class Permissions:
                 return decision
         if self._settings.default == Effect.ALLOW:
             return PermissionDecision(True, 'no [[permission]] fits, and trust.default = "allow"')
-        return PermissionDecision(False, f"no [[permission]] lets {module} {_DONE[access]} {name}")
+        return PermissionDecision(False, f"no [[permission]] lets {asker_name(module)} {_DONE[access]} {name}")
+
+    def judge_all(self, access: Access, whom: str, name: str) -> PermissionDecision | None:
+        """The decision about a name that holds for all modules alike, however they are called; ``None``: it differs.
+
+        Args:
+            access: What they would do.
+            whom: What the text calls them, which is no name of a module: ``any other site``.
+            name: As for ``judge``.
+        """
+        common = self.judge(access, whom, name)
+        if not common.allowed and common.number is not None:
+            return common  # a denial to all
+        other = Effect.DENY if common.allowed else Effect.ALLOW
+        globs = ((key, glob) for rule in self._settings.rules if rule.effect is other for key, glob in _globs(rule))
+        asked = (each for key, glob in globs for each in _accesses(key, glob.replace(PEER, "*")))
+        return None if any(what is access and matches(glob, name) for what, glob in asked) else common
 
     def may_relay(self, module: str) -> PermissionDecision:
         """Decide whether a module may pass on what others offer: the origin that it names cannot be proved."""
@@ -106,6 +122,11 @@ class Permissions:
             if matches(glob, module):
                 return PermissionDecision(True, f"trust.relays has {glob!r}")
         return PermissionDecision(False, f"trust.relays does not have {module}")
+
+    def knows(self, module: str) -> bool:
+        """Whether a module may do anything, as far as rules say."""
+        found = self._decisions(module).values()
+        return self._settings.default == Effect.ALLOW or any(each.allowed for rules in found for _, each in rules)
 
     def groups_of(self, module: str) -> tuple[str, ...]:
         """The groups that a module is in, in the order of the file."""
@@ -131,15 +152,10 @@ class Permissions:
         if whom is None:
             return
         verb = "allows" if rule.effect is Effect.ALLOW else "denies"
-        for key, globs in rule.names.items():
-            for written in globs:
-                text = f"[[permission]] {number} {verb} {key} of {written!r} to {whom}"
-                filled = written.replace(PEER, module)
-                if key not in (ACTION_CLIENT, ACTION_SERVER):
-                    yield Access(key), filled, text
-                    continue
-                for access, topic in action_topics(key, filled):
-                    yield access, topic, text
+        for key, written in _globs(rule):
+            text = f"[[permission]] {number} {verb} {key} of {written!r} to {whom}"
+            for access, glob in _accesses(key, written.replace(PEER, module)):
+                yield access, glob, text
 
     def _fit(self, rule: PermissionRule, module: str) -> str | None:
         """Why a rule is about a module, as text; ``None``: it is not."""
@@ -152,14 +168,19 @@ class Permissions:
         return None
 
 
+def asker_name(asker: str) -> str:
+    """How a module or site is named in texts; an empty one is a program at a router that names none."""
+    return asker or "a program without a site"
+
+
 def refusal(access: Access, module: str, name: str, where: str = "there") -> str:
     """What a refused module is told: that it may not, and nothing of the rules."""
-    return f"the permissions {where} do not let {module} {_DONE[access]} {name}"
+    return f"the permissions {where} do not let {asker_name(module)} {_DONE[access]} {name}"
 
 
 def prohibition(access: Access, module: str, name: str) -> str:
     """That a module may not do something: ``arm2 may not publish /cmd_vel``."""
-    return f"{module} may not {_DONE[access]} {name}"
+    return f"{asker_name(module)} may not {_DONE[access]} {name}"
 
 
 def action_topics(key: str, name: str) -> Iterator[tuple[Access, str]]:
@@ -172,6 +193,16 @@ def action_topics(key: str, name: str) -> Iterator[tuple[Access, str]]:
     for access in (Access.PUBLISH, Access.SUBSCRIBE):
         for topic in _ACTION_TOPICS[key, access]:
             yield access, f"{name.rstrip('/')}/{topic}"
+
+
+def _globs(rule: PermissionRule) -> Iterator[tuple[str, str]]:
+    """Each glob of a rule, with the key that it stands behind."""
+    return ((key, glob) for key, globs in rule.names.items() for glob in globs)
+
+
+def _accesses(key: str, glob: str) -> Iterable[tuple[Access, str]]:
+    """What a glob behind a key of a rule is about: an action's topics, or the glob itself."""
+    return action_topics(key, glob) if key in (ACTION_CLIENT, ACTION_SERVER) else ((Access(key), glob),)
 
 
 def _first(globs: tuple[str, ...], name: str) -> str | None:

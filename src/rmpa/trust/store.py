@@ -488,11 +488,16 @@ def check_open(
     if here:
         start = [f"start as {name}: {option} {name}" for name in _startable(here, module)]
         raise _refused(module, f"{_listed(here)} here in {state}", start)
-    others = [(place, there) for place in other_state_dirs(environ, state) if (there := _keys_in(place))]
-    for place, there in sorted(others, key=lambda each: module not in each[1]):  # first where its own keys are
+    # First where its own keys are.
+    for place, there in sorted(keys_elsewhere(state, environ), key=lambda each: module not in each[1]):
         names = [module] if module in there else _startable(there, module)
         start = [f"start with RMPA_STATE_DIR={place} {option} {name}" for name in names]
         raise _refused(module, f"{_listed(there)} in {place}", start)
+
+
+def keys_elsewhere(state: Path | None, environ: Mapping[str, str]) -> list[tuple[Path, list[str]]]:
+    """The modules with keys in other state directories of this user than the one in use, as far as they are known."""
+    return [(place, there) for place in other_state_dirs(environ, state) if (there := _keys_in(place))]
 
 
 def _startable(names: list[str], module: str) -> list[str]:

@@ -8,11 +8,15 @@ from typing import TYPE_CHECKING
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate
+from rmpa.config.peer_rules import Effect, PermissionRule
 from rmpa.config.rules import Crossing, CrossingRule
+from rmpa.config.settings import TrustSettings
 from rmpa.gateway import limits
 from rmpa.gateway.rules import CrossingRules, ForeignSource, MeshSource, SourceKind
 from rmpa.gateway.sites.keys import SiteModule, SiteSource, parse_token
 from rmpa.gateway.sites.plans import SiteExport, SiteExports, SiteImport, SiteImports
+from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
     import pytest
@@ -34,9 +38,10 @@ def announced(name: str, module: str = "arm", type_name: str = "std_msgs/String"
 class Exports(SiteExports):
     """The exports of the site ``home``, and the changes that it has told."""
 
-    def __init__(self, *rules: CrossingRule, site: str = "home") -> None:
+    def __init__(self, *rules: CrossingRule, site: str = "home", gate: PermissionGate = OPEN_GATE) -> None:
         self.told: list[tuple[SiteModule | SiteExport, bool]] = []
-        super().__init__(site, CrossingRules(rules), lambda item, there: self.told.append((item, there)))
+        told = CrossingRules(rules, gate=gate)
+        super().__init__(site, told, lambda item, there: self.told.append((item, there)))
 
 
 class Imports(SiteImports):
@@ -93,6 +98,39 @@ def test_what_exceeds_the_bound_is_told_and_offered_when_there_is_room(monkeypat
     assert list(exports.refusals()) == []
 
 
+def test_what_permissions_let_no_site_have_is_offered_to_none_and_the_rest_to_those_that_may() -> None:
+    gate = PermissionGate(
+        Permissions(
+            TrustSettings(
+                rules=(
+                    PermissionRule(("yard",), names={"subscribe": ("/map", "/all"), "call": ("/dock",)}),
+                    PermissionRule(("*",), names={"subscribe": ("/all", "/{peer}/**")}),
+                    PermissionRule(("street",), effect=Effect.DENY, names={"subscribe": ("/all",)}),
+                    PermissionRule(("*",), names={"subscribe": ("/open",)}),
+                )
+            )
+        )
+    )
+    exports = Exports(gate=gate)
+    exports.sites_seen(["yard", "street", "hall"])
+    for name in ("/map", "/secret", "/all", "/open", "/hall/plan"):
+        exports.changed(mesh_source(name), there=True)
+    exports.changed(mesh_source("/dock", kind=S, type_name="*"), there=True)
+    exports.changed(mesh_source("/off", kind=S, type_name="*"), there=True)
+    assert {(each.source.name, each.announced.to) for each in exports.entries} == {
+        ("/map", "yard"),
+        ("/all", "yard"),
+        ("/all", "hall"),
+        ("/open", ""),
+        ("/hall/plan", "hall"),
+        ("/dock", "yard"),
+    }
+    assert {source.name: why for source, why in exports.refusals()} == {
+        "/secret": "no [[permission]] lets yard subscribe to /secret",  # nor any other that is there
+        "/off": "no [[permission]] lets any other site call /off",
+    }
+
+
 def test_what_rules_let_out_to_some_sites_is_announced_to_each_of_them_alone() -> None:
     rules = (
         CrossingRule(sites=("yard*",), rate=2.0),
@@ -102,7 +140,7 @@ def test_what_rules_let_out_to_some_sites_is_announced_to_each_of_them_alone() -
     exports = Exports(*rules)
     exports.changed(mesh_source("/scan"), there=True)
     assert exports.entries == []
-    assert "of which none was here yet" in next(why for _, why in exports.refusals())
+    assert "no site that may have it was here yet" in next(why for _, why in exports.refusals())
     exports.sites_seen(["hall", "street", "yard1"])
     exports.changed(mesh_source("/stop", kind=S, type_name="*"), there=True)
     assert [(each.source.name, each.announced.to, each.rate) for each in exports.entries] == [

@@ -132,7 +132,7 @@ async def test_a_module_and_a_site_are_told_only_of_what_they_may_have(bed: Aske
     to_desk = PermissionRule(("desk",), names={"subscribe": ("/open",), "call": ("/open",)})
     to_hall = PermissionRule(("hall",), names={"subscribe": ("/open", "/hidden")})
     yard = await bed.site("yard", permissions=(to_hall,))
-    to_yard = PermissionRule(("yard",), names={"publish": ("/**",)})
+    to_yard = PermissionRule(("yard",), names={"publish": ("/**",), "subscribe": ("/home/**",)})
     hall = await bed.site("hall", permissions=(to_desk, to_yard))
     for name in ("/open", "/hidden", "/secret"):
         yard.site.graph.add(name, TEXT)

@@ -15,7 +15,7 @@ from rmpa.config.rules import GatewaySettings
 from rmpa.config.settings import Settings
 from rmpa.core.errors import StartError
 from rmpa.gateway.zenoh import config as trust
-from rmpa.gateway.zenoh.config import revoked_modules, zenohd_config
+from rmpa.gateway.zenoh.config import zenohd_config
 from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.trust.certificates import DenyList
 from tests.gateway.memory_zenoh import eventually
@@ -109,19 +109,54 @@ def test_the_file_for_zenohd_needs_certificates_or_says_that_it_is_insecure(tmp_
     assert json.loads(text[text.index("{") :])["listen"]["endpoints"] == ["tcp/0.0.0.0:7447"]
 
 
-def test_a_revoked_name_stays_out_of_the_table_while_its_certificates_may_be_valid(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_revoked_name_stays_out_of_the_table_while_its_certificates_may_be_valid(tmp_path: Path) -> None:
     mesh = SecuredMesh(tmp_path)
-    settings = Settings(name="fleet", state_dir=str(tmp_path), gateway=GatewaySettings(listen=("tls/0.0.0.0:7447",)))
-    mesh.deny = DenyList().with_name("old", time.time() - 8 * 86_400).with_name("stolen", time.time() - 6 * 86_400)
-    mesh.save("fleet", time.time())
-    assert revoked_modules(settings) == ("stolen",)
-    table, note = trust.access_table(settings)
-    assert table["subjects"] == [{"id": "members"}]
-    assert "stolen: revoked, and let in until the certificate ends" in note, "only the authority knows the others"
-    assert f"// Note: {note}" in zenohd_config(settings)
-    monkeypatch.setattr(trust, "known_modules", lambda _: ("arm", "fleet", "old", "stolen"))
-    table, note = trust.access_table(settings)
-    assert table["subjects"] == [{"id": "members", "cert_common_names": ["arm", "fleet", "old"]}]
-    assert note == ""
+    settings = Settings(name="hall", state_dir=str(tmp_path), gateway=GatewaySettings(listen=("tls/0.0.0.0:7447",)))
+
+    def subjects() -> object:
+        mesh.save("hall", time.time())
+        return trust.access_table(settings)["subjects"]
+
+    assert subjects() == [{"id": "members"}]
+    mesh.deny = DenyList(members=("arm", "hall", "old")).with_name("old", time.time() - 8 * 86_400)
+    assert subjects() == [{"id": "members"}], "its certificates have ended"
+    mesh.deny = mesh.deny.with_name("stolen", time.time() - 6 * 86_400)
+    assert subjects() == [{"id": "members", "cert_common_names": ["arm", "hall"]}]
+    mesh.deny = DenyList().with_name("stolen", time.time())
+    assert subjects() == [{"id": "members", "cert_common_names": ["hall"]}], (
+        "a list that names no member lets none in"
+    )
+
+
+async def test_a_listener_that_is_no_authority_refuses_what_was_revoked_and_lets_the_others_in(fleet: Fleet) -> None:
+    """A certificate of the CA passes TLS; by the table of access the revoked one hears nothing."""
+    names = ("fleet", "a", "b", "later")
+    fleet.mesh.deny = DenyList(members=names).with_name("b", time.time())
+    await fleet.router()
+    a, b, later = [await fleet.gateway(name) for name in names[1:]]
+    heard: dict[str, list[object]] = {name: [] for name in names}
+    b.subscribe("rmpa/1/**", lambda sample: heard["b"].append(sample.payload), history=True)
+    b.watch_tokens("rmpa/1/**", lambda key, _: heard["b"].append(key))
+    later.subscribe("rmpa/1/**", lambda sample: heard["later"].append(sample.payload), history=True)
+    later.watch_tokens("rmpa/1/**", lambda key, _: heard["later"].append(key))
+    matching: list[bool] = []
+    scan = a.publisher("rmpa/1/home/arm/t/a%B/scan", ZenohQos(cache=1), matching.append)
+    a.token("rmpa/1/home/arm/up/00")
+    await eventually(lambda: True in matching)
+    scan.put(b"scan")
+    await eventually(lambda: {b"scan", "rmpa/1/home/arm/up/00"} <= {*heard["later"]})
+    assert heard["b"] == []
+    # What it sends goes nowhere either.
+    forged: list[object] = []
+    a.subscribe("rmpa/1/home/arm/t/a%B/forged", lambda sample: forged.append(sample.payload))
+    sent = b.publisher("rmpa/1/home/arm/t/a%B/forged", ZenohQos(), lambda _: None)
+    proof = later.publisher("rmpa/1/home/arm/t/a%B/forged", ZenohQos(), lambda _: None)
+    sent.put(b"forged")
+    await eventually(lambda: sent.sent)
+
+    def arrived() -> bool:
+        proof.put(b"proof")
+        return b"proof" in forged
+
+    await eventually(arrived)
+    assert b"forged" not in forged

@@ -28,7 +28,7 @@ from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.loop import SystemClock
 from rmpa.trust import certificates
 from rmpa.trust import store as files_of
-from rmpa.trust.certificates import make_request
+from rmpa.trust.certificates import DenyList, make_request
 from rmpa.trust.joining import JoinServer, join_mesh, renew_at_authority
 from rmpa.trust.membership import (
     Membership,
@@ -286,6 +286,22 @@ async def test_a_revocation_holds_also_if_the_clock_went_back(lab: Lab, again: b
         lab.clock.wall_seconds += DAY / 2
         with pytest.raises(TrustError, match="arm was revoked"):
             lab.base.judge_member(arm.files.certificate, "arm")
+
+
+async def test_the_deny_list_names_the_members_while_a_revoked_certificate_may_be_valid(lab: Lab) -> None:
+    async with running(lab):
+        await lab.join(lab.invite())
+        await lab.join(lab.invite(), "leg")
+        assert lab.base.deny == DenyList(), "nothing was revoked"
+        assert lab.authority.revoke("leg").members == ("arm", "base")
+        joined = lab.member(await lab.join(lab.invite(), "hand"), "hand")
+        assert joined.deny == lab.base.deny, "the newcomer has the list with its own name"
+        assert (joined.deny.number, joined.deny.members) == (2, ("arm", "base", "hand"))
+        await renew_at_authority(joined, "127.0.0.1", lab.port)
+        assert lab.base.deny.number == 2, "a renewal changes no name"
+        lab.clock.wall_seconds += 8 * DAY
+        await lab.join(lab.invite(), "foot")
+        assert lab.base.deny.number == 2, "what was revoked has ended"
 
 
 async def test_revoking_ends_invitations_of_that_name(lab: Lab) -> None:

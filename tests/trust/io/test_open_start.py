@@ -79,11 +79,12 @@ def test_keys_of_another_name_are_named_with_what_to_do(tmp_path: Path) -> None:
         assert remedy in text
 
 
-def test_another_or_a_forgotten_state_directory_is_noticed(tmp_path: Path) -> None:
+def test_another_or_a_forgotten_state_directory_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     home = {"HOME": str(tmp_path)}
     usual, data = tmp_path / ".local/state/rmpa", tmp_path / "data"
     _keys(data)
-    note_state_dir(home, data)
+    monkeypatch.setenv("TEST_HOME", str(tmp_path))
+    assert note_state_dir(data) == ""
     for used in (usual, tmp_path / "third"):  # forgotten; and another one
         with pytest.raises(StartError, match=f"in {data}; start with RMPA_STATE_DIR={data} --name sec; or"):
             check_open(TrustSettings(), used, "sec", home)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import stat
 from typing import TYPE_CHECKING, Any
 
@@ -154,3 +155,14 @@ def test_beyond_loopback_the_token_is_made_and_its_url_told_once(tmp_path: Path)
 def test_without_a_place_for_the_token_the_remedy_is_told() -> None:
     with pytest.raises(StartError, match="--token-file"):
         access_of(WebSettings(listen="192.168.1.7"), "base", {})
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files to another user")
+def test_a_token_that_another_user_has_made_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "token"
+    token_from(path)
+    monkeypatch.setattr(os, "geteuid", lambda: 12345)
+    assert token_from(path)[0], "root's"
+    os.chown(path, 999, -1)
+    with pytest.raises(StartError, match="belongs to user 999, who knows the token"):
+        token_from(path)

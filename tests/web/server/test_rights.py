@@ -47,7 +47,7 @@ RULES = (
     PermissionRule(("web",), effect=Effect.DENY, names={"subscribe": ("/camera/**",), "publish": ("/odom",)}),
     PermissionRule(("tablet",), effect=Effect.DENY, names={"publish": ("/cmd_vel",)}),
 )
-SETTINGS = Settings(web=WebSettings(control=True), trust=TrustSettings(rules=RULES))
+SETTINGS = Settings(web=WebSettings(control=True), trust=TrustSettings(default="allow", rules=RULES))
 TOKEN = TokenAccess("secret-" * 6)
 
 
@@ -58,7 +58,7 @@ def setup(settings: Settings = SETTINGS, access: TokenAccess = TOKEN, *, trusted
 def denying(**names: tuple[str, ...]) -> NodeRules:
     """The rules of a node that may do everything but what ``names`` say."""
     rule = PermissionRule(("*",), effect=Effect.DENY, names=names)
-    return setup(replace(SETTINGS, trust=TrustSettings(rules=(rule,)))).rules
+    return setup(replace(SETTINGS, trust=TrustSettings(default="allow", rules=(rule,)))).rules
 
 
 RULED = setup().rules
@@ -210,6 +210,30 @@ async def test_a_client_hears_the_rule_of_what_it_may_not() -> None:
         called = await asked(client, op="call_service", service="/motors/enable", type="std_srvs/Empty")
         assert called["result"] is False
         assert "web may not call /motors/enable" in called["values"]
+
+
+async def test_a_parameter_is_found_and_read_where_the_rules_let_that_one_be_read() -> None:
+    rule = PermissionRule(("web",), names={"param": ("/ours/**",)})
+    rules = setup(replace(SETTINGS, trust=TrustSettings(rules=(rule,)))).rules
+    async with (
+        running(TOKEN.token, rules) as (server, core),
+        aiohttp.ClientSession() as session,
+        session.ws_connect(f"ws://127.0.0.1:{server.port}/rosbridge?token={TOKEN.token}") as client,
+    ):
+        core.call("setParam", "/setter", "/ours/speed", 3)
+        core.call("setParam", "/setter", "/theirs", 4)
+
+        async def ask(service: str, name: str) -> Any:
+            answer = await asked(client, op="call_service", service=f"/rosapi/{service}", args={"name": name})
+            return answer["values"]
+
+        async with asyncio.timeout(DEADLINE):
+            while await ask("get_param", "/ours") != {"value": '{"speed": 3}'}:
+                pass
+        assert await ask("search_param", "ours/speed") == {"global_name": "/ours/speed"}
+        assert await ask("has_param", "/ours/none") == {"exists": False}
+        for service, name in (("search_param", "theirs"), ("get_param", "/"), ("has_param", "/none")):
+            assert "no [[permission]] lets web read or set" in await ask(service, name)
 
 
 async def test_rosapi_shows_no_parameter_that_is_denied_and_changes_none() -> None:

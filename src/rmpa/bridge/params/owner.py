@@ -30,7 +30,7 @@ from rmpa.ros.http.rpc import read_large, slices
 from rmpa.ros.master.parameters import holds_nil, leaves
 from rmpa.ros.wire.xmlrpc import response_pieces
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
-from rmpa.trust.permissions import refusal
+from rmpa.trust.permissions import asker_name, refusal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -185,7 +185,7 @@ class _Asker:
         return cls(session.link.name, site, tuple(dict.fromkeys(modules)))
 
     def __str__(self) -> str:
-        return self.peer if self.site is None else self.site or "a program without a site"
+        return self.peer if self.site is None else asker_name(self.site)
 
 
 @dataclass(slots=True, eq=False)

@@ -12,12 +12,14 @@ their keys are made as its others are.
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import yaml
 from rosbags.typesys.base import TypesysError
 
+from rmpa.config.writers import check_writers
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_type_name
 from rmpa.gateway import limits
@@ -77,6 +79,7 @@ class TypeMapping:
             ConfigError: It cannot be read, or a rule is wrong; the error names the rule.
         """
         try:
+            check_writers(path, os.environ, "gateway.ros2.mapping")
             rules = yaml.safe_load(path.read_text(encoding="utf-8"))
         except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
             raise ConfigError("gateway.ros2.mapping", f"cannot be read: {error}", path=path) from error

@@ -442,7 +442,8 @@ class SiteAnswers:
                 yield self._way_out(source, asking, entry, refused)
         for source, why in self._sites.exports.refusals():
             if meant(source):
-                yield self._way_out(source, asking, None, why)
+                told = self._rules.refusal(asking, source.module, source.name, ACCESS[source.kind]) if asking else ""
+                yield self._way_out(source, asking, None, told or why)
 
     def _way_out(self, source: MeshSource, asking: str, entry: SiteExport | None, refused: str) -> Diagnosis:
         where, to = "there" if asking else "here", entry.announced.to if entry is not None else ""

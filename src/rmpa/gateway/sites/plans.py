@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.identity import is_type_name
@@ -142,11 +142,12 @@ class SiteExports:
         decisions = {"": decision} if decision.allowed else {}
         if decision.addressed:
             self._addressed.add(key)
-            judged = {site: self._rules.outgoing_to(site, source.module, source.name) for site in self._sites}
+            judged = {site: self._rules.offered_to(site, source) for site in self._sites}
             decisions = {site: each for site, each in judged.items() if each.allowed}
+            nowhere = f"{decision.why}; no site that may have it was here yet"
+            decision = next(iter(judged.values()), replace(decision, why=nowhere))
         if not decisions:
-            nowhere = " names the sites that it goes out to, of which none was here yet" * decision.addressed
-            self._refused[key] = decision.why + nowhere
+            self._refused[key] = decision.why
         module = SiteModule(self._site, source.module, source.instance)
         return {
             site: SiteExport(

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from rmpa.config.rules import GatewaySettings
     from rmpa.config.settings import Settings
+    from rmpa.trust.certificates import DenyList
 
 # Seconds of the line's rate that the kernel's buffer of a connection holds, which counts them twice. In that buffer
 # there are no priorities: on 1 Mbit/s with images a command waited 2.7 s with Linux's own size, 0.3 s with this one,
@@ -219,8 +220,8 @@ _HEAD: Final = """\
 """
 
 
-def session_config(settings: Settings) -> tuple[ZenohConfig, str]:
-    """What the gateway's session is opened with, and what its table of access cannot say.
+def session_config(settings: Settings) -> ZenohConfig:
+    """What the gateway's session is opened with.
 
     Raises:
         StartError: As ``gateway_config``; or the certificates are not whole, or other users can read them.
@@ -232,32 +233,26 @@ def session_config(settings: Settings) -> tuple[ZenohConfig, str]:
         certificates = MeshCertificates(*(str(store.path(name)) for name in (CA, CERTIFICATE, KEY)))
     config = gateway_config(settings.gateway, certificates)
     if certificates is None or not config.listen:
-        return config, ""
-    table, note = access_table(settings)
-    return replace(config, access_control=table), note
+        return config
+    return replace(config, access_control=access_table(settings))
 
 
-def access_table(settings: Settings) -> tuple[dict[str, object], str]:
+def access_table(settings: Settings) -> dict[str, object]:
     """Zenoh's ``access_control``: members may use the keys of sites, revoked modules nothing.
 
-    Zenoh allows a certificate what it allows to everybody, whatever is denied to its name. So once a module was
-    revoked, the others are named, which the mesh's authority alone can do.
-
-    Returns:
-        The table, and what it cannot say.
+    Zenoh allows a certificate what it allows to everybody, whatever is denied to its name, and knows it by its name
+    alone. So while a certificate that was revoked may be valid, the others are named, as the deny list has them; a
+    name that was invited again stays out until then.
     """
     keys = _ALL if settings.trust.default == Effect.ALLOW else _SITES
     if settings.gateway.ros2.enabled:
         domain = settings.gateway.ros2.domain
         keys = (*keys, "@ros2_lv/**", f"{domain}/**", f"{domain}/**/@adv/**")
     subject: dict[str, object] = {"id": "members"}
-    note = ""
-    if revoked := revoked_modules(settings):
-        if known := known_modules(settings):
-            subject["cert_common_names"] = sorted(set(known) - set(revoked))
-        else:
-            names = ", ".join(revoked)
-            note = f"{names}: revoked, and let in until the certificate ends; let the authority be the router"
+    if (deny := _deny_list(settings)) is not None and (revoked := deny.in_force(time.time())):
+        # Never empty, which would be everybody.
+        named = sorted({*deny.members, settings.name}.difference(revoked)) or [settings.name]
+        subject["cert_common_names"] = named
     rule = {"id": "sites", "permission": "allow", "flows": ["ingress", "egress"]}
     return {
         "enabled": True,
@@ -265,7 +260,7 @@ def access_table(settings: Settings) -> tuple[dict[str, object], str]:
         "rules": [{**rule, "messages": list(_MESSAGES), "key_exprs": list(dict.fromkeys(keys))}],
         "subjects": [subject],
         "policies": [{"rules": ["sites"], "subjects": ["members"]}],
-    }, note
+    }
 
 
 def zenohd_config(settings: Settings) -> str:
@@ -275,48 +270,33 @@ def zenohd_config(settings: Settings) -> str:
         StartError: The module has joined no secured mesh, and ``insecure`` is not set; or its files are broken.
     """
     gateway = replace(settings.gateway, router=True, listen=settings.gateway.listen or _LISTEN)
-    config, note = session_config(replace(settings, gateway=gateway))
-    text = _HEAD.format(days=CERTIFICATE_LIFETIME * RENEWAL_SHARE / 86_400) + (f"// Note: {note}\n" if note else "")
+    config = session_config(replace(settings, gateway=gateway))
+    text = _HEAD.format(days=CERTIFICATE_LIFETIME * RENEWAL_SHARE / 86_400)
     if config.certificates is None:
         text += "// INSECURE: no certificates, and no rules of access.\n"
     return text + json.dumps(zenohd_entries(config), indent=2) + "\n"
 
 
-def known_modules(settings: Settings) -> tuple[str, ...]:
-    """The modules with a certificate, which the mesh's authority knows; at other modules none."""
-    store = trust_store(settings)
-    if store is None or not store.is_authority:
-        return ()
-    try:
-        return tuple(sorted(store.load_issued()))
-    except StartError:
-        return ()
-
-
-def revoked_modules(settings: Settings) -> tuple[str, ...]:
-    """The modules on the deny list whose certificates from before may still be valid.
-
-    Zenoh knows a certificate by its name alone. So a name that was invited again stays out until those have ended.
+def _deny_list(settings: Settings) -> DenyList | None:
+    """The deny list of this module's mesh; ``None``: nothing was ever revoked, or it has joined none.
 
     Raises:
         StartError: The files of trust are not whole, or the deny list is broken.
     """
     store = trust_store(settings)
     if store is None or not store.exists:
-        return ()
+        return None
     files = store.load()
     if not files.deny:
-        return ()
+        return None
     from rmpa.trust.certificates import DenyList, ca_public_key, read_document  # noqa: PLC0415 - the extra rmpa[trust]
 
     try:
-        deny = read_document(files.deny, ca_public_key(files.ca), DenyList)
+        return read_document(files.deny, ca_public_key(files.ca), DenyList)
     except RemoteProtocolError as error:
         raise StartError(
             str(store.path(DENY)), f"is broken: {error}", "see rmpa trust status", code="keys-unusable"
         ) from None
-    ended = time.time() - CERTIFICATE_LIFETIME
-    return tuple(sorted(entry.name for entry in deny.entries if entry.before > ended))
 
 
 # Bounds what the kernel holds unsent of Zenoh's connections, so that priorities hold on a slow line too.

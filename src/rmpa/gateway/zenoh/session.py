@@ -486,14 +486,12 @@ async def open_trusted_session(settings: Settings) -> OpenSession:
     Raises:
         StartError: It may not be opened without certificates, an address is taken, or no router answers.
     """
-    config, note = session_config(settings)
-    if note:
-        _log.warning("! zenoh: %s [zenoh-trouble]", note)
+    config = session_config(settings)
 
     def changed() -> bool:
         """Whether the table of access would be another one now: a module was revoked, or has joined since."""
         try:
-            return session_config(settings)[0].access_control != config.access_control
+            return session_config(settings).access_control != config.access_control
         except StartError:
             return False  # files are being written
 

@@ -335,8 +335,11 @@ class FoxgloveSession(Session):
 
     def op_get_parameters(self, *, parameter_names: protocol.Names = (), id_: protocol.Text | None = None) -> None:
         """Send parameters; all where no name is given."""
-        _check_names(parameter_names)
-        self._await_values(self.get_params(tuple(dict.fromkeys(parameter_names))), id_)
+        names = self._readable(parameter_names)
+        if names or not parameter_names:
+            self._await_values(self.get_params(names), id_)
+        else:
+            self.connection.push(protocol.parameter_values({}, id_))
 
     def op_set_parameters(self, *, parameters: protocol.FoxgloveParameters, id_: protocol.Text | None = None) -> None:
         """Set parameters, and delete those without a value; one that is malformed leaves all as they are."""
@@ -374,12 +377,25 @@ class FoxgloveSession(Session):
 
     def op_subscribe_parameter_updates(self, *, parameter_names: protocol.Names = ()) -> None:
         """Send changes of parameters; of all where no name is given."""
-        _check_names(parameter_names)
-        self._follow_also(parameter_names, wanted=True)
+        names = self._readable(parameter_names)
+        if names or not parameter_names:
+            self._follow_also(names, wanted=True)
 
     def op_unsubscribe_parameter_updates(self, *, parameter_names: protocol.Names = ()) -> None:
         """End updates of parameters; of all where no name is given."""
         self._follow_also(parameter_names, wanted=False)
+
+    def _readable(self, names: protocol.Names) -> tuple[str, ...]:
+        """Those that the client may read, each once; the others are refused."""
+        _check_names(names)
+        found: list[str] = []
+
+        def take(name: str) -> None:
+            self.read_param(name)
+            found.append(name)
+
+        self._each(take, dict.fromkeys(names))
+        return tuple(found)
 
     def _follow_also(self, names: Iterable[str], *, wanted: bool) -> None:
         if not names:

@@ -124,18 +124,20 @@ class Gateways:
 
     async def handle(self, request: web.Request) -> web.StreamResponse:
         """Serve one client until it has gone."""
-        offered = [name.strip() for name in request.headers.get("Sec-WebSocket-Protocol", "").split(",")]
+        lines = request.headers.getall("Sec-WebSocket-Protocol", ())
+        offered = [name.strip() for name in ",".join(lines).split(",") if name.strip()]
         protocol = choose_subprotocol(offered)
         address = request.remote or "?"
         client = self._hub, self._rights, self._priority, address
         session: Session
         if request.path == MONITOR_PATH:
             if self._monitor is None or SUBPROTOCOL not in offered:
-                text = f"pages speak {SUBPROTOCOL} here; see /rosbridge"
-                self.refuse(address, "handshake", text)
-                return web.Response(status=400, text=f"{text}\n")
+                return self._refuse_protocol(address, f"pages speak {SUBPROTOCOL} here; see /rosbridge")
             await self._monitor.mesh.first()
             return await self._serve(request, MonitorSession(*client, self._monitor), limits.REQUEST_MAX + 1)
+        if offered and protocol is None:
+            spoken = f"Foxglove's {' and '.join(SUBPROTOCOLS)}, and rosbridge without a subprotocol"
+            return self._refuse_protocol(address, f"{', '.join(offered)[:80]!a} is not spoken here: {spoken} are")
         await self._hub.settled(limits.SETTLE)
         # Only a client that sends data has a use for large messages: aiohttp keeps what it has gathered to the end.
         if protocol is not None:
@@ -143,6 +145,10 @@ class Gateways:
         else:
             session, most = RosbridgeSession(*client, self._encoder), limits.FRAME_MAX
         return await self._serve(request, session, most if self._rights.control else limits.FOXGLOVE_TEXT_MAX)
+
+    def _refuse_protocol(self, address: str, text: str) -> web.Response:
+        self.refuse(address, "handshake", text)
+        return web.Response(status=400, text=f"{text}\n")
 
     async def _serve(self, request: web.Request, session: Session, most: int) -> web.StreamResponse:
         response = FrameSocket(

@@ -10,12 +10,13 @@ import time
 import weakref
 from typing import TYPE_CHECKING, Any, Final, Self, TypeAlias, TypeVar
 
+from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.types.codec import codec_for
 from rmpa.web import limits
 from rmpa.web.hub.graph import GraphWatch, TypeLibrary
 from rmpa.web.hub.node_link import CONTROL_REMEDY, EVERYTHING, READ_REMEDY, NodeLink
-from rmpa.web.hub.params import ParamMirror, RosTime
+from rmpa.web.hub.params import ParamMirror, RosTime, value_at
 from rmpa.web.hub.services import ServedServices, ServiceCalls, read_asset
 from rmpa.web.hub.topics import HubTopics
 
@@ -204,7 +205,8 @@ class HubClient:
 
     def find_service(self, service: str) -> Coroutine[Any, Any, str]:
         """The type of a service that is to be called; see ``GraphWatch.find``."""
-        self._check_age()
+        self.check_command("call services")
+        self.hub.link.rules.check(Access.CALL, service)
         return self.hub.graph.find(service)
 
     def serve(
@@ -225,7 +227,18 @@ class HubClient:
     @property
     def param_tree(self) -> Mapping[str, ParamValue]:
         """The parameters that the client may see, as a tree."""
-        return self.hub.link.rules.visible_tree(self.hub.params.tree) if self.rights.view else {}
+        self._check_view("read parameters")
+        return self.hub.link.rules.visible_tree(self.hub.params.tree)
+
+    def read_param(self, name: str) -> object:
+        """The value of a global name, a namespace as a whole; ``MISSING`` where there is none.
+
+        What the rules deny is refused, also one parameter in a namespace: it never counts as not there.
+        """
+        self._check_view("read parameters")
+        value = value_at(self.hub.params.tree, name)
+        self.hub.link.rules.check_param(name, value)
+        return value
 
     async def get_params(self, names: tuple[str, ...] = (), prefix: str = "/") -> Mapping[str, ParamValue]:
         """The values of ``names`` that are there; without names those of all parameters below ``prefix``."""

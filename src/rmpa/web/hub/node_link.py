@@ -100,6 +100,12 @@ class NodeRules:
         for each in sorted(changed) or [name]:
             self.check(Access.PARAM, each)
 
+    def check_param(self, name: str, value: object) -> None:
+        """Check that a parameter may be read, with all in it if it is a namespace; raises as ``check``."""
+        if self.permissions is not None:
+            for each in [leaf for leaf, _ in leaves(_resolved(name), value)] or [name]:
+                self.check(Access.PARAM, each)
+
     def visible(self, values: Mapping[str, ParamValue]) -> Mapping[str, ParamValue]:
         """Those of some parameters that clients may read.
 

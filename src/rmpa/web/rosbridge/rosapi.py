@@ -14,13 +14,13 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from urllib.parse import urlsplit
 
-from rmpa.core.errors import RmpaError
+from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import parse_definition
 from rmpa.ros.types.installed import ServiceType
 from rmpa.web import limits
 from rmpa.web.hub.graph import GraphService, GraphTopic
-from rmpa.web.hub.params import MISSING, value_at
+from rmpa.web.hub.params import MISSING
 from rmpa.web.rosbridge.protocol import OpError, graph_name, type_name
 
 if TYPE_CHECKING:
@@ -253,13 +253,12 @@ class Rosapi:
 
     # --- parameters -----------------------------------------------------------------------------------------------
 
-    def _parameter(self, name: str) -> tuple[bool, object]:
-        """Whether a global name is there, and its value."""
-        value = value_at(self._client.param_tree, name)
-        return value is not MISSING, None if value is MISSING else value
+    def _is_parameter(self, name: str) -> bool:
+        return self._client.read_param(name) is not MISSING
 
     def _answer_get_param(self, name: str, default: str) -> Values:
-        there, value = self._parameter(graph_name(name))
+        value = self._client.read_param(graph_name(name))
+        there, value = value is not MISSING, None if value is MISSING else value
         if not there and default:
             try:
                 value = json.loads(default)
@@ -279,19 +278,21 @@ class Rosapi:
         return self._client.set_param(graph_name(name), read)
 
     def _answer_has_param(self, name: str) -> Values:
-        return {"exists": self._parameter(graph_name(name))[0]}
+        return {"exists": self._is_parameter(graph_name(name))}
 
     def _answer_search_param(self, name: str) -> Values:
         # As rospy.search_param of the node /rosapi: first below its name, then upwards.
         if name.startswith("/"):
-            return {"global_name": graph_name(name) if self._parameter(graph_name(name))[0] else ""}
+            return {"global_name": graph_name(name) if self._is_parameter(graph_name(name)) else ""}
         first = graph_name(name).split("/")[1]
-        found = (each for each in (NAMESPACE, "/") if self._parameter(f"{each}{first}")[0])
-        return {"global_name": next((graph_name(f"{each}{name}") for each in found), "")}
+        with contextlib.suppress(PeerRefused):  # below its name, where rules seldom let anything be read
+            if self._is_parameter(f"{NAMESPACE}{first}"):
+                return {"global_name": graph_name(f"{NAMESPACE}{name}")}
+        return {"global_name": graph_name(f"/{name}") if self._is_parameter(f"/{first}") else ""}
 
     def _answer_delete_param(self, name: str) -> Answer:
-        there, _ = self._parameter(graph_name(name))
-        return self._client.delete_param(graph_name(name)) if there else {}
+        self._client.check_command("delete parameters")
+        return self._client.delete_param(graph_name(name)) if self._is_parameter(graph_name(name)) else {}
 
     def _answer_get_param_names(self) -> Values:
         names: list[str] = []

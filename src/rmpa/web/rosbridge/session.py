@@ -352,6 +352,7 @@ class RosbridgeSession(Session):
 
     def op_advertise(self, *, id_: Id = None, topic: str, type_: str, latch: bool | None = False) -> None:
         """Begin a publisher, or count one more id of it."""
+        self.check_control("publish")
         name, kind = graph_name(topic), type_name(type_)
         publisher = self._publishers.get(name)
         if publisher is not None and publisher.type != kind:
@@ -385,6 +386,7 @@ class RosbridgeSession(Session):
 
     def op_publish(self, *, id_: Id = None, topic: str, msg: Any = None, latch: bool | None = False) -> None:
         """Publish a message; a topic that was not advertised is, with the type that the graph knows."""
+        self.check_control("publish")
         name = graph_name(topic)
         publisher = self._publishers.get(name)
         if publisher is None:
@@ -496,6 +498,7 @@ class RosbridgeSession(Session):
 
     def op_advertise_service(self, *, id_: Id = None, service: str, type_: str) -> None:
         """Offer a service; one that the client offers already is offered again."""
+        self.check_control("offer services")
         name = graph_name(service)
         kind = self.hub.types.service(type_name(type_))
         old = self._services.get(name)

@@ -251,7 +251,11 @@ def token_from(path: Path) -> tuple[str, bool]:
 
 def _read(path: Path) -> str:
     with path.open("rb") as file:
-        mode = os.fstat(file.fileno()).st_mode
+        info = os.fstat(file.fileno())
+        mode = info.st_mode
+        if stat.S_ISREG(mode) and info.st_uid not in (0, os.geteuid()) and os.geteuid():
+            problem = f"the token's file belongs to user {info.st_uid}, who knows the token"
+            raise StartError(str(path), problem, f"chown {os.geteuid()} {path}", code="directory-unusable")
         if stat.S_ISREG(mode) and mode & 0o077:
             problem = f"other users may use the token's file (mode {stat.S_IMODE(mode):03o})"
             raise StartError(str(path), problem, f"chmod 600 {path}", code="directory-unusable")

@@ -9,12 +9,11 @@ import signal
 import socket
 import ssl
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from rmpa.config.module_name import module_dir, state_dir
-from rmpa.config.peer_rules import Effect
 from rmpa.core.contract import Priority
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
 from rmpa.ros.node.node import Node
@@ -274,10 +273,8 @@ class WebSetup:
 
     @property
     def rules(self) -> NodeRules:
-        """What the server's node may do: in a secured mesh nothing that a ``[[permission]]`` denies."""
-        if not self.trusted:
-            return EVERYTHING
-        return NodeRules(Permissions(replace(self.settings.trust, default=Effect.ALLOW.value)))
+        """What the server's node may do: in a secured mesh what ``[trust]`` lets the module ``web`` do."""
+        return NodeRules(Permissions(self.settings.trust)) if self.trusted else EVERYTHING
 
     def serves_as(self, other: WebSetup) -> bool:
         """Whether a server made of the other one would let clients do the same under the same token."""
