@@ -68,7 +68,9 @@ class Podman:
         cgroups = "umount -R /sys/fs/cgroup && mount -t cgroup2 none /sys/fs/cgroup"
         # What podman and its networks keep beside the images is in /run and /var/lib.
         memory = f"for place in /run /var/lib {home}; do mount -t tmpfs tmpfs $place; done"
-        boot = f"{memory}; ip link set lo up; {cgroups}; echo up; exec sleep infinity"
+        # crun gives what a container reads and writes to the container's user (990): it gets another null device.
+        null = "mknod -m 666 /run/null c 1 3 && mount --bind /run/null /dev/null"
+        boot = f"{memory}; {null}; ip link set lo up; {cgroups}; echo up; exec sleep infinity"
         words = ["unshare", "--net", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc", "sh", "-c", boot]
         self._machine = Process(words)
         self._machine.wait_for("up")
@@ -86,7 +88,7 @@ class Podman:
     def run(self, *words: str | Path, timeout: float = DEADLINE, online: bool = False) -> str:
         """Run any program on that machine; ``online`` with the network of the real one, to reach the registries."""
         enter = ["nsenter", f"--target={self._pid}", "--mount", "--pid", *([] if online else ["--net"])]
-        return run([*enter, *words], env=self.env, timeout=timeout)
+        return run([*enter, "sh", "-c", 'exec "$@" </dev/null', "sh", *words], env=self.env, timeout=timeout)
 
     def __call__(self, *words: str | Path, timeout: float = DEADLINE) -> str:
         """Run podman there."""
