@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config.settings import SETTINGS
 from rmpa.core.counters import Backoff, remedy
-from rmpa.core.errors import ConfigError, StartError
+from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.observe.control import ReloadReply
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime import process as realtime
@@ -61,22 +61,28 @@ class Reloader:
         settings: Those that the agent runs with.
         load: Reads all sources again; may take long and raise ``ConfigError``.
         apply: Called with the settings that hold from now on; only those of ``LIVE`` differ.
+        check: Raises ``RmpaError`` where an agent that now runs with the first could not start with the second.
 
     Attributes:
         waiting: The settings that need a restart to take effect, as of the last reload.
     """
 
     def __init__(
-        self, settings: Settings, load: Callable[[], Loaded] | None, apply: Callable[[Settings], None]
+        self,
+        settings: Settings,
+        load: Callable[[], Loaded] | None,
+        apply: Callable[[Settings], None],
+        check: Callable[[Settings, Settings], Awaitable[None]],
     ) -> None:
         self._settings = settings
         self._load = load
         self._apply = apply
+        self._check = check
         self._one = asyncio.Lock()
         self.waiting: tuple[str, ...] = ()
 
     async def reload(self, *, check: bool = False) -> ReloadReply:
-        """Read the settings and apply those of ``LIVE``. Settings with an error change nothing.
+        """Read the settings and apply those of ``LIVE``; if they have an error or would not start, nothing changes.
 
         Args:
             check: Whether to report only what would change, and to apply nothing.
@@ -90,7 +96,8 @@ class Reloader:
             try:
                 # In a thread: reading a long file takes long, and finding the line of an error takes longer.
                 loaded = await asyncio.to_thread(self._load)
-            except ConfigError as error:
+                await self._check(self._settings, loaded.settings)
+            except RmpaError as error:
                 if not check:
                     _log.error("! the settings stay as they are: %s [%s]", error, error.code)
                 return ReloadReply(problem=str(error), code=error.code)

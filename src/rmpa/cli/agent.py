@@ -50,7 +50,7 @@ _WELL: Final = {"service": "it can be called", "module": "it is linked"}
 def reload(check: bool, options: Options) -> int:
     """Make the agent read its rmpa.toml again; what has not changed is not interrupted.
 
-    Exit code 2 if the settings cannot be used; then nothing has changed.
+    Exit code 2 if the settings cannot be used, or it would not start with them; then nothing has changed.
 
     ---
     What takes effect at once: [bridge], [[contract]], [[peer]], [services], [[service]], [params], [[param]], [time]

@@ -90,10 +90,11 @@ def gateway(context: click.Context, /, **options: object) -> int:
         beside = find_module(None, {"config": options.get("config")}, _own(os.environ)).name
 
     def load() -> Loaded:
-        return load_gateway(options, dict(os.environ), socket.gethostname(), beside)
+        loaded = load_gateway(options, dict(os.environ), socket.gethostname(), beside)
+        _check_settings(loaded.settings)
+        return loaded
 
     loaded = load()
-    _check_settings(loaded.settings)
     _check_agents(loaded.settings)
     writer = LogWriter(sys.stderr.fileno())
     journal = in_journal(os.environ, sys.stderr.fileno())
@@ -266,8 +267,9 @@ def _is_there(name: str) -> bool:
     config_option,
     click.option("--with-agent", is_flag=True, hidden=True, help="End when standard input ends."),
     flag("--insecure", help="Start without an agent although other modules here have keys."),
+    flag("--check", help="Only check that it could start with these settings."),
 )
-def web(config: str | None, with_agent: bool, insecure: bool, options: Options, **given: Any) -> int:
+def web(config: str | None, with_agent: bool, insecure: bool, check: bool, options: Options, **given: Any) -> int:
     """Show the mesh in a browser; serve rosbridge and Foxglove clients, /metrics for Prometheus, /api/v1 as JSON.
 
     It is a process of its own: the agent does not depend on it. It starts without an agent too, and finds it later.
@@ -298,6 +300,9 @@ def web(config: str | None, with_agent: bool, insecure: bool, options: Options, 
         return module, _setup(module, settings)
 
     module, setup = make()
+    if check:
+        options.show({}, "the settings can be used")
+        return 0
     journal = in_journal(os.environ, sys.stderr.fileno())
     configure_logging(setup.settings.log_level, sys.stderr, as_json=setup.settings.log_json, in_journal=journal)
     for note in module.loaded.notes:
@@ -327,7 +332,7 @@ def _setup(module: Module, settings: Settings) -> WebSetup:
         RmpaError: A file cannot be used; or no agent runs, the module has no keys, and others have some.
     """
     from rmpa.trust.store import check_open
-    from rmpa.web.server.process import WebSetup, access_of, certificate_files
+    from rmpa.web.server.process import WebSetup, access_of, certificate_files, tls_context
 
     store = module.store if module.state is not None else None
     trusted = module.agent == "secured" or (store is not None and store.exists)
@@ -338,6 +343,7 @@ def _setup(module: Module, settings: Settings) -> WebSetup:
         theirs = load_settings({"config": module.config_file}, os.environ, host_name=socket.gethostname())
         settings = replace(settings, trust=theirs.settings.trust)
     files = certificate_files(settings.web.cert, settings.web.key, store if trusted else None)
+    tls_context(files)  # a changed certificate that cannot be used must not end a server that runs
     access = access_of(settings.web, module.name, os.environ, settings.state_dir)
     folder = str(store.folder) if store is not None else ""
     return WebSetup(settings, access, files, trusted, module.name, folder)
