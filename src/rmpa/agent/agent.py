@@ -15,7 +15,7 @@ import os
 import random
 from typing import TYPE_CHECKING, Final
 
-from rmpa.agent.process import Reloader, WebProcess, run_process, serve, web_command, web_environment
+from rmpa.agent.process import Reloader, WebProcess, run_process, serve
 from rmpa.agent.trust import AgentTrust, TrustCommands, open_membership, restart_to_join
 from rmpa.bridge.bridge import Bridge, TwinWatch
 from rmpa.bridge.nodes import Nodes
@@ -568,7 +568,7 @@ async def _serve(
     started: Callable[[], None] = lambda: None,
 ) -> None:
     agent = Agent(settings, realtime, load)
-    web = WebProcess(web_command(settings), random.random, environ=web_environment(settings, os.environ))
+    web = WebProcess.of(settings, random.random)
     agent.reloaded = web.reload
 
     async def start() -> None:
@@ -576,6 +576,8 @@ async def _serve(
         await asyncio.to_thread(started)
         if settings.web.enabled:
             web.start()
+        else:
+            await web.close()
 
     async def close() -> None:
         await web.close()

@@ -265,11 +265,10 @@ def _is_there(name: str) -> bool:
     click.option("--key", metavar="FILE", help="Its private key (PEM). [default: in the certificate's file]"),
     flag("--drive", help="Let the joystick of its pages command a robot; they need the token."),
     config_option,
-    click.option("--with-agent", is_flag=True, hidden=True, help="End when standard input ends."),
     flag("--insecure", help="Start without an agent although other modules here have keys."),
     flag("--check", help="Only check that it could start with these settings."),
 )
-def web(config: str | None, with_agent: bool, insecure: bool, check: bool, options: Options, **given: Any) -> int:
+def web(config: str | None, insecure: bool, check: bool, options: Options, **given: Any) -> int:
     """Show the mesh in a browser; serve rosbridge and Foxglove clients, /metrics for Prometheus, /api/v1 as JSON.
 
     It is a process of its own: the agent does not depend on it. It starts without an agent too, and finds it later.
@@ -320,7 +319,7 @@ def web(config: str | None, with_agent: bool, insecure: bool, check: bool, optio
 
     while True:
         pinned = module.name if module.chosen.source.said else None
-        if not asyncio.run(serve(setup, pinned, announce, with_agent=with_agent, load=lambda: make()[1])):
+        if not asyncio.run(serve(setup, pinned, announce, load=lambda: make()[1])):
             return 0
         module, setup = make()
 
