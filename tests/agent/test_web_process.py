@@ -113,27 +113,24 @@ async def test_that_of_an_agent_before_is_taken_over(child: Child, tmp_path: Pat
     ready = tmp_path / "ready"
     program = f"import pathlib, signal; signal.signal(signal.SIGHUP, lambda *_: None);{touch(ready)}; {PAUSES}"
     former, web = child(program), child(program)
-    former.start()
+    pid = former._take_over_or_start()  # by an agent that is killed then
     await until(ready.exists)
-    pid = former.pid
-    assert pid is not None
     web.start()
-    await until(lambda: web.pid == pid)
+    await until(lambda: web.pid)
+    assert web.pid == pid
     await web.close()
-    await until(lambda: former.pid != pid)
-    await former.close()
+    assert former._process is not None
+    assert former._process.wait() == -signal.SIGTERM
 
 
 async def test_one_of_another_program_is_replaced(child: Child) -> None:
     former, web = child(WAITS), child(f"{WAITS}  # other settings")
-    former.start()
-    await until(lambda: former.pid)
-    first = former.pid
+    former._take_over_or_start()
     web.start()
     await until(lambda: web.pid)
-    assert web.pid != first
-    await until(lambda: former.pid is None)
-    await former.close()
+    assert former._process is not None
+    assert former._process.wait() == -signal.SIGTERM
+    assert web.pid != former._process.pid
     await web.close()
 
 

@@ -243,6 +243,7 @@ class WebProcess:
         self._environ = environ
         self._file = file
         self._one = threading.Lock()  # a start that was cancelled goes on in its thread
+        self._process: subprocess.Popen[bytes] | None = None  # ``None`` too if an agent before has started it
         self._backoff = Backoff(WEB_RESTART_FIRST, WEB_RESTART_CAP, rng)
         self._task: asyncio.Task[None] | None = None
         self.pid: int | None = None
@@ -294,33 +295,32 @@ class WebProcess:
             await asyncio.sleep(delay)
 
     async def _run(self) -> int:
-        pid, process = await asyncio.to_thread(self._take_over_or_start)
+        pid = await asyncio.to_thread(self._take_over_or_start)
         try:
             self.pid = pid
             await _ended(pid)
         finally:
             self.pid = None
             await asyncio.to_thread(_end, pid)
-            if process is not None:
-                process.wait()
-        return process.returncode if process is not None else 1
+        return self._process.wait() if self._process is not None else 1
 
-    def _take_over_or_start(self) -> tuple[int, subprocess.Popen[bytes] | None]:
-        """The process of the child, and its handle if this agent has started it."""
+    def _take_over_or_start(self) -> int:
+        """The process of the child."""
         words = [*self._command]
         ours = {} if self._environ is None else {k: v for k, v in self._environ.items() if k.startswith(_READ)}
         made_of = [__version__, words, dict(sorted(ours.items()))]
         with self._one, self._file.open("a+b") as file:
+            self._process = None
             if (former := _noted(file)) is not None:
                 pid, other = former
                 if other == made_of:
                     _log.info("= rmpa web (process %d) goes on, of the agent before", pid)
                     os.kill(pid, signal.SIGHUP)  # what is in rmpa.toml may have changed
-                    return pid, None
+                    return pid
                 _end(pid)
                 fcntl.flock(file, fcntl.LOCK_EX)
             # In a session of its own Ctrl-C does not reach it: the agent ends it.
-            process = subprocess.Popen(  # noqa: S603 - our own program
+            self._process = process = subprocess.Popen(  # noqa: S603 - our own program
                 words,
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,
@@ -329,13 +329,15 @@ class WebProcess:
             )
             file.truncate(0)
             file.write(json.dumps([process.pid, made_of]).encode())
-        return process.pid, process
+        return process.pid
 
     def _end_former(self) -> None:
         with self._one, self._file.open("r+b") as file:
             if (former := _noted(file)) is not None:
                 _end(former[0])
             self._file.unlink()
+        if self._process is not None:
+            self._process.wait()
 
 
 def _noted(file: BinaryIO) -> tuple[int, object] | None:
