@@ -76,7 +76,7 @@ def gateway(context: click.Context, /, **options: object) -> int:
       rmpa gateway --router --listen tls/0.0.0.0:7447                    the router that the sites connect to
       rmpa gateway --site b --rank 200 --connect tls/fleet.example:7447  standby for the one with rank 100
       rmpa gateway --ros2 --connect tcp/localhost:7447                   ROS 2 nodes beside rmw_zenohd
-      rmpa gateway zenoh-config --listen tls/0.0.0.0:7447 > zenohd.json5 a router with zenohd instead
+      rmpa gateway zenoh-config --listen tls/0.0.0.0:7447 > zenohd.json5  a router with zenohd instead
     """
     if context.invoked_subcommand is not None:
         given = [name for name, value in options.items() if value not in (None, ())]
@@ -446,7 +446,8 @@ def gateway_zenoh_config(**options: object) -> None:
     [[permission]] and [trust] of rmpa.toml. Print it again and restart zenohd when a rule has changed.
 
     Examples:
-      rmpa gateway zenoh-config --name fleet > zenohd.json5 && zenohd -c zenohd.json5
+      rmpa gateway zenoh-config --name fleet > zenohd.json5
+      zenohd -c zenohd.json5
       rmpa gateway zenoh-config --listen tcp/0.0.0.0:7447 --insecure     in a network of your own
     """
     loaded = load_gateway(options, dict(os.environ), socket.gethostname())
