@@ -528,7 +528,7 @@ class Agent:
             reason, _, remedy = problem.partition("; ")
             effect = "when that of a direct subscriber does, a rospy publisher without queue_size may hang"
             text = f"the agent may not end connections that a vanished host leaves behind ({reason}): {effect}"
-            _log.warning("! %s; %s (docs/guides/direct-transport.md#the-right-to-end-connections) [stale-connections]", text, remedy)
+            _log.warning("! %s; %s (docs/guides/direct-transport.md#cap_net_admin) [stale-connections]", text, remedy)
 
     async def check_start(self, running: Settings, new: Settings) -> None:
         """Check that this agent could start anew with settings that differ: its keys, the core's address, the ports.

@@ -104,7 +104,7 @@ WantedBy=multi-user.target
 """
 # The agent's alone.
 _NET_ADMIN: Final = """\
-# To end connections whose host has vanished (docs/guides/direct-transport.md#the-right-to-end-connections).
+# To end connections whose host has vanished (docs/guides/direct-transport.md#cap_net_admin).
 AmbientCapabilities=CAP_NET_ADMIN
 CapabilityBoundingSet=CAP_NET_ADMIN"""
 _REALTIME: Final = """\
