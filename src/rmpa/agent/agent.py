@@ -537,16 +537,14 @@ class Agent:
             RmpaError: It could not, and why.
         """
 
-        def of_trust(settings: Settings) -> object:
-            return settings.name, settings.state_dir, settings.trust.require, settings.trust.insecure
-
-        if of_trust(new) != of_trust(running):
+        old, trust = running.trust, new.trust
+        before = (running.name, running.state_dir, old.require, old.insecure)
+        if (new.name, new.state_dir, trust.require, trust.insecure) != before:
             await asyncio.to_thread(open_membership, new, SystemClock())
         if new.core_mode == "embedded" and (new.core_host, new.core_port) != (running.core_host, running.core_port):
             port = 0 if self.core.uri.rstrip("/").endswith(f":{new.core_port}") else new.core_port  # its own is taken
             (await listen("ROS core", new.core_host, port, Use.CORE)).close()
-        at = self.network.endpoint
-        if new.port != running.port and not (at is not None and at.port == new.port):
+        if new.port != running.port and new.port != getattr(self.network.endpoint, "port", None):
             for sock in open_mesh_port(new.port):
                 sock.close()
 
