@@ -536,7 +536,6 @@ class Agent:
         Raises:
             RmpaError: It could not, and why.
         """
-
         old, trust = running.trust, new.trust
         before = (running.name, running.state_dir, old.require, old.insecure)
         if (new.name, new.state_dir, trust.require, trust.insecure) != before:

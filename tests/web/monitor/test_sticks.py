@@ -103,6 +103,21 @@ def test_it_is_taken_over_by_one_press_and_the_first_one_hears_from_whom() -> No
     assert pc.holder == "pc"
 
 
+def test_a_late_word_of_an_earlier_hold_changes_nothing() -> None:
+    mesh = Mesh("base", "pc")
+    base, pc = mesh.sticks.values()
+    mesh.bus.held = []
+    base.take("base", "10.0.0.1")
+    late = [*mesh.bus.held]
+    mesh.bus.held = None
+    for _ in range(2):
+        pc.stop("10.0.0.2")
+    pc.take("pc", "10.0.0.2")
+    for word in late:
+        word()
+    assert (pc.holder, mesh.holders()) == ("pc", ["10.0.0.2"] * 2)
+
+
 def test_whoever_sees_it_may_stop_the_robot() -> None:
     mesh = Mesh("base", "pc")
     base, pc = mesh.sticks.values()
