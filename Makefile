@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# What builds wheel, bundle and package: .venv where it is, else a small one, which takes a minute.
+SMALL := .venv-build
+BUILDER := $(if $(wildcard $(STAMP)),$(VENV),$(SMALL))
 
 .DEFAULT_GOAL := venv
 # One apt at a time: a lock on this folder.
@@ -12,6 +15,10 @@ APT := flock scripts
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
 	touch $(STAMP)
+
+$(SMALL)/.installed: pyproject.toml constraints.txt scripts/bootstrap
+	scripts/bootstrap $(PYTHON) $(SMALL) small
+	touch $@
 
 venv: $(STAMP)  ## build .venv with everything that the commands below need
 
@@ -120,20 +127,20 @@ bench: $(STAMP) ros  ## the measurements, as ratios in one run; results in lab/r
 experiment: $(STAMP) ros  ## classic ROS beside RMPA, with a report: make experiment [ARGS="--short"]; docs/compare/experiments.md
 	$(BIN)/python -m lab experiment run $(ARGS)
 
-wheel: $(STAMP)  ## build sdist and wheel into dist/ and check them
-	scripts/build-wheel $(BIN)/python
+wheel: $(BUILDER)/.installed  ## build sdist and wheel into dist/ and check them
+	scripts/build-wheel $(BUILDER)/bin/python
 
-bundle: $(STAMP)  ## build RMPA with a Python of its own into dist/: make bundle [ARCH=aarch64] [PREFIX=an interpreter that is there] [FRESH=1]
-	$(BIN)/python packaging/bundle/build $(if $(ARCH),--arch $(ARCH)) $(if $(PREFIX),--python $(PREFIX)) dist
+bundle: $(BUILDER)/.installed  ## build RMPA with a Python of its own into dist/: make bundle [ARCH=aarch64] [PREFIX=an interpreter that is there] [FRESH=1]
+	$(BUILDER)/bin/python packaging/bundle/build $(if $(ARCH),--arch $(ARCH)) $(if $(PREFIX),--python $(PREFIX)) dist
 
 # Debian's names of the machines that the bundle calls by the kernel's.
-deb: $(STAMP)  ## build the Debian package around the bundle into dist/: make deb [ARCH=arm64] [PREFIX=as for bundle]
-	$(BIN)/python packaging/bundle/build --folder-only $(if $(ARCH),--arch $(patsubst amd64,x86_64,$(patsubst arm64,aarch64,$(ARCH)))) $(if $(PREFIX),--python $(PREFIX)) dist
-	$(BIN)/python packaging/debian/build $(if $(ARCH),--arch $(ARCH)) dist
+deb: $(BUILDER)/.installed  ## build the Debian package around the bundle into dist/: make deb [ARCH=arm64] [PREFIX=as for bundle]
+	$(BUILDER)/bin/python packaging/bundle/build --folder-only $(if $(ARCH),--arch $(patsubst amd64,x86_64,$(patsubst arm64,aarch64,$(ARCH)))) $(if $(PREFIX),--python $(PREFIX)) dist
+	$(BUILDER)/bin/python packaging/debian/build $(if $(ARCH),--arch $(ARCH)) dist
 
 release: $(STAMP)  ## all files of a release with checksums, into dist/release-VERSION: make release [ARGS=--check, ARGS=--trial]
 	$(BIN)/python scripts/release $(ARGS)
 
 clean:  ## remove what the commands above made
-	rm -rf $(VENV) .uv build dist site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(SMALL) .uv build dist site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -6,11 +6,12 @@ import asyncio
 import os
 import pty
 import signal
+import socket
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
@@ -22,10 +23,13 @@ from rmpa.config.settings import Settings, TrustSettings
 from rmpa.config.values import HostPort
 from rmpa.core.contract import ContractRule
 from rmpa.core.errors import ConfigError
+from tests.agent.test_agent import running
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+# A port that another program has.
+TAKEN: Final = -1
 OLD = Settings(name="a", config_file=Path("/etc/rmpa.toml"))
 NEW = replace(
     OLD,
@@ -39,8 +43,12 @@ NEW = replace(
 )
 
 
+async def could_start(_running: Settings, _new: Settings) -> None:
+    """Any settings."""
+
+
 def reloader(load: Callable[[], Loaded], applied: list[Settings]) -> Reloader:
-    return Reloader(OLD, load, applied.append)
+    return Reloader(OLD, load, applied.append, could_start)
 
 
 async def test_what_can_be_taken_is_taken_and_the_rest_is_named() -> None:
@@ -91,7 +99,39 @@ async def test_invalid_settings_change_nothing(caplog: pytest.LogCaptureFixture)
 
 async def test_an_agent_that_a_program_made_says_so() -> None:
     with pytest.raises(ConfigError, match="this agent was given them by a program"):
-        await Reloader(OLD, None, lambda _: None).reload()
+        await Reloader(OLD, None, lambda _: None, could_start).reload()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"core_host": "198.51.100.7"}, "this machine does not have that address"),
+        ({"core_port": TAKEN}, "is already in use"),
+        ({"port": TAKEN}, "is in use, perhaps by another agent"),
+        ({"trust": TrustSettings(require=True)}, "has joined no secured mesh"),
+    ],
+)
+async def test_what_would_not_start_is_refused_at_once(
+    settings: Callable[..., Settings], wrong: dict[str, Any], said: str
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        changed = {key: port if value == TAKEN else value for key, value in wrong.items()}
+        async with running(settings("a")) as (agent,):
+            denied = replace(settings("a").policy, deny=("/secret",))
+            agent.reloader._load = lambda: Loaded(replace(settings("a"), policy=denied, **changed))
+            reply = await agent.reloader.reload()
+            assert said in reply.problem
+            assert agent.settings.policy.deny == (), "none of it holds"
+
+
+async def test_a_port_that_the_agent_has_itself_may_be_written_down(settings: Callable[..., Settings]) -> None:
+    async with running(settings("a")) as (agent,):
+        assert agent.network.endpoint is not None
+        core_port = int(agent.core.uri.rstrip("/").rpartition(":")[2])
+        fixed = replace(settings("a"), port=agent.network.endpoint.port, core_port=core_port)
+        agent.reloader._load = lambda: Loaded(fixed)
+        assert (await agent.reloader.reload()).problem == ""
 
 
 async def nothing() -> None:

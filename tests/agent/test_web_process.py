@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import os
 import signal
 import sys
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import pytest
@@ -15,14 +17,24 @@ from rmpa.agent.process import WebProcess, web_command, web_environment
 from rmpa.config.settings import Settings, WebSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
 DEADLINE = 30.0
+WAITS = "import signal; signal.pause()"
+PAUSES = "[signal.pause() for _ in iter(int, 1)]"
 
 
-def child(program: str) -> WebProcess:
-    return WebProcess([sys.executable, "-c", program], lambda: 1.0)
+def touch(file: Path) -> str:
+    return f"pathlib.Path({str(file)!r}).touch()"
+
+
+Child = Callable[[str], WebProcess]
+
+
+@pytest.fixture
+def child(tmp_path: Path) -> Child:
+    """A child of an agent, which runs a program; several are of agents one after the other."""
+    return lambda program: WebProcess([sys.executable, "-c", program], lambda: 1.0, tmp_path / "base.web")
 
 
 async def until(condition: Callable[[], object]) -> None:
@@ -37,8 +49,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("quick")
-async def test_a_child_that_is_killed_is_started_again() -> None:
-    web = child("import sys; sys.stdin.read()")
+async def test_a_child_that_is_killed_is_started_again(child: Child) -> None:
+    web = child(WAITS)
     web.start()
     await until(lambda: web.pid)
     first = web.pid
@@ -49,20 +61,25 @@ async def test_a_child_that_is_killed_is_started_again() -> None:
     assert web.pid is None
 
 
-async def test_the_child_ends_with_the_agent(tmp_path: Path) -> None:
-    file = tmp_path / "ended"
-    web = child(f"import sys; sys.stdin.read(); open({str(file)!r}, 'w').close()")
+async def test_the_child_ends_with_the_agent(child: Child, tmp_path: Path) -> None:
+    ready, file = tmp_path / "ready", tmp_path / "ended"
+    asked = "import pathlib, signal; signal.signal(signal.SIGTERM, lambda *_: None)"
+    web = child(f"{asked}; {touch(ready)}; signal.pause(); {touch(file)}")
     web.start()
-    await until(lambda: web.pid)
+    await until(ready.exists)
     await web.close()
-    assert file.exists()  # by the end of its input: not killed
+    assert file.exists()  # it was asked to end, not killed
+    assert not (tmp_path / "base.web").exists()
 
 
-async def test_a_child_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_child_that_does_not_end_is_killed(
+    child: Child, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr(limits, "WEB_END_TIMEOUT", 0.1)
-    web = child("import time; time.sleep(1000)")
+    ready = tmp_path / "ready"
+    web = child(f"import pathlib, signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); {touch(ready)}; {PAUSES}")
     web.start()
-    await until(lambda: web.pid)
+    await until(ready.exists)
     pid = web.pid
     assert pid is not None
     await web.close()
@@ -71,7 +88,9 @@ async def test_a_child_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.usefixtures("quick")
-async def test_a_usage_error_is_not_tried_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_usage_error_is_not_tried_again(
+    child: Child, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     web = child(f"import sys; open({str(tmp_path / 'runs')!r}, 'a').write('x'); sys.exit(2)")
     web.start()
     await until(lambda: "not started again" in caplog.text)
@@ -80,10 +99,52 @@ async def test_a_usage_error_is_not_tried_again(tmp_path: Path, caplog: pytest.L
 
 
 @pytest.mark.usefixtures("quick")
-async def test_a_program_that_is_not_there_costs_the_agent_nothing(caplog: pytest.LogCaptureFixture) -> None:
-    web = WebProcess(["/nonexistent/program"], lambda: 1.0)
+async def test_a_program_that_is_not_there_costs_the_agent_nothing(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    web = WebProcess(["/nonexistent/program"], lambda: 1.0, tmp_path / "base.web")
     web.start()
     await until(lambda: caplog.text.count("cannot be started") >= 2)
+    await web.close()
+
+
+@pytest.mark.usefixtures("quick")
+async def test_that_of_an_agent_before_is_taken_over(child: Child, tmp_path: Path) -> None:
+    ready = tmp_path / "ready"
+    program = f"import pathlib, signal; signal.signal(signal.SIGHUP, lambda *_: None);{touch(ready)}; {PAUSES}"
+    former, web = child(program), child(program)
+    pid = former._take_over_or_start()  # by an agent that is killed then
+    await until(ready.exists)
+    web.start()
+    await until(lambda: web.pid)
+    assert web.pid == pid
+    await web.close()
+    assert former._process is not None
+    assert former._process.wait() == -signal.SIGTERM
+
+
+async def test_one_of_another_program_is_replaced(child: Child) -> None:
+    former, web = child(WAITS), child(f"{WAITS}  # other settings")
+    former._take_over_or_start()
+    web.start()
+    await until(lambda: web.pid)
+    assert former._process is not None
+    assert former._process.wait() == -signal.SIGTERM
+    assert web.pid != former._process.pid
+    await web.close()
+
+
+@pytest.mark.usefixtures("quick")
+async def test_one_that_was_not_noted_is_left_alone(
+    child: Child, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with (tmp_path / "base.web").open("wb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        web = child(WAITS)
+        web.start()
+        await until(lambda: "its process is not known" in caplog.text)
+        assert web.pid is None
+    await until(lambda: web.pid)
     await web.close()
 
 
@@ -94,7 +155,7 @@ def test_its_command_and_environment_have_what_the_agent_was_told(tmp_path: Path
         config_file=tmp_path / "rmpa.toml",
     )
     command = " ".join(web_command(settings))
-    for part in ("--agent base", "--port 9000", "--listen 0.0.0.0", "--token-file t", "--config", "--with-agent"):
+    for part in ("--agent base", "--port 9000", "--listen 0.0.0.0", "--token-file t", "--config"):
         assert part in command
     settings = Settings(log_level="debug", log_json=True)
     of_systemd = {"NOTIFY_SOCKET": "/run/systemd/notify", "WATCHDOG_USEC": "10000000"}

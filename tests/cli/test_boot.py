@@ -10,6 +10,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ from rmpa.cli.boot import Former
 from rmpa.cli.machine import Machine
 from rmpa.cli.main import main
 from rmpa.config import module_name
-from rmpa.config.settings import Settings
+from rmpa.config.settings import Settings, TrustSettings
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.observe import control_client
 from tests.cli.conftest import compare
@@ -241,6 +242,27 @@ def test_what_a_user_s_agent_has_kept_is_taken_over_once(tmp_path: Path, root: P
     boot._take_over(changed, before, "rmpa", "arm")
     assert changed.changes[1:] == ["keep the name arm"]
     assert (place / "module-name").read_text() == "arm\n"
+
+
+def test_of_several_modules_only_the_one_that_is_installed_is_copied(tmp_path: Path, root: Path) -> None:
+    before, said = _former(tmp_path), list[str]()
+    assert before.state is not None
+    for other in ("base_gateway", "arm"):
+        (before.state / other).mkdir()
+        (before.state / other / "file").write_text(other)
+    boot._take_over(Machine(str(root), dry=False, tell=said.append), before, "rmpa", None)
+    copied = {"module-name": "base\n", "base/trust/module.key": "secret", "base_gateway/file": "base_gateway"}
+    assert _files(root / "var/lib/rmpa") == copied
+    assert said[0] == f"what other modules have kept stays in {before.state}: arm"
+
+
+def test_one_without_keys_is_not_installed_beside_one_that_has_some(tmp_path: Path, root: Path) -> None:
+    before = _former(tmp_path)
+    with pytest.raises(StartError, match="install that one, --name base"):
+        boot._take_over(Machine(str(root), dry=False), before, "rmpa", "arm")
+    open_one = replace(before, settings=replace(before.settings, trust=TrustSettings(insecure=True)))
+    boot._take_over(Machine(str(root), dry=False), open_one, "rmpa", "arm")
+    assert _files(root / "var/lib/rmpa") == {"module-name": "arm\n"}
 
 
 def test_links_and_pipes_are_not_taken_over(tmp_path: Path, root: Path) -> None:

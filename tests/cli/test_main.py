@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import pty
+import re
 import subprocess
 import sys
 import threading
@@ -17,7 +20,8 @@ from click.testing import CliRunner
 import rmpa
 from lab.bed.processes import eventually
 from rmpa.cli import agent as agent_verbs
-from rmpa.cli.main import MEANT, REMOVED_VERBS, LazyGroup, cli, main
+from rmpa.cli.main import MEANT, REMOVED_VERBS, VERBS, LazyGroup, cli, main
+from rmpa.core import codes
 from tests.cli.conftest import DEADLINE, with_core
 
 if TYPE_CHECKING:
@@ -243,3 +247,50 @@ def test_an_agent_that_hangs_does_not_hold_up_the_shell(monkeypatch: pytest.Monk
     monkeypatch.setitem(agent_verbs._FIND, "peer", hang)
     assert agent_verbs.complete_names("peer", click.Context(cli), "") == []
     end.set()
+
+
+def help_lines(place: Place, words: str, width: int) -> list[str]:
+    place.environ["COLUMNS"] = str(width)
+    code, out, _ = place.run(*words.split(), "--help")
+    assert code == 0
+    return out.splitlines()
+
+
+def test_every_help_fits_80_columns(place: Place) -> None:
+    long = {words: [line for line in help_lines(place, words, 80) if len(line) > 80] for words in ("", *VERBS)}
+    assert {words: lines for words, lines in long.items() if lines} == {}
+
+
+def test_a_wide_terminal_shows_examples_beside_what_they_do(place: Place) -> None:
+    assert any(re.search(r"rmpa why arm:/move +why the service", line) for line in help_lines(place, "why", 200))
+    narrow = help_lines(place, "why", 80)
+    at = narrow.index("    rmpa why arm:/move")
+    assert narrow[at + 1] == "        why the service /move of arm cannot be called here"
+
+
+def test_the_list_of_codes_has_one_line_for_each(place: Place) -> None:
+    code, out, _ = place.run("explain")
+    lines = [line.split(maxsplit=1) for line in out.splitlines()]
+    assert (code, {one for one, _ in lines}) == (0, set(codes.texts()))
+    assert all(meaning for _, meaning in lines)
+
+
+@pytest.mark.pty
+@pytest.mark.parametrize(
+    ("variables", "coloured"), [({}, True), ({"NO_COLOR": "1"}, False), ({"TERM": "dumb"}, False)]
+)
+def test_a_dumb_terminal_gets_no_escapes(place: Place, variables: dict[str, str], coloured: bool) -> None:
+    environ = {key: value for key, value in place.environ.items() if key != "NO_COLOR"}
+    leader, follower = pty.openpty()
+    program = [sys.executable, "-m", "rmpa.cli.main", "doctor"]
+    environ |= {"TERM": "xterm", **variables}
+    said = b""
+    with subprocess.Popen(program, env=environ, cwd=place.path, stdin=subprocess.DEVNULL, stdout=follower) as process:
+        os.close(follower)
+        with contextlib.suppress(OSError):  # EIO is the end
+            while data := os.read(leader, 4096):
+                said += data
+        process.wait(DEADLINE)
+    os.close(leader)
+    assert b"settings" in said
+    assert (b"\x1b[" in said) is coloured

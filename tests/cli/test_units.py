@@ -5,17 +5,21 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+import sys
 import tomllib
 from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.cli.units import config_text, realtime_text, unit_texts
+from rmpa.cli.units import CONFIG, config_text, realtime_text, unit_texts
 from rmpa.config.settings import SETTINGS
 from tests.core.example import EXAMPLE
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
+
+    from tests.cli.conftest import Machine
 
 # Of `systemd-analyze security`, in tenths; 0 is best. docs/guides/running.md#at-boot says what makes it up.
 _EXPOSURE = {"rmpa.service": 20, "rmpa-web.service": 20, "rmpa-gateway.service": 20}
@@ -56,3 +60,40 @@ def test_systemd_takes_every_line_and_finds_little_exposed(tmp_path: Path) -> No
         if done.stderr:  # systemd-analyze before 250 has no --offline; in some containers it cannot begin
             pytest.skip(done.stderr)
         assert done.returncode == 0, done.stdout
+
+
+def reload_commands(unit: str, config: Path, pid: int) -> list[list[str]]:
+    """What systemd runs to reload a unit, on the machine of a test."""
+    program = f"{sys.executable} -m rmpa.cli.main"
+    lines = re.findall(r"^ExecReload=(.*)$", unit_texts("PROGRAM")[unit], re.MULTILINE)
+    texts = [line.replace("PROGRAM", program).replace(CONFIG, str(config)) for line in lines]
+    return [text.replace("$MAINPID", str(pid)).split() for text in texts]
+
+
+def test_a_reload_of_a_unit_fails_with_what_the_settings_lack(machines: Callable[[str], Machine]) -> None:
+    """Of several agents here the unit's own is asked; the web server is not asked to read what it cannot use."""
+    machine = machines("")
+    config = machine.path / "rmpa.toml"
+
+    def reload(unit: str, pid: int, settings: str) -> tuple[int, str]:
+        config.write_text(settings)
+        for words in reload_commands(unit, config, pid):
+            done = subprocess.run(words, env=machine.environ, capture_output=True, text=True, check=False)
+            if done.returncode:
+                return done.returncode, done.stderr
+        return 0, ""
+
+    config.touch()
+    process = machine.up("--config", str(config), "--name", "base")
+    other = machine.up("--name", "arm")
+    code, said = reload("rmpa.service", process.pid, "[bridge]\ndeny = 3\n")
+    assert (code, f"{config}:2: bridge.deny" in said) == (2, True)
+    code, said = reload("rmpa.service", process.pid, '[core]\nhost = "198.51.100.7"\n')
+    assert (code, "this machine does not have that address" in said) == (2, True)
+    assert reload("rmpa.service", process.pid, '[bridge]\ndeny = ["/secret"]\n') == (0, "")
+    assert "settings read again: bridge.deny" in machine.log()
+    assert other.poll() is None
+    code, said = reload("rmpa-web.service", 0, '[web]\nkey = "/etc/key.pem"\n')
+    assert (code, "there is a key without a certificate" in said) == (2, True)
+    code, said = reload("rmpa-web.service", 0, '[web]\ncert = "/nowhere/cert.pem"\n')
+    assert (code, "/nowhere/cert.pem: there is no such file" in said) == (1, True)

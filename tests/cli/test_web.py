@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import os
 import signal
@@ -17,11 +18,11 @@ from tests.cli.conftest import DEADLINE, free_port, until
 
 if TYPE_CHECKING:
     import subprocess
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     import pytest
 
-    from tests.cli.conftest import Place
+    from tests.cli.conftest import Machine, Place
 
 
 def get(port: int, path: str, token: str = "") -> tuple[int, str]:
@@ -74,18 +75,54 @@ def test_it_waits_for_an_agent_and_survives_its_end(place: Place) -> None:
 def test_up_web_starts_it_again_and_ends_it(place: Place) -> None:
     port = free_port()
     place.environ["RMPA_WEB_PORT"] = str(port)
-    with running(place, *agent_options("--web"), end=signal.SIGKILL) as agent:
+    with running(place, *agent_options("--web")) as agent:
         until(lambda: get(port, "/healthz")[0] == 200)
         first = child_of(agent.pid)
         os.kill(first, signal.SIGKILL)
         until(lambda: get(port, "/healthz")[0] == 200)
-        second = child_of(agent.pid)
-        assert first != second
-    until(lambda: get(port, "/healthz")[0] == 0)  # the agent was killed, and it ended by itself
-    with running(place, *agent_options("--web")) as agent:
-        until(lambda: get(port, "/healthz")[0] == 200)
+        assert child_of(agent.pid) != first
     assert agent.returncode == 0
     assert get(port, "/healthz")[0] == 0
+
+
+def test_it_outlives_an_agent_that_is_killed_and_the_next_one_takes_it_over(
+    machines: Callable[[str], Machine],
+) -> None:
+    machine, port = machines("base"), free_port()
+    words = ("--web", "--core-port", str(free_port()))
+    client = http.client.HTTPConnection("127.0.0.1", port, timeout=DEADLINE)
+
+    def answer() -> int:
+        client.request("GET", "/healthz", headers={"Connection": "keep-alive"})
+        with client.getresponse() as response:
+            response.read()
+            return response.status
+
+    def kill(agent: subprocess.Popen[str]) -> None:
+        agent.kill()
+        agent.wait(DEADLINE)
+        (machine.path / "base.sock").unlink()
+
+    agent = machine.up(*words, RMPA_WEB_PORT=str(port))
+    until(lambda: get(port, "/healthz")[0] == 200)
+    web = child_of(agent.pid)
+    assert answer() == 200
+    connection = client.sock
+    kill(agent)
+    until(lambda: answer() == 503)
+    agent = machine.up(*words, RMPA_WEB_PORT=str(port))
+    until(lambda: answer() == 200)
+    assert client.sock is connection, "its client is connected all the time"
+    until(lambda: f"rmpa web (process {web}) goes on, of the agent before" in machine.log())
+    kill(agent)
+    other = free_port()
+    agent = machine.up(*words, RMPA_WEB_PORT=str(other))
+    until(lambda: get(other, "/healthz")[0] == 200)
+    assert get(port, "/healthz")[0] == 0, "one that was set in another way is replaced"
+    kill(agent)
+    machine.up(*words[1:])
+    until(lambda: get(other, "/healthz")[0] == 0)
+    client.close()
 
 
 def child_of(pid: int) -> int:

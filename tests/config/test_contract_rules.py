@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from tests.config.conftest import Load, Refuse
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "guides" / "contracts.md"
+DIRECT = DOCUMENT.with_name("direct-transport.md")
 
 
 def test_every_key(load: Load) -> None:
@@ -117,7 +118,7 @@ def test_the_examples_rules_load(load: Load) -> None:
 
 
 def test_the_rules_of_the_documentation_load(load: Load) -> None:
-    blocks = re.findall(r"```toml\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    blocks = re.findall(r"```toml\n(.*?)```", (DOCUMENT.read_text() + DIRECT.read_text()), re.DOTALL)
     assert len(blocks) >= 4
     for block in blocks:
         loaded = load(block)

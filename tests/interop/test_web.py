@@ -200,6 +200,42 @@ async def test_a_joystick_drives_a_robot_of_another_module_until_its_browser_is_
 
 
 @needs_browser
+async def test_pages_of_two_modules_share_one_stick(lab: Lab, modules: ModuleFactory, web: WebFactory) -> None:
+    """Each module has a server and a page of its own, and both drive the robot of one of them."""
+    base, arm = modules("base", "arm")
+    servers = web(base.agent, "--drive"), web(arm.agent, "--drive")
+    tablet, phone = lab.host("tablet", 0), lab.host("phone", 0)
+    wheels = arm.ros.rospy("wheels", name="wheels", topic="/cmd_vel")
+    await wheels.expect_event("up")
+    holder = "document.querySelector('.holder').innerText"
+    async with Chromium(tablet) as first, Chromium(phone) as second:
+        for page, served in zip((first, second), servers, strict=True):
+            await served.open(page, "drive")
+            await page.wait(f"{holder}.includes('is free')")
+        await first.run("document.querySelector('input[type=checkbox]').click()")
+        await second.wait(f"{holder}.includes('at base has the stick')")
+        await first.run("document.querySelector('.stick').focus()")
+        await first.down("ArrowUp")
+        await wheels.expect_event("speed", where=lambda event: event["linear"] == pytest.approx(HELD))
+        mark = wheels.mark_events()
+        await second.click("Take over")
+        await first.wait_text("at arm has taken the stick over")
+        await second.wait(f"{holder}.includes('This page has the stick')")
+        await wheels.expect_event("speed", where=lambda event: event["linear"] == 0, since=mark)
+        await second.run("document.querySelector('.stick').focus()")
+        await second.down("ArrowDown")
+        await wheels.expect_event("speed", where=lambda event: event["linear"] == pytest.approx(-HELD))
+        mark = wheels.mark_events()
+        await wheels.expect_event("speed", since=mark + 5)
+        assert all(float(str(event["linear"])) <= 0 for event in wheels.events("speed", since=mark)), "none of the first page"
+        await first.click("Stop the robot")
+        await second.wait_text("at base has stopped the robot")
+        await wheels.expect_event("speed", where=lambda event: event["linear"] == 0, since=mark)
+        assert first.errors == second.errors == []
+        await second.kill()
+
+
+@needs_browser
 async def test_a_robot_does_not_move_by_what_tcp_kept_while_the_network_was_away(
     lab: Lab, modules: ModuleFactory, web: WebFactory
 ) -> None:

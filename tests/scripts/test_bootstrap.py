@@ -117,7 +117,7 @@ def test_one_that_was_named_is_taken_or_refused(clone: Path) -> None:
 def test_an_environment_that_is_there_stays(clone: Path) -> None:
     interpreter(clone / ".venv/bin/python", "3.13.0")
     done = bootstrap(clone)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (done.returncode, "Building" in done.stderr) == (0, False)
     assert "pip of 3.13.0" in done.stdout
 
 
@@ -156,3 +156,19 @@ def test_without_any_python(clone: Path) -> None:
     done = bootstrap(clone)
     assert done.returncode == 1
     assert "'python3' is not there" in done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize(("there", "builder"), [(False, ".venv-build"), (True, ".venv")])
+@pytest.mark.parametrize("target", ["wheel", "bundle", "deb"])
+def test_what_is_built_needs_no_developer_s_environment(
+    tmp_path: Path, target: str, there: bool, builder: str
+) -> None:
+    shutil.copy(_SCRIPT.parents[1] / "Makefile", tmp_path)
+    for name in ("pyproject.toml", "constraints.txt", "scripts/bootstrap"):
+        write(tmp_path / name, "")
+    if there:
+        write(tmp_path / ".venv/.installed", "")
+    done = subprocess.run(["make", "-n", target], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert ("scripts/bootstrap python3 .venv-build small" in done.stdout) is not there
+    assert "scripts/bootstrap python3 .venv\n" not in done.stdout
+    assert f"{builder}/bin/python" in done.stdout

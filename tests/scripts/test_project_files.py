@@ -43,3 +43,18 @@ def test_the_citation_is_of_this_program_and_its_paper() -> None:
     assert [(one["title"], one["type"]) for one in cited["references"]] == [
         ("Distributed Real-time Control Architecture for ROS-based Modular Robots", "article")
     ]
+
+
+def test_the_wheel_has_every_page_that_help_texts_and_remedies_name() -> None:
+    shipped = {
+        str(page.relative_to(ROOT))
+        for patterns in tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"][
+            "data-files"
+        ].values()
+        for pattern in patterns
+        for page in ROOT.glob(pattern)
+    }
+    text = "".join(path.read_text() for path in (ROOT / "src/rmpa").rglob("*") if path.suffix in {".py", ".toml"})
+    named = set(re.findall(r"\bdocs/(?!design/|compare/)[\w/-]+\.md", text))
+    assert len(named) > 10
+    assert named <= shipped

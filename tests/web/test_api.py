@@ -99,7 +99,7 @@ def test_no_path_breaks_it(path: str) -> None:
 EVERYTHING = (*metrics(FULL), *web_metrics((1, 2), {"200": 3}, {"host": 4}, (5, 0.6), {}))
 DOCS = Path(__file__).parents[2] / "docs"
 DASHBOARD = DOCS / "grafana" / "rmpa.json"
-PAGE = DOCS / "guides" / "web.md"
+PAGE = DOCS / "reference" / "metrics.md"
 PROMTOOL = shutil.which("promtool")
 with_promtool = pytest.mark.skipif(PROMTOOL is None, reason="promtool is not installed (apt install prometheus)")
 ROUTE = {"topic": "/image", "peer": "arm", "node": "/camera", "direction": "in"}

@@ -15,7 +15,7 @@ import os
 import random
 from typing import TYPE_CHECKING, Final
 
-from rmpa.agent.process import Reloader, WebProcess, run_process, serve, web_command, web_environment
+from rmpa.agent.process import Reloader, WebProcess, run_process, serve
 from rmpa.agent.trust import AgentTrust, TrustCommands, open_membership, restart_to_join
 from rmpa.bridge.bridge import Bridge, TwinWatch
 from rmpa.bridge.nodes import Nodes
@@ -44,10 +44,11 @@ from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.external import ExternalCore
 from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback, shown_uri
 from rmpa.ros.http.rpc import call_api, is_own_name
+from rmpa.ros.http.server import listen
 from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.node.slave_node import LoggerServices
 from rmpa.runtime import process as garbage_collector
-from rmpa.runtime.accept import open_mesh_port
+from rmpa.runtime.accept import Use, open_mesh_port
 from rmpa.runtime.kernel_tcp import may_end_connections
 from rmpa.runtime.loop import SystemClock
 from rmpa.runtime.process import unit_of
@@ -437,7 +438,7 @@ class Agent:
             self.trust = AgentTrust(settings, membership, self.bridge, clock)
             self.bridge.add(self.trust)
         self.network = Network(settings, self.bridge, self.trust)
-        self.reloader = Reloader(settings, load, self.apply_settings)
+        self.reloader = Reloader(settings, load, self.apply_settings, self.check_start)
         self.reloaded: Callable[[], None] = lambda: None
         self.other_notes: list[Callable[[], Iterable[str]]] = []
         counters = Counters()
@@ -527,7 +528,24 @@ class Agent:
             reason, _, remedy = problem.partition("; ")
             effect = "when that of a direct subscriber does, a rospy publisher without queue_size may hang"
             text = f"the agent may not end connections that a vanished host leaves behind ({reason}): {effect}"
-            _log.warning("! %s; %s (docs/guides/running.md#direct-transport) [stale-connections]", text, remedy)
+            _log.warning("! %s; %s (docs/guides/direct-transport.md#cap_net_admin) [stale-connections]", text, remedy)
+
+    async def check_start(self, running: Settings, new: Settings) -> None:
+        """Check that this agent could start anew with settings that differ: its keys, the core's address, the ports.
+
+        Raises:
+            RmpaError: It could not, and why.
+        """
+        old, trust = running.trust, new.trust
+        before = (running.name, running.state_dir, old.require, old.insecure)
+        if (new.name, new.state_dir, trust.require, trust.insecure) != before:
+            await asyncio.to_thread(open_membership, new, SystemClock())
+        if new.core_mode == "embedded" and (new.core_host, new.core_port) != (running.core_host, running.core_port):
+            port = 0 if self.core.uri.rstrip("/").endswith(f":{new.core_port}") else new.core_port  # its own is taken
+            (await listen("ROS core", new.core_host, port, Use.CORE)).close()
+        if new.port != running.port and new.port != getattr(self.network.endpoint, "port", None):
+            for sock in open_mesh_port(new.port):
+                sock.close()
 
     def apply_settings(self, settings: Settings) -> None:
         """Take settings that were read again; only those of ``agent.process.LIVE`` differ."""
@@ -547,7 +565,7 @@ async def _serve(
     started: Callable[[], None] = lambda: None,
 ) -> None:
     agent = Agent(settings, realtime, load)
-    web = WebProcess(web_command(settings), random.random, environ=web_environment(settings, os.environ))
+    web = WebProcess.of(settings, random.random)
     agent.reloaded = web.reload
 
     async def start() -> None:
@@ -555,6 +573,8 @@ async def _serve(
         await asyncio.to_thread(started)
         if settings.web.enabled:
             web.start()
+        else:
+            await web.close()
 
     async def close() -> None:
         await web.close()

@@ -7,19 +7,25 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
+import json
 import logging
 import os
+import select
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
 
+from rmpa import __version__
 from rmpa.config.settings import SETTINGS
 from rmpa.core.counters import Backoff, remedy
-from rmpa.core.errors import ConfigError, StartError
+from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.observe.control import ReloadReply
+from rmpa.observe.control_client import runtime_dir
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime import process as realtime
 from rmpa.runtime.accept import is_shortage, raise_file_limit
@@ -29,6 +35,7 @@ from rmpa.runtime.process import SERVICE_VARIABLES, feed_watchdog, notify_servic
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+    from pathlib import Path
 
     from rmpa.config.read import Loaded
     from rmpa.config.settings import Settings
@@ -61,22 +68,28 @@ class Reloader:
         settings: Those that the agent runs with.
         load: Reads all sources again; may take long and raise ``ConfigError``.
         apply: Called with the settings that hold from now on; only those of ``LIVE`` differ.
+        check: Raises ``RmpaError`` where an agent that now runs with the first could not start with the second.
 
     Attributes:
         waiting: The settings that need a restart to take effect, as of the last reload.
     """
 
     def __init__(
-        self, settings: Settings, load: Callable[[], Loaded] | None, apply: Callable[[Settings], None]
+        self,
+        settings: Settings,
+        load: Callable[[], Loaded] | None,
+        apply: Callable[[Settings], None],
+        check: Callable[[Settings, Settings], Awaitable[None]],
     ) -> None:
         self._settings = settings
         self._load = load
         self._apply = apply
+        self._check = check
         self._one = asyncio.Lock()
         self.waiting: tuple[str, ...] = ()
 
     async def reload(self, *, check: bool = False) -> ReloadReply:
-        """Read the settings and apply those of ``LIVE``. Settings with an error change nothing.
+        """Read the settings and apply those of ``LIVE``; if they have an error or would not start, nothing changes.
 
         Args:
             check: Whether to report only what would change, and to apply nothing.
@@ -90,7 +103,8 @@ class Reloader:
             try:
                 # In a thread: reading a long file takes long, and finding the line of an error takes longer.
                 loaded = await asyncio.to_thread(self._load)
-            except ConfigError as error:
+                await self._check(self._settings, loaded.settings)
+            except RmpaError as error:
                 if not check:
                     _log.error("! the settings stay as they are: %s [%s]", error, error.code)
                 return ReloadReply(problem=str(error), code=error.code)
@@ -175,23 +189,26 @@ def _shown(value: object) -> str:
 
 # --- Runs ``rmpa web`` as a child process of the agent, which does not depend on it ---------------------------------
 #
-# The child's standard input is a pipe from the agent: its end tells the child that the agent has ended, however it
-# did.
+# It ends with an agent that ends in order. An agent that is killed leaves it, with its clients, to the next one: the
+# file ``<name>.web`` beside the control socket notes the process, and is locked as long as that runs, which has
+# inherited the descriptor.
 
 
 # The exit code of a command that cannot run as it is written: another start would end alike.
 _USAGE: Final = 2
+# Names of variables that the child reads begin so: with other ones it is another child.
+_READ: Final = ("RMPA_", "ROS_", "XDG_")
 
 
 def web_command(settings: Settings) -> list[str]:
     """The command line of the child: all that the agent's own options may have changed is given."""
     web = settings.web
-    command = own_command("web", "--with-agent", "--agent", settings.name)
+    command = own_command("web", "--agent", settings.name)
     command += ["--port", str(web.port), "--listen", web.listen]
     if web.token_file:
         command += ["--token-file", web.token_file]
     if settings.config_file is not None:
-        command += ["--config", str(settings.config_file)]
+        command += ["--config", str(settings.config_file.absolute())]
     return command
 
 
@@ -202,11 +219,12 @@ def web_environment(settings: Settings, environ: Mapping[str, str]) -> dict[str,
 
 
 class WebProcess:
-    """The child, started again with a growing delay whenever it ends.
+    """The child, started again with a growing delay whenever it ends; that of an agent before is taken over.
 
     Args:
         command: Its command line.
         rng: Uniform numbers in [0, 1), for the delays.
+        file: Where its process is noted.
         environ: Its environment; ``None``: the agent's.
 
     Attributes:
@@ -217,14 +235,24 @@ class WebProcess:
         self,
         command: Sequence[str],
         rng: Callable[[], float],
+        file: Path,
         *,
         environ: Mapping[str, str] | None = None,
     ) -> None:
         self._command = command
         self._environ = environ
+        self._file = file
+        self._one = threading.Lock()  # a start that was cancelled goes on in its thread
+        self._process: subprocess.Popen[bytes] | None = None  # ``None`` too if an agent before has started it
         self._backoff = Backoff(WEB_RESTART_FIRST, WEB_RESTART_CAP, rng)
         self._task: asyncio.Task[None] | None = None
         self.pid: int | None = None
+
+    @classmethod
+    def of(cls, settings: Settings, rng: Callable[[], float]) -> Self:
+        """That of an agent with these settings."""
+        file = runtime_dir(os.environ, settings.runtime_dir) / f"{settings.name}.web"
+        return cls(web_command(settings), rng, file, environ=web_environment(settings, os.environ))
 
     def start(self) -> None:
         """Start the child, and look after it until ``close()``."""
@@ -237,12 +265,14 @@ class WebProcess:
                 os.kill(self.pid, signal.SIGHUP)
 
     async def close(self) -> None:
-        """End the child, and wait until it has ended."""
+        """End the child, also one that an agent before has left, and wait until it has ended."""
         if self._task is not None:
             self._task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await self._task
             self._task = None
+        with contextlib.suppress(OSError):
+            await asyncio.to_thread(self._end_former)
 
     async def _supervise(self) -> None:
         loop = asyncio.get_running_loop()
@@ -265,26 +295,82 @@ class WebProcess:
             await asyncio.sleep(delay)
 
     async def _run(self) -> int:
-        # In a session of its own Ctrl-C does not reach it: it ends with the agent, and not before.
-        process = await asyncio.to_thread(
-            lambda: subprocess.Popen(  # noqa: S603 - our own program
-                self._command, stdin=subprocess.PIPE, start_new_session=True, env=self._environ
-            )
-        )
+        pid = await asyncio.to_thread(self._take_over_or_start)
         try:
-            self.pid = process.pid
-            await _ended(process.pid)
+            self.pid = pid
+            await _ended(pid)
         finally:
             self.pid = None
-            if process.stdin is not None:
-                process.stdin.close()
-            try:
-                async with asyncio.timeout(WEB_END_TIMEOUT):
-                    await _ended(process.pid)
-            except TimeoutError:
-                process.kill()
-            process.wait()
-        return process.returncode
+            await asyncio.to_thread(_end, pid)
+        return self._process.wait() if self._process is not None else 1
+
+    def _take_over_or_start(self) -> int:
+        """The process of the child."""
+        words = [*self._command]
+        ours = {} if self._environ is None else {k: v for k, v in self._environ.items() if k.startswith(_READ)}
+        made_of = [__version__, words, dict(sorted(ours.items()))]
+        with self._one, self._file.open("a+b") as file:
+            self._process = None
+            if (former := _noted(file)) is not None:
+                pid, other = former
+                if other == made_of:
+                    _log.info("= rmpa web (process %d) goes on, of the agent before", pid)
+                    os.kill(pid, signal.SIGHUP)  # what is in rmpa.toml may have changed
+                    return pid
+                _end(pid)
+                fcntl.flock(file, fcntl.LOCK_EX)
+            # In a session of its own Ctrl-C does not reach it: the agent ends it.
+            self._process = process = subprocess.Popen(  # noqa: S603 - our own program
+                words,
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+                env=self._environ,
+                pass_fds=(file.fileno(),),
+            )
+            file.truncate(0)
+            file.write(json.dumps([process.pid, made_of]).encode())
+        return process.pid
+
+    def _end_former(self) -> None:
+        with self._one, self._file.open("r+b") as file:
+            if (former := _noted(file)) is not None:
+                _end(former[0])
+            self._file.unlink()
+        if self._process is not None:
+            self._process.wait()
+
+
+def _noted(file: BinaryIO) -> tuple[int, object] | None:
+    """The process that a file notes and what it was made of; ``None``: it has ended, and the file is locked by us.
+
+    Raises:
+        OSError: It runs, but the agent that started it was killed before it could note it.
+    """
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.seek(0)
+        try:
+            pid, made_of = json.loads(file.read())
+        except ValueError:
+            raise OSError("the one of the agent before runs, and its process is not known") from None
+        return int(pid), made_of
+    return None
+
+
+def _end(pid: int) -> None:
+    """End a process: it is asked to, and killed if it does not in time."""
+    with contextlib.suppress(ProcessLookupError):
+        descriptor = os.pidfd_open(pid)
+        try:
+            signal.pidfd_send_signal(descriptor, signal.SIGTERM)
+            ended = select.poll()
+            ended.register(descriptor, select.POLLIN)
+            if not ended.poll(WEB_END_TIMEOUT * 1000):
+                signal.pidfd_send_signal(descriptor, signal.SIGKILL)
+                ended.poll()
+        finally:
+            os.close(descriptor)
 
 
 async def _ended(pid: int) -> None:

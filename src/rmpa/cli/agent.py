@@ -6,10 +6,12 @@ import contextlib
 import gc
 import logging
 import os
+import shutil
 import socket
 import sys
 import threading
 from functools import partial
+from textwrap import shorten
 from typing import TYPE_CHECKING, Final
 
 import click
@@ -50,7 +52,7 @@ _WELL: Final = {"service": "it can be called", "module": "it is linked"}
 def reload(check: bool, options: Options) -> int:
     """Make the agent read its rmpa.toml again; what has not changed is not interrupted.
 
-    Exit code 2 if the settings cannot be used; then nothing has changed.
+    Exit code 2 if the settings cannot be used, or it would not start with them; then nothing has changed.
 
     ---
     What takes effect at once: [bridge], [[contract]], [[peer]], [services], [[service]], [params], [[param]], [time]
@@ -118,7 +120,7 @@ def config_schema() -> None:
 def explain(code: str | None, options: Options) -> None:
     """Say what a code such as [port-in-use], at the end of an error or a warning, means, and what to do.
 
-    Without CODE all codes are shown, as docs/reference/codes.md has them.
+    Without CODE all codes are listed, one a line.
 
     ---
 
@@ -131,8 +133,16 @@ def explain(code: str | None, options: Options) -> None:
         raise ConfigError("CODE", f"there is no code {wanted!r}", remedy, code="unknown-name")
     found = [(one, *map(codes.plain, about)) for one, about in known.items() if wanted in ("", one)]
     fields = ("code", "meaning", "remedy")
-    texts = ((one, *(click.wrap_text(text, 78, "  ", "  ").splitlines() for text in about)) for one, *about in found)
-    options.show([dict(zip(fields, each, strict=True)) for each in found], texts)
+    rows = [dict(zip(fields, each, strict=True)) for each in found]
+    if wanted:
+        texts = (
+            (one, *(click.wrap_text(text, 78, "  ", "  ").splitlines() for text in about)) for one, *about in found
+        )
+        options.show(rows, texts)
+    else:
+        first = max(map(len, known)) + 2
+        width = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
+        options.show(rows, (f"{one:<{first}}{shorten(about, width - first)}" for one, about, _ in found))
 
 
 @agent_verb(

@@ -14,7 +14,16 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.machine import UNIT_FOLDER, Machine, check_machine, copy_state, own_program, remove_folder
+from rmpa.cli.machine import (
+    UNIT_FOLDER,
+    Machine,
+    check_machine,
+    copy_state,
+    entries,
+    modules_in,
+    own_program,
+    remove_folder,
+)
 from rmpa.cli.options import Options, flag, json_verb
 from rmpa.cli.trust import confirm
 from rmpa.cli.units import (
@@ -32,7 +41,6 @@ from rmpa.cli.units import (
 )
 from rmpa.config.module_name import (
     GATEWAY_SUFFIX,
-    PLACES_FILE,
     NameSource,
     choose_name,
     keep_name,
@@ -42,7 +50,7 @@ from rmpa.config.module_name import (
 from rmpa.config.read import line_of, load_settings, parse_config
 from rmpa.config.settings import Settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError
-from rmpa.core.identity import peer_name_problem
+from rmpa.core.identity import peer_name_from, peer_name_problem
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -65,9 +73,6 @@ _AWAY: Final = ("inactive", "unknown")
 _LOG_LINES: Final = 5
 # A user without any rights of its own: what it cannot run, the unit's user cannot either.
 _NOBODY: Final = 65534
-
-
-# --- install --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,15 +112,10 @@ def former(environ: Mapping[str, str], root: str = "") -> Former:
     return Former(
         user.pw_name,
         config if config is not None and str(config) != CONFIG else None,
-        state if state is not None and str(state) != STATE and _entries(state) else None,
+        state if state is not None and str(state) != STATE and entries(state) else None,
         chosen.name if chosen.source is not NameSource.DEFAULT else "",
         loaded.settings,
     )
-
-
-def _entries(state: Path) -> list[Path]:
-    """What a state directory keeps of modules."""
-    return sorted(path for path in state.glob("*") if path.name != PLACES_FILE)
 
 
 def choose_user(program: str) -> str:
@@ -321,12 +321,18 @@ def _take_over(machine: Machine, before: Former, user: str, name: str | None) ->
     place = machine.path(STATE)
     kept = kept_name(place)
     ids = None if machine.dry or os.geteuid() else machine.ids(user)
-    if _entries(place):
+    if entries(place):
         machine.note(f"{STATE} stays as it is")
     elif before.state is not None:
-        kept = kept_name(before.state)
-        if machine.change(f"copy what {before.user}'s agent has kept in {before.state}: {_about(before.state)}"):
-            copy_state(before.state, place, ids)
+        module = name or kept_name(before.state) or before.name or peer_name_from(socket.gethostname())
+        ours, others = modules_in(before.state, module, insecure=before.settings.trust.insecure)
+        if others:
+            machine.note(f"what other modules have kept stays in {before.state}: {', '.join(others)}")
+        if ours or not others:
+            kept = kept_name(before.state)
+            what = ", ".join([*([f"the name {kept}"] if kept else []), *ours.values()])
+            if machine.change(f"copy what {before.user}'s agent has kept in {before.state}: {what}"):
+                copy_state(before.state, place, ids, others)
     wanted = name or kept or before.name
     if not wanted or wanted == kept:
         return False
@@ -337,15 +343,6 @@ def _take_over(machine: Machine, before: Former, user: str, name: str | None) ->
                 os.chown(place, *ids)
         keep_name(place, wanted, instead=True)
     return True
-
-
-def _about(state: Path) -> str:
-    """What a state directory has, in a few words: ``the name base, base/ with keys of a secured mesh``."""
-    kept = kept_name(state)
-    folders = [path for path in _entries(state) if path.is_dir()]
-    keys = [" with keys of a secured mesh" if (folder / "trust").is_dir() else "" for folder in folders]
-    words = [f"{folder.name}/{text}" for folder, text in zip(folders, keys, strict=True)]
-    return ", ".join([*([f"the name {kept}"] if kept else []), *words])
 
 
 def _write_units(machine: Machine, wanted: Sequence[str], program: str, user: str) -> list[str]:
@@ -384,9 +381,6 @@ def _start(machine: Machine, wanted: Sequence[str], changed: Sequence[str]) -> N
             raise RmpaError(
                 "\n".join([str(error), *(f"  {line}" for line in _log(unit))]), code="service-unit"
             ) from None
-
-
-# --- status ---------------------------------------------------------------------------------------------------------
 
 
 def _shown(unit: str) -> dict[str, str]:
@@ -507,9 +501,6 @@ def _peers() -> tuple[list[tuple[str, str]], str, str]:
     return [], "", f"this user may not ask: use sudo, or join the group {GROUP}"
 
 
-# --- uninstall ------------------------------------------------------------------------------------------------------
-
-
 @json_verb(
     flag(
         "--purge", help="Remove settings and state too, and the user rmpa: the module's name and keys are then lost."
@@ -552,6 +543,11 @@ def service_uninstall(purge: bool, yes: bool, dry_run: bool, root: str, options:
         machine.systemctl("daemon-reload")
     if purge:
         _purge(machine)
+    elif not machine.packaged:
+        stays = [each for each in (CONFIG, STATE) if machine.path(each).exists()]
+        stays += [f"the user {USER}"] if machine.ids(USER) is not None else []
+        if stays:
+            machine.note(f"{', '.join(stays)} stay; they go by: rmpa service uninstall --purge")
     if not machine.changes:
         machine.note("nothing is installed")
     options.show({"units": parts, "changes": machine.changes, "dry_run": dry_run})

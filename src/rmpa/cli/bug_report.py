@@ -13,6 +13,7 @@ import socket
 import sys
 import tarfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -53,10 +54,12 @@ _OF_AGENTS: Final = {
     "nodes.txt": "node list",
     "sites.txt": "site list",
 }
-# Seconds for all commands together; they run side by side, and an agent that does not answer takes each 10 s.
-DEADLINE: Final = 30.0
-# Seconds for the snapshot of an agent.
-_SNAPSHOT: Final = 5.0
+# Commands that run at a time: together they would take the processor from each other, and from the agent.
+_AT_A_TIME: Final = 4
+# Seconds for one command: they are processes of Python, which take a minute each at a load of 30 for each core.
+DEADLINE: Final = 120.0
+# Seconds for the snapshot of an agent; one that does not answer is not asked for its lists either.
+_SNAPSHOT: Final = 10.0
 _LOG: Final = "journalctl --no-pager --quiet --output=short-iso-precise --lines=1000"
 _LOG_BYTES: Final = 512 * KIB
 # Variables whose values are shown; of others that begin so only the names.
@@ -89,15 +92,17 @@ Files that could not be filled say why.
     click.option("--log", metavar="FILE", type=click.Path(exists=True, dir_okay=False), help="A log of rmpa up."),
     flag("--anonymous", help="Replace names of hosts and modules, and addresses, each by one word."),
 )
-def bug_report(config: str | None, output: str | None, log: str | None, anonymous: bool, options: Options) -> None:
+def bug_report(config: str | None, output: str | None, log: str | None, anonymous: bool, options: Options) -> int:
     """Collect what a maintainer needs into one archive: versions, doctor, lists, settings, the end of the log.
 
     Keys, tokens, passwords, user names and home directories are taken out, and messages are never in it. Names of
     hosts and addresses stay, unless --anonymous is given. Nothing is sent: look into it, and attach it to the issue.
 
     ---
-    It works as any user, without an agent, and with an agent that hangs (within 30 s, and 5 s for each such agent);
+    It works as any user, without an agent, and with an agent that hangs. On a busy machine each part has 120 s.
     sudo adds the log of the units and the rules of the firewall.
+
+    Exit codes: 0 written; 1 written, but parts are missing, as the last lines say; 2 a wrong option.
 
     Examples:
       rmpa bug-report
@@ -108,7 +113,7 @@ def bug_report(config: str | None, output: str | None, log: str | None, anonymou
     if path.exists():
         raise ConfigError("--output", f"{path} is there already", "name another one")
     environ = {**os.environ, "RMPA_CONFIG": config} if config else dict(os.environ)
-    found, modules = collect(environ, log)
+    found, modules, missing = collect(environ, log)
     settings: dict[str, Any] = {}
     with suppress(ValueError, KeyError):  # they cannot be read: the file says why
         settings = {each["name"]: each["value"] for each in json.loads(found["settings.json"])["settings"]}
@@ -128,18 +133,20 @@ def bug_report(config: str | None, output: str | None, log: str | None, anonymou
     counts = {what: count for what, count in redactor.counts.items() if count}
     sizes = {name: len(data) for name, data in clean.items()}
     if options.as_json:
-        options.show(
-            {"file": str(path).encode(errors="backslashreplace").decode(), "files": sizes, "redacted": counts}
-        )
-        return
+        file = str(path).encode(errors="backslashreplace").decode()
+        options.show({"file": file, "files": sizes, "redacted": counts, "missing": missing})
+        return 1 if missing else 0
     print_text(Table("FILE, >SIZE", [(name, size(count)) for name, count in sizes.items()]), "")
     print_text(f"redacted: {', '.join(f'{count} {what}' for what, count in counts.items()) or 'nothing'}")
     if found["log.txt"] == _NO_LOG and os.geteuid():
         print_text("log.txt is empty: if a unit of rmpa runs here, only root may read its log: sudo rmpa bug-report")
     print_text(f"{path} is written, and was not sent anywhere. Names may stay: look through it before you send it.")
+    for name, why in missing.items():
+        print_text(f"missing: {name}: {why}")
+    return 1 if missing else 0
 
 
-def collect(environ: Mapping[str, str], log: str | None) -> tuple[dict[str, str], list[str]]:
+def collect(environ: Mapping[str, str], log: str | None) -> tuple[dict[str, str], list[str], dict[str, str]]:
     """Ask this machine.
 
     Args:
@@ -147,53 +154,64 @@ def collect(environ: Mapping[str, str], log: str | None) -> tuple[dict[str, str]
         log: A file with the agent's log.
 
     Returns:
-        The text of each file, not redacted, and the names of modules.
+        The text of each file, not redacted; the names of modules; of files that could not be filled, the reason.
     """
-    agents = find_agents(environ)
     system = json.dumps(_system(environ), default=str)
-    found, modules = {"system.json": system, "state.txt": "\n".join(_state(environ))}, []
+    found, modules, missing = {"system.json": system, "state.txt": "\n".join(_state(environ))}, [], {}
     programs = {file: own_command(*of.split()) for file, of in _COMMANDS.items()}
-    for name in (agent.name for agent in agents):
-        programs |= {f"{name}/{file}": own_command(*of.split(), "--agent", name) for file, of in _OF_AGENTS.items()}
-    programs["log.txt"] = [*_LOG.split(), *(f"--unit={unit}" for unit in UNITS.values())]
-    found |= run_programs(programs, environ)
-    for agent in agents:
+    for agent in find_agents(environ):
         modules.append(agent.name)
+        file = f"{agent.name}/snapshot.json"
         try:
             with ControlClient(agent.path, _SNAPSHOT) as client:
                 shown = client.snapshot()
         except RmpaError as error:
-            found[f"{agent.name}/snapshot.json"] = json.dumps({"error": str(error)})
+            found[file] = json.dumps({"error": str(error)})
+            missing[file] = f"{error} (its lists neither)"
         else:
-            found[f"{agent.name}/snapshot.json"] = msgspec.json.encode(shown).decode()
+            found[file] = msgspec.json.encode(shown).decode()
             modules += [peer.name for peer in (*shown.peers, *shown.strangers)]
+            of_agent = ("--agent", agent.name)
+            programs |= {
+                f"{agent.name}/{file}": own_command(*of.split(), *of_agent) for file, of in _OF_AGENTS.items()
+            }
+    programs["log.txt"] = [*_LOG.split(), *(f"--unit={unit}" for unit in UNITS.values())]
+    told, late = run_programs(programs, environ)
+    found |= told
+    missing |= late
     if not found["log.txt"]:
         found["log.txt"] = _NO_LOG
     if log is not None:
         found["up.log"] = Path(log).read_bytes()[-_LOG_BYTES:].decode("utf-8", "replace")
-    return found, modules
+    return found, modules, missing
 
 
-def run_programs(programs: Mapping[str, list[str]], environ: Mapping[str, str]) -> dict[str, str]:
-    """What programs print, all run side by side; of one that fails or hangs also what it says, or that it hangs."""
-    until, running, found = time.monotonic() + DEADLINE, {}, {}
-    for file, words in programs.items():
+def run_programs(
+    programs: Mapping[str, list[str]], environ: Mapping[str, str]
+) -> tuple[dict[str, str], dict[str, str]]:
+    """What programs print, and of those that were ended that they were; of one that fails also what it says."""
+    missing = {}
+
+    def run(file: str) -> str:
+        words, said = programs[file], ""
         try:
-            running[file] = Popen(words, stdin=DEVNULL, stdout=PIPE, stderr=PIPE, env=environ)  # noqa: S603 - ours
+            process = Popen(words, stdin=DEVNULL, stdout=PIPE, stderr=PIPE, env=environ)  # noqa: S603 - ours
         except OSError as error:
-            found[file] = f"{words[0]}: {error.strerror}\n"
-    for file, process in running.items():
+            return f"{words[0]}: {error.strerror}\n"
         try:
-            out, err = process.communicate(timeout=max(0.1, until - time.monotonic()))
-            said = f"exit code {process.returncode}\n" if process.returncode and not file.endswith(".json") else ""
+            out, err = process.communicate(timeout=DEADLINE)
+            if process.returncode and not file.endswith(".json"):
+                said = f"exit code {process.returncode}\n"
         except TimeoutExpired:
             process.kill()
             out, err = process.communicate()
-            said = f"it was ended after {DEADLINE:g} s\n"
-        found[file] = out[-_LOG_BYTES * 8 :].decode("utf-8", "replace")
-        if (err or said) and not (file.endswith(".json") and out):
-            found[file] += said + err.decode("utf-8", "replace")
-    return found
+            missing[file] = f"it was ended after {DEADLINE:g} s"
+            said = f"{missing[file]}\n"
+        text = out[-_LOG_BYTES * 8 :].decode("utf-8", "replace")
+        return text if file.endswith(".json") and out else text + said + err.decode("utf-8", "replace")
+
+    with ThreadPoolExecutor(_AT_A_TIME) as pool:
+        return dict(zip(programs, pool.map(run, programs), strict=True)), missing
 
 
 def _system(environ: Mapping[str, str]) -> dict[str, object]:

@@ -76,7 +76,7 @@ def gateway(context: click.Context, /, **options: object) -> int:
       rmpa gateway --router --listen tls/0.0.0.0:7447                    the router that the sites connect to
       rmpa gateway --site b --rank 200 --connect tls/fleet.example:7447  standby for the one with rank 100
       rmpa gateway --ros2 --connect tcp/localhost:7447                   ROS 2 nodes beside rmw_zenohd
-      rmpa gateway zenoh-config --listen tls/0.0.0.0:7447 > zenohd.json5 a router with zenohd instead
+      rmpa gateway zenoh-config --listen tls/0.0.0.0:7447 > zenohd.json5  a router with zenohd instead
     """
     if context.invoked_subcommand is not None:
         given = [name for name, value in options.items() if value not in (None, ())]
@@ -90,10 +90,11 @@ def gateway(context: click.Context, /, **options: object) -> int:
         beside = find_module(None, {"config": options.get("config")}, _own(os.environ)).name
 
     def load() -> Loaded:
-        return load_gateway(options, dict(os.environ), socket.gethostname(), beside)
+        loaded = load_gateway(options, dict(os.environ), socket.gethostname(), beside)
+        _check_settings(loaded.settings)
+        return loaded
 
     loaded = load()
-    _check_settings(loaded.settings)
     _check_agents(loaded.settings)
     writer = LogWriter(sys.stderr.fileno())
     journal = in_journal(os.environ, sys.stderr.fileno())
@@ -264,10 +265,10 @@ def _is_there(name: str) -> bool:
     click.option("--key", metavar="FILE", help="Its private key (PEM). [default: in the certificate's file]"),
     flag("--drive", help="Let the joystick of its pages command a robot; they need the token."),
     config_option,
-    click.option("--with-agent", is_flag=True, hidden=True, help="End when standard input ends."),
     flag("--insecure", help="Start without an agent although other modules here have keys."),
+    flag("--check", help="Only check that it could start with these settings."),
 )
-def web(config: str | None, with_agent: bool, insecure: bool, options: Options, **given: Any) -> int:
+def web(config: str | None, insecure: bool, check: bool, options: Options, **given: Any) -> int:
     """Show the mesh in a browser; serve rosbridge and Foxglove clients, /metrics for Prometheus, /api/v1 as JSON.
 
     It is a process of its own: the agent does not depend on it. It starts without an agent too, and finds it later.
@@ -298,6 +299,9 @@ def web(config: str | None, with_agent: bool, insecure: bool, options: Options, 
         return module, _setup(module, settings)
 
     module, setup = make()
+    if check:
+        options.show({}, "the settings can be used")
+        return 0
     journal = in_journal(os.environ, sys.stderr.fileno())
     configure_logging(setup.settings.log_level, sys.stderr, as_json=setup.settings.log_json, in_journal=journal)
     said = [f"--insecure: {INSECURE['trust.insecure']}"] if insecure else []
@@ -318,7 +322,7 @@ def web(config: str | None, with_agent: bool, insecure: bool, options: Options, 
         if setup.trusted and not Permissions(setup.settings.trust).knows("web"):
             _web_log.warning("! no [[permission]] lets web do anything: its clients see names alone [not-permitted]")
         pinned = module.name if module.chosen.source.said else None
-        if not asyncio.run(serve(setup, pinned, announce, with_agent=with_agent, load=lambda: make()[1])):
+        if not asyncio.run(serve(setup, pinned, announce, load=lambda: make()[1])):
             return 0
         module, setup = make()
 
@@ -330,7 +334,7 @@ def _setup(module: Module, settings: Settings) -> WebSetup:
         RmpaError: A file cannot be used; or no agent runs, the module has no keys, and others have some.
     """
     from rmpa.trust.store import check_open
-    from rmpa.web.server.process import WebSetup, access_of, certificate_files
+    from rmpa.web.server.process import WebSetup, access_of, certificate_files, tls_context
 
     store = module.store if module.state is not None else None
     trusted = module.agent == "secured" or (store is not None and store.exists)
@@ -339,6 +343,7 @@ def _setup(module: Module, settings: Settings) -> WebSetup:
     if trusted:
         settings = replace(settings, trust=agent_settings(module).settings.trust)
     files = certificate_files(settings.web.cert, settings.web.key, store if trusted else None)
+    tls_context(files)  # a changed certificate that cannot be used must not end a server that runs
     access = access_of(settings.web, module.name, os.environ, settings.state_dir)
     folder = str(store.folder) if store is not None else ""
     return WebSetup(settings, access, files, trusted, module.name, folder)
@@ -442,7 +447,8 @@ def gateway_zenoh_config(**options: object) -> None:
     [[permission]] and [trust] of rmpa.toml. Print it again and restart zenohd when a rule has changed.
 
     Examples:
-      rmpa gateway zenoh-config --name fleet > zenohd.json5 && zenohd -c zenohd.json5
+      rmpa gateway zenoh-config --name fleet > zenohd.json5
+      zenohd -c zenohd.json5
       rmpa gateway zenoh-config --listen tcp/0.0.0.0:7447 --insecure     in a network of your own
     """
     loaded = load_gateway(options, dict(os.environ), socket.gethostname())

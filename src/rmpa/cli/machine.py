@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from rmpa.cli.units import GROUP, PACKAGED, UNITS
-from rmpa.config.module_name import PLACES_FILE
+from rmpa.config.module_name import GATEWAY_SUFFIX, PLACES_FILE, module_dir
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Collection
 
 # The folder of the administrator's units; a package has its own in one of the others.
 UNIT_FOLDER: Final = "/etc/systemd/system"
@@ -176,13 +176,43 @@ def own_program() -> str:
     )
 
 
-def copy_state(state: Path, place: Path, ids: tuple[int, int] | None) -> None:
+def entries(state: Path) -> list[Path]:
+    """What a state directory keeps of modules."""
+    return sorted(path for path in state.glob("*") if path.name != PLACES_FILE)
+
+
+def modules_in(state: Path, module: str, *, insecure: bool) -> tuple[dict[str, str], list[str]]:
+    """The folders of a state directory: those of a module and its gateway, with what is said of them; and others.
+
+    Args:
+        state: The directory.
+        module: The module.
+        insecure: Whether it may be without keys although others have some.
+
+    Raises:
+        StartError: It may not.
+    """
+    wanted = {module_dir(state, each) for each in (module, module + GATEWAY_SUFFIX)}
+    folders = [path for path in entries(state) if path.is_dir() and not path.is_symlink()]
+    keys = {path: (path / "trust").is_dir() for path in folders}
+    others = [path.name for path in folders if path not in wanted]
+    secured = [path.name for path in folders if keys[path] and path not in wanted]
+    if secured and not keys.get(module_dir(state, module)) and not insecure:
+        problem = f"it has no keys in {state}, but {', '.join(secured)} has"
+        remedy = f"install that one, --name {secured[0]}; or first: rmpa trust join --name {module} TOKEN"
+        raise StartError(f"the module {module}", problem, remedy, code="keys-unusable")
+    ours = [path for path in folders if path in wanted]
+    return {path.name: f"{path.name}/{' with keys of a secured mesh' if keys[path] else ''}" for path in ours}, others
+
+
+def copy_state(state: Path, place: Path, ids: tuple[int, int] | None, without: Collection[str] = ()) -> None:
     """Copy files and folders into a new folder, which no other user can reach before it takes its place.
 
     Args:
         state: The user's state directory. Links in it are not followed.
         place: That of the units: missing or empty.
         ids: User and group that it is to belong to; ``None``: it stays this user's.
+        without: Folders in it that are left out.
 
     Raises:
         StartError: It cannot be copied; then nothing was.
@@ -192,7 +222,7 @@ def copy_state(state: Path, place: Path, ids: tuple[int, int] | None) -> None:
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         new = Path(tempfile.mkdtemp(prefix=f".{place.name}-", dir=place.parent))
-        _copy_files(state.resolve(), new)
+        _copy_files(state.resolve(), new, without)
         if ids is not None:
             for path in (*new.rglob("*"), new):
                 os.chown(path, *ids)
@@ -205,12 +235,14 @@ def copy_state(state: Path, place: Path, ids: tuple[int, int] | None) -> None:
         ) from None
 
 
-def _copy_files(state: Path, new: Path) -> None:
+def _copy_files(state: Path, new: Path, without: Collection[str]) -> None:
     def fail(error: OSError) -> None:
         raise error
 
     for folder, folders, names, place in os.fwalk(state, onerror=fail):
         to = new / Path(folder).relative_to(state)
+        if Path(folder) == state:
+            folders[:] = [name for name in folders if name not in without]
         for name in folders:
             if stat.S_ISDIR(os.stat(name, dir_fd=place, follow_symlinks=False).st_mode):
                 (to / name).mkdir(mode=0o700)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import os
+import re
 import sys
 from itertools import takewhile
 from typing import TYPE_CHECKING, Any, Final
@@ -22,7 +23,7 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError, with_places
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
 # By the words behind ``rmpa``: the module of ``rmpa.cli``, and the line that the help of the group shows.
 #
@@ -159,11 +160,35 @@ def help_of(docstring: str | None) -> dict[str, Any]:
 
 
 class PlacedHelp(click.Command):
-    """A command whose help says where the pages are that it names; they are looked for when it is shown."""
+    """A command whose help fits the terminal, and says where the pages are that it names."""
 
-    def get_help(self, ctx: click.Context) -> str:
-        """The help as it is printed."""
-        return with_places(super().get_help(ctx))
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's
+        """Write the epilog: sentences are filled; where a line is too long, what an example does stands below it."""
+        for paragraph in with_places(self.epilog or "").replace("\b\n", "").strip("\n").split("\n\n"):
+            lines = paragraph.splitlines()
+            examples = [line for line in lines if line.startswith(" ")]
+            formatter.write_paragraph()
+            with formatter.indentation():
+                formatter.write_text(" ".join(line for line in lines if not line.startswith(" ")))
+                room = formatter.width - formatter.current_indent
+                for line in shown_examples(examples, room):
+                    formatter.write(f"{'':>{formatter.current_indent}}{line}\n")
+
+
+def shown_examples(lines: Sequence[str], width: int) -> Iterator[str]:
+    """Examples, each ``  command   what it does``, in so many columns.
+
+    Where one is longer, each has below it what it does. A command that is longer itself stays one line, to be copied.
+    """
+    parts = [re.fullmatch(r"( *.*?\S)(?: {2,}(\S.*))?", line) for line in lines]
+    if all(len(line) <= width for line in lines):
+        yield from lines
+        return
+    for part in parts:
+        if part is not None:
+            yield part[1]
+            if part[2]:
+                yield from click.wrap_text(part[2], width, "      ", "      ").splitlines()
 
 
 class LazyGroup(PlacedHelp, click.Group):
@@ -415,7 +440,8 @@ def cli() -> None:
       rmpa topic echo joystick:/cmd  one peer's messages
       rmpa why joystick:/cmd         why they do not come
     """
-    if os.environ.get("NO_COLOR"):  # no-color.org; without it click colours what a terminal shows
+    # no-color.org; without it click colours what a terminal shows.
+    if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
         click.get_current_context().color = False
 
 

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import csv
 import io
+import os
 import re
 import sys
 import time
@@ -218,7 +219,7 @@ def topic_echo(
                 click.echo(_csv(["%time", *(name for name, _ in columns)]))
             click.echo(_csv([str(received.stamp_ns), *(cell for _, cell in columns)]))
         else:
-            if clear and sys.stdout.isatty():
+            if clear and sys.stdout.isatty() and os.environ.get("TERM") != "dumb":
                 click.clear()
             click.echo(to_text(plain) + "\n---")
         if number == count:
@@ -262,7 +263,7 @@ def topic_pub(
 
     Examples:
       rmpa topic pub -1 /chatter std_msgs/String hello
-      rmpa topic pub -r 10 /cmd_vel geometry_msgs/Twist '{linear: {x: 0.2}, angular: {z: 0.1}}'
+      rmpa topic pub -r 10 /cmd_vel geometry_msgs/Twist '{linear: {x: 0.2}}'
       rmpa topic pub /cmd sensor_msgs/Joy '{header: auto, axes: [0.5, 0.0]}'
     """
     from rmpa.ros.types.definitions import UnknownTypeError

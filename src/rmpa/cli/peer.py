@@ -366,7 +366,7 @@ def site_info(site: str, name: str | None, options: Options) -> int:
 
     Examples:
       rmpa site info warehouse
-      rmpa site info warehouse --json | jq '.sites[0].sources[] | select(.here == "")'
+      rmpa site info hall --json | jq '.sites[0].sources[] | select(.here=="")'
     """
     from rmpa.observe.operations import INFO
 

@@ -334,7 +334,7 @@ def service_call(service: str, values: tuple[str, ...], wait: bool, timeout: flo
       rmpa service call /add_two_ints 20 22
       rmpa service call /arm/enable '{data: true}'
       rmpa service call base:/plan '{start: {header: auto}}' --timeout 120
-      rmpa service call /map_server/static_map --wait --json | jq .response.map.info
+      rmpa service call /static_map --wait --json | jq .response.map.info
     """
     from rmpa.ros.node.service_client import ServiceConnection
 

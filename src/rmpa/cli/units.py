@@ -47,7 +47,8 @@ StartLimitIntervalSec=0
 [Service]
 Type=notify
 ExecStart={program} {command} --config {config}
-ExecReload=/bin/kill -HUP $MAINPID
+# It waits for the answer, and fails with what the settings lack.
+{reload}
 Restart=always
 RestartSec=0.5
 RestartPreventExitStatus=2
@@ -103,7 +104,7 @@ WantedBy=multi-user.target
 """
 # The agent's alone.
 _NET_ADMIN: Final = """\
-# To end connections whose host has vanished (docs/guides/running.md#direct-transport).
+# To end connections whose host has vanished (docs/guides/direct-transport.md#cap_net_admin).
 AmbientCapabilities=CAP_NET_ADMIN
 CapabilityBoundingSet=CAP_NET_ADMIN"""
 _REALTIME: Final = """\
@@ -130,15 +131,17 @@ def unit_texts(program: str = PACKAGED, user: str = USER, header: str = "") -> d
         user: The user whose rights they have; its group is ``GROUP`` in any case.
         header: Comment lines above each.
     """
+    quoted = program.replace("%", "%%").replace(" ", "\\x20")
     return {
         unit: _UNIT.format(
             header=header,
             description=_DESCRIPTIONS[command],
             documentation="Documentation=man:rmpa(1)\n" if program == PACKAGED else "",
             after="" if command == "up" else f" {UNITS['up']}",
-            program=program.replace("%", "%%").replace(" ", "\\x20"),
+            program=quoted,
             command=command,
             config=CONFIG,
+            reload="\n".join(f"ExecReload={words}" for words in _reload(command, quoted)),
             user=user,
             group=GROUP,
             runtime=RUNTIME,
@@ -148,6 +151,13 @@ def unit_texts(program: str = PACKAGED, user: str = USER, header: str = "") -> d
         )
         for command, unit in UNITS.items()
     }
+
+
+def _reload(command: str, program: str) -> tuple[str, ...]:
+    """The commands that have the process of a unit read its settings again; the web server has no control socket."""
+    if command == "web":
+        return f"{program} web --config {CONFIG} --check", "/bin/kill -HUP $MAINPID"
+    return (f"{program} reload --agent $MAINPID",)
 
 
 def realtime_text(header: str = "") -> str:

@@ -11,6 +11,7 @@ import grp
 import os
 import socket
 import stat
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Generic, Literal, Self, TypeVar
@@ -250,6 +251,12 @@ class ControlClient:
         """The agent's name."""
         return self.path.stem
 
+    @property
+    def pid(self) -> int:
+        """The process that listens at the socket."""
+        # ``struct ucred`` begins with it.
+        return int.from_bytes(self._sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)[:4], sys.byteorder)
+
     def __enter__(self) -> Self:
         return self
 
@@ -305,10 +312,11 @@ class ControlClient:
 
 @dataclass(frozen=True, slots=True)
 class FoundAgent:
-    """An agent that runs on this machine."""
+    """An agent that runs on this machine, and the id of its process."""
 
     name: str
     path: Path
+    pid: int = 0
 
 
 def find_agents(environ: Mapping[str, str]) -> list[FoundAgent]:
@@ -316,13 +324,13 @@ def find_agents(environ: Mapping[str, str]) -> list[FoundAgent]:
     found = []
     for place in runtime_dirs(environ):
         for path in sorted(place.glob("*.sock")):
-            with contextlib.suppress(UnreachableError), ControlClient(path, timeout=limits.CONTROL_LOOK_TIMEOUT):
-                found.append(FoundAgent(path.stem, path))
+            with contextlib.suppress(UnreachableError), ControlClient(path, limits.CONTROL_LOOK_TIMEOUT) as client:
+                found.append(FoundAgent(path.stem, path, client.pid))
     return sorted(found, key=lambda agent: agent.name)
 
 
 def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAgent:
-    """The named agent; else that of RMPA_AGENT, else the one that ``config.module_name.running_agent`` chooses.
+    """The agent of that name or process id; else of RMPA_AGENT, else as ``config.module_name.running_agent`` chooses.
 
     Raises:
         UnreachableError: No agent runs, or none of that name.
@@ -346,7 +354,7 @@ def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAg
                 names = load_settings({}, environ, host_name=socket.gethostname()).names
         wanted = running_agent(names, *running_agents(agents, environ))
     for agent in agents:
-        if agent.name == wanted:
+        if wanted in (agent.name, str(agent.pid)):
             return agent
     path = runtime_dir(environ) / f"{wanted}.sock"
     remedy = f"running here: {listed}" if agents else f"start it with `rmpa up --name {wanted}`"

@@ -356,6 +356,12 @@ ORDER_AGE: Final = 5.0
 # At it: the robot is stopped
 # Why: A joystick sends every 0.1 s.
 DRIVE_TIMEOUT: Final = 0.3
+# How often the server of the page that has the stick tells other servers; a second may lose two of them.
+STICK_RENEW: Final = 0.5
+# [Pages] Time without a word of the server whose page has the stick
+# At it: the stick is free
+# Why: It tells it every 0.5 s.
+STICK_EXPIRY: Final = 2.0
 # Magnitude of a linear speed that a joystick may command, m/s.
 DRIVE_SPEED: Final = 2.0
 # Magnitude of an angular speed that a joystick may command, rad/s.

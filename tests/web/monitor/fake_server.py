@@ -39,7 +39,9 @@ from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.session import MonitorSession
 from rmpa.web.monitor.state import StateBuilder, details, node_detail, node_key
+from rmpa.web.monitor.sticks import Sticks
 from rmpa.web.server.app import HEADERS
+from tests.web.monitor.test_sticks import Bus
 from tests.web.recorder import FakeHub, PageConnection, Recorded
 
 if TYPE_CHECKING:
@@ -195,6 +197,9 @@ class FakeServer:
         self.speeds: list[SimpleNamespace] = []
         self.reports: list[str] = []
         self.asked: list[SimpleNamespace] = []
+        self.pages = itertools.count(7)
+        bus: Any = Bus()
+        self.sticks = Sticks(bus, lambda: "pc")
         self.params: dict[str, Any] = {
             "/rosdistro": "noetic",
             "/use_sim_time": False,
@@ -356,9 +361,10 @@ class _Client(Recorded):
         mesh = SimpleNamespace(agent="pc", details=server._details, follow=lambda *_: None, unfollow=lambda _: None)
         log = SimpleNamespace(follow=self._follow_log, unfollow=self._unfollow_log, refused=None)
         answers, values = SimpleNamespace(answer=server.answer), SimpleNamespace(of=self._decode)
-        monitor: Any = SimpleNamespace(mesh=mesh, log=log, answers=answers, values=values)
+        monitor: Any = SimpleNamespace(mesh=mesh, log=log, answers=answers, values=values, sticks=server.sticks)
         hub: Any = FakeHub()
-        super().__init__(MonitorSession(hub, server.rights, lambda _: 0, "page", monitor, time.monotonic))
+        address = f"10.0.0.{next(server.pages)}"
+        super().__init__(MonitorSession(hub, server.rights, lambda _: 0, address, monitor, time.monotonic))
         self.page = self.connection = self.session.connection = PageConnection(self)
 
     def _follow_log(self, _page: object, show: Callable[[list[Any]], None]) -> list[Any]:

@@ -15,7 +15,9 @@ from rmpa.web import limits
 from rmpa.web.hub.node_link import FULL, Rights
 from rmpa.web.hub.topics import ReceivedMessage
 from rmpa.web.monitor.session import MonitorSession
+from rmpa.web.monitor.sticks import Sticks
 from tests.web.monitor.patches import apply
+from tests.web.monitor.test_sticks import Bus
 from tests.web.recorder import Asked, FakeHub, PageConnection, Recorded
 
 STOP = ("/cmd_vel", 0.0, 0.0)
@@ -25,19 +27,22 @@ ALL = dataclasses.replace(FULL, drive=True)
 class Page(Recorded):
     """A session with a clock and the state that its page has."""
 
-    def __init__(self, rights: Rights = ALL) -> None:
+    def __init__(self, rights: Rights = ALL, sticks: Sticks | None = None) -> None:
         self.now = 100.0
         self.details: Any = {("topic", "/odom"): {"rate": 50.0}}
         self.decoded = self.ticks = self.n = self.number = 0
         self.tick_at = 0.0
         self.state: Any = None
+        self.stick: Any = None
         self.news: list[Any] = []
         self.kept: list[Any] = []
+        made: Any = Bus()
         monitor: Any = SimpleNamespace(
             mesh=SimpleNamespace(agent="pc", details=self._details, follow=lambda *_: None, unfollow=lambda _: None),
             values=SimpleNamespace(of=self._decode),
             log=SimpleNamespace(follow=lambda *_: self.kept, unfollow=lambda _: None, refused=None),
             answers=SimpleNamespace(answer=self._asked),
+            sticks=sticks or Sticks(made, lambda: "pc", lambda: self.now),
         )
         hub: Any = FakeHub()
         super().__init__(MonitorSession(hub, rights, lambda _: 0, "page", monitor, lambda: self.now))
@@ -66,6 +71,9 @@ class Page(Recorded):
             if message["op"] == "tick":
                 self.ticks += 1
                 self.tick_at = message["at"]
+                continue
+            if message["op"] == "stick":
+                self.stick = message
                 continue
             new.append(message)
             if message["op"] == "state":
@@ -308,6 +316,88 @@ def test_a_robot_is_stopped_at_once(page: Page, how: str) -> None:
 
 
 WATCH = {"op": "watch", "id": 1, "topic": "/a", "how": "value"}
+
+
+def pair() -> tuple[Page, Page]:
+    """Two pages of one server, both of which show the joystick."""
+    made: Any = Bus()
+    sticks = Sticks(made, lambda: "pc", lambda: 100.0)
+    first, second = Page(sticks=sticks), Page(sticks=sticks)
+    for each in (first, second):
+        each.send("stick", topic="/cmd_vel", want="look")
+        assert each.stick == {
+            "op": "stick", "topic": "/cmd_vel", "holder": None, "mine": False, "problem": ""
+        }  # fmt: skip
+    return first, second
+
+
+def test_two_pages_never_drive_one_robot_in_turns() -> None:
+    first, second = pair()
+    first.send("stick", topic="/cmd_vel", want="take")
+    first.drive(1)
+    first.drive(1)
+    second.take()
+    assert (second.stick["mine"], second.stick["holder"]["by"], second.stick["holder"]["module"]) == (
+        False, "page", "pc"
+    )  # fmt: skip
+    (told,) = [frame for _ in range(5) for frame in second.drive(-1)]
+    assert "the page of page at pc has it" in told["error"]
+    assert second.speeds == []
+    second.send("release", hold=1)
+    assert second.speeds == [], "a zero of it would land between the commands of the other"
+
+
+def test_the_one_from_which_it_is_taken_over_is_told_and_drives_no_more() -> None:
+    first, second = pair()
+    first.drive(1)
+    first.drive(1)
+    second.send("stick", topic="/cmd_vel", want="over")
+    assert second.stick["mine"]
+    (told,) = first.take()
+    assert "has taken the stick over" in told["error"]
+    assert (first.stick["mine"], first.speeds[-1]) == (False, STOP)
+    count = len(first.speeds)
+    second.drive(0.5, hold=7)
+    second.drive(0.5, hold=7)
+    second.send("stick", topic="/cmd_vel", want="leave")
+    first.drive(1)
+    first.drive(1)
+    assert len(first.speeds) == count, "the stick that is still pressed there moves nothing, though it is free"
+    first.drive(1, hold=2)
+    first.drive(1, hold=2)
+    assert first.speeds[-1] == ("/cmd_vel", limits.DRIVE_SPEED, 0.0)
+
+
+def test_every_page_may_stop_the_robot() -> None:
+    made: Any = Bus()
+    sticks = Sticks(made, lambda: "pc", lambda: 100.0)
+    first, second = Page(sticks=sticks), Page(Rights(), sticks)
+    first.drive(1)
+    first.drive(1)
+    second.send("stick", topic="/cmd_vel", want="take")
+    assert "may not drive" in second.news[-1]["error"]
+    second.send("stick", topic="/cmd_vel", want="stop")
+    assert second.asked == [], "it publishes nothing itself"
+    assert first.speeds[-1] == STOP
+    assert "has stopped the robot" in first.take()[-1]["error"]
+    count = len(first.speeds)
+    first.drive(1)
+    assert len(first.speeds) == count
+
+
+@pytest.mark.parametrize("how", ["the page has gone", "another topic"])
+def test_a_page_that_leaves_lets_the_stick_go(how: str) -> None:
+    first, second = pair()
+    first.drive(1)
+    if how == "another topic":
+        first.send("stick", topic="/other", want="look")
+    else:
+        first.session.closing()
+    second.take()
+    assert second.stick["holder"] is None
+    assert first.speeds[-1] == STOP
+
+
 DRIVE = {"op": "drive", "topic": "/cmd_vel", "linear": 0, "angular": 0, "hold": 1, "n": 1, "at": 0}
 
 

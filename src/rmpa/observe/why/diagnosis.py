@@ -256,7 +256,7 @@ def remedy_for(one: SubscriberTransport) -> str:
     """What to do about a subscriber that is relayed, or has to be."""
     if one.transport == "direct":
         return (
-            "if it lasts, give the agent CAP_NET_ADMIN (docs/guides/running.md#direct-transport), "
+            "if it lasts, give the agent CAP_NET_ADMIN (docs/guides/direct-transport.md#cap_net_admin), "
             "or restart that subscriber"
         )
     return _REMEDIES.get(one.condition, "docs/guides/contracts.md explains the conditions")

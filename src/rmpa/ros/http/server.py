@@ -331,7 +331,7 @@ class XmlRpcServer:
         Raises:
             StartError: The address is in use, not of this machine, or not allowed.
         """
-        sock = await _listen(self._name, *self._address, self._use)
+        sock = await listen(self._name, *self._address, self._use)
         self.port = sock.getsockname()[1]
         self._acceptor = Acceptor(
             sock,
@@ -528,7 +528,7 @@ class XmlRpcServer:
         return serialize_fault(1, f"{method} failed here: {type(error).__name__}: {error}")
 
 
-async def _listen(name: str, host: str, port: int, use: Use) -> socket.socket:
+async def listen(name: str, host: str, port: int, use: Use) -> socket.socket:
     """Open a listening socket; ``host`` may be empty for all addresses.
 
     Raises:

@@ -19,6 +19,7 @@ from rmpa.web.monitor.messages import LOG_TOPIC
 from rmpa.web.monitor.questions import Answers
 from rmpa.web.monitor.resources import MessageValues, ResourceWatch
 from rmpa.web.monitor.state import StateBuilder, details
+from rmpa.web.monitor.sticks import Sticks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -258,6 +259,7 @@ class Monitor:
         self.resources = ResourceWatch(hub, self.values)
         self.log = LogFeed(hub, self.values)
         self.mesh = MeshFeed(watch, self.resources, lambda: hub.params.changes)
+        self.sticks = Sticks(hub, lambda: self.mesh.agent)
         self.answers = Answers(
             hub,
             self.resources,

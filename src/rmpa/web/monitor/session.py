@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from rmpa.web.hub.node_link import Rights
     from rmpa.web.hub.topics import ClientPublication, ClientSubscription, ReceivedMessage
     from rmpa.web.monitor.monitor import Monitor
+    from rmpa.web.monitor.sticks import Stick
 
 _log = logging.getLogger(__name__)
 Id: TypeAlias = Annotated[int, Meta(gt=0, lt=2**32)]
@@ -44,6 +45,7 @@ _NO_TOKEN: Final = (
     "this page may not read parameters",
     "open it with a token: rmpa web --token-file FILE, or --control",
 )
+_NO_DRIVE: Final = "this page may not drive", "start rmpa web with --drive"
 _NO_CONTROL: Final = "this page may only look", "start rmpa web with --control"
 _TWIST: Final = "geometry_msgs/Twist"
 # A geometry_msgs/Twist: linear x, y, z in m/s, then angular x, y, z in rad/s.
@@ -102,9 +104,9 @@ class Joystick:
         told, self._told_late = self._told_late, self._told_late or now - at > limits.DRIVE_TIMEOUT
         return self._told_late and not told
 
-    def release(self, hold: int) -> None:
-        """The stick was let go: nothing more of that hold is obeyed."""
-        self._released = max(self._released, hold)
+    def release(self, hold: int = 0) -> None:
+        """The stick was let go: nothing more of that hold is obeyed, nor of the present one if none is given."""
+        self._released = max(self._released, hold or self._hold)
 
 
 class StatePatches:
@@ -197,6 +199,8 @@ class MonitorSession(Session):
         self._questions: set[int] = set()
         self._joystick = Joystick()
         self._driven: ClientPublication | None = None
+        self._stick: Stick | None = None
+        self._has_stick = False
 
     # --- the connection ---------------------------------------------------------------------------------------
 
@@ -213,6 +217,7 @@ class MonitorSession(Session):
         self._monitor.mesh.unfollow(self)
         self._monitor.log.unfollow(self)
         self._stop()
+        self._show_stick("")
         self._questions.clear()
 
     def received_frame(self, data: str | bytes, now: float) -> None:
@@ -244,6 +249,8 @@ class MonitorSession(Session):
     def next_timer(self) -> float | None:
         """When something is due that the page waits for, or the robot must be stopped."""
         dues: list[float | None] = [self._tick, self._joystick.due, self._patches.due]
+        if self._stick is not None and (wait := self._stick.due(self)) is not None:
+            dues.append(self._clock() + wait)
         if self.connection.unsent == 0:
             dues += [watch.due(0.0) for watch, _ in self._watches.values()]
         elif self._watches:
@@ -256,6 +263,8 @@ class MonitorSession(Session):
         if self._joystick.due is not None and now >= self._joystick.due:
             self._stop()
         with self._turn():
+            if self._stick is not None:
+                self._stick.handle_timer(self)
             if (news := self._patches.take(now, self._monitor.mesh.details)) is not None:
                 self._send(news)
             self._flush(now)
@@ -284,8 +293,8 @@ class MonitorSession(Session):
         text = str(error).removesuffix(f"; {remedy}") if remedy else str(error)
         self._refuse(id_, text, remedy, error.code)
 
-    def _refuse(self, id_: int, error: str, remedy: str = "", code: str = "refused") -> None:
-        self._send({"op": "failed", "id": id_, "error": error, "remedy": remedy, "code": code})
+    def _refuse(self, id_: int, error: str, remedy: str = "", code: str = "refused", **more: Any) -> None:
+        self._send({"op": "failed", "id": id_, "error": error, "remedy": remedy, "code": code, **more})
 
     # --- states and details -----------------------------------------------------------------------------------
 
@@ -420,6 +429,56 @@ class MonitorSession(Session):
 
     # --- driving ----------------------------------------------------------------------------------------------
 
+    def op_stick(self, _: float, *, topic: str, want: Literal["look", "take", "over", "leave", "stop"]) -> None:
+        """The page shows the joystick of a topic (``""``: none), and wants to know the holder, or to be it or not.
+
+        ``stop`` ends the hold of any page and stops the robot; every page may.
+        """
+        if topic:
+            _check_topic(topic)
+        self._show_stick(topic)
+        if (stick := self._stick) is None:
+            return
+        if want == "stop":
+            stick.stop(self.address)
+            if self._may.drive:
+                self._publish(topic, 0.0, 0.0)
+        elif want == "leave":
+            stick.leave(self)
+        elif want != "look":
+            if not self._may.drive:
+                self._refuse(0, *_NO_DRIVE)
+                return
+            stick.take(self, self.address, over=want == "over")
+
+    def _show_stick(self, topic: str) -> None:
+        stick = self._stick
+        if stick is not None and stick.topic != topic:
+            self._monitor.sticks.hide(stick, self)
+            self._stick, self._has_stick = None, False
+        if topic and self._stick is None:
+            self._stick = self._monitor.sticks.show(topic, self, self._stick_changed, drives=self._may.drive)
+            self._tell_stick(self._stick)
+
+    def _stick_changed(self) -> None:
+        stick = self._stick
+        if stick is None:
+            return
+        had, self._has_stick = self._has_stick, stick.holder is self
+        with self._turn():
+            if had and not self._has_stick:
+                self._joystick.release()
+                self._stop()
+                if stick.hold.ended:
+                    self._refuse(0, stick.hold.ended, "the robot does not obey this page any more")
+            self._tell_stick(stick)
+
+    def _tell_stick(self, stick: Stick) -> None:
+        hold = stick.hold
+        holder = {"by": hold.by, "module": hold.module, "since": hold.since} if hold.by else None
+        about = {"holder": holder, "mine": self._has_stick, "problem": stick.problem}
+        self._send({"op": "stick", "topic": stick.topic, **about})
+
     def op_drive(self, now: float, *, topic: str, linear: Tilt, angular: Tilt, hold: int, n: int, at: float) -> None:
         """A joystick; repeated every 0.1 s while it is held.
 
@@ -427,17 +486,24 @@ class MonitorSession(Session):
         was made, by the server's clock as the page knows it (``Joystick``).
         """
         if not self._may.drive:
-            self._refuse(0, "this page may not drive", "start rmpa web with --drive")
+            self._refuse(0, *_NO_DRIVE)
             return
         _check_topic(topic)
         joystick = self._joystick
         if not joystick.takes(hold, n, at, now):
             if joystick.is_new_late(at, now):
                 late = f"commands reach the server {now - at:.1f} s late, and are dropped"
-                self._refuse(0, late, f"above {limits.DRIVE_TIMEOUT:g} s the robot stays where it is")
+                self._refuse(0, late, f"above {limits.DRIVE_TIMEOUT:g} s the robot stays where it is", hold=hold)
             return
         if joystick.topic != topic:
             self._stop()
+        self._show_stick(topic)
+        assert self._stick is not None  # noqa: S101 - shown just now
+        try:
+            self._stick.take(self, self.address)
+        except RmpaError:
+            joystick.release(hold)  # said once
+            raise
         if joystick.drive(topic, now):
             self._publish(topic, linear * limits.DRIVE_SPEED, angular * limits.DRIVE_TURN)
         else:

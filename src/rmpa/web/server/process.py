@@ -8,7 +8,6 @@ import os
 import signal
 import socket
 import ssl
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -322,8 +321,6 @@ async def serve(
     setup: WebSetup,
     agent: str | None,
     announce: Callable[[str, TokenAccess], None],
-    *,
-    with_agent: bool,
     load: Callable[[], WebSetup],
 ) -> bool:
     """Serve until SIGINT or SIGTERM; at SIGHUP the settings are read again.
@@ -335,7 +332,6 @@ async def serve(
         setup: The settings, token and certificate.
         agent: The agent's name; ``None``: the one that runs.
         announce: Called with the URL and the token when the server listens.
-        with_agent: Whether to end when standard input ends: it is a pipe that the agent holds open.
         load: Reads all of ``setup`` again; it may block, and raise ``RmpaError``.
 
     Raises:
@@ -367,8 +363,6 @@ async def serve(
             certificate.start()
             monitor.start()
             follower.start(hub.graph)
-            if with_agent:
-                _stop_at_end_of_input(loop, stop)
             announce(url_of(web, setup.access, server.port, is_https=certificate.context is not None), setup.access)
             notify_service_manager("READY=1")
             feed_watchdog(loop)
@@ -410,14 +404,3 @@ async def _changed(setup: WebSetup, load: Callable[[], WebSetup], asked: asyncio
             _log.error("! rmpa web keeps its settings: the module with keys is not found now [keys-unusable]")
         elif not setup.serves_as(new):
             return
-
-
-def _stop_at_end_of_input(loop: asyncio.AbstractEventLoop, stop: asyncio.Event) -> None:
-    descriptor = sys.stdin.fileno()
-
-    def readable() -> None:
-        if not os.read(descriptor, 4096):  # the agent has ended, however it did
-            loop.remove_reader(descriptor)
-            stop.set()
-
-    loop.add_reader(descriptor, readable)

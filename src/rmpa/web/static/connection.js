@@ -21,6 +21,8 @@ export class Connection {
     this.questions = new Map();
     this.logSinks = new Set();
     this.notice = null;
+    this.driven = ""; // the topic whose joystick is shown
+    this.stick = null; // who has its stick
     this.counter = 0;
     this.wait = FIRST_WAIT;
     this.frames = { patches: 0, bytes: 0 };
@@ -63,12 +65,13 @@ export class Connection {
       if (this.looks.length) this.send({ op: "look", at: this.looks });
       for (const [id, watch] of this.watches) this.send({ op: "watch", id, ...watch.wanted });
       if (this.logSinks.size) this.send({ op: "log", on: true });
+      if (this.driven) this.orderStick(this.driven, "look");
       this.changed();
     };
   }
 
   closed(event, opened) {
-    this.socket = null;
+    this.socket = this.stick = null;
     if (this.phase !== "lost") this.lostAt = Date.now();
     this.phase = "lost";
     this.reason = event.reason;
@@ -139,6 +142,10 @@ export class Connection {
         break;
       case "answer":
         this.settle(message.id)?.resolve(message.value);
+        break;
+      case "stick":
+        this.stick = message;
+        this.changed();
         break;
       case "failed":
         this.failed(message);
@@ -226,6 +233,19 @@ export class Connection {
       this.questions.set(id, { resolve, reject, timer });
       this.send({ op: "ask", id, what, args, at: this.serverTime() });
     });
+  }
+
+  // Shows who has the stick of a topic, takes it, takes it over, leaves it, or stops the robot.
+  orderStick(topic, want) {
+    this.driven = topic;
+    this.send({ op: "stick", topic, want });
+  }
+
+  // What was said of one hold of the stick ends with it.
+  endHold() {
+    if (this.notice?.hold === undefined) return;
+    this.notice = null;
+    this.changed();
   }
 
   followLog(sink) {

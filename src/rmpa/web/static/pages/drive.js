@@ -1,11 +1,13 @@
 // A joystick for a robot. It drives only while it is held; the server stops the robot 0.3 s after the last command.
 
 import { html, useEffect, useRef, useState } from "../markup.js";
+import { sentence } from "../format.js";
 import { entries } from "../state.js";
-import { Page, Panel } from "../parts.js";
+import { Page, Panel, Since } from "../parts.js";
 
 const PERIOD = 100; // milliseconds between two commands
 const TYPE = "geometry_msgs/Twist";
+const TYPED = 400; // milliseconds after the last key until a topic counts as written
 const KEYS = { ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [-1, 0], ArrowRight: [1, 0] };
 
 const HELD =
@@ -18,10 +20,16 @@ export function DrivePage({ state, connection }) {
     .filter(([, one]) => one.type === TYPE)
     .map(([name]) => name);
   const [topic, setTopic] = useState("/cmd_vel");
-  const [armed, arm] = useState(false);
   const [share, setShare] = useState(0.15);
   const fastest = connection.hello.fastest || { linear: 0, angular: 0 };
   const allowed = connection.may("drive");
+  const stick = connection.stick?.topic === topic ? connection.stick : {};
+  const order = (want) => connection.orderStick(topic, want);
+  useEffect(() => {
+    const timer = setTimeout(order, connection.driven ? TYPED : 0, "look");
+    return () => clearTimeout(timer);
+  }, [topic]);
+  useEffect(() => () => connection.orderStick("", "look"), []);
   const hold = useRef(0); // the server drops old commands, and those of an earlier hold
   return html`<${Page} title="Drive" kind="A joystick for geometry_msgs/Twist"
     ><div class="grid">
@@ -33,7 +41,7 @@ export function DrivePage({ state, connection }) {
               list="twists"
               value=${topic}
               onInput=${(event) => {
-                arm(false);
+                if (stick.mine) order("leave");
                 setTopic(event.target.value);
               }} /></label
           ><datalist id="twists">${topics.map((each) => html`<option key=${each} value=${each} />`)}</datalist>
@@ -50,19 +58,23 @@ export function DrivePage({ state, connection }) {
             ><span
               ><input
                 type="checkbox"
-                checked=${armed}
-                disabled=${!allowed}
-                onChange=${(event) => arm(event.target.checked)}
+                checked=${Boolean(stick.mine)}
+                disabled=${!allowed || (stick.holder && !stick.mine)}
+                onChange=${(event) => order(event.target.checked ? "take" : "leave")}
               />${" "}The robot may move: I see it</span
             ></label
           >
+          <${Holder} stick=${stick} allowed=${allowed} order=${order} />
           <p class="muted">${allowed ? HELD : DENIED}</p>
         </div><//
       >
       <${Panel} title="Joystick"
+        ><button type="button" class="stop" disabled=${connection.phase !== "open"} onClick=${() => order("stop")}>
+          Stop the robot</button
         ><${Stick}
-          on=${allowed && armed}
+          on=${allowed && stick.mine}
           take=${() => {
+            connection.endHold();
             hold.current = ++connection.counter;
           }}
           send=${(linear, angular) =>
@@ -75,9 +87,28 @@ export function DrivePage({ state, connection }) {
               n: ++connection.counter,
               at: connection.serverTime(),
             })}
-          release=${() => connection.send({ op: "release", hold: hold.current })}
+          release=${() => {
+            connection.send({ op: "release", hold: hold.current });
+            connection.endHold();
+          }}
       /><//></div
   ><//>`;
+}
+
+// Who has the stick; one press takes it over.
+function Holder({ stick, allowed, order }) {
+  const { holder, mine, problem } = stick;
+  return html`<div class="holder" role="status">
+      ${mine
+        ? "This page has the stick."
+        : holder
+          ? html`<span
+                ><strong>${holder.by} at ${holder.module}</strong> has the stick, for${" "}
+                <${Since} moment=${holder.since} />.</span
+              ><button type="button" disabled=${!allowed} onClick=${() => order("over")}>Take over</button>`
+          : "The stick is free."}
+    </div>
+    ${problem && html`<p class="muted">${sentence(problem)}</p>`}`;
 }
 
 function Stick({ on, take, send, release }) {
