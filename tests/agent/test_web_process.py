@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import signal
 import sys
@@ -68,6 +69,28 @@ async def test_a_child_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPat
     await web.close()
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
+
+
+@pytest.mark.usefixtures("quick")
+async def test_a_child_that_cannot_be_waited_for_ends_before_the_next_one(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    children: list[int] = []
+
+    def no_descriptor(pid: int) -> int:
+        children.append(pid)
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pidfd_open", no_descriptor)
+        web = child("import time; time.sleep(1000)")
+        web.start()
+        await until(lambda: "cannot be started" in caplog.text)
+    with pytest.raises(ProcessLookupError):
+        os.kill(children[0], 0)
+    await until(lambda: web.pid)
+    monkeypatch.setattr(limits, "WEB_END_TIMEOUT", 0.1)
+    await web.close()
 
 
 @pytest.mark.usefixtures("quick")

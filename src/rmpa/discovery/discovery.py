@@ -29,6 +29,7 @@ from rmpa.discovery.beacon import (
 )
 from rmpa.discovery.membership import MembershipProtocol
 from rmpa.runtime.loop import MachineTimer, yield_to_data
+from rmpa.runtime.tasks import end_tasks, keep_task
 from rmpa.trust import limits as trust_limits
 from rmpa.trust.packets import Verdict
 from rmpa.trust.permissions import TrustReason, not_of_this_mesh
@@ -357,7 +358,6 @@ class Discovery:
     async def start(self) -> None:
         """Listen, and announce this agent. A socket that cannot be opened is logged; discovery works without it."""
         self._started = True
-        loop = asyncio.get_running_loop()
         self._listen(self._udp, multicast=False)
         # Unicasts to the discovery port, the port of seeds without one; one agent of a machine gets them.
         self._open_receiver(_ALL_NETWORKS, multicast=False, lost="seeds of others must name our port")
@@ -370,12 +370,13 @@ class Discovery:
         self._membership.interfaces_changed(now, self._other_addresses())
         self._membership.start(now)
         self._flush()
-        self._tasks = [loop.create_task(network.watch_interfaces(self._look_again), name="interfaces")]
+        self._tasks = [keep_task(partial(network.watch_interfaces, self._look_again), "watch the interfaces")]
         for host in dict.fromkeys(seed.host for seed in self._settings.seeds):
             try:
                 self._seed_hosts[host] = [str(IPv4Address(host))]
             except AddressValueError:
-                self._tasks.append(loop.create_task(network.follow_seed(host, self._resolve, self._seed_is)))
+                follow = partial(network.follow_seed, host, self._resolve, self._seed_is)
+                self._tasks.append(keep_task(follow, f"follow seed {host}"))
         self._set_seeds()
 
     async def close(self) -> None:
@@ -383,9 +384,7 @@ class Discovery:
         if not self._started:
             return
         self._started = False
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await end_tasks(*self._tasks)
         self._timer.close()
         self._membership.goodbye(time.monotonic())
         self._flush()

@@ -23,6 +23,7 @@ from rmpa.observe.control import ControlReply, ControlRequest
 from rmpa.observe.control_client import NameLock
 from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.loop import yielding_to_data
+from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -108,7 +109,7 @@ class ControlServer:
         self._group = group
         self._lock: NameLock | None = None
         self._acceptor: Acceptor | None = None
-        self._clients: set[asyncio.Task[None]] = set()
+        self._clients = OwnedTasks()
         self.path = place / f"{name}.sock"
 
     def add(self, handlers: Mapping[str, Handler]) -> None:
@@ -161,10 +162,7 @@ class ControlServer:
         if served is not None:
             served.close()
         await asyncio.sleep(0)  # lets tasks of clients accepted just now begin: only then do they close their sockets
-        clients = list(self._clients)
-        for task in clients:
-            task.cancel()
-        await asyncio.gather(*clients, return_exceptions=True)
+        await self._clients.close()
         if served is not None:
             self.path.unlink(missing_ok=True)
         if self._lock is not None:
@@ -172,9 +170,7 @@ class ControlServer:
             self._lock = None
 
     def _connected(self, sock: socket.socket, _address: str) -> None:
-        task = asyncio.get_running_loop().create_task(self._serve(sock))
-        self._clients.add(task)
-        task.add_done_callback(self._clients.discard)
+        self._clients.start(self._serve(sock), "serve a client of the control socket")
 
     async def _serve(self, sock: socket.socket) -> None:
         try:
@@ -195,8 +191,6 @@ class ControlServer:
                     await reader.read(limits.CONTROL_REQUEST_MAX)
         except (OSError, TimeoutError, asyncio.IncompleteReadError):
             pass  # gone, idle, or closed half-way: none is an error
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! control client failed")
         finally:
             writer.close()
             with contextlib.suppress(OSError):

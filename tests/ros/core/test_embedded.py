@@ -397,14 +397,15 @@ async def test_rosout_yields_its_name_and_takes_it_back(whole: RosCore) -> None:
         assert not [name for name, _ in other.calls if name == "shutdown"]
 
 
-async def test_rosout_starts_when_it_can(whole: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [StartError("node /rosout", "no file descriptor is left"), RuntimeError("a fault")])
+async def test_rosout_starts_when_it_can(whole: RosCore, monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     start, failures = SlaveNode.start, 0
 
     async def fails_twice(node: SlaveNode) -> None:
         nonlocal failures
         failures += 1
         if failures < 3:
-            raise StartError("node /rosout", "no file descriptor is left")
+            raise error
         await start(node)
 
     monkeypatch.setattr(SlaveNode, "start", fails_twice)

@@ -20,6 +20,7 @@ from rmpa.bridge.sessions import Part
 from rmpa.config.rules import SIM_TIME, overlap
 from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
     from rmpa.bridge.sessions import PeerSession
@@ -140,15 +141,11 @@ class Params(Part):
     def reconcile(self) -> None:
         """Compare the values in the background, and mend differences."""
         if self._looking is None:
-            self._looking = asyncio.create_task(self._look(), name="look at parameters")
+            self._looking = start_task(self._look(), "look at parameters")
 
     async def close(self) -> None:
         """End all tasks, and unsubscribe from the local core, which may live on; the values stay there."""
-        found = (self._looking, self._working, *self._asking.values(), *self.owner.tasks())
-        tasks = [task for task in found if task is not None]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await end_tasks(self._looking, self._working, *self._asking.values(), *self.owner.tasks())
         with contextlib.suppress(RmpaError, TimeoutError):
             async with asyncio.timeout(limits.PARAM_LEAVE_TIMEOUT):
                 await self._core.leave_others(set())
@@ -166,8 +163,6 @@ class Params(Part):
             pass  # reported by the core itself
         except RmpaError as error:
             _log.warning("! parameters cannot be read: %s [param-trouble]", error)
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! looking at parameters failed")
         finally:
             self._looking = None
 
@@ -190,7 +185,7 @@ class Params(Part):
     def _ask(self, session: PeerSession) -> None:
         if session.peer not in self._asking:
             name = f"follow parameters of {session.link.name}"
-            self._asking[session.peer] = asyncio.create_task(self._follow(session), name=name)
+            self._asking[session.peer] = start_task(self._follow(session), name)
 
     async def _follow(self, session: PeerSession) -> None:
         mine = [entry for entry in self.followed if entry.peer == session.peer]
@@ -200,9 +195,6 @@ class Params(Part):
             refused = answer.get("refused", {}) if isinstance(answer, dict) else {}
         except RmpaError as error:
             refused = dict.fromkeys(keys, str(error))
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! following parameters of %s failed", session.link.name)
-            refused = {}
         finally:
             if self._asking.get(session.peer) is asyncio.current_task():
                 del self._asking[session.peer]
@@ -267,7 +259,7 @@ class Params(Part):
 
     def _work_soon(self) -> None:
         if self._working is None and any(entry.due for entry in self.followed):
-            self._working = asyncio.create_task(self._work(), name="follow parameters")
+            self._working = start_task(self._work(), "follow parameters")
 
     async def _work(self) -> None:
         """Set the values that are due; ``look`` tries again what failed."""
@@ -283,8 +275,6 @@ class Params(Part):
                             str(entry.rule),
                             f"{entry.rule} cannot be set as its owner has it: {error}",
                         )
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! following parameters failed")
         finally:
             self._working = None
 

@@ -24,9 +24,10 @@ from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.wire.tcpros import ServiceDescription, parse_service_uri
 from rmpa.runtime.kernel_tcp import ask_listening_ports
 from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
+from rmpa.runtime.tasks import OwnedTasks, keep_task
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Coroutine, Mapping
+    from collections.abc import Collection, Mapping
 
     from rmpa.bridge.data.reception import LinkTime
     from rmpa.bridge.services.books import ServiceExports, ServiceRoute
@@ -313,17 +314,15 @@ class Serving:
         self.stats: dict[str, CallStats] = {}
         self._servers: dict[tuple[int, int], Server] = {}
         self._pools: dict[str, ServicePool] = {}
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = OwnedTasks()
 
     def start(self) -> None:
         """Begin to check that servers live."""
-        self._spawn(self._look_after(), "servers' liveness")
+        self._tasks.add(keep_task(self._look_after, "servers' liveness"))
 
     async def close(self) -> None:
         """End all calls and all connections to servers."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._tasks.close()
         pools, self._pools = list(self._pools.values()), {}
         for pool in pools:
             pool.close("the agent ends")
@@ -331,7 +330,7 @@ class Serving:
 
     def probe(self, service: str, server: LocalService) -> None:
         """Ask a server for its types; the answer goes to the exports."""
-        self._spawn(self._ask_server(service, server), f"describe {service}")
+        self._tasks.start(self._ask_server(service, server), f"describe {service}")
 
     def serve(self, peer: int, number: int, route: ServiceRoute, server: LocalService) -> None:
         """Serve a peer's calls: requests come in on ``route.requests``, replies go out on the route ``number``."""
@@ -377,11 +376,6 @@ class Serving:
             del self.stats[service]
 
     # --- inside ---------------------------------------------------------------------------------------------
-
-    def _spawn(self, work: Coroutine[None, None, None], name: str) -> None:
-        task = asyncio.get_running_loop().create_task(work, name=name)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
 
     def _pool(self, service: str, server: LocalService) -> ServicePool:
         pool = self._pools.get(service)

@@ -27,6 +27,7 @@ from rmpa.ros.node.subscription import PublisherConnection, Subscription
 from rmpa.ros.types.definitions import known_description
 from rmpa.runtime.accept import Use
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
+from rmpa.runtime.tasks import end_tasks, keep_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -142,13 +143,11 @@ class Rosout:
             StartError: The address cannot be used.
         """
         await self._begin()
-        self._keeper = asyncio.create_task(self._keep(), name="keep /rosout")
+        self._keeper = keep_task(self._keep, "keep /rosout")
 
     async def close(self) -> None:
         """Unregister and close."""
-        if self._keeper is not None:
-            self._keeper.cancel()
-            await asyncio.gather(self._keeper, return_exceptions=True)
+        await end_tasks(self._keeper)
         await self._end()
 
     def graph_changed(self, change: GraphChange) -> None:
@@ -208,14 +207,14 @@ class Rosout:
 
     async def _keep(self) -> None:
         while True:
-            await self._changed.wait()
-            self._changed.clear()
             # Both registrations must be in the graph.
             core, ours = self._core, self.uri
             if not core.publishers(AGGREGATED).get(NODE) == core.subscribers(TOPIC).get(NODE) == ours:
                 await self._end()
                 await asyncio.sleep(limits.ROSOUT_RESPAWN)
                 await self._restart()
+            await self._changed.wait()
+            self._changed.clear()
 
     async def _restart(self) -> None:
         told = False

@@ -24,6 +24,7 @@ from rmpa.ros.master.registrations import ANY_TYPE
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief, call_pieces
 from rmpa.runtime.accept import Use
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
+from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -227,7 +228,7 @@ class ExternalCore(Core):
         self._next_poll = self._loop.time()
         await self._poll()
         await self._flush()
-        self._task = self._loop.create_task(self._work(), name="external core")
+        self._task = keep_task(self._work, f"looking at the roscore {self.uri}")
         self.liveness.start()
 
     async def close(self) -> None:
@@ -245,10 +246,7 @@ class ExternalCore(Core):
                 _log.warning(
                     "! %d changes could not be sent to the roscore at %s [core-slow]", len(self._writes), self.uri
                 )
-        tasks = [task for task in (self._task, self._revival) if task is not None]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await end_tasks(self._task, self._revival)
         await self.liveness.close()
         self._problem = "the agent has ended"
         self._drop_writes()
@@ -312,14 +310,13 @@ class ExternalCore(Core):
                     return
                 if self._loop.time() >= self._next_poll:
                     await self._poll()
-            except Exception:  # noqa: BLE001 - a task's top: polling must go on
-                _log.exception("! looking at the roscore %s failed", self.uri)
+            except Exception:
                 self._seen = b""
-                self._next_poll = self._loop.time() + _MASTER_LOOK_MAX
+                raise
             if self._loop.time() - checked > limits.NODE_CHECK_INTERVAL:
                 checked = self._loop.time()
                 if self._mirror.dead and (self._revival is None or self._revival.done()):
-                    self._revival = self._loop.create_task(self._revive(dict(self._mirror.dead)), name="the dead")
+                    self._revival = start_task(self._revive(dict(self._mirror.dead)), "ask for nodes that left")
             if self._problem or not self._writes:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout_at(self._next_poll):

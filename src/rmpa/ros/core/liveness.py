@@ -31,6 +31,7 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import Use, is_shortage
 from rmpa.runtime.kernel_tcp import ask_listening_ports
 from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
+from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -156,7 +157,7 @@ class Liveness:
 
     def start(self) -> None:
         """Begin to check."""
-        self._task = asyncio.get_running_loop().create_task(self._check_all(), name="node liveness")
+        self._task = keep_task(self._check_all, "node liveness")
 
     async def close(self) -> None:
         """Stop checking; ``suspect`` does nothing from now on.
@@ -164,10 +165,7 @@ class Liveness:
         A call of ``ask_listening_ports`` cannot be stopped in its thread. It is waited for, as it has a socket open.
         """
         self._closed = True
-        tasks = [*self._checks.values(), *([self._task] if self._task is not None else [])]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await end_tasks(self._task, *self._checks.values())
         if self._ports is not None:
             await asyncio.wait([self._ports], timeout=runtime_limits.DRAIN_TIMEOUT)
 
@@ -176,8 +174,7 @@ class Liveness:
         api = self._nodes().get(node)
         if api is None or node in self._checks or self._closed:
             return
-        task = asyncio.get_running_loop().create_task(self._check(node, api), name=f"check {node}")
-        self._checks[node] = task
+        task = self._checks[node] = start_task(self._check(node, api), f"check {node}")
         task.add_done_callback(lambda _: self._checks.pop(node, None))
 
     async def _check_all(self) -> None:
@@ -417,15 +414,12 @@ class Notifier:
             del queue[next(iter(queue))]
             self._counters.add("notify.dropped")
         if api not in self._tasks:
-            self._tasks[api] = asyncio.get_running_loop().create_task(self._empty(api, queue), name=f"notify {api}")
+            self._tasks[api] = start_task(self._empty(api, queue), f"notify {api}")
 
     async def close(self) -> None:
         """Stop at once; queued notifications are not sent."""
         self._closed = True
-        tasks = list(self._tasks.values())
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await end_tasks(*self._tasks.values())
 
     async def _empty(self, api: str, queue: _Queue) -> None:
         backoff = Backoff(_NOTIFY_RETRY_FIRST, _NOTIFY_RETRY_MAX, random.random)
@@ -444,8 +438,6 @@ class Notifier:
                         queue[key] = value
                         queue.move_to_end(key, last=False)
                     await asyncio.sleep(backoff.delay())
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! notifications to %s failed", api)
         finally:
             del self._queues[api], self._tasks[api]
 

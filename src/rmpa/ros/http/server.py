@@ -33,6 +33,7 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import DESCRIPTORS, Acceptor, Use
 from rmpa.runtime.kernel_tcp import program_at
 from rmpa.runtime.loop import yield_to_data
+from rmpa.runtime.tasks import OwnedTasks, start_task
 
 _log = logging.getLogger(__name__)
 
@@ -237,7 +238,7 @@ class HttpConnection(asyncio.Protocol):
         if isinstance(answer, bytes):
             self._reply(answer)
         else:
-            self._task = self._loop.create_task(self._wait(answer))
+            self._task = start_task(self._wait(answer), "answer a call")
 
     async def _wait(self, answer: Awaitable[bytes]) -> None:
         body = await answer
@@ -319,7 +320,7 @@ class XmlRpcServer:
         self._refusals = RefusalLog(_log, self.counters)
         self._use = use
         self._acceptor: Acceptor | None = None
-        self._arriving: set[asyncio.Task[None]] = set()
+        self._arriving = OwnedTasks()
         # In the order of their last use, which ``_evict`` needs.
         self._connections: dict[HttpConnection, None] = {}
         self._empty: asyncio.Future[None] | None = None
@@ -350,9 +351,7 @@ class XmlRpcServer:
         Args:
             sock: Non-blocking; owned from here on.
         """
-        task = asyncio.get_running_loop().create_task(self._connect(sock))
-        self._arriving.add(task)
-        task.add_done_callback(self._arriving.discard)
+        self._arriving.start(self._connect(sock), f"serve a connection of {self._name}", raises=(OSError,))
 
     async def _connect(self, sock: socket.socket) -> None:
         try:

@@ -27,6 +27,7 @@ from rmpa.ros.wire.tcpros import (
 )
 from rmpa.runtime.accept import is_shortage
 from rmpa.runtime.stream import Stream
+from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
     import socket
@@ -176,7 +177,7 @@ class PublisherConnection(TopicConnection):
 
     def start(self) -> None:
         """Connect, in a task of its own."""
-        self._task = asyncio.get_running_loop().create_task(self._run(), name=f"subscribe {self.topic} {self.uri}")
+        self._task = keep_task(self._run, f"subscribe {self.topic} {self.uri}")
 
     def close(self) -> None:
         """Disconnect at once; no callback is called any more."""
