@@ -236,15 +236,17 @@ class ControlServer:
         if handler is None:
             remedy = suggestion(request.op, self._handlers, f"there are {', '.join(sorted(self._handlers))}")
             return ControlReply(ok=False, error=f"no op {request.op!r}", remedy=remedy)
+        deadline = asyncio.timeout(limits.CONTROL_HANDLER_TIMEOUT)
         try:
-            async with asyncio.timeout(limits.CONTROL_HANDLER_TIMEOUT):
+            async with deadline:
                 value = handler(request.args)
                 return ControlReply(ok=True, value=await value if inspect.isawaitable(value) else value)
         except RmpaError as error:
             return ControlReply(ok=False, error=str(error), code=error.code)
-        except TimeoutError:
-            return ControlReply(ok=False, error=f"{request.op} took more than {limits.CONTROL_HANDLER_TIMEOUT:.0f} s")
         except Exception:  # noqa: BLE001 - one handler's bug must not end the client's connection
+            if deadline.expired():
+                text = f"{request.op} took more than {limits.CONTROL_HANDLER_TIMEOUT:.0f} s"
+                return ControlReply(ok=False, error=text)
             self.counters.add("control.failed")
             _log.exception("! control handler %s failed", request)
             return ControlReply(
