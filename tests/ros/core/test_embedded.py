@@ -22,7 +22,7 @@ from tests.ros.core.slaves import Slave
 from tests.ros.node.peers import DEADLINE, until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator
 
     from rmpa.runtime.accept import Use
 
@@ -114,7 +114,7 @@ async def test_notifications_never_wait_in_the_reply_and_one_goes_at_a_time(core
 
 
 async def test_silent_node_is_notified_again(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rmpa.ros.core.liveness.call", _with_timeout(0.5))
+    monkeypatch.setattr(limits, "TCPROS_CONNECT_TIMEOUT", 0.5)
     async with Slave() as slave:
         slave.go.clear()
         core.call("registerSubscriber", "/s", "/t", STRING, slave.uri)
@@ -123,13 +123,6 @@ async def test_silent_node_is_notified_again(core: RosCore, monkeypatch: pytest.
         slave.go.set()
         await until(lambda: core.counters["notify.sent"] == 1)
         await until(lambda: waiting(core) == 0)
-
-
-def _with_timeout(seconds: float) -> Callable[..., object]:
-    async def quick(uri: str, method: str, *params: XmlRpcValue, use: Use) -> XmlRpcValue:
-        return await call(uri, method, *params, timeout=seconds, use=use)
-
-    return quick
 
 
 async def test_parameter_updates_are_in_order(core: RosCore) -> None:

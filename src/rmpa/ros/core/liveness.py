@@ -270,12 +270,12 @@ async def try_connect(api: str) -> str:
     """
     try:
         host, port, _ = split_uri(api)
-        async with asyncio.timeout(limits.TCPROS_CONNECT_TIMEOUT):
+        async with asyncio.timeout(limits.SLAVE_CALL_TIMEOUT):
             sock = await connect(host, port, Use.CORE)
     except ConnectionRefusedError:
         raise
     except TimeoutError:
-        return f"no answer in {limits.TCPROS_CONNECT_TIMEOUT:g} s"
+        return f"no answer in {limits.SLAVE_CALL_TIMEOUT:g} s"
     except UnreachableError as error:
         return error.remedy or str(error)
     except OSError as error:
@@ -448,7 +448,8 @@ class Notifier:
                 await self._shut_down(api, name, value)
             else:
                 _log.debug("> %s %s %s", api, method, name)
-                await call(api, method, MASTER_ID, name, value, use=Use.CORE)
+                # Given up earlier it might be carried out behind the next one, which is newer.
+                await call(api, method, MASTER_ID, name, value, timeout=limits.TCPROS_CONNECT_TIMEOUT, use=Use.CORE)
         except (UnreachableError, RosFault, RemoteProtocolError, LocalProtocolError) as error:
             self._counters.add("notify.failed")
             # A shortage is this process's, and is reported elsewhere: the node may be well.

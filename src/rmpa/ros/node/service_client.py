@@ -86,7 +86,7 @@ class ServiceConnection:
         md5sum: str = tcpros.ANY,
         persistent: bool = True,
         probe: bool = False,
-        timeout: float = limits.SERVICE_OPEN_TIMEOUT,  # noqa: ASYNC109 - the message names it
+        timeout: float = limits.TCPROS_CONNECT_TIMEOUT,  # noqa: ASYNC109 - the message names it
         on_closed: Callable[[], None] | None = None,
     ) -> Self:
         """Connect and exchange headers.
