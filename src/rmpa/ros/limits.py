@@ -131,8 +131,9 @@ HTTP_BODY_INLINE: Final = 64 * KIB
 # [Core] Connections to the core, and to each proxy
 # At it: a new one replaces a slow one, else the one idle for longest
 # Told in: log, `http.evicted`
-# Why: ``ros.http.server`` chooses it.
-HTTP_CONNECTIONS_MAX: Final = 512
+# Why: ``ros.http.server`` chooses it. rosmaster takes any number; clients that reconnect whenever they have given way
+#   would keep all others out, so there is room for thousands, of 5 KB each.
+HTTP_CONNECTIONS_MAX: Final = 4096
 # Time after which a kept-alive connection without a call is closed; rospy and roscpp reconnect by themselves.
 HTTP_IDLE_TIMEOUT: Final = 60.0
 # [Core] Time for a call to arrive
