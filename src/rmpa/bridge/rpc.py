@@ -216,11 +216,9 @@ class LinkRequests(BodyReceiver):
                     future.set_result(message.value)
                 else:
                     future.set_exception(PeerRefused(self._link.name, message.error, message.remedy))
-        elif late > 0 or self._link.abandoned:
+        elif late > 0:
             self._rpc.counters.add("ask.late")
-            text = "this agent was stopped when the question came, and the asking one has given it up"
-            if late > 0:
-                text = f"the question came {late:.1f} s after the asking agent had given it up"
+            text = f"the question came {late:.1f} s after the asking agent had given it up"
             self._refuse(message.number, text, "ask again")
         elif len(self.tasks) >= limits.ASKS_AT_ONCE:
             self._refuse(message.number, "too many questions at once")
@@ -231,6 +229,9 @@ class LinkRequests(BodyReceiver):
             task.add_done_callback(lambda _: self._budget.give(size))
 
     async def _respond(self, ask: Request) -> None:
+        proven = asyncio.Event()
+        self._link.when_proven(proven.set)
+        await proven.wait()
         handler = self._rpc.handlers.get(ask.what)
         if handler is None:
             text = f"this agent {UNKNOWN_QUESTION} {ask.what!r}"

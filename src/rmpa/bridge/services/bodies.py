@@ -107,6 +107,11 @@ class BodySender:
             budget.give(len(body))
         return False
 
+    @property
+    def closed(self) -> bool:
+        """Whether nothing is sent any more."""
+        return self._link is None
+
     def close(self) -> None:
         """Send nothing more, and drop what waits."""
         link, self._link = self._link, None

@@ -13,6 +13,7 @@ from rmpa.bridge.services.bodies import (
     BodyReceiver,
     BodySender,
     Budget,
+    Done,
     LocalService,
     ServicePool,
 )
@@ -233,22 +234,25 @@ class Server(BodyReceiver):
         """Pass a request to the server, unless its caller has given it up: it must not act then."""
         stats, size = self._stats, len(body)
         stats.calls += 1
-        if late := self._late():
-            self._reply_failed(sequence, late)
-            return
         if not self._budget.take(size):
             self._reply_failed(sequence, f"more than {self._budget.limit >> 20} MiB of requests are being served")
             return
-        stats.active += 1
-        timeout = self._timeout + limits.SERVICE_GRACE
-        self._pool.call(body, timeout, partial(self._answered, sequence, size, self._loop.time()))
+        done = partial(self._answered, sequence, size, self._loop.time())
+        self._link.when_proven(partial(self._pass, body, self._stamp_ns, done))
 
-    def _late(self) -> str:
-        """Why the caller waits no longer for the present request; empty while it may."""
-        if self._link.abandoned:
-            return "this agent was stopped when the request came, and the caller has given it up"
+    def _pass(self, body: bytes | bytearray, stamp_ns: int, done: Done) -> None:
+        self._stats.active += 1
+        if late := self._late(stamp_ns):
+            done(False, f"service [{self._pool.service}]: {late}".encode())
+        else:
+            self._pool.call(body, self._timeout + limits.SERVICE_GRACE, done)
+
+    def _late(self, stamp_ns: int) -> str:
+        """Why the caller waits no longer for a request that was sent then; empty while it may."""
+        if self._sender.closed:
+            return "the caller has left"
         error = self._time.error_ns
-        age = time.time_ns() - self._stamp_ns + self._time.ahead_ns
+        age = time.time_ns() - stamp_ns + self._time.ahead_ns
         if error is not None and age - error > self._timeout * 1e9:
             return f"the request came {age / 1e9:.1f} s late; the caller waits for {self._timeout:g} s"
         return ""
