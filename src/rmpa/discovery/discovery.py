@@ -441,9 +441,8 @@ class Discovery:
         try:
             sock = network.open_receiver(host, port)
         except OSError as error:
-            self._warn(
-                f"cannot listen at {host or '*'}:{port} ({error.strerror}): {lost}, or choose another --multicast"
-            )
+            text = f"cannot listen at {host or '*'}:{port} ({error.strerror}): {lost}, or choose another --multicast"
+            self._warn(text, "multicast-blocked")
             return None
         self._receivers.append(sock)
         self._listen(sock, multicast=multicast)
@@ -515,7 +514,7 @@ class Discovery:
         wanted = self._settings.interfaces
         before, self.interfaces = self.interfaces, network.choose(self._everything, wanted)
         if problem := network.unknown_names(self._everything, wanted):
-            self._warn(problem)
+            self._warn(problem, "no-interface")
         if not self._settings.multicast.enabled:
             return
         if self.interfaces != before:
@@ -523,11 +522,12 @@ class Discovery:
         if any(not i.loopback for i in self.interfaces) or (wanted and self.interfaces):
             self._warned.discard(_ALONE)
         else:
-            self._warn(_ALONE)
+            self._warn(_ALONE, "no-interface")
         if self._group_socket is not None:
             refused = network.join_group(self._group_socket, self._group[0], self.interfaces, self._joined)
             for name, error in refused.items():
-                self._warn(f"{name}: the group cannot be joined ({error.strerror}); tried again when it changes")
+                text = f"{name}: the group cannot be joined ({error.strerror}); tried again when it changes"
+                self._warn(text, network.failure_code(error))
 
     def _seed_is(self, host: str, addresses: list[str]) -> None:
         if addresses != self._seed_hosts.get(host):
@@ -541,10 +541,10 @@ class Discovery:
         self._membership.set_seeds((a, s.port or default) for s in seeds for a in self._seed_hosts.get(s.host, ()))
         self._flush()
 
-    def _warn(self, text: str) -> None:
+    def _warn(self, text: str, code: str) -> None:
         if text not in self._warned:
             self._warned.add(text)
-            _log.warning("! %s [multicast-blocked]", text)
+            _log.warning("! %s [%s]", text, code)
 
     # --- outputs and events -----------------------------------------------------------------------------------
 
