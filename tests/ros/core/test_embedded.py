@@ -439,3 +439,25 @@ async def test_no_connection_to_a_node_is_kept_open(core: RosCore) -> None:
             await until(lambda wanted=number: len(slave.calls) == wanted)  # type: ignore[misc]
         await until(lambda: core.counters["notify.sent"] == 8)
         await until(lambda: not slave.server._connections)
+
+
+async def test_the_log_has_one_line_a_second_of_all_changes(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("rmpa.ros.core.external._GRAPH_LINE", 0.05)
+
+    def said() -> list[str]:
+        return [record.getMessage() for record in caplog.records if record.levelname == "INFO"]
+
+    caplog.set_level("INFO")
+    api = "http://127.0.0.1:1/"
+    for number in range(7):
+        core.call("registerPublisher", f"/once_{number}", "/t", STRING, api)
+        core.call("unregisterPublisher", f"/once_{number}", "/t", api)
+    await until(lambda: bool(said()))
+    text = "= 7 registrations more, 7 less, of 7 nodes: /once_0, /once_1, /once_2, /once_3, /once_4, …"
+    assert said() == [text]
+    caplog.clear()
+    core.call("registerPublisher", "/p", "/t", STRING, api)
+    await until(lambda: bool(said()))
+    assert said() == ["= + publisher /t of /p"]

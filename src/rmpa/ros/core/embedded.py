@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RmpaError
 from rmpa.ros import limits
-from rmpa.ros.core.external import LOOPBACK, Core
+from rmpa.ros.core.external import LOOPBACK, Core, GraphLog
 from rmpa.ros.core.liveness import Liveness, Notifier
 from rmpa.ros.core.state import CoreState
 from rmpa.ros.http.server import XmlRpcServer
@@ -273,7 +273,7 @@ class RosCore(Core):
     ) -> None:
         self.counters = counters if counters is not None else Counters()
         self.uri, self.node_host, self.node_address = "", LOOPBACK, LOOPBACK
-        self.listeners = []
+        self.listeners = [GraphLog().note]
         self._host = host
         self._advertised = advertised_host or (os.uname().nodename if host in {"", "0.0.0.0"} else host)  # noqa: S104
         self._on_shutdown = on_shutdown
