@@ -45,6 +45,8 @@ _log = logging.getLogger(__name__)
 # Time between the two refused connects that prove a node dead: it may be restarting its server.
 NODE_RECHECK_DELAY: Final = 0.2
 
+# Time for a connection that only shows that a node is there.
+_CONNECT_TIMEOUT: Final = 3.0
 # Concurrent attempts to reach unreachable nodes: each may hold a thread of the resolver for seconds.
 _NODE_UNREACHABLE_CHECKS: Final = 4
 # With this many updates queued for a node, only the latest of each parameter is kept; with fewer all of them.
@@ -270,12 +272,12 @@ async def try_connect(api: str) -> str:
     """
     try:
         host, port, _ = split_uri(api)
-        async with asyncio.timeout(limits.SLAVE_CALL_TIMEOUT):
+        async with asyncio.timeout(_CONNECT_TIMEOUT):
             sock = await connect(host, port, Use.CORE)
     except ConnectionRefusedError:
         raise
     except TimeoutError:
-        return f"no answer in {limits.SLAVE_CALL_TIMEOUT:g} s"
+        return f"no answer in {_CONNECT_TIMEOUT:g} s"
     except UnreachableError as error:
         return error.remedy or str(error)
     except OSError as error:
