@@ -296,7 +296,8 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         if entry.cause != before and CONFLICT in {entry.cause, before}:
             text = entry.hidden if entry.cause == CONFLICT else ""
             if text:
-                self._out.warn("mismatch.type", str(entry.wire), f"{entry.wire}: {text}")
+                counter = "clock.second" if entry.name == CLOCK else "mismatch.type"
+                self._out.warn(counter, str(entry.wire), f"{entry.wire}: {text}")
             self._out.send(entry.peer, Mismatch(entry.wire.topic, entry.node, "", text))
         if entry.cause == DENIED != before:
             module, relay = self._speaker(entry)
