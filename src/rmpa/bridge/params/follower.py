@@ -77,6 +77,7 @@ class Params(Part):
         owner: This module's own parameters, for peers.
         followed: The parameters that this module follows, in the order of the rules.
         _time_before: What ``/use_sim_time`` was here before it was followed; empty if it was not followed.
+        _renamed: Names under which values still stand that have another name since a reload.
     """
 
     def __init__(self, shared: Shared) -> None:
@@ -86,6 +87,7 @@ class Params(Part):
         self.followed = [Followed(rule) for rule in follow_rules(shared.context.settings)]
         self._refusals = RefusalLog(_log, shared.counters)
         self._time_before: list[str | None] = []
+        self._renamed: set[str] = set()
         self._asking: dict[int, asyncio.Task[None]] = {}
         self._working: asyncio.Task[None] | None = None
         self._looking: asyncio.Task[None] | None = None
@@ -105,6 +107,12 @@ class Params(Part):
         self.owner.judge_again()
         before = {entry.rule: entry for entry in self.followed}
         rules = follow_rules(self._shared.context.settings)
+        sources = {(rule.owner, rule.key): rule.to for rule in rules}
+        self._renamed |= {
+            rule.to
+            for rule, entry in before.items()
+            if entry.text is not None and sources.get((rule.owner, rule.key), rule.to) != rule.to
+        }
         self.followed = [before.pop(rule, Followed(rule)) for rule in rules]
         gone = {rule.owner for rule in before}
         for session in self._shared.sessions.linked():
@@ -236,6 +244,9 @@ class Params(Part):
         """
         if self._time_before and all(entry.rule.to != SIM_TIME for entry in self.followed):
             await self._reset_time(self._time_before.pop())
+        for key in {key for key in self._renamed if not any(overlap(entry.rule.to, key) for entry in self.followed)}:
+            await self._core.delete(key)
+        self._renamed.clear()
         for entry in list(self.followed):
             if restarted:
                 entry.due = entry.told = entry.known and entry.had
