@@ -29,6 +29,7 @@ from rmpa.core.schedule import positive
 from rmpa.ros import limits
 from rmpa.ros.node.endpoints import check_plain
 from rmpa.ros.node.node import Node
+from rmpa.runtime.tasks import end_tasks
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
@@ -480,10 +481,7 @@ class SyncNode:
             return
 
         async def cancel() -> None:
-            others = asyncio.all_tasks() - {asyncio.current_task()}
-            for task in others:
-                task.cancel()
-            await asyncio.gather(*others, return_exceptions=True)
+            await end_tasks(*(asyncio.all_tasks() - {asyncio.current_task()}))
             await loop.shutdown_asyncgens()
             await loop.shutdown_default_executor()
 

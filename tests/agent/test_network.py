@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 from ipaddress import IPv4Address
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
@@ -53,11 +54,15 @@ def test_interfaces_that_the_user_did_not_choose_do_not_count() -> None:
 
 
 class Endpoint:
-    """A place in the network; those that fail cannot be started."""
+    """A place in the network; those that fail cannot be started, or not even be made."""
 
     failing = 0
+    unlisted = 0
 
     def __init__(self, network: Network, port: int) -> None:
+        if Endpoint.unlisted:
+            Endpoint.unlisted -= 1
+            raise OSError(errno.EMFILE, "the interfaces cannot be listed")
         self.port = port
         self.displaced = network.move
         self.started = self.closed = False
@@ -83,6 +88,7 @@ def joined(monkeypatch: pytest.MonkeyPatch) -> Callable[[], Network]:
     made.clear()
     monkeypatch.setattr(agent, "NetworkEndpoint", Endpoint)
     monkeypatch.setattr(Endpoint, "failing", 0)
+    monkeypatch.setattr(Endpoint, "unlisted", 0)
     return lambda: Network(Settings(), cast("Any", None), trust=cast("Any", SimpleNamespace()))
 
 
@@ -90,9 +96,9 @@ def test_a_move_goes_on_until_the_agent_is_in_the_network_again(joined: Callable
     async def main() -> None:
         sut = joined()
         await sut.start()
-        Endpoint.failing = 2
+        Endpoint.failing, Endpoint.unlisted = 2, 1
         made[0].displaced()
-        await asyncio.sleep(2 * JOIN_RETRY + 10.0)
+        await asyncio.sleep(3 * JOIN_RETRY + 10.0)
         assert [one.closed for one in made] == [True, True, True, False]
         assert sut.endpoint is not None
         assert made[-1].started

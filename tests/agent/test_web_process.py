@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import fcntl
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -85,6 +87,30 @@ async def test_a_child_that_does_not_end_is_killed(
     await web.close()
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
+
+
+@pytest.mark.usefixtures("quick")
+async def test_a_child_that_cannot_be_waited_for_is_found_again_and_no_second_one_starts(
+    child: Child, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    children: list[int] = []
+
+    def no_descriptor(pid: int) -> int:
+        children.append(pid)
+        while not runs.exists():  # until then SIGHUP, which the next attempt sends, would end it
+            time.sleep(0.01)
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    runs = tmp_path / "runs"
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pidfd_open", no_descriptor)
+        deaf = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)"
+        web = child(f"{deaf}; open({str(runs)!r}, 'a').write('x'); {PAUSES}")
+        web.start()
+        await until(lambda: "cannot be started" in caplog.text)
+    await until(lambda: web.pid == children[0])
+    assert runs.read_text() == "x"
+    await web.close()
 
 
 @pytest.mark.usefixtures("quick")

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
+from dataclasses import replace
 from datetime import datetime
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, ClassVar, cast
@@ -603,6 +604,23 @@ async def test_other_rules_leave_the_rest_alone() -> None:
     await base.look()
     assert pad.core.get("/base/robot_description") == "mine", "it is ours again"
     assert base.params.owner.followed == {"/arm"}
+
+
+async def test_a_value_that_gets_another_name_leaves_the_old_one() -> None:
+    base, pad = Side("base"), Side("pad", follows(DESCRIPTION, ARM))
+    base.core.set("/robot_description", "one")
+    base.core.set("/arm", 1)
+    join(base, pad)
+    await until(lambda: pad.core.get("/base/robot_description") == "one" and pad.core.get("/arm") == 1)
+    pad.reload(Settings(params=follows(replace(DESCRIPTION, to="/urdf"), ARM)))
+    await until(lambda: pad.core.get("/urdf") == "one")
+    await pad.look()
+    assert pad.core.get("/base/robot_description") is None
+    assert pad.core.get("/arm") == 1
+    pad.reload(Settings(params=follows(replace(DESCRIPTION, to="/arm"))))
+    await pad.look()
+    await until(lambda: pad.core.get("/arm") == "one")
+    assert pad.core.get("/urdf") is None
 
 
 async def test_time_is_followed_although_nothing_may_be_read() -> None:

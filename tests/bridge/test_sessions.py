@@ -73,7 +73,6 @@ class Link:
 
     name = "far"
     resumed_at = 0.0
-    abandoned = False
 
     def __init__(self, run_number: int, *, silent: bool, host: str = "10.0.0.1") -> None:
         self.identity = Identity(Guid.of(host, 1000), bytes([run_number]) * 16, self.name)

@@ -66,7 +66,7 @@ def test_a_second_source_is_refused_until_the_first_goes() -> None:
     actions = advertise(machine, 1, SECOND)
     text = "time comes from /gazebo of sim already, and has one source"
     assert actions == [
-        Warn("mismatch.type", str(SECOND), f"{SECOND}: {text}"),
+        Warn("clock.second", str(SECOND), f"{SECOND}: {text}"),
         Send(1, Mismatch("/clock", "/other", "", text)),
     ]
     over = Send(1, Mismatch("/clock", "/other", "", ""))

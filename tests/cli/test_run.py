@@ -106,7 +106,8 @@ class Ground:
         return f"http://127.0.0.1:{self.port}"
 
     def rmpa(self, *words: str) -> Process:
-        process = Process([sys.executable, "-m", "rmpa.cli.main", *words], env=self.place.environ, name=words[0])
+        env = {**self.place.environ, "RMPA_LOG_LEVEL": "debug"}  # it has each change of the graph
+        process = Process([sys.executable, "-m", "rmpa.cli.main", *words], env=env, name=words[0])
         self.started.append(process)
         return process
 

@@ -17,7 +17,7 @@ from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.read import find_config_file, line_of, parse_config
 from rmpa.config.rules import GatewaySettings
 from rmpa.config.settings import SETTINGS, LaneSettings, RealtimeSettings, Settings, TrustSettings, json_value
-from rmpa.config.values import HostPort, Multicast
+from rmpa.config.values import HostPort, Multicast, did_you_mean
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Transport
 from rmpa.core.errors import ConfigError
@@ -549,3 +549,11 @@ def test_too_many_followed_parameters_are_refused(load: Load, refuse: Refuse) ->
     rules = "".join(f'[[param]]\nkey = "/a{n}"\nfrom = "arm"\n' for n in range(3))
     assert "3 rules, more than limits.params = 2; raise that" in refuse(f"{rules}[limits]\nparams = 2\n")
     assert len(load(f"{rules}[limits]\nparams = 3\n").settings.params.follow) == 3
+
+
+@pytest.mark.parametrize(
+    ("word", "near"),
+    [("/dead", None), ("/cmd", "/cmd_vel"), ("/chater", "/chatter"), ("/Cmd-Vel", "/cmd_vel"), ("/x", None)],
+)
+def test_a_name_is_offered_only_if_it_is_like_the_misspelt_one(word: str, near: str | None) -> None:
+    assert did_you_mean(word, ["/chatter", "/cmd_vel", "/denied2"]) == near

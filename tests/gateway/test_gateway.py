@@ -73,6 +73,8 @@ class Bed:
     def __init__(self, settings: Settings, gateway: GatewaySettings = CONNECT, failures: int = 0) -> None:
         self.events: list[str] = []
         self.failures = failures
+        self.faults = 0
+        """How often neighbours still fail to be made."""
         self.sessions: list[Any] = []
         self.rules: list[tuple[CrossingRule, ...]] = []
         """Of each time that the neighbours were made."""
@@ -88,6 +90,9 @@ class Bed:
 
     def _make(self, graph: AgentGraph, _session: OpenSession, settings: Settings) -> Mapping[str, Neighbour]:
         self.rules.append(settings.gateway.rules)
+        if self.faults:
+            self.faults -= 1
+            raise RuntimeError("a fault")
         return {"sites": RecordedNeighbour(graph, self.events)}
 
 
@@ -134,6 +139,14 @@ async def test_neighbours_start_with_the_session_end_before_it_are_reported_and_
         await until(lambda: bed.events == ["started in g", "closed", "started in g"])
         assert bed.rules == [(), rules]
     assert bed.events[3:] == ["closed", "session closed"]
+
+
+async def test_neighbours_that_failed_are_made_again(bed: Bed) -> None:
+    async with started(bed) as gateway:
+        bed.faults = 1
+        rules = (CrossingRule(crossing=Crossing.NONE),)
+        gateway.agent.apply_settings(replace(bed.settings, gateway=replace(CONNECT, rules=rules)))
+        await until(lambda: bed.events == ["started in g", "closed", "started in g"])
 
 
 async def test_a_session_whose_certificate_was_renewed_is_opened_anew_with_its_neighbours(bed: Bed) -> None:

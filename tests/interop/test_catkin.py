@@ -68,7 +68,7 @@ def test_agents_of_roslaunch_beside_a_roscore_and_in_its_place_are_a_mesh(users:
     bringup = tmp_path / "bringup.launch"
     bringup.write_text(BRINGUP)
     beside = a.start("roslaunch", "rmpa_ros", "up.launch", f"rmpa:={RMPA}", "name:=arm", "prefix_peers:=true")
-    found = {"PATH": f"{b.env['PATH']}:{RMPA.parent}", "RMPA_NAME": "base"}
+    found = {"PATH": f"{b.env['PATH']}:{RMPA.parent}", "RMPA_NAME": "base", "RMPA_LOG_LEVEL": "debug"}
     in_place = b.start(PACKAGE / "scripts/launch", f"--program={RMPA.parents[1]}", bringup, env=found)
     in_place.wait_for("this core has an agent already", 40.0)
     beside.wait_for("base .*linked", 40.0)

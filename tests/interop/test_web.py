@@ -227,7 +227,9 @@ async def test_pages_of_two_modules_share_one_stick(lab: Lab, modules: ModuleFac
         await wheels.expect_event("speed", where=lambda event: event["linear"] == pytest.approx(-HELD))
         mark = wheels.mark_events()
         await wheels.expect_event("speed", since=mark + 5)
-        assert all(float(str(event["linear"])) <= 0 for event in wheels.events("speed", since=mark)), "none of the first page"
+        assert all(float(str(event["linear"])) <= 0 for event in wheels.events("speed", since=mark)), (
+            "none of the first page"
+        )
         await first.click("Stop the robot")
         await second.wait_text("at base has stopped the robot")
         await wheels.expect_event("speed", where=lambda event: event["linear"] == 0, since=mark)

@@ -230,7 +230,7 @@ def test_after_a_pause_beyond_the_lease_nothing_is_acted_on_until_the_peer_answe
     """The peer has ended the link then, and what it asked before comes from this side's buffers."""
     told: list[bool] = []
     for one in (dialler, acceptor):
-        one.routes = AnyRoute(lambda *_, link=one: told.append(link.abandoned))
+        one.routes = AnyRoute(lambda *_, link=one: told.append(link.doubted))
     data = pack_data_header(3, 1, 1, 1) + b"abc"
     pass_time(dialler, time, 0.3)
     time.now += 0.9 * limits.EXPRESS_LEASE - 0.3

@@ -52,6 +52,7 @@ from rmpa.runtime.accept import Use, open_mesh_port
 from rmpa.runtime.kernel_tcp import may_end_connections
 from rmpa.runtime.loop import SystemClock
 from rmpa.runtime.process import unit_of
+from rmpa.runtime.tasks import start_task
 from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
@@ -243,17 +244,19 @@ class Network:
     def move(self) -> None:
         """Take a new GUID, with an address that the machine has."""
         if self._moving is None:
-            self._moving = asyncio.create_task(self._move(), name="move to the new address")
+            self._moving = start_task(self._move(), "move to the new address")
 
     async def _move(self) -> None:
         try:
             port = self.endpoint.port if self.endpoint is not None else self.settings.port
             _log.info("= the machine's addresses have changed: taking a new GUID")
-            await self._leave()
-            while self.endpoint is None and not self._over.is_set():
+            joined = False
+            while not joined and not self._over.is_set():
                 try:
+                    await self._leave()
                     await self._join(port)
-                except RmpaError as error:
+                    joined = True
+                except Exception as error:  # noqa: BLE001 - until it has joined, no change of an address is noticed
                     _log.warning("! cannot join the mesh with the new address; tried again: %s [cannot-start]", error)
                     with contextlib.suppress(TimeoutError):
                         await asyncio.wait_for(self._over.wait(), JOIN_RETRY)

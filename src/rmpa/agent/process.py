@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
 
 from rmpa import __version__
@@ -32,6 +33,7 @@ from rmpa.runtime.accept import is_shortage, raise_file_limit
 from rmpa.runtime.interpreter import own_command
 from rmpa.runtime.loop import AgentLoop
 from rmpa.runtime.process import SERVICE_VARIABLES, feed_watchdog, notify_service_manager
+from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
@@ -256,7 +258,7 @@ class WebProcess:
 
     def start(self) -> None:
         """Start the child, and look after it until ``close()``."""
-        self._task = asyncio.create_task(self._supervise(), name="rmpa web")
+        self._task = keep_task(self._supervise, "rmpa web")
 
     def reload(self) -> None:
         """Have the child read its settings again; one that is not there reads them when it starts."""
@@ -414,10 +416,10 @@ async def serve(
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup has it
         loop.add_signal_handler(signal.SIGHUP, came.set)
     await start()
-    following = reloader.follow(came, stop.set, had_terminal=had_terminal)
-    tasks = [asyncio.create_task(following, name="read the settings again")]
+    following = partial(reloader.follow, came, stop.set, had_terminal=had_terminal)
+    tasks = [keep_task(following, "read the settings again")]
     if watch is not None:
-        tasks.append(asyncio.create_task(watch(), name="watch"))
+        tasks.append(start_task(watch(), "watch", raises=(Exception,)))
         tasks[1].add_done_callback(lambda _: stop.set())
     try:
         notify_service_manager("READY=1")
@@ -428,9 +430,7 @@ async def serve(
         if watch is not None and tasks[1].done():
             tasks[1].result()
     finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.wait(tasks)
+        await end_tasks(*tasks)
         await close()
 
 

@@ -33,6 +33,7 @@ from rmpa.core.errors import (
 )
 from rmpa.discovery.network import list_interfaces
 from rmpa.runtime.process import restart_text
+from rmpa.runtime.tasks import end_tasks, keep_task
 from rmpa.trust import limits
 from rmpa.trust.permissions import (
     HAVE,
@@ -158,14 +159,12 @@ class AgentTrust(Part):
 
     def start(self) -> None:
         """Look after the certificate from now on."""
-        self._renewing = asyncio.create_task(self._look_after(), name="renew the certificate")
+        self._renewing = keep_task(self._look_after, "renew the certificate")
 
     async def close(self) -> None:
         """End the renewal of the certificate."""
-        if self._renewing is not None:
-            self._renewing.cancel()
-            await asyncio.gather(self._renewing, return_exceptions=True)
-            self._renewing = None
+        await end_tasks(self._renewing)
+        self._renewing = None
 
     def notes(self) -> tuple[str, ...]:
         """What the user should do something about."""
@@ -260,12 +259,7 @@ class AgentTrust(Part):
     async def _look_after(self) -> None:
         while True:
             self._wake.clear()  # before the look: what changes meanwhile is looked at, too
-            try:
-                await self._look()
-            except asyncio.CancelledError:
-                raise
-            except Exception:  # noqa: BLE001 - the task's top: the next look may succeed
-                _log.exception("! the certificate could not be renewed")
+            await self._look()
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._wake.wait(), limits.RENEWAL_LOOK)
 

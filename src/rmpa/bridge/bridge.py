@@ -140,13 +140,15 @@ class Bridge(Shared):
         if session is None:
             return
         part = self._by_op.get(op_of(payload))
-        if part is not None:
-            # Parsing takes long, and this is called from a reader of data: so it is done later.
-            part.advertised(session, bytes(payload))
-            return
-        message = decode(payload)
-        if not any(part.message(session, message) for part in self._parts):
-            raise RemoteProtocolError(f"a message of kind {type(message).__name__} that no part here takes")
+        if part is None:
+            message = decode(payload)
+            part = self._by_op.get(str(message.__struct_config__.tag))  # its JSON has blanks, or another order
+            if part is None:
+                if not any(each.message(session, message) for each in self._parts):
+                    raise RemoteProtocolError(f"a message of kind {type(message).__name__} that no part here takes")
+                return
+        # Parsing takes long, and this is called from a reader of data: so it is done later.
+        part.advertised(session, bytes(payload))
 
     def mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
         """Pass an acknowledgement, or the answer to a fence, to the route's sender."""

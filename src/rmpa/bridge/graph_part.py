@@ -194,7 +194,7 @@ class GraphPart(Part, Effects):
     def _applied(self, session: PeerSession, message: Advertise | AdvertiseServices) -> Iterator[None]:
         if message.added or message.removed:
             more, less = len(message.added), len(message.removed)
-            _log.info("< %s %s %d more %s, %d less", session.link.name, self.verb, more, self.exports.kind, less)
+            _log.debug("< %s %s %d more %s, %d less", session.link.name, self.verb, more, self.exports.kind, less)
         for wire, offer in self.imports.changes(session.peer, message):
             self.imports.take_in(session.peer, wire, offer, self.now())
             yield

@@ -9,9 +9,6 @@ from typing import Final
 
 from rmpa.core.limits import KIB, MIB
 
-# Seconds that a peer has to answer a request to open a route. Then a topic's route is asked for again, and a
-# service's is given up: the calls that wait for it fail.
-ROUTE_OPEN_TIMEOUT: Final = 5.0
 # Seconds that a topic's route stays open after its last local subscriber left: a reconnecting node finds it open.
 ROUTE_LINGER: Final = 1.0
 # Entries that one advertisement of this module takes from the pending changes, which takes a millisecond; the rest

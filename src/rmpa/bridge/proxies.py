@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import os
 from collections.abc import Callable
@@ -18,8 +17,10 @@ from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.xmlrpc import RosReply
 from rmpa.runtime.accept import DESCRIPTORS, Use, is_shortage
 from rmpa.runtime.loop import yielding_to_data
+from rmpa.runtime.tasks import start_task
 
 if TYPE_CHECKING:
+    import asyncio
     from collections.abc import Awaitable, Collection, Hashable, Iterable, Iterator
 
     from rmpa.bridge.messages import Origin
@@ -292,14 +293,14 @@ class PeerProxies:
     def _change(self, node: str, keys: Iterable[Hashable]) -> None:
         self._changed.setdefault(node, {}).update(dict.fromkeys(keys))
         if self._task is None:
-            self._task = asyncio.create_task(self._work(), name=f"proxies {self.prefix}")
+            self._task = start_task(self._work(), f"proxies {self.prefix}")
 
     async def _work(self) -> None:
         while self._changed:
             node = next(iter(self._changed))
             try:
                 await self._settle(node, self._changed.pop(node))
-            except Exception as error:  # noqa: BLE001 - the task's top: one node that fails must not stop the others
+            except Exception as error:  # noqa: BLE001 - one node that fails must not stop the others
                 self._fail(node, error)
         self._task = None
 

@@ -27,6 +27,7 @@ from rmpa.bridge.services.bodies import BodyReceiver, BodySender, Budget
 from rmpa.bridge.sessions import Part
 from rmpa.core.errors import LimitExceeded, PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.core.limits import UINT32_MAX
+from rmpa.runtime.tasks import OwnedTasks, end_tasks
 
 if TYPE_CHECKING:
     from rmpa.bridge.messages import Message
@@ -122,10 +123,7 @@ class PeerRpc(Part):
 
     async def close(self) -> None:
         """Cancel all handlers that are running."""
-        tasks = [task for link in self._links.values() for task in link.tasks]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await end_tasks(*(task for link in self._links.values() for task in link.tasks))
 
 
 class LinkRequests(BodyReceiver):
@@ -149,7 +147,7 @@ class LinkRequests(BodyReceiver):
         self._outgoing = Budget(limits.ASK_BYTES)
         self._numbers = itertools.cycle(range(1, UINT32_MAX + 1))
         self.waiting: dict[int, asyncio.Future[Any]] = {}
-        self.tasks: set[asyncio.Task[None]] = set()
+        self.tasks = OwnedTasks()
 
     async def request(self, what: str, args: dict[str, Any], timeout: float) -> Any:  # noqa: ASYNC109 - as above
         """Send a request, and return the value of its response; errors as ``PeerRpc.request``."""
@@ -218,24 +216,22 @@ class LinkRequests(BodyReceiver):
                     future.set_result(message.value)
                 else:
                     future.set_exception(PeerRefused(self._link.name, message.error, message.remedy))
-        elif late > 0 or self._link.abandoned:
+        elif late > 0:
             self._rpc.counters.add("ask.late")
-            text = "this agent was stopped when the question came, and the asking one has given it up"
-            if late > 0:
-                text = f"the question came {late:.1f} s after the asking agent had given it up"
+            text = f"the question came {late:.1f} s after the asking agent had given it up"
             self._refuse(message.number, text, "ask again")
         elif len(self.tasks) >= limits.ASKS_AT_ONCE:
             self._refuse(message.number, "too many questions at once")
         elif not self._budget.take(size):
             self._refuse(message.number, "too many large questions at once")
         else:
-            name = f"answer {message.what} of {self._link.name}"
-            task = asyncio.create_task(self._respond(message), name=name)
-            self.tasks.add(task)
-            task.add_done_callback(self.tasks.discard)
+            task = self.tasks.start(self._respond(message), f"answer {message.what} of {self._link.name}")
             task.add_done_callback(lambda _: self._budget.give(size))
 
     async def _respond(self, ask: Request) -> None:
+        proven = asyncio.Event()
+        self._link.when_proven(proven.set)
+        await proven.wait()
         handler = self._rpc.handlers.get(ask.what)
         if handler is None:
             text = f"this agent {UNKNOWN_QUESTION} {ask.what!r}"
@@ -248,10 +244,10 @@ class LinkRequests(BodyReceiver):
             self._send(Response(ask.number, ok=True, value=msgspec.to_builtins(value)))
         except RmpaError as error:
             self._refuse(ask.number, str(error)[: limits.CONTROL_TEXT_MAX])
-        except Exception:  # noqa: BLE001 - a task's top: one question must not end the link
+        except Exception:
             self._rpc.counters.add("ask.failed")
-            _log.exception("! a question of %s failed: %s", self._link.name, ask.what)
             self._refuse(ask.number, f"the agent failed at {ask.what}", "its log says why")
+            raise
 
     def _refuse(self, number: int, error: str, remedy: str = "") -> None:
         self._send(Response(number, ok=False, error=error, remedy=remedy))

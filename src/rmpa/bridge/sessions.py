@@ -15,6 +15,7 @@ from rmpa.bridge.proxies import PeerProxies, ProxyNamespaces
 from rmpa.core.counters import logged_failure
 from rmpa.mesh import limits as mesh_limits
 from rmpa.runtime.loop import MachineTimer, yield_to_data
+from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
@@ -244,7 +245,7 @@ class PeerSessions:
         self._by_number: dict[int, PeerSession] = {}
         self._by_link: dict[PeerLink, PeerSession] = {}
         self._namespaces = ProxyNamespaces()
-        self._closing: set[asyncio.Task[None]] = set()
+        self._closing = OwnedTasks()
         self._timer = MachineTimer(self._next_timer, self._handle_timer)
 
     def __iter__(self) -> Iterator[PeerSession]:
@@ -366,9 +367,7 @@ class PeerSessions:
             call_each(self._parts, lambda part: part.link_down(session))
         call_each(self._parts, lambda part: part.gone(session))
         self._namespaces.remove(session.peer)
-        task = asyncio.create_task(session.proxies.close(), name=f"retract {session.proxies.prefix}")
-        self._closing.add(task)
-        task.add_done_callback(self._closing.discard)
+        self._closing.start(session.proxies.close(), f"retract {session.proxies.prefix}")
 
     async def close(self) -> None:
         """End every session, and wait until all proxies are closed."""
@@ -376,7 +375,7 @@ class PeerSessions:
         for session in self:
             self._end(session)
         if self._closing:
-            await asyncio.gather(*self._closing, return_exceptions=True)
+            await asyncio.wait(self._closing)
 
     # --- the rest ------------------------------------------------------------------------------------------------
 

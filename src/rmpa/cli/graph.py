@@ -398,6 +398,8 @@ async def watch_topic(
     """
     import asyncio
 
+    from rmpa.runtime.tasks import start_task
+
     ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
     def on_message(received: Received) -> None:
@@ -412,7 +414,7 @@ async def watch_topic(
 
     async def listen(node: Node) -> None:
         subscriber = await node.subscribe(wanted.name, None, on_message)
-        stopped = asyncio.create_task(node.stopped.wait())
+        stopped = start_task(node.stopped.wait(), "wait for the node's end")
         try:
             ends: set[asyncio.Future[Any]] = {ended, stopped}
             done: set[asyncio.Future[Any]] = set()

@@ -359,6 +359,7 @@ def _state_dir(module: str, state: str | None) -> Path | None:
 async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, stores: Path | None = None) -> int:
     from rmpa.resource.node import run_all
     from rmpa.runtime.accept import raise_file_limit
+    from rmpa.runtime.tasks import end_tasks, start_task
 
     raise_file_limit()
     sys.setswitchinterval(limits.THREAD_SWITCH)  # so that a due task interrupts the event loop's work
@@ -376,7 +377,7 @@ async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, s
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         loop.add_signal_handler(number, on_signal, number)
     process = agent.process if agent is not None else None
-    died = asyncio.create_task(_watch(process, stop)) if process is not None else None
+    died = start_task(_watch(process, stop), "watch the agent") if process is not None else None
 
     def ready() -> None:
         gc.freeze()  # a full collection then skips what was loaded until now
@@ -389,9 +390,7 @@ async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, s
     except RmpaError as error:
         failure = error
     finally:
-        if died is not None:
-            died.cancel()
-            await asyncio.wait([died])
+        await end_tasks(died)
     if failure is None and process is not None and process.poll() is not None:
         failure = StartError("the module's agent", f"it ended with code {process.returncode}", "its log says why")
     threads.shutdown(wait=False, cancel_futures=True)

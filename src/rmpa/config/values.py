@@ -76,7 +76,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str | None:
     import difflib  # noqa: PLC0415 - only errors need it
 
     folded = {k.lower().replace("-", "_"): k for k in known}
-    near = difflib.get_close_matches(word.lower().replace("-", "_"), folded, n=1, cutoff=0.6)
+    near = difflib.get_close_matches(word.lower().replace("-", "_"), folded, n=1, cutoff=0.65)
     return folded[near[0]] if near else None
 
 

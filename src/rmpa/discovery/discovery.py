@@ -30,6 +30,7 @@ from rmpa.discovery.beacon import (
 )
 from rmpa.discovery.membership import MembershipProtocol
 from rmpa.runtime.loop import MachineTimer, call_at_tick, yield_to_data
+from rmpa.runtime.tasks import end_tasks, keep_task
 from rmpa.trust import limits as trust_limits
 from rmpa.trust.packets import Verdict
 from rmpa.trust.permissions import TrustReason, not_of_this_mesh
@@ -361,7 +362,6 @@ class Discovery:
     async def start(self) -> None:
         """Listen, and announce this agent. A socket that cannot be opened is logged; discovery works without it."""
         self._started = True
-        loop = asyncio.get_running_loop()
         self._listen(self._udp, multicast=False)
         # Unicasts to the discovery port, the port of seeds without one; one agent of a machine gets them.
         self._open_receiver(_ALL_NETWORKS, multicast=False, lost="seeds of others must name our port")
@@ -373,12 +373,13 @@ class Discovery:
         self._membership.interfaces_changed(now, self._other_addresses())
         self._membership.start(now)
         self._flush()
-        self._tasks = [loop.create_task(network.watch_interfaces(self._look_again), name="interfaces")]
+        self._tasks = [keep_task(partial(network.watch_interfaces, self._look_again), "watch the interfaces")]
         for host in dict.fromkeys(seed.host for seed in self._settings.seeds):
             try:
                 self._seed_hosts[host] = [str(IPv4Address(host))]
             except AddressValueError:
-                self._tasks.append(loop.create_task(network.follow_seed(host, self._resolve, self._seed_is)))
+                follow = partial(network.follow_seed, host, self._resolve, self._seed_is)
+                self._tasks.append(keep_task(follow, f"follow seed {host}"))
         self._set_seeds()
 
     async def close(self) -> None:
@@ -386,9 +387,7 @@ class Discovery:
         if not self._started:
             return
         self._started = False
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await end_tasks(*self._tasks)
         self._timer.close()
         self._membership.goodbye(time.monotonic())
         self._flush()
@@ -461,9 +460,8 @@ class Discovery:
         try:
             sock = network.open_receiver(host, port, heartbeats=heartbeats)
         except OSError as error:
-            self._warn(
-                f"cannot listen at {host or '*'}:{port} ({error.strerror}): {lost}, or choose another --multicast"
-            )
+            text = f"cannot listen at {host or '*'}:{port} ({error.strerror}): {lost}, or choose another --multicast"
+            self._warn(text, "multicast-blocked")
             return None
         self._receivers.append(sock)
         self._listen(sock, multicast=multicast)
@@ -557,7 +555,7 @@ class Discovery:
         wanted = self._settings.interfaces
         before, self.interfaces = self.interfaces, network.choose(self._everything, wanted)
         if problem := network.unknown_names(self._everything, wanted):
-            self._warn(problem)
+            self._warn(problem, "no-interface")
         if not self._settings.multicast.enabled:
             return
         if self.interfaces != before:
@@ -565,11 +563,12 @@ class Discovery:
         if any(not i.loopback for i in self.interfaces) or (wanted and self.interfaces):
             self._warned.discard(_ALONE)
         else:
-            self._warn(_ALONE)
+            self._warn(_ALONE, "no-interface")
         for sock, joined in self._joined.items():
             refused = network.join_group(sock, self._group[0], self.interfaces, joined)
             for name, error in refused.items():
-                self._warn(f"{name}: the group cannot be joined ({error.strerror}); tried again when it changes")
+                text = f"{name}: the group cannot be joined ({error.strerror}); tried again when it changes"
+                self._warn(text, network.failure_code(error))
 
     def _seed_is(self, host: str, addresses: list[str]) -> None:
         if addresses != self._seed_hosts.get(host):
@@ -583,10 +582,10 @@ class Discovery:
         self._membership.set_seeds((a, s.port or default) for s in seeds for a in self._seed_hosts.get(s.host, ()))
         self._flush()
 
-    def _warn(self, text: str) -> None:
+    def _warn(self, text: str, code: str) -> None:
         if text not in self._warned:
             self._warned.add(text)
-            _log.warning("! %s [multicast-blocked]", text)
+            _log.warning("! %s [%s]", text, code)
 
     # --- outputs and events -----------------------------------------------------------------------------------
 

@@ -328,6 +328,15 @@ def join_group(
     return refused
 
 
+# Errors of an interface that is missing, down or without an address.
+_NO_INTERFACE: Final = frozenset({errno.ENODEV, errno.ENXIO, errno.ENETDOWN, errno.ENETUNREACH, errno.EADDRNOTAVAIL})
+
+
+def failure_code(error: OSError) -> str:
+    """The code of a failure to join a group, or to send to it, on an interface."""
+    return "no-interface" if error.errno in _NO_INTERFACE else "multicast-blocked"
+
+
 class Sender:
     """Sends beacons through the mesh's UDP socket; a failure is logged once, and once more when it is over.
 
@@ -361,8 +370,8 @@ class Sender:
                 self._counters.add("beacon.send_failed")
                 if self._failing.get(name) != error.errno:
                     self._failing[name] = error.errno
-                    text = "! %s: beacons cannot be sent (%s); tried again with each beacon [multicast-blocked]"
-                    _log.warning(text, name, error.strerror)
+                    text = "! %s: beacons cannot be sent (%s); tried again with each beacon [%s]"
+                    _log.warning(text, name, error.strerror, failure_code(error))
             else:
                 self._counters.add("beacon.out_multicast")
                 if self._failing.pop(name, None) is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import logging
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import Origin, Source, is_crossing_name, is_crossing_type
@@ -18,9 +18,10 @@ from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.service_server import ServiceEndpoint
 from rmpa.ros.wire.tcpros import LENGTH, TopicDescription, printable
+from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine, Mapping
+    from collections.abc import Awaitable, Callable, Mapping
 
     from rmpa.agent.agent import Agent
     from rmpa.gateway.rules import SourceKey
@@ -31,42 +32,8 @@ if TYPE_CHECKING:
 
     Respond = Callable[[ArrivedQuery], Awaitable[tuple[bytes, bytes]]]
 
-_T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 _INSTANCE_LABEL: Final = b"rmpa site 1"
-
-
-class OwnedTasks:
-    """Tasks that end together; the failure of one is logged."""
-
-    def __init__(self) -> None:
-        self._tasks: set[asyncio.Task[Any]] = set()
-
-    def __len__(self) -> int:
-        """Those that run now."""
-        return len(self._tasks)
-
-    def spawn(self, work: Coroutine[Any, Any, _T], name: str = "") -> asyncio.Task[_T]:
-        """Run a coroutine in the background."""
-        task = asyncio.get_running_loop().create_task(work, name=name or None)
-        self._tasks.add(task)
-        task.add_done_callback(self._done)
-        return task
-
-    def cancel(self) -> None:
-        """End them all."""
-        for task in self._tasks:
-            task.cancel()
-
-    async def close(self) -> None:
-        """End them all, and wait for it."""
-        self.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-
-    def _done(self, task: asyncio.Task[Any]) -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            _log.error("! a task of the gateway ended with an error", exc_info=error)
 
 
 class Answering(OwnedTasks):
@@ -93,7 +60,7 @@ class Answering(OwnedTasks):
         if len(self) >= self._most:
             query.reply_error(f"{len(self)} calls of {self._what} wait already; try again later")
             return False
-        self.spawn(self._answer(query, respond), f"answer for {self._what}")
+        self.start(self._answer(query, respond), f"answer for {self._what}")
         return True
 
     async def _answer(self, query: ArrivedQuery, respond: Respond) -> None:
@@ -107,9 +74,9 @@ class Answering(OwnedTasks):
         except asyncio.CancelledError:
             query.reply_error(self._ends)
             raise
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! an answer for %s failed", self._what)
+        except Exception:
             query.reply_error(f"the gateway failed at {self._what}; its log says why")
+            raise
 
 
 def foreign_origin(source: ForeignSource) -> Origin:
@@ -399,7 +366,7 @@ class ProxiedService(ProxiedSource):
             self._register()
 
     def _called(self, call: ServiceCall) -> None:
-        task = self._calls.spawn(self._answer(call), f"call {self.source.name}")
+        task = self._calls.start(self._answer(call), f"call {self.source.name}")
         call.on_gone = lambda: task.cancel() and None
 
     async def _answer(self, call: ServiceCall) -> None:
@@ -407,9 +374,9 @@ class ProxiedService(ProxiedSource):
             call.reply(True, await self._serve(bytes(call.request)))
         except RmpaError as error:
             call.fail(str(error))
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! service %s of %s failed", self.source.name, self.source.site)
+        except Exception:
             call.fail(f"service [{self.source.name}]: the gateway failed at this call; its log says why")
+            raise
 
     def _mismatched(self, _fields: Mapping[str, str], text: str) -> None:
         self._mismatch = text

@@ -17,9 +17,10 @@ from rmpa.gateway import limits
 from rmpa.gateway.own_graph import AgentGraph
 from rmpa.gateway.zenoh.session import open_trusted_session
 from rmpa.observe.control import GATEWAY_REPORT, GATEWAY_ROLE, ROLE
+from rmpa.runtime.tasks import keep_task, start_task
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator, Mapping
+    from collections.abc import Callable, Coroutine, Iterator, Mapping
 
     from rmpa.config.read import Loaded
     from rmpa.config.settings import Settings
@@ -55,7 +56,7 @@ class Gateway:
         realtime: tuple[str, ...] = (),
         load: Callable[[], Loaded] | None = None,
         *,
-        open_session: Callable[[Settings], Awaitable[OpenSession]] = open_trusted_session,
+        open_session: Callable[[Settings], Coroutine[None, None, OpenSession]] = open_trusted_session,
         make_neighbours: Callable[[AgentGraph, OpenSession, Settings], Mapping[str, Neighbour]] | None = None,
     ) -> None:
         self._settings = replace(settings, relay=True)
@@ -86,7 +87,7 @@ class Gateway:
             StartError: The agent or the session cannot start on this machine with these settings.
         """
         # At once: the library is read in another thread while the agent starts.
-        opening = asyncio.ensure_future(self._open_session(self._settings))
+        opening = start_task(self._open_session(self._settings), "open the zenoh session", raises=(StartError,))
         try:
             await self.agent.start()
         except BaseException:
@@ -104,7 +105,7 @@ class Gateway:
             await _discard(opening)
             await self.close()
             raise
-        self._running = asyncio.get_running_loop().create_task(self._run(), name="keep the zenoh session")
+        self._running = keep_task(self._run, "keep the zenoh session")
 
     async def close(self) -> None:
         """Take everything back: the neighbours first, the agent last."""
@@ -220,6 +221,9 @@ class Gateway:
         except RmpaError as error:
             self._problem = str(error)
             _log.error("! %s [%s]", error, error.code)
+        except BaseException:
+            self._changed.set()  # they are made anew when ``_run`` goes on
+            raise
 
 
 def _rules(settings: Settings) -> tuple[object, ...]:

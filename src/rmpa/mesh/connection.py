@@ -106,9 +106,9 @@ class ConnectionProtocol:
         malformed: Whether the remote side broke the protocol.
         routes: The handler of each open route. Assigned once the peer, and so the receiver of its data, is known.
         clock: Round-trip time and remote clock, as the pings of this connection show them.
-        abandoned: Whether this process was stopped for longer than the lease that it promised: the remote side has
-            ended the connection then, and given up what it asked in it. True until a ping from after that is
-            answered.
+        doubted: Whether this process was stopped for longer than the lease that it promised: unless the remote side
+            was stopped too, it has ended the connection, and given up what it asked in it. True until a ping from
+            after that is answered.
         output: The bytes that ``take_output`` returns.
     """
 
@@ -139,7 +139,7 @@ class ConnectionProtocol:
         phase = int.from_bytes(ours.instance[:2], "big") / 65536 * limits.IDLE_KEEPALIVE_INTERVAL
         lease = limits.BULK_LEASE if lane == Lane.BULK else limits.EXPRESS_LEASE
         self.keepalive = Keepalive(lease, now, acceptor=not dialled, phase=phase)
-        self.abandoned = False
+        self.doubted = False
         self.output = bytearray()
         self._proof: int | None = None
         # Bytes that are still missing of a data frame whose first bytes were handed on.
@@ -182,6 +182,9 @@ class ConnectionProtocol:
     def pong_received(self, stamp: int, rtt: float) -> None:
         """The answer to the ping with this stamp came; ``rtt`` is the round trip on the wire in seconds."""
 
+    def proved(self) -> None:
+        """The connection is doubted no more."""
+
     def closed(self, reason: str) -> None:
         """The connection is over: the driver sends the remaining output and closes the socket."""
 
@@ -216,7 +219,7 @@ class ConnectionProtocol:
         keepalive = self.keepalive
         keepalive.heard, keepalive.excused = now, 0.0
         if now - keepalive.sent > keepalive.lease:
-            self.abandoned, self._proof = True, None
+            self.doubted, self._proof = True, None
         size = len(view)
         offset = handled = 0
         try:
@@ -295,7 +298,7 @@ class ConnectionProtocol:
         if not self.up:
             raise LocalProtocolError(f"no ping on a link that is {self.state.name}")
         stamp = self._wall_ns()
-        if self.abandoned and self._proof is None:
+        if self.doubted and self._proof is None:
             self._proof = stamp
         self.clock.pinged(stamp, now)
         self._send(Frame(FrameKind.PING, stamp_ns=stamp))
@@ -335,7 +338,7 @@ class ConnectionProtocol:
         if now - due > _PAUSE_NOTICED:
             keepalive.excuse(now - due, now)
         if now - keepalive.sent > keepalive.lease:
-            self.abandoned, self._proof = True, None
+            self.doubted, self._proof = True, None
         if self.state is ConnectionState.CLOSING:
             self._end(self._reason)
         elif self.state is ConnectionState.HANDSHAKING:
@@ -397,7 +400,8 @@ class ConnectionProtocol:
             case FrameKind.PONG:
                 t1, t2 = frames.parse_pong(payload)
                 if t1 == self._proof:
-                    self.abandoned, self._proof = False, None
+                    self.doubted, self._proof = False, None
+                    self.proved()
                 rtt = self.clock.ponged(t1, t2, stamp_ns, self._wall_ns(), now)
                 if rtt is not None:
                     self.pong_received(t1, rtt)

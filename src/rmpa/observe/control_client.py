@@ -52,9 +52,17 @@ def runtime_dir(environ: Mapping[str, str], setting: str = "") -> Path:
         return Path(setting or environ["RMPA_RUNTIME_DIR"])
     if environ.get("XDG_RUNTIME_DIR"):
         return Path(environ["XDG_RUNTIME_DIR"]) / "rmpa"
-    if os.geteuid() == 0 and os.access(_SYSTEM.parent, os.W_OK):
+    if os.geteuid() == 0 and os.access(_SYSTEM.parent, os.W_OK) and not _is_a_units():
         return _SYSTEM
     return Path(f"/tmp/rmpa-{os.geteuid()}")  # noqa: S108 - made with mode 0700, its owner checked
+
+
+def _is_a_units() -> bool:
+    """Whether the system's directory belongs to the user of a unit, which runs an agent then."""
+    try:
+        return _SYSTEM.stat().st_uid != 0
+    except OSError:
+        return False
 
 
 def runtime_dirs(environ: Mapping[str, str]) -> list[Path]:

@@ -22,6 +22,7 @@ from rmpa.observe.control import ControlReply, ControlRequest
 from rmpa.observe.control_client import NameLock
 from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.loop import yielding_to_data
+from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -106,7 +107,7 @@ class ControlServer:
         self._group = group
         self._lock: NameLock | None = None
         self._acceptor: Acceptor | None = None
-        self._clients: set[asyncio.Task[None]] = set()
+        self._clients = OwnedTasks()
         self.path = place / f"{name}.sock"
 
     def add(self, handlers: Mapping[str, Handler]) -> None:
@@ -159,10 +160,7 @@ class ControlServer:
         if served is not None:
             served.close()
         await asyncio.sleep(0)  # lets tasks of clients accepted just now begin: only then do they close their sockets
-        clients = list(self._clients)
-        for task in clients:
-            task.cancel()
-        await asyncio.gather(*clients, return_exceptions=True)
+        await self._clients.close()
         if served is not None:
             self.path.unlink(missing_ok=True)
         if self._lock is not None:
@@ -170,9 +168,7 @@ class ControlServer:
             self._lock = None
 
     def _connected(self, sock: socket.socket, _address: str) -> None:
-        task = asyncio.get_running_loop().create_task(self._serve(sock))
-        self._clients.add(task)
-        task.add_done_callback(self._clients.discard)
+        self._clients.start(self._serve(sock), "serve a client of the control socket")
 
     async def _serve(self, sock: socket.socket) -> None:
         try:
@@ -193,8 +189,6 @@ class ControlServer:
                     await reader.read(limits.CONTROL_REQUEST_MAX)
         except (OSError, TimeoutError, asyncio.IncompleteReadError):
             pass  # gone, idle, or closed half-way: none is an error
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! control client failed")
         finally:
             writer.close()
             with contextlib.suppress(OSError):
@@ -240,15 +234,17 @@ class ControlServer:
         if handler is None:
             remedy = suggestion(request.op, self._handlers, f"there are {', '.join(sorted(self._handlers))}")
             return ControlReply(ok=False, error=f"no op {request.op!r}", remedy=remedy)
+        deadline = asyncio.timeout(limits.CONTROL_HANDLER_TIMEOUT)
         try:
-            async with asyncio.timeout(limits.CONTROL_HANDLER_TIMEOUT):
+            async with deadline:
                 value = handler(request.args)
                 return ControlReply(ok=True, value=await value if inspect.isawaitable(value) else value)
         except RmpaError as error:
             return ControlReply(ok=False, error=str(error), code=error.code)
-        except TimeoutError:
-            return ControlReply(ok=False, error=f"{request.op} took more than {limits.CONTROL_HANDLER_TIMEOUT:.0f} s")
         except Exception:  # noqa: BLE001 - one handler's bug must not end the client's connection
+            if deadline.expired():
+                text = f"{request.op} took more than {limits.CONTROL_HANDLER_TIMEOUT:.0f} s"
+                return ControlReply(ok=False, error=text)
             self.counters.add("control.failed")
             _log.exception("! control handler %s failed", request)
             return ControlReply(

@@ -27,6 +27,7 @@ from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import LENGTH, printable
 from rmpa.runtime.accept import in_thread
 from rmpa.runtime.loop import MachineTimer
+from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -86,7 +87,7 @@ async def call_function(function: Hook, what: str, name: str, limit: float, reme
         if outcome is not None:
             await outcome
 
-    call = asyncio.create_task(run(), name=f"{what} {name}")
+    call = start_task(run(), f"{what} {name}", raises=(Exception,))
     try:
         await asyncio.wait([call], timeout=limit)
     finally:
@@ -119,7 +120,8 @@ class Preconditions:
         """
         for name, needs in self._needs.items():
             if name not in self._calls:
-                self._calls[name] = asyncio.create_task(in_thread(needs, f"needs of {name}"), name=f"needs of {name}")
+                what = f"needs of {name}"
+                self._calls[name] = start_task(in_thread(needs, what), what, raises=(Exception,))
         if not self._calls:
             return {}
         done, _ = await asyncio.wait(self._calls.values(), timeout=limits.PRECONDITION_TIMEOUT)
@@ -138,9 +140,7 @@ class Preconditions:
 
     async def close(self) -> None:
         """Stop waiting for calls; threads that hang are left behind."""
-        for call in self._calls.values():
-            call.cancel()
-        await asyncio.gather(*self._calls.values(), return_exceptions=True)
+        await end_tasks(*self._calls.values())
 
 
 # --- Texts and values of a resource's reports -----------------------------------------------------------------------
@@ -297,10 +297,7 @@ class Adapter(RuntimePart):
         for timer in self._timers:
             timer.close()
         self.publishers.clear()
-        tasks = [task for task in (self._checking, self._applying) if task is not None]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await end_tasks(self._checking, self._applying)
         await self._preconditions.close()
 
     # --- measurements -------------------------------------------------------------------------------------------
@@ -326,7 +323,7 @@ class Adapter(RuntimePart):
             level = DiagnosticLevel.STALE if missing else DiagnosticLevel.OK
             self._report("alarms", level, message, {"cleared": str(not missing).lower()})
         if self._checking is None or self._checking.done():
-            self._checking = self._loop.create_task(self._check_preconditions(), name="check preconditions")
+            self._checking = start_task(self._check_preconditions(), "check preconditions")
         self.adaptation.window(self._measured, now)
         for part in self._runtime.parts:
             part.window_ended(self._measured)
@@ -421,7 +418,7 @@ class Adapter(RuntimePart):
     def apply(self, profile: str, why: str) -> None:
         """Begin to apply a profile; the loop decides on the next one only after the outcome of this one."""
         _log.info("= %s: profile %s: %s", self._name, profile, why)
-        self._applying = self._loop.create_task(self._apply(profile), name=f"apply {profile}")
+        self._applying = start_task(self._apply(profile), f"apply {profile}")
 
     async def _apply(self, profile: str) -> None:
         function, limit, why = self._runtime.resource.profiles[profile].apply, self._settings.apply_timeout, ""

@@ -28,6 +28,7 @@ from rmpa.resource.runtime import RuntimePart
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
+from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
@@ -167,7 +168,7 @@ class ResourceClient:
     async def answers(self) -> AsyncIterator[RequirementAnswer]:
         """The present answer, if there is one, and each change from now on, until the node is closed."""
         seen = 0
-        stopped = asyncio.ensure_future(self._node.stopped.wait())
+        stopped = start_task(self._node.stopped.wait(), f"answers of {self.resource}")
         stopped.add_done_callback(lambda _: self._change.set())
         try:
             while True:
@@ -222,8 +223,8 @@ class Demands(RuntimePart):
                 demand.on_change = functools.partial(self._runtime.call_in_loop, self._request)
                 undo.callback(setattr, demand, "on_change", None)
                 name = f"follow {demand.resource}"
-                following = asyncio.get_running_loop().create_task(self._follow(demand, client), name=name)
-                undo.push_async_callback(_ended, following)
+                following = keep_task(functools.partial(self._follow, demand, client), name)
+                undo.push_async_callback(end_tasks, following)
                 if demand.requests:
                     self._request(demand)
                 if any(name.startswith(f"{demand.resource}/") for name in self._runtime.resource.inputs):
@@ -300,8 +301,3 @@ class Demands(RuntimePart):
                     _log.info("= %s: %s says: %s", *texts)
                 else:
                     _log.warning("! %s: %s says: %s [resource-trouble]", *texts)
-
-
-async def _ended(task: asyncio.Task[None]) -> None:
-    task.cancel()
-    await asyncio.wait([task])

@@ -23,10 +23,9 @@ from rmpa.resource.runtime import RuntimePart
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.loop import MachineTimer
+from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
-
     from rmpa.resource.adapter import Adapter
     from rmpa.resource.declare import Input, Output, Parameter, Scalar
     from rmpa.resource.runtime import Runtime
@@ -77,7 +76,7 @@ class Contexts(RuntimePart):
         self._retry = 0.0
         # Held during a switch, and from a choice to its outcome: one that fails must not undo the next.
         self._lock = asyncio.Lock()
-        self._work: set[asyncio.Task[None]] = set()
+        self._work = OwnedTasks()
         self._next_evaluation: float | None = None
         self._timer = MachineTimer(lambda: self._next_evaluation, self._evaluate)
         # True before ``start`` and after ``close``.
@@ -102,7 +101,7 @@ class Contexts(RuntimePart):
                 _log.warning("! %s: %s [resource-trouble]", node.name, error)
                 self.chosen = ""
         if self._fields:
-            self._spawn(self._find_topics(), "find topics of rules")
+            self._work.start(self._find_topics(), "find topics of rules")
         if self._rules:
             self._evaluate(self._loop.time())
             self._timer.arm()
@@ -111,9 +110,7 @@ class Contexts(RuntimePart):
         """Stop the evaluation of rules; the present context stays."""
         self._closed = True
         self._timer.close()
-        for task in self._work:
-            task.cancel()
-        await asyncio.gather(*self._work, return_exceptions=True)
+        await self._work.close()
 
     async def choose(self, name: str) -> None:
         """Choose a context by hand; an empty name lets the rules decide again.
@@ -213,7 +210,7 @@ class Contexts(RuntimePart):
         """Begin a switch if the rules select another context."""
         self._next_evaluation = now + _INTERVAL
         if not self._lock.locked() and now >= self._retry and self._wanted(now) != self.current:
-            self._spawn(self._follow_rules(), "switch context")
+            self._work.start(self._follow_rules(), "switch context")
 
     async def _follow_rules(self) -> None:
         async with self._lock:
@@ -224,7 +221,7 @@ class Contexts(RuntimePart):
                 self._retry = self._loop.time() + limits.CONTEXT_RETRY
 
     def _choice_received(self, message: Received) -> None:
-        self._spawn(self._choose_by_topic(str(message.message.data), message.caller_id), "choose context")
+        self._work.start(self._choose_by_topic(str(message.message.data), message.caller_id), "choose context")
 
     async def _choose_by_topic(self, name: str, client: str) -> None:
         try:
@@ -270,11 +267,6 @@ class Contexts(RuntimePart):
         if not self._closed:
             self._runtime.publish_text("context", self.current)
             self._runtime.changed()
-
-    def _spawn(self, work: Coroutine[Any, Any, None], name: str) -> None:
-        task = self._loop.create_task(work, name=name)
-        self._work.add(task)
-        task.add_done_callback(self._work.discard)
 
 
 class _TopicField:

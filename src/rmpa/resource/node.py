@@ -20,6 +20,7 @@ from rmpa.ros.node.fetch_type import fetch_type
 from rmpa.ros.node.node import Node
 from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.accept import in_thread
+from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -243,7 +244,7 @@ class ResourceNode:
         over = self._deactivating is None or self._deactivating.done()
         if over and self.runtime.state is _ACTIVE and not self._under_way:
             _log.error("! %s is deactivated: %s [resource-trouble]", self.runtime.node.name, why)
-            self._deactivating = asyncio.get_running_loop().create_task(self.deactivate(), name="deactivate")
+            self._deactivating = start_task(self.deactivate(), f"deactivate {self.resource.name}")
 
     def _state(self, now: float, now_ns: int) -> SavedState:
         """The state to keep over a restart; see ``Persistence``."""
@@ -285,17 +286,16 @@ async def run_all(
         RmpaError: A resource cannot start, or a function of one has exceeded its time-out; all are closed.
     """
     running: list[ResourceNode] = []
-    stopped = asyncio.create_task(stop.wait())
+    stopped = start_task(stop.wait(), "wait for the end")
     try:
         # Resources that wait for the type of an output start last.
         for resource in sorted(resources, key=lambda each: any(o.known is None for o in each.outputs.values())):
             state = directory / f"{resource.name}.json" if directory is not None else None
             one = ResourceNode(resource, master_uri, state=state, stop=stop)
-            types = asyncio.create_task(one.learn(), name=f"types of {resource.name}")
+            types = start_task(one.learn(), f"types of {resource.name}", raises=(RmpaError,))
             await asyncio.wait([types, stopped], return_when=asyncio.FIRST_COMPLETED)
             if not types.done():
-                types.cancel()
-                await asyncio.gather(types, return_exceptions=True)
+                await end_tasks(types)
                 break
             await types
             await one.start()
@@ -303,12 +303,11 @@ async def run_all(
         else:
             ready()
             while not stop.is_set() and (left := [one for one in running if not one.ended.is_set()]):
-                ended = asyncio.create_task(left[0].ended.wait())
+                ended = start_task(left[0].ended.wait(), "wait for a resource's end")
                 await asyncio.wait([ended, stopped], return_when=asyncio.FIRST_COMPLETED)
                 ended.cancel()
     finally:
-        stopped.cancel()
-        await asyncio.gather(stopped, return_exceptions=True)
+        await end_tasks(stopped)
         for one in reversed(running):
             await one.close()
     for one in running:

@@ -23,6 +23,7 @@ from rmpa.resource.declare import Parameter
 from rmpa.resource.runtime import RuntimePart
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
+from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -263,8 +264,7 @@ class Reconfigure(RuntimePart):
         if self._mirror is not None:
             # The next start on this core loads these values.
             await asyncio.wait([self._mirror], timeout=_MIRROR_TIMEOUT)
-            self._mirror.cancel()
-            await asyncio.wait([self._mirror])
+            await end_tasks(self._mirror)
 
     @property
     def values(self) -> dict[str, ParameterValue]:
@@ -311,7 +311,7 @@ class Reconfigure(RuntimePart):
         self._published = values
         self._updates.publish(config(values, self._known))
         if self._mirror is None or self._mirror.done():
-            self._mirror = asyncio.get_running_loop().create_task(self._to_server(), name="mirror parameters")
+            self._mirror = start_task(self._to_server(), "mirror parameters")
 
     # --- inside -------------------------------------------------------------------------------------------------
 

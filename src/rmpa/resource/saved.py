@@ -25,6 +25,7 @@ from rmpa.resource.quality import parse_requirement
 from rmpa.resource.runtime import RuntimePart
 from rmpa.runtime.accept import in_thread
 from rmpa.runtime.files import set_aside
+from rmpa.runtime.tasks import start_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -366,7 +367,7 @@ class Persistence(RuntimePart):
             await asyncio.wait([self._writing], timeout=limits.STORE_TIMEOUT)
         if self._started:
             self._started = False
-            await asyncio.wait([asyncio.create_task(self._write())], timeout=limits.STORE_TIMEOUT)
+            await asyncio.wait([start_task(self._write(), f"write {self._path}")], timeout=limits.STORE_TIMEOUT)
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
@@ -379,7 +380,7 @@ class Persistence(RuntimePart):
         """Write the state if it has changed; called with each window too, so a write that failed is tried again."""
         idle = self._writing is None or self._writing.done()
         if self._started and idle and self._collect(0.0, 0) != self._written:
-            self._writing = asyncio.create_task(self._write(), name=f"write {self._path}")
+            self._writing = start_task(self._write(), f"write {self._path}")
 
     def problems(self) -> tuple[list[str], list[str]]:
         """Why nothing can be stored at present."""

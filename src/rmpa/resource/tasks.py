@@ -22,6 +22,7 @@ from rmpa.resource import limits
 from rmpa.resource.declare import OnFailure
 from rmpa.resource.runtime import RuntimePart
 from rmpa.runtime.loop import MachineTimer, TimerFd
+from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -236,7 +237,7 @@ class AsyncTaskRunner(TaskRunner):
         """Start the runs in a task of the event loop."""
         self._wake = asyncio.Event()
         self.wake = self._wake.set
-        self._run_task = asyncio.get_running_loop().create_task(self._run(), name=f"task {self.task.name}")
+        self._run_task = keep_task(self._run, f"task {self.task.name}")
 
     def stop(self, *, stuck: bool = False) -> None:
         """Cancel the present run, if any, and end; ``stuck``: the run is no longer counted as inside the gate."""

@@ -30,10 +30,11 @@ TCPROS_LENGTH_MAX: Final = 1_000_000_000
 # Told in: log, `why` (*route*)
 # Why: rospy and roscpp wait without a limit.
 TCPROS_HANDSHAKE_TIMEOUT: Final = 10.0
-# [Messages] Time for a connection to a node
+# [Messages] Time for each answer of a local publisher: its port, a connection, its header; for a service's server too
 # At it: it is tried again
 # Told in: `topic info`, `why` (*route*), log
-TCPROS_CONNECT_TIMEOUT: Final = 3.0
+# Why: As in rospy. A node without processor time is slow, not dead: another attempt would wait behind the first.
+TCPROS_CONNECT_TIMEOUT: Final = 60.0
 # [Messages] Subscribers connected to one proxy
 # At it: further ones are refused, and try again
 # Told in: log, counters
@@ -51,7 +52,7 @@ LOOPBACK_RESTING_MAX: Final = 16_384
 # Told in: the caller's error, log
 # Why: It is held in memory: maps and point clouds reach some 10 MB.
 SERVICE_MESSAGE_MAX: Final = 64 * MIB
-# Time-out of the connection to a service's server and the exchange of headers together.
+# Time-out of a question for a service's type: the connection to its server and the headers together.
 SERVICE_OPEN_TIMEOUT: Final = 5.0
 # [Messages] Messages that wait for one slow local subscriber (`depth` of `[[contract]]`)
 # At it: the oldest is dropped
@@ -130,8 +131,9 @@ HTTP_BODY_INLINE: Final = 64 * KIB
 # [Core] Connections to the core, and to each proxy
 # At it: a new one replaces a slow one, else the one idle for longest
 # Told in: log, `http.evicted`
-# Why: ``ros.http.server`` chooses it.
-HTTP_CONNECTIONS_MAX: Final = 512
+# Why: ``ros.http.server`` chooses it. rosmaster takes any number; clients that reconnect whenever they have given way
+#   would keep all others out, so there is room for thousands, of 5 KB each.
+HTTP_CONNECTIONS_MAX: Final = 4096
 # Time after which a kept-alive connection without a call is closed; rospy and roscpp reconnect by themselves.
 HTTP_IDLE_TIMEOUT: Final = 60.0
 # [Core] Time for a call to arrive

@@ -11,12 +11,12 @@ link or a route begins at 0 when that is opened again, which PromQL's ``rate`` u
 
 from __future__ import annotations
 
-import difflib
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, TypeVar
 from urllib.parse import unquote
 
 import msgspec
 
+from rmpa.config.values import did_you_mean
 from rmpa.core.identity import is_legal_name
 from rmpa.web import limits
 from rmpa.web.gateways.gateways import PROTOCOLS, GatewayFigures
@@ -118,8 +118,8 @@ def respond(path: str, snapshot: Snapshot | None, why: str = "") -> RestResponse
 
 def _missing(kind: str, name: str, names: Sequence[str]) -> str:
     text = f"there is no {kind[:-1]} {_short(name)}"
-    if near := difflib.get_close_matches(name, names, 1):
-        return f"{text}; did you mean {near[0]}?"
+    if near := did_you_mean(name, names):
+        return f"{text}; did you mean {near}?"
     if kind != "peers" and not is_legal_name(name):
         return f"{text}: that is not a ROS name"
     return f"{text}; {PREFIX}/{kind} lists all"

@@ -103,7 +103,7 @@ class LinkEnd:
         self.crashed = False
         self.clock_offset: float | None = None
         self.clock_error: float | None = None
-        self.gone = self.abandoned = False
+        self.gone = False
         self.busy = False
         self.expects_the_worst = False
         self.aborted = ""
@@ -134,6 +134,10 @@ class LinkEnd:
         """Send a control message."""
         assert not self.gone
         self.wires["express"].send((Frame(FrameKind.CONTROL, payload).serialize(),), URGENT)
+
+    def when_proven(self, act: Callable[[], None]) -> None:
+        """No process was stopped."""
+        act()
 
     def need(self, *, needed: bool, parks: bool = False) -> None:
         """What the bridge says of this link."""

@@ -183,7 +183,7 @@ class World:
         return True
 
     def time(self, _service: str = "") -> None:
-        self.now += limits.ROUTE_OPEN_TIMEOUT / 2
+        self.now += 30.0
         self.act(self.imports.handle_timer(self.now))
 
     def _to_caller(self, message: Message) -> None:

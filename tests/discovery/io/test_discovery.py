@@ -297,7 +297,8 @@ async def test_an_unknown_interface_is_said_and_used_when_it_comes(
     pc = Agent("pc", settings)
     await start(agents, base, pc)
     assert "--interface lo, wlan7: not here; there are" in caplog.text
-    assert "other machines are only found by --seed" in caplog.text
+    assert "other machines are only found by --seed [no-interface]" in caplog.text
+    assert "if it comes [no-interface]" in caplog.text
     assert base.discovery.interfaces == ()
     now_there.append(loopback)
     base.discovery._look_again()
@@ -320,6 +321,7 @@ async def test_an_interface_that_refuses_is_said_once(
     assert len(said) == 2, said
     assert any("beacons cannot be sent" in line for line in said)
     assert any("cannot be joined" in line for line in said)
+    assert all(line.endswith("[no-interface]") for line in said), "it is gone, and nothing blocks it"
 
 
 async def test_a_discovery_port_that_somebody_keeps_is_said(

@@ -499,3 +499,22 @@ async def test_a_wish_for_the_lane_before_the_link_is_used_is_kept() -> None:
         link.use(used=True)
         one.mesh.dial_bulk(link)
         await until(lambda: len(one.data) == 1, "it comes")
+
+
+async def test_what_a_peer_asks_waits_after_a_stop_until_the_link_is_proven() -> None:
+    async with linked_pair() as (one, other):
+        link, done = one.link(other), list[str]()
+        link.when_proven(lambda: done.append("at once"))
+        link.connection.doubted = bulk_of(link).doubted = True
+        link.when_proven(lambda: done.append("in turn"))
+        assert done == ["at once"]
+        link.when_proven(lambda: done.append("behind it"))
+        await link.ping()
+        await bulk_of(link).measure()
+        await until(lambda: len(done) == 3, "the answers")
+        assert done == ["at once", "in turn", "behind it"]
+        link.connection.doubted = True
+        link.when_proven(lambda: done.append("never"))
+        link.abort("the peer had ended it")
+        await until(lambda: bool(one.downs), "the end")
+        assert len(done) == 3

@@ -388,8 +388,8 @@ async def test_a_handshake_that_has_not_begun_leaves_no_socket_when_the_mesh_end
             pause=lambda _: None,
         )
         securing.accept(ours, ("127.0.0.1", 1))
-        (task,) = securing.close()
-        await asyncio.wait([task])
+        (task,) = securing._unproven
+        await securing.close()
         assert task.cancelled()
         assert ours.fileno() == -1
 

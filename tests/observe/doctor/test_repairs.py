@@ -116,6 +116,24 @@ def test_what_a_killed_agent_has_left_is_removed(leavings: Path) -> None:
     assert [path.name for path in leavings.iterdir()] == ["other.txt"]
 
 
+@pytest.mark.parametrize("by_command", [True, False])
+def test_what_many_killed_agents_have_left_is_one_line(tmp_path: Path, by_command: bool) -> None:
+    names = [f"robot_{number:02}" for number in range(18)]
+    for name in names:
+        with socket.socket(socket.AF_UNIX) as sock:
+            sock.bind(str(tmp_path / f"{name}.sock"))
+        (tmp_path / f"{name}.lock").touch()
+    with (tmp_path / "robot_17.lock").open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        (repair,) = of_leavings(tmp_path)
+        assert repair.text.startswith("17 agents were killed")
+        if by_command:
+            subprocess.run(repair.words, check=True)
+        else:
+            do(repair)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["robot_17.lock", "robot_17.sock"]
+
+
 def test_a_lock_that_is_held_stays_also_if_it_was_taken_since(leavings: Path) -> None:
     (repair,) = of_leavings(leavings)
     with (leavings / "base.lock").open() as lock:

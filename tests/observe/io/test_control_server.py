@@ -137,6 +137,16 @@ async def test_a_handlers_bug_is_logged_and_the_connection_goes_on(
     assert server.counters["control.failed"] == 1
 
 
+async def test_a_handlers_own_time_out_is_not_the_servers(serve: Serve, caplog: pytest.LogCaptureFixture) -> None:
+    def fail(_: dict[str, object]) -> object:
+        raise TimeoutError("of a lock")
+
+    server = await serve(handlers={"fail": fail})
+    (reply,) = await raw(server.path, b'{"op":"fail"}\n')
+    assert reply.error == "the agent failed at fail"
+    assert "TimeoutError: of a lock" in caplog.text
+
+
 @pytest.mark.parametrize("data", [b"GET / HTTP/1.1\r\n\r\n", b"\x00\xff\n", b"{}\n", b"[" * 5000 + b"\n"])
 async def test_garbage_is_answered_counted_and_closed(
     server: ControlServer, data: bytes, caplog: pytest.LogCaptureFixture

@@ -32,6 +32,7 @@ def test_the_order_of_places(monkeypatch: pytest.MonkeyPatch) -> None:
     assert runtime_dir({"XDG_RUNTIME_DIR": "/run/user/1"}) == Path("/run/user/1/rmpa")
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     monkeypatch.setattr(os, "access", lambda *_: True)
+    monkeypatch.setattr(module, "_is_a_units", lambda: False)
     assert runtime_dir({}) == Path("/run/rmpa")
     monkeypatch.setattr(os, "geteuid", lambda: 1234)
     assert runtime_dir({}) == Path("/tmp/rmpa-1234")
@@ -78,6 +79,18 @@ def test_root_finds_the_agent_of_a_services_user(place: Path, monkeypatch: pytes
     monkeypatch.setattr(os, "geteuid", lambda: 4321)  # and so the directory is somebody else's
     assert place not in runtime_dirs({})
     monkeypatch.setattr(module, "_SYSTEM", place)
+    assert place in runtime_dirs({})
+
+
+def test_an_agent_of_root_beside_the_service_has_a_directory_of_its_own(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    monkeypatch.setattr(module, "_SYSTEM", place / "none")
+    assert runtime_dir({}) == place / "none"
+    monkeypatch.setattr(module, "_SYSTEM", place)
+    monkeypatch.setattr(module, "_is_a_units", lambda: True)
+    assert runtime_dir({}) == Path("/tmp/rmpa-0")
     assert place in runtime_dirs({})
 
 

@@ -22,7 +22,7 @@ from tests.ros.core.slaves import Slave
 from tests.ros.node.peers import DEADLINE, until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator
 
     from rmpa.runtime.accept import Use
 
@@ -114,7 +114,7 @@ async def test_notifications_never_wait_in_the_reply_and_one_goes_at_a_time(core
 
 
 async def test_silent_node_is_notified_again(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rmpa.ros.core.liveness.call", _with_timeout(0.5))
+    monkeypatch.setattr(limits, "TCPROS_CONNECT_TIMEOUT", 0.5)
     async with Slave() as slave:
         slave.go.clear()
         core.call("registerSubscriber", "/s", "/t", STRING, slave.uri)
@@ -123,13 +123,6 @@ async def test_silent_node_is_notified_again(core: RosCore, monkeypatch: pytest.
         slave.go.set()
         await until(lambda: core.counters["notify.sent"] == 1)
         await until(lambda: waiting(core) == 0)
-
-
-def _with_timeout(seconds: float) -> Callable[..., object]:
-    async def quick(uri: str, method: str, *params: XmlRpcValue, use: Use) -> XmlRpcValue:
-        return await call(uri, method, *params, timeout=seconds, use=use)
-
-    return quick
 
 
 async def test_parameter_updates_are_in_order(core: RosCore) -> None:
@@ -397,14 +390,15 @@ async def test_rosout_yields_its_name_and_takes_it_back(whole: RosCore) -> None:
         assert not [name for name, _ in other.calls if name == "shutdown"]
 
 
-async def test_rosout_starts_when_it_can(whole: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [StartError("node /rosout", "no file descriptor is left"), RuntimeError("a fault")])
+async def test_rosout_starts_when_it_can(whole: RosCore, monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     start, failures = SlaveNode.start, 0
 
     async def fails_twice(node: SlaveNode) -> None:
         nonlocal failures
         failures += 1
         if failures < 3:
-            raise StartError("node /rosout", "no file descriptor is left")
+            raise error
         await start(node)
 
     monkeypatch.setattr(SlaveNode, "start", fails_twice)
@@ -445,3 +439,25 @@ async def test_no_connection_to_a_node_is_kept_open(core: RosCore) -> None:
             await until(lambda wanted=number: len(slave.calls) == wanted)  # type: ignore[misc]
         await until(lambda: core.counters["notify.sent"] == 8)
         await until(lambda: not slave.server._connections)
+
+
+async def test_the_log_has_one_line_a_second_of_all_changes(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("rmpa.ros.core.external._GRAPH_LINE", 0.05)
+
+    def said() -> list[str]:
+        return [record.getMessage() for record in caplog.records if record.levelname == "INFO"]
+
+    caplog.set_level("INFO")
+    api = "http://127.0.0.1:1/"
+    for number in range(7):
+        core.call("registerPublisher", f"/once_{number}", "/t", STRING, api)
+        core.call("unregisterPublisher", f"/once_{number}", "/t", api)
+    await until(lambda: bool(said()))
+    text = "= 7 registrations more, 7 less, of 7 nodes: /once_0, /once_1, /once_2, /once_3, /once_4, …"
+    assert said() == [text]
+    caplog.clear()
+    core.call("registerPublisher", "/p", "/t", STRING, api)
+    await until(lambda: bool(said()))
+    assert said() == ["= + publisher /t of /p"]

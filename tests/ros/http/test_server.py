@@ -14,6 +14,7 @@ from rmpa.ros.http.rpc import XMLRPC_SLICE, call
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.wire.http import HTTP_HEADERS_MAX
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, parse_response, serialize_call, serialize_response
+from rmpa.runtime.accept import raise_file_limit
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -262,6 +263,22 @@ async def test_slow_connections_block_no_other_client(
         assert len(server._connections) <= 8
         assert server.counters["http.refused.connections"] == 0
         assert server.counters["http.evicted.slow"] + server.counters["http.evicted"] >= 5
+
+
+async def test_two_thousand_half_sent_calls_give_way_to_none(server: XmlRpcServer) -> None:
+    """Clients that reconnect whenever they have given way kept the callers out, for seconds."""
+    if raise_file_limit() < 5000:
+        pytest.skip("this process may not have 5000 open files")
+    loop = asyncio.get_running_loop()
+    with contextlib.ExitStack() as stack:
+        for _ in range(2000):
+            sock = stack.enter_context(socket.socket())
+            sock.setblocking(False)
+            await loop.sock_connect(sock, ("127.0.0.1", server.port))
+            await loop.sock_sendall(sock, b"POST / HTTP/1.1\r\n")
+        assert await call(f"http://127.0.0.1:{server.port}/", "echo", 1) == [1, "127.0.0.1", [1]]
+        assert len(server._connections) >= 2000
+        assert server.counters.as_dict() == {"xmlrpc.calls": 1}
 
 
 async def test_unread_answers_block_no_other_client(server: XmlRpcServer, monkeypatch: pytest.MonkeyPatch) -> None:

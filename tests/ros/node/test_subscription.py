@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import socket
 import struct
 from typing import TYPE_CHECKING, ClassVar
@@ -10,7 +12,7 @@ from rmpa.core import limits as core_limits
 from rmpa.ros import limits
 from rmpa.ros.node.subscription import PublisherConnection, Subscription
 from rmpa.ros.wire.tcpros import TopicDescription, encode_header, frame_message, publisher_header
-from tests.ros.node.peers import MD5, STRING, RawPublisher, until
+from tests.ros.node.peers import MD5, STRING, RawPublisher, RawServer, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
@@ -224,12 +226,30 @@ async def test_a_message_beyond_the_limit_takes_no_memory(
 
 
 @pytest.mark.trap(18)
-async def test_one_that_never_answers_is_given_up(publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "TCPROS_HANDSHAKE_TIMEOUT", 0.05)
+async def test_one_that_never_answers_is_given_up_after_the_time_of_rospy(
+    publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert limits.TCPROS_CONNECT_TIMEOUT == 60
+    monkeypatch.setattr(limits, "TCPROS_CONNECT_TIMEOUT", 0.05)
     said = Said(publisher.uri)
     await publisher.accept()
     await until(lambda: said.lost)
-    assert "no header from the publisher" in said.lost[0]
+    assert said.lost[0] == "no header from the publisher in 0.05 s"
+    with contextlib.closing(RawServer()) as silent:
+        said = Said(f"http://127.0.0.1:{silent.port}/")
+        await until(lambda: said.lost)
+        assert "no answer to requestTopic in 0.05 s" in said.lost[0]
+
+
+async def test_a_header_that_is_slow_is_waited_for(publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "TCPROS_HANDSHAKE_TIMEOUT", 0.0)  # for those that connect to this process
+    said = Said(publisher.uri)
+    link = await publisher.accept()
+    await link.header()
+    await asyncio.sleep(0.01)
+    await link.send(encode_header(publisher_header("/t", "/p", STRING)))
+    await until(lambda: said.headers)
+    assert (len(publisher.asked), said.lost) == (1, [])
 
 
 async def test_closed_from_within_a_message_no_other_comes(publisher: RawPublisher) -> None:

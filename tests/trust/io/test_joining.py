@@ -104,7 +104,7 @@ async def running(lab: Lab) -> AsyncIterator[Lab]:
             yield lab
     finally:
         acceptor.close()
-        await asyncio.gather(*securing.close(), return_exceptions=True)
+        await securing.close()
 
 
 @pytest.fixture

@@ -40,6 +40,7 @@ from rmpa.ros.wire.slave_api import TCPROS
 from rmpa.ros.wire.tcpros import ANY, parse_service_uri
 from rmpa.ros.wire.xmlrpc import RosFault
 from rmpa.runtime.kernel_tcp import connections, end_connections, listening_addresses
+from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -268,7 +269,7 @@ class NodePorts:
         if task is None:
             if len(self._ports) >= limits.DIRECT_MAX:
                 del self._ports[next(iter(self._ports))]
-            task = self._ports[uri] = asyncio.create_task(_ask_port(node, uri, topic), name=f"port of {node}")
+            task = self._ports[uri] = start_task(_ask_port(node, uri, topic), f"port of {node}")
             asyncio.get_running_loop().call_later(limits.DIRECT_PORT_KNOWN, self.forget, uri)
         found = await asyncio.shield(task)
         if isinstance(found, Unmet):
@@ -281,9 +282,7 @@ class NodePorts:
 
     async def close(self) -> None:
         """Cancel the questions to nodes."""
-        for task in self._ports.values():
-            task.cancel()
-        await asyncio.gather(*self._ports.values(), return_exceptions=True)
+        await end_tasks(*self._ports.values())
 
 
 async def _ask_port(node: str, uri: str, topic: str) -> int | Unmet:

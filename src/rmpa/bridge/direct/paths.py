@@ -23,9 +23,10 @@ from rmpa.bridge.peer_offers import EntryT
 from rmpa.bridge.rpc import UNKNOWN_QUESTION
 from rmpa.core.contract import Contract, Transport
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
+from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterator
+    from collections.abc import Callable, Iterator
 
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
@@ -124,7 +125,7 @@ class Paths(Generic[EntryT]):
         self._paths: dict[tuple[int, str, str], dict[str, Path[EntryT]]] = {}
         self._probes: dict[tuple[int, int, str], asyncio.Task[str]] = {}
         self._asks: dict[int, asyncio.Semaphore] = {}
-        self._tasks: set[asyncio.Task[Any]] = set()
+        self._tasks = OwnedTasks()
         self._closed = False
 
     def __iter__(self) -> Iterator[Path[EntryT]]:
@@ -236,10 +237,7 @@ class Paths(Generic[EntryT]):
         self._closed = True
         for path in self:
             self._stop(path)
-        tasks = list(self._tasks)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await self._tasks.close()
 
     # --- the decision -----------------------------------------------------------------------------------------------
 
@@ -266,7 +264,7 @@ class Paths(Generic[EntryT]):
         if (unmet := self._unmet(path)) is not None:
             self._decide(path, unmet)
         else:
-            path.task = self._spawn(self._find(path, pause), f"direct {path.want.name}")
+            path.task = self._tasks.start(self._find(path, pause), f"direct {path.want.name}")
 
     async def decision(self, path: Path[EntryT]) -> None:
         """Wait for the decision, at most ``limits.DIRECT_HOLD``."""
@@ -282,18 +280,6 @@ class Paths(Generic[EntryT]):
             if work is not None:
                 work.cancel()
         path.task = path.retry = None
-
-    def _spawn(self, work: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
-        task = asyncio.create_task(work, name=name)
-        self._tasks.add(task)
-        task.add_done_callback(self._ended)
-        return task
-
-    def _ended(self, task: asyncio.Task[Any]) -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            self._shared.counters.add("direct.failed")
-            _log.error("! %s failed", task.get_name(), exc_info=error)
 
     async def _find(self, path: Path[EntryT], pause: float) -> None:
         found: Grant | Unmet = Unmet(Condition.AGENT, "this agent failed")
@@ -346,7 +332,7 @@ class Paths(Generic[EntryT]):
         key = (id(path.session.link), grant.port, "" if path.want.user else path.want.name)
         task = self._probes.get(key)
         if task is None:
-            task = self._probes[key] = self._spawn(self._probe(path, grant), f"probe {grant.node}")
+            task = self._probes[key] = self._tasks.start(self._probe(path, grant), f"probe {grant.node}")
             task.add_done_callback(lambda _: self._probes.pop(key, None))
         problem = await asyncio.shield(task)
         return Unmet(Condition.REACHABLE, problem) if problem else None

@@ -20,6 +20,7 @@ from rmpa.bridge.sessions import Part
 from rmpa.config.rules import SIM_TIME, overlap
 from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
     from rmpa.bridge.sessions import PeerSession
@@ -76,6 +77,7 @@ class Params(Part):
         owner: This module's own parameters, for peers.
         followed: The parameters that this module follows, in the order of the rules.
         _time_before: What ``/use_sim_time`` was here before it was followed; empty if it was not followed.
+        _renamed: Names under which values still stand that have another name since a reload.
     """
 
     def __init__(self, shared: Shared) -> None:
@@ -85,6 +87,7 @@ class Params(Part):
         self.followed = [Followed(rule) for rule in follow_rules(shared.context.settings)]
         self._refusals = RefusalLog(_log, shared.counters)
         self._time_before: list[str | None] = []
+        self._renamed: set[str] = set()
         self._asking: dict[int, asyncio.Task[None]] = {}
         self._working: asyncio.Task[None] | None = None
         self._looking: asyncio.Task[None] | None = None
@@ -104,6 +107,12 @@ class Params(Part):
         self.owner.judge_again()
         before = {entry.rule: entry for entry in self.followed}
         rules = follow_rules(self._shared.context.settings)
+        sources = {(rule.owner, rule.key): rule.to for rule in rules}
+        self._renamed |= {
+            rule.to
+            for rule, entry in before.items()
+            if entry.text is not None and sources.get((rule.owner, rule.key), rule.to) != rule.to
+        }
         self.followed = [before.pop(rule, Followed(rule)) for rule in rules]
         gone = {rule.owner for rule in before}
         for session in self._shared.sessions.linked():
@@ -140,15 +149,11 @@ class Params(Part):
     def reconcile(self) -> None:
         """Compare the values in the background, and mend differences."""
         if self._looking is None:
-            self._looking = asyncio.create_task(self._look(), name="look at parameters")
+            self._looking = start_task(self._look(), "look at parameters")
 
     async def close(self) -> None:
         """End all tasks, and unsubscribe from the local core, which may live on; the values stay there."""
-        found = (self._looking, self._working, *self._asking.values(), *self.owner.tasks())
-        tasks = [task for task in found if task is not None]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await end_tasks(self._looking, self._working, *self._asking.values(), *self.owner.tasks())
         with contextlib.suppress(RmpaError, TimeoutError):
             async with asyncio.timeout(limits.PARAM_LEAVE_TIMEOUT):
                 await self._core.leave_others(set())
@@ -166,8 +171,6 @@ class Params(Part):
             pass  # reported by the core itself
         except RmpaError as error:
             _log.warning("! parameters cannot be read: %s [param-trouble]", error)
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! looking at parameters failed")
         finally:
             self._looking = None
 
@@ -190,7 +193,7 @@ class Params(Part):
     def _ask(self, session: PeerSession) -> None:
         if session.peer not in self._asking:
             name = f"follow parameters of {session.link.name}"
-            self._asking[session.peer] = asyncio.create_task(self._follow(session), name=name)
+            self._asking[session.peer] = start_task(self._follow(session), name)
 
     async def _follow(self, session: PeerSession) -> None:
         mine = [entry for entry in self.followed if entry.peer == session.peer]
@@ -200,9 +203,6 @@ class Params(Part):
             refused = answer.get("refused", {}) if isinstance(answer, dict) else {}
         except RmpaError as error:
             refused = dict.fromkeys(keys, str(error))
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! following parameters of %s failed", session.link.name)
-            refused = {}
         finally:
             if self._asking.get(session.peer) is asyncio.current_task():
                 del self._asking[session.peer]
@@ -244,6 +244,9 @@ class Params(Part):
         """
         if self._time_before and all(entry.rule.to != SIM_TIME for entry in self.followed):
             await self._reset_time(self._time_before.pop())
+        for key in {key for key in self._renamed if not any(overlap(entry.rule.to, key) for entry in self.followed)}:
+            await self._core.delete(key)
+        self._renamed.clear()
         for entry in list(self.followed):
             if restarted:
                 entry.due = entry.told = entry.known and entry.had
@@ -267,7 +270,7 @@ class Params(Part):
 
     def _work_soon(self) -> None:
         if self._working is None and any(entry.due for entry in self.followed):
-            self._working = asyncio.create_task(self._work(), name="follow parameters")
+            self._working = start_task(self._work(), "follow parameters")
 
     async def _work(self) -> None:
         """Set the values that are due; ``look`` tries again what failed."""
@@ -283,8 +286,6 @@ class Params(Part):
                             str(entry.rule),
                             f"{entry.rule} cannot be set as its owner has it: {error}",
                         )
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! following parameters failed")
         finally:
             self._working = None
 

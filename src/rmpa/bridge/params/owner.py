@@ -30,6 +30,7 @@ from rmpa.ros.http.rpc import read_large, slices
 from rmpa.ros.master.parameters import holds_nil, leaves
 from rmpa.ros.wire.xmlrpc import response_pieces
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
+from rmpa.runtime.tasks import start_task
 from rmpa.trust.permissions import asker_name, refusal
 
 if TYPE_CHECKING:
@@ -422,7 +423,7 @@ class ParamOwner:
             follower.told.pop(key, None)
         if follower.task is None and not follower.keys <= follower.told.keys():
             name = f"tell {follower.session.link.name} of parameters"
-            follower.task = asyncio.create_task(self._tell(follower), name=name)
+            follower.task = start_task(self._tell(follower), name)
 
     async def _tell(self, follower: _Follower) -> None:
         """Tell a peer the present values of what has changed, one after the other; what fails is left to ``look``."""
@@ -434,8 +435,6 @@ class ParamOwner:
                     if key in follower.keys and not await self._tell_one(follower, key):
                         follower.told.pop(key, None)
                         return
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! telling peers of parameters failed")
         finally:
             follower.task = None
 

@@ -29,6 +29,7 @@ from rmpa.mesh.connection import DataHandler
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 from rmpa.runtime.loop import yield_to_data
+from rmpa.runtime.tasks import OwnedTasks, start_task
 
 if TYPE_CHECKING:
     from rmpa.bridge.messages import Origin
@@ -106,6 +107,11 @@ class BodySender:
             budget.give(len(body))
         return False
 
+    @property
+    def closed(self) -> bool:
+        """Whether nothing is sent any more."""
+        return self._link is None
+
     def close(self) -> None:
         """Send nothing more, and drop what waits."""
         link, self._link = self._link, None
@@ -128,7 +134,7 @@ class BodySender:
             sequence, head, body, _ = self._large[0]
             if len(head) + len(body) > _WHOLE:
                 work = self._send_portions(self._link.bulk, sequence, head, body)
-                self._task = asyncio.get_running_loop().create_task(work, name=f"bodies {self._route}")
+                self._task = start_task(work, f"bodies {self._route}")
                 return
             self._link.bulk.send(self._route, sequence, time.time_ns(), _framed(head, body))
             self._left()
@@ -285,7 +291,7 @@ class ServicePool:
         self._loop = asyncio.get_running_loop()
         self._idle: list[tuple[ServiceConnection, float]] = []
         self._busy: set[ServiceConnection] = set()
-        self._opening: set[asyncio.Task[None]] = set()
+        self._opening = OwnedTasks()
         self._queue: deque[tuple[Buffer, float, Done]] = deque()
         self._closed = False
 
@@ -334,8 +340,7 @@ class ServicePool:
     def close(self, reason: str) -> None:
         """Close all connections; the calls under way and those that wait fail with the reason."""
         self._closed = True
-        for task in self._opening:
-            task.cancel()
+        self._opening.cancel()
         for connection in [*(connection for connection, _ in self._idle), *self._busy]:
             connection.close()
         self._idle.clear()
@@ -344,7 +349,7 @@ class ServicePool:
 
     async def closed(self) -> None:
         """Wait until attempts to connect have ended; call after ``close``."""
-        await asyncio.gather(*self._opening, return_exceptions=True)
+        await self._opening.close()
 
     # --- inside ---------------------------------------------------------------------------------------------
 
@@ -372,9 +377,7 @@ class ServicePool:
             self._idle.append((connection, since))
             done(False, problem)
         while len(self._opening) < len(self._queue) and self.size < limits.SERVICE_POOL:
-            task = self._loop.create_task(self._open(), name=f"connect to {self.service}")
-            self._opening.add(task)
-            task.add_done_callback(self._opening.discard)
+            self._opening.start(self._open(), f"connect to {self.service}")
 
     async def _open(self) -> None:
         try:

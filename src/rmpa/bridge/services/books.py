@@ -12,7 +12,7 @@ with the reason, and one of them is shown when the first one leaves. The state o
 (``RemoteService.state``)::
 
     idle ──wanted──► opening ──opened──► open
-      ▲                 │ closed, 5 s      │ closed, withdrawn, link down, released
+      ▲                 │ closed, time     │ closed, withdrawn, link down, released
       └─────────────────┴──────────────────┘
 
 What the server of an opened service said of it is remembered until the service is withdrawn or advertised again.
@@ -457,11 +457,12 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
             known.last_route += 1
             # Odd ones are for replies; the even ones are for requests of the peer.
             remote.route = limits.SERVICE_ROUTES + 2 * known.last_route - 1
-            remote.due = now + limits.ROUTE_OPEN_TIMEOUT
+            # Its server may be slow; after the time for a call the calls that wait fail.
+            timeout = self._out.context.services.timeout(remote.name)
+            remote.due = now + timeout
             known.routes[remote.route] = remote
             self._opening[remote] = None
             self._out.arm_timer()
-            timeout = self._out.context.services.timeout(remote.name)
             self._out.send(remote.peer, OpenService(remote.route, remote.wire, timeout))
 
     def opened(self, peer: int, message: ServiceOpened) -> None:

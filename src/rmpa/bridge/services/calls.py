@@ -13,6 +13,7 @@ from rmpa.bridge.services.bodies import (
     BodyReceiver,
     BodySender,
     Budget,
+    Done,
     LocalService,
     ServicePool,
 )
@@ -24,9 +25,10 @@ from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.wire.tcpros import ServiceDescription, parse_service_uri
 from rmpa.runtime.kernel_tcp import ask_listening_ports
 from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
+from rmpa.runtime.tasks import OwnedTasks, end_tasks, keep_task
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Coroutine, Mapping
+    from collections.abc import Collection, Mapping
 
     from rmpa.bridge.data.reception import LinkTime
     from rmpa.bridge.services.books import ServiceExports, ServiceRoute
@@ -232,22 +234,25 @@ class Server(BodyReceiver):
         """Pass a request to the server, unless its caller has given it up: it must not act then."""
         stats, size = self._stats, len(body)
         stats.calls += 1
-        if late := self._late():
-            self._reply_failed(sequence, late)
-            return
         if not self._budget.take(size):
             self._reply_failed(sequence, f"more than {self._budget.limit >> 20} MiB of requests are being served")
             return
-        stats.active += 1
-        timeout = self._timeout + limits.SERVICE_GRACE
-        self._pool.call(body, timeout, partial(self._answered, sequence, size, self._loop.time()))
+        done = partial(self._answered, sequence, size, self._loop.time())
+        self._link.when_proven(partial(self._pass, body, self._stamp_ns, done))
 
-    def _late(self) -> str:
-        """Why the caller waits no longer for the present request; empty while it may."""
-        if self._link.abandoned:
-            return "this agent was stopped when the request came, and the caller has given it up"
+    def _pass(self, body: bytes | bytearray, stamp_ns: int, done: Done) -> None:
+        self._stats.active += 1
+        if late := self._late(stamp_ns):
+            done(False, f"service [{self._pool.service}]: {late}".encode())
+        else:
+            self._pool.call(body, self._timeout + limits.SERVICE_GRACE, done)
+
+    def _late(self, stamp_ns: int) -> str:
+        """Why the caller waits no longer for a request that was sent then; empty while it may."""
+        if self._sender.closed:
+            return "the caller has left"
         error = self._time.error_ns
-        age = time.time_ns() - self._stamp_ns + self._time.ahead_ns
+        age = time.time_ns() - stamp_ns + self._time.ahead_ns
         if error is not None and age - error > self._timeout * 1e9:
             return f"the request came {age / 1e9:.1f} s late; the caller waits for {self._timeout:g} s"
         return ""
@@ -313,20 +318,17 @@ class Serving:
         self.stats: dict[str, CallStats] = {}
         self._servers: dict[tuple[int, int], Server] = {}
         self._pools: dict[str, ServicePool] = {}
-        self._tasks: set[asyncio.Task[None]] = set()
-        self._looking = False
+        self._tasks = OwnedTasks()
+        self._looking: asyncio.Task[None] | None = None
 
     def look_after(self) -> None:
         """Check that servers live, for as long as services are offered: a module without any sleeps meanwhile."""
-        if self._exports.offered and not self._looking:
-            self._looking = True
-            self._spawn(self._look_after(), "servers' liveness")
+        if self._exports.offered and (self._looking is None or self._looking.done()):
+            self._looking = keep_task(self._look_after, "servers' liveness")
 
     async def close(self) -> None:
         """End all calls and all connections to servers."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await end_tasks(self._looking, *self._tasks)
         pools, self._pools = list(self._pools.values()), {}
         for pool in pools:
             pool.close("the agent ends")
@@ -334,7 +336,7 @@ class Serving:
 
     def probe(self, service: str, server: LocalService) -> None:
         """Ask a server for its types; the answer goes to the exports."""
-        self._spawn(self._ask_server(service, server), f"describe {service}")
+        self._tasks.start(self._ask_server(service, server), f"describe {service}")
 
     def serve(self, peer: int, number: int, route: ServiceRoute, server: LocalService) -> None:
         """Serve a peer's calls: requests come in on ``route.requests``, replies go out on the route ``number``."""
@@ -381,11 +383,6 @@ class Serving:
 
     # --- inside ---------------------------------------------------------------------------------------------
 
-    def _spawn(self, work: Coroutine[None, None, None], name: str) -> None:
-        task = asyncio.get_running_loop().create_task(work, name=name)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-
     def _pool(self, service: str, server: LocalService) -> ServicePool:
         pool = self._pools.get(service)
         if pool is None or pool.server != server:
@@ -415,7 +412,6 @@ class Serving:
                 if self._exports.offered.get(service) == server and _is_deaf(server, ports, here):
                     self._core.suspect(server.node)
             await sleep_to_tick(max(limits.SERVER_LOOK, 50 * cost))  # at most 2 % of the processor's time
-        self._looking = False
 
 
 def _listening() -> tuple[set[int] | None, frozenset[str], float]:

@@ -346,7 +346,7 @@ class TopicPaths(Paths["RemoteTopic"]):
         """Make a subscriber leave its direct connection; it is not called back."""
         if path.endpoint is not None and not self._closed:
             self._shared.counters.add("direct.hung_up")
-            self._spawn(self._leave(path), f"hang up {path.want.user}")
+            self._tasks.start(self._leave(path), f"hang up {path.want.user}")
             # The source may be shown again at once: the list of its end must not be the last one that arrives.
             asyncio.get_running_loop().call_later(limits.DIRECT_LIST_AGAIN, self._list_again, path)
 
@@ -384,7 +384,7 @@ class TopicPaths(Paths["RemoteTopic"]):
 
     def _place(self, path: TopicPath) -> None:
         if path.mover is None and not self._closed and self._is_misplaced(path):
-            path.mover = self._spawn(self._move(path), f"move {path.want.user}")
+            path.mover = self._tasks.start(self._move(path), f"move {path.want.user}")
 
     async def _move(self, path: TopicPath) -> None:
         """Make a subscriber leave its connection, and call it back to get the answer that was decided."""
@@ -454,7 +454,7 @@ class TopicPaths(Paths["RemoteTopic"]):
     def _list_again(self, path: TopicPath) -> None:
         """Repeat the list of publishers: a roscore's graph is known here with a delay, and calls may be lost."""
         if not self._closed and path.mover is None:
-            self._spawn(self._list(path), f"call back {path.want.user}")
+            self._tasks.start(self._list(path), f"call back {path.want.user}")
 
     def _warn(self, path: TopicPath, endpoint: tuple[str, int], problem: str) -> None:
         source, user = path.entry.wire, path.want.user
@@ -486,7 +486,7 @@ class TopicPaths(Paths["RemoteTopic"]):
         there = {address: standing(address) for address in {endpoint[0] for endpoint in wanted}}
         for path, endpoint in settled:
             if len(there[endpoint[0]].get(endpoint[1], ())) < wanted[endpoint]:
-                self._spawn(self._check_one(path, endpoint), f"check {path.want.user}")
+                self._tasks.start(self._check_one(path, endpoint), f"check {path.want.user}")
 
     async def _check_one(self, path: TopicPath, endpoint: tuple[str, int]) -> None:
         uri = self._uri(path)

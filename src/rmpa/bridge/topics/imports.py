@@ -4,7 +4,7 @@ The state of a source's route follows from its facts (``RemoteTopic.state``); ``
 for::
 
     idle ──wanted──► opening ──opened──► open ──unwanted──► lingering ──time──► idle
-      ▲                 │ closed, time      │ closed             │ wanted ──► open
+      ▲                 │ closed            │ closed             │ wanted ──► open
       │ unwanted        ▼                   ▼
       └────────────── waiting ◄─────────────┘    time ──► opening
 
@@ -296,7 +296,8 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         if entry.cause != before and CONFLICT in {entry.cause, before}:
             text = entry.hidden if entry.cause == CONFLICT else ""
             if text:
-                self._out.warn("mismatch.type", str(entry.wire), f"{entry.wire}: {text}")
+                counter = "clock.second" if entry.name == CLOCK else "mismatch.type"
+                self._out.warn(counter, str(entry.wire), f"{entry.wire}: {text}")
             self._out.send(entry.peer, Mismatch(entry.wire.topic, entry.node, "", text))
         if entry.cause == DENIED != before:
             module, relay = self._speaker(entry)
@@ -391,9 +392,6 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         """Open, keep or close a source's route, by the facts of now; call it again whenever one has changed."""
         known, due = self._peers[entry.peer], entry.until is not None and entry.until <= now
         match entry.state:
-            case "opening" if due:
-                self._out.send(entry.peer, CloseRoute(entry.route))
-                self._fail(entry, "the peer has not answered", now)
             case "opening" if not entry.wanted:
                 self._close(entry)
             case "lingering" if due:
@@ -403,7 +401,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             case "waiting" if not known.away and (due or entry.until is None):
                 known.last_route += 1
                 entry.route, known.routes[known.last_route] = known.last_route, entry
-                self._wait(entry, now + limits.ROUTE_OPEN_TIMEOUT)
+                entry.until = None  # the peer answers once its publisher has, and that may take long
                 entry.asked = self._out.context.contracts.of(entry.name, entry.type)
                 epoch, after = self._do.position(entry) or (0, 0)
                 asked = OpenRoute(entry.route, entry.wire.topic, entry.node, entry.asked, epoch, after)

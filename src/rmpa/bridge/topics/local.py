@@ -21,6 +21,7 @@ from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender
 from rmpa.bridge.messages import Audience, Description, Mismatch, Source, encode, is_crossing_name
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.config.peer_rules import Access
+from rmpa.config.rules import CLOCK
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import OWN_NODE, is_own, is_type_name, proxied_node, proxy_name
 from rmpa.mesh import limits as mesh_limits
@@ -363,7 +364,8 @@ class Mismatches:
             return
         self._add(source, subscriber, message.text)
         where = f"{name}: {source}"
-        self._out.warn("mismatch.remote", where, f"{where}: {message.text}")
+        counter = "clock.second" if source.topic == CLOCK else "mismatch.remote"
+        self._out.warn(counter, where, f"{where}: {message.text}")
 
     def registration_changed(self, topic: str, subscriber: str) -> None:
         """A local subscriber has gone or has registered again: forget its mismatch, here and at the peers."""

@@ -90,7 +90,7 @@ class JoinedAction(Goals):
         self._taps: dict[MeshSource, TopicTap] = {}
         self._declared: list[Declaration | OwnEndpoint | QueuedPublisher] = []
         self._sequence = 0
-        context.spawn(self._join())
+        context.start(self._join(), f"join action {name}")
 
     def close(self) -> None:
         """The server is gone: goals under way end as aborted, and all is taken back but the topics for ROS 1."""
@@ -250,7 +250,7 @@ class OfferedAction(JoinedAction, GoalsToRos1):
             if source not in self._taps:
                 self._tap(source, part, self._changed)
         self._judge_ready()
-        self._context.spawn(self._send_when_ready(query))
+        self._context.start(self._send_when_ready(query), f"goal of {self._name}")
 
     async def _send_when_ready(self, query: ArrivedQuery) -> None:
         try:
@@ -321,7 +321,7 @@ class ShownAction(JoinedAction, GoalsToRos2):
     def ask(self, service: str, uuid: bytes, request: bytes) -> None:
         """Call a service of the server, and tell the goals what comes of it."""
         if self._open:
-            self._context.spawn(self._ask(service, uuid, request))
+            self._context.start(self._ask(service, uuid, request), f"ask {service}")
 
     # --- inside ----------------------------------------------------------------------------------------------------
 

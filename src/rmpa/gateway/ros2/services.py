@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from rmpa.bridge.policy import Needs
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.gateway import limits
-from rmpa.gateway.foreign import Answering, OwnedTasks
+from rmpa.gateway.foreign import Answering
 from rmpa.gateway.ros2.conversion import ActionPair, Conversion, NoConversion
 from rmpa.gateway.ros2.format import GID_BYTES, EntityKind, Ros2Attachment, Ros2Qos, data_key
 from rmpa.gateway.ros2.graph import SITE, OwnRos2Nodes, Ros2Graph, Ros2TypeAsker, valid_name
@@ -23,6 +23,7 @@ from rmpa.gateway.rules import CrossingRules, ForeignSource, SourceKind
 from rmpa.gateway.zenoh.threads import first_answer
 from rmpa.ros.types.definitions import known_types
 from rmpa.ros.types.find import find_service_type
+from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -268,7 +269,7 @@ class OfferedService:
         """Begin to offer it; once."""
         if not self._started:
             self._started = True
-            self._context.spawn(self._offer())
+            self._context.start(self._offer(), f"offer {self.source.here}")
 
     def close(self) -> None:
         """Take it back; calls under way get an error."""
@@ -364,7 +365,7 @@ class ShownRos2Service:
         self._numbers = itertools.count(1)
         self._calls = 0
         self._closed = False
-        context.spawn(self._show())
+        context.start(self._show(), f"show {here}")
 
     def close(self) -> None:
         """Take it out of the graph; calls under way get an error."""

@@ -458,7 +458,7 @@ class Ros2Topics:
             exports[source.proxy] = export, dialect
             export.start()
             if export.announced and not dialect.latched and source.type not in _STREAMS:
-                self.context.spawn(self._look(export))
+                self.context.start(self._look(export), f"look at {source.here}")
         if not exports:
             del self._exports[source.here]
         return True
@@ -539,7 +539,7 @@ class Ros2Topics:
         if conversion is not None:
             imported.converted(conversion)
         else:
-            self.context.spawn(self._ask_type(imported, endpoint))
+            self.context.start(self._ask_type(imported, endpoint), f"type of {endpoint.name}")
 
     async def _ask_type(self, imported: Ros2Import, endpoint: Ros2Endpoint) -> None:
         """Ask the publisher's node for the fields of its type."""

@@ -26,12 +26,13 @@ from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RemoteProtocolError
 from rmpa.core.identity import is_type_name
 from rmpa.gateway import limits
-from rmpa.gateway.foreign import Answering, OwnedTasks
+from rmpa.gateway.foreign import Answering
 from rmpa.gateway.rules import SourceKind
 from rmpa.gateway.sites.keys import ROOT, TO, UNKNOWN_TYPE, AttachmentReader, MessageSource, data_key, read_json
 from rmpa.gateway.zenoh.threads import ZenohPriority, first_answer
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.wire.tcpros import ServiceDescription
+from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
     from rmpa.gateway.own_graph import AgentGraph, TopicTap
@@ -235,14 +236,16 @@ class ImportedService:
         source, loop = self._source, asyncio.get_running_loop()
         attachment = MessageSource(md5, source.node, (self._context.name,)).writer()
         began = loop.time()
-        asking = self._asking.spawn(
+        asking = self._asking.start(
             self._context.session.get(
                 source.key() + parameters,
                 request,
                 attachment(next(self._numbers), time.time_ns()),
                 timeout=within + _SITE_CALL_GRACE,
                 priority=ZenohPriority.INTERACTIVE_HIGH,
-            )
+            ),
+            f"call {source.name} of {source.site}",
+            raises=(Exception,),
         )
         try:
             await asyncio.wait((asking,))

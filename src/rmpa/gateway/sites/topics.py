@@ -20,6 +20,7 @@ from rmpa.gateway.sites.keys import ROOT, AttachmentReader, MessageSource, Seque
 from rmpa.gateway.topics import Export
 from rmpa.gateway.zenoh.threads import PRIORITIES, BoundedQueue, ZenohPriority, ZenohQos, first_answer
 from rmpa.ros.wire.tcpros import printable
+from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -309,9 +310,7 @@ class ImportedTopic:
     def _ask(self) -> None:
         if self._task is None or self._task.done():
             source = self.entry.source
-            self._task = asyncio.get_running_loop().create_task(
-                self._ask_until_known(), name=f"header of {source.name} at {source.site}"
-            )
+            self._task = keep_task(self._ask_until_known, f"header of {source.name} at {source.site}")
 
     async def _ask_until_known(self) -> None:
         pause = _HEADER_RETRY / 16

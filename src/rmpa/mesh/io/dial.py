@@ -17,6 +17,7 @@ from rmpa.core.limits import KIB, MIB
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Lane
 from rmpa.runtime.accept import DESCRIPTORS, Use
+from rmpa.runtime.tasks import start_task
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -215,7 +216,9 @@ class Dialler:
             while left or running:
                 if left:
                     endpoint = left.pop(0)
-                    task = asyncio.get_running_loop().create_task(self._attempt(endpoint, briefly=briefly))
+                    task = start_task(
+                        self._attempt(endpoint, briefly=briefly), f"dial {endpoint[0]}", raises=(OSError,)
+                    )
                     running[task] = endpoint
                 pause = _DIAL_STAGGER if left else None
                 done, _ = await asyncio.wait(running, timeout=pause, return_when=asyncio.FIRST_COMPLETED)

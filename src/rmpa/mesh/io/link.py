@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import ssl
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, cast
 
@@ -267,6 +268,11 @@ class Connection(ConnectionProtocol):
         if (link := self._express_of()) is not None:
             self.mesh.handlers.clock(link)
 
+    def proved(self) -> None:
+        """What came over the link stands."""
+        if self.link is not None:
+            self.link.proved()
+
     def closed(self, reason: str) -> None:
         """The connection is over."""
         self._end_lanes(reason)
@@ -394,6 +400,7 @@ class PeerLink:
         self.touched_at = mesh.clock.now()
         self._mesh = mesh
         self._needed = True
+        self._unproven: deque[Callable[[], None]] = deque()
         self._bulk_in = self._bulk_out = 0  # bytes of the bulk lane's earlier connections
         connection.link = self
         self.express.connect(connection.stream)
@@ -426,10 +433,18 @@ class PeerLink:
         """The offset is true within ± this many seconds; ``None`` if unknown."""
         return (self.connection.clock.estimate(self._mesh.clock.now()) or (None, None))[1]
 
-    @property
-    def abandoned(self) -> bool:
-        """Whether the peer has given up what it asked over this link; see ``ConnectionProtocol.abandoned``."""
-        return any(connection.abandoned for connection in self._connections())
+    def when_proven(self, act: Callable[[], None]) -> None:
+        """Act on what the peer has asked: at once, or once no connection is doubted any more.
+
+        Until then the peer may have given it up. Where the link ends first nothing is done.
+        """
+        self._unproven.append(act)
+        self.proved()
+
+    def proved(self) -> None:
+        """Do what waits, unless a connection is doubted."""
+        while self._unproven and not any(connection.doubted for connection in self._connections()):
+            self._unproven.popleft()()
 
     @property
     def resumed_at(self) -> float:
@@ -527,6 +542,7 @@ class PeerLink:
         self.bulk.disconnect()
         if self.used:
             self._mesh.handlers.lane_lost(self)
+            self.proved()
 
     def end_lanes(self, reason: str) -> None:
         """Stop sending and close the bulk lane's connection, because the express lane's connection is closing."""
@@ -540,6 +556,7 @@ class PeerLink:
     def discard(self) -> int:
         """Drop all waiting messages after the end of the link, because they may be large; return their number."""
         self.use(used=False)
+        self._unproven.clear()
         discarded = self.express.outbox.waiting_entries + self.bulk.outbox.waiting_entries
         self.express.clear()
         self.bulk.clear()

@@ -22,11 +22,12 @@ from rmpa.mesh.peering import REPLACED, RESTARTED, Peer, Peering, PeeringOutput
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.loop import MachineTimer, SystemClock
+from rmpa.runtime.tasks import OwnedTasks
 from rmpa.trust.permissions import TrustReason
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Callable, Coroutine
+    from collections.abc import Callable
 
     from rmpa.core.identity import Guid, Identity
     from rmpa.mesh.frames import Hello
@@ -86,7 +87,7 @@ class Mesh(LinkOwner):
         # The links, by the id of the express lane's connection.
         self._links: dict[int, PeerLink] = {}
         # The dials that are under way.
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = OwnedTasks()
         self._security = security
         self._securing: Securing | None = None
         if security is not None:
@@ -119,10 +120,9 @@ class Mesh(LinkOwner):
         self._timer.close()
         if self._security is not None:
             self._security.on_denied.remove(self._denied)
-        tasks = [*(self._securing.close() if self._securing is not None else []), *self._tasks]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        if self._securing is not None:
+            await self._securing.close()
+        await self._tasks.close()
         for connection in self.connections():
             connection.end(f"{self.identity.name} ends")
         if ends := [connection.over for connection in self.connections()]:
@@ -299,7 +299,7 @@ class Mesh(LinkOwner):
         match output:
             case ("dial", guid, endpoints, briefly):
                 if self._running:
-                    self._start(self._dial(guid, endpoints, briefly=briefly), f"dial {guid}")
+                    self._tasks.start(self._dial(guid, endpoints, briefly=briefly), f"dial {guid}")
             case ("close", link_id, reason):
                 self._links[link_id].close(reason)
             case ("up", link_id):
@@ -352,7 +352,7 @@ class Mesh(LinkOwner):
     def redial(self, link: PeerLink) -> None:
         """Try a new connection to the peer of a silent link, because TCP retransmits more and more rarely."""
         if self._running and _is_over(link.redial):
-            link.redial = self._start(self._redial(link), f"redial {link.name}")
+            link.redial = self._tasks.start(self._redial(link), f"redial {link.name}")
 
     async def _redial(self, link: PeerLink) -> None:
         """Replace a link without acknowledgements as soon as the peer can be reached again, on any path."""
@@ -375,7 +375,7 @@ class Mesh(LinkOwner):
         """Dial the bulk lane of a link in ``delay`` seconds, if it is wanted and missing, and this side has to."""
         missing = link.bulk_connection is None and _is_over(link.bulk_dial)
         if self._running and link.used and link.dialled and link.bulk_wanted and missing:
-            link.bulk_dial = self._start(self._dial_bulk(link, delay), f"bulk {link.name}")
+            link.bulk_dial = self._tasks.start(self._dial_bulk(link, delay), f"bulk {link.name}")
 
     async def _dial_bulk(self, link: PeerLink, delay: float) -> None:
         """Connect the bulk lane of a link, at the endpoint of the express lane."""
@@ -421,14 +421,6 @@ class Mesh(LinkOwner):
             number, self, sock, endpoint, dialled=guid is not None, expected=guid, lane=lane, secured=secured
         )
 
-    def _start(self, work: Coroutine[object, object, None], name: str) -> asyncio.Task[None]:
-        """Begin a task that is not awaited; an error that it does not expect is logged."""
-        task = asyncio.get_running_loop().create_task(work, name=name)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-        task.add_done_callback(_report)
-        return task
-
     # --- accepting ------------------------------------------------------------------------------------------------
 
     def _accepted(self, sock: socket.socket, address: SocketAddress) -> None:
@@ -460,9 +452,3 @@ class Mesh(LinkOwner):
 
 def _is_over(task: asyncio.Task[None] | None) -> bool:
     return task is None or task.done()
-
-
-def _report(task: asyncio.Task[None]) -> None:
-    """Log an unexpected error of a task: it is a bug, and no caller awaits the task."""
-    if not task.cancelled() and (error := task.exception()) is not None:
-        _log.error("! %s failed", task.get_name(), exc_info=error)

@@ -21,6 +21,7 @@ from rmpa.core.counters import TokenBucket
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, Refusal, Refuse
+from rmpa.runtime.tasks import end_tasks, start_task
 from rmpa.runtime.tls import SecureSocket, TlsHandshake
 from rmpa.trust.permissions import TrustError, TrustReason
 from rmpa.trust.store import ALPN_JOIN, ALPN_LINK
@@ -243,23 +244,18 @@ class Securing:
         """Do the handshake of a connection; the socket belongs to this object from here on."""
         host = address[0]
         self._make_room(host)
-        task = asyncio.get_running_loop().create_task(self._secure(sock, address), name=f"secure {host}")
+        task = start_task(self._secure(sock, address), f"secure {host}")
         self._unproven[task] = host
         task.add_done_callback(lambda task: self._ended(task, sock))
 
-    def close(self) -> list[asyncio.Task[None]]:
-        """Close what is not secured yet; return the tasks, to be awaited."""
-        tasks = list(self._unproven)
-        for task in tasks:
-            task.cancel()
-        return tasks
+    async def close(self) -> None:
+        """Close what is not secured yet."""
+        await end_tasks(*self._unproven)
 
     def _ended(self, task: asyncio.Task[None], sock: socket.socket) -> None:
         self._unproven.pop(task, None)
         if task.cancelled():
             sock.close()  # a task that is cancelled before it begins runs no ``finally``
-        elif (error := task.exception()) is not None:
-            _log.error("! %s failed", task.get_name(), exc_info=error)
 
     def _make_room(self, host: str) -> None:
         """Close the oldest connection of this address, or of that with the most, if there is no place for one more.

@@ -31,12 +31,14 @@ from rmpa.observe.doctor.machine import UNIT, read_unit
 from rmpa.observe.peer_info import OK, WARN, Check
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rmpa.observe.doctor.machine import DoctorInput
 
 _LOCKS: Final = Path("/proc/locks")
 _ANEW: Final = "nothing: the next agent of that name makes them again"
+# Killed agents of one directory that are named.
+_SHOWN: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,12 +214,18 @@ def of_leavings(place: Path) -> Iterator[Repair]:
         locks = _LOCKS.read_text("ascii", "replace")
     except OSError:
         return
-    for name in names:
-        sock, lock = place / f"{name}.sock", place / f"{name}.lock"
-        if not (_is_held(lock, locks) or _is_alive(sock)):
-            command = ("flock", "--nonblock", str(lock), "rm", "-f", str(sock), str(lock))
-            text = f"the agent {name} was killed, and has left {sock.name} and {lock.name}"
-            yield Repair("directory", str(place), text, command, _ANEW, do=partial(_remove, place, name))
+    dead = [n for n in names if not (_is_held(place / f"{n}.lock", locks) or _is_alive(place / f"{n}.sock"))]
+    if not dead:
+        return
+    sock, lock = f"{place}/{dead[0]}.sock", f"{place}/{dead[0]}.lock"
+    command: tuple[str, ...] = ("flock", "--nonblock", lock, "rm", "-f", sock, lock)
+    text = f"the agent {dead[0]} was killed, and has left {dead[0]}.sock and {dead[0]}.lock"
+    if len(dead) > 1:
+        each = "do flock --nonblock $name.lock rm -f $name.sock $name.lock; done"
+        command = ("sh", "-c", f"cd {shlex.quote(str(place))} && for name in {' '.join(dead)}; {each}")
+        shown = ", ".join(dead[:_SHOWN]) + (", …" if len(dead) > _SHOWN else "")
+        text = f"{len(dead)} agents were killed, and have left their sockets and locks: {shown}"
+    yield Repair("directory", str(place), text, command, _ANEW, do=partial(_remove_all, place, dead))
 
 
 def _are_ours(place: int, name: str) -> bool:
@@ -228,6 +236,11 @@ def _are_ours(place: int, name: str) -> bool:
         return False
     kinds = stat.S_ISSOCK(sock.st_mode) and stat.S_ISREG(lock.st_mode)
     return kinds and sock.st_uid == lock.st_uid == os.geteuid()
+
+
+def _remove_all(directory: Path, names: Iterable[str]) -> None:
+    for name in names:
+        _remove(directory, name)
 
 
 def _remove(directory: Path, name: str) -> None:

@@ -19,6 +19,7 @@ from rmpa.bridge.peer_offers import CONFLICT, DENIED
 from rmpa.bridge.policy import OUTSIDE_GUID
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
+from rmpa.config.rules import CLOCK
 from rmpa.config.values import did_you_mean
 from rmpa.core import limits as core_limits
 from rmpa.observe import limits as observe_limits
@@ -355,7 +356,7 @@ def _permission_here(way: Way) -> Check | None:
 
 def _type(way: Way) -> Check:
     if way.here.cause == CONFLICT:
-        return Check.from_message("type", FAIL, way.before.problem)
+        return Check.from_message("time" if way.ends.topic == CLOCK else "type", FAIL, way.before.problem)
     return Check("type", OK, f"no local publisher has another type than {way.before.type}")
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RmpaError
 from rmpa.ros import limits
-from rmpa.ros.core.external import LOOPBACK, Core
+from rmpa.ros.core.external import LOOPBACK, Core, GraphLog
 from rmpa.ros.core.liveness import Liveness, Notifier
 from rmpa.ros.core.state import CoreState
 from rmpa.ros.http.server import XmlRpcServer
@@ -27,6 +27,7 @@ from rmpa.ros.node.subscription import PublisherConnection, Subscription
 from rmpa.ros.types.definitions import known_description
 from rmpa.runtime.accept import Use
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
+from rmpa.runtime.tasks import end_tasks, keep_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -142,13 +143,11 @@ class Rosout:
             StartError: The address cannot be used.
         """
         await self._begin()
-        self._keeper = asyncio.create_task(self._keep(), name="keep /rosout")
+        self._keeper = keep_task(self._keep, "keep /rosout")
 
     async def close(self) -> None:
         """Unregister and close."""
-        if self._keeper is not None:
-            self._keeper.cancel()
-            await asyncio.gather(self._keeper, return_exceptions=True)
+        await end_tasks(self._keeper)
         await self._end()
 
     def graph_changed(self, change: GraphChange) -> None:
@@ -208,14 +207,14 @@ class Rosout:
 
     async def _keep(self) -> None:
         while True:
-            await self._changed.wait()
-            self._changed.clear()
             # Both registrations must be in the graph.
             core, ours = self._core, self.uri
             if not core.publishers(AGGREGATED).get(NODE) == core.subscribers(TOPIC).get(NODE) == ours:
                 await self._end()
                 await asyncio.sleep(limits.ROSOUT_RESPAWN)
                 await self._restart()
+            await self._changed.wait()
+            self._changed.clear()
 
     async def _restart(self) -> None:
         told = False
@@ -274,7 +273,7 @@ class RosCore(Core):
     ) -> None:
         self.counters = counters if counters is not None else Counters()
         self.uri, self.node_host, self.node_address = "", LOOPBACK, LOOPBACK
-        self.listeners = []
+        self.listeners = [GraphLog().note]
         self._host = host
         self._advertised = advertised_host or (os.uname().nodename if host in {"", "0.0.0.0"} else host)  # noqa: S104
         self._on_shutdown = on_shutdown

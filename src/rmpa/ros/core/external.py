@@ -24,6 +24,7 @@ from rmpa.ros.master.registrations import ANY_TYPE
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief, call_pieces
 from rmpa.runtime.accept import Use
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
+from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -57,9 +58,36 @@ _MASTER_LOOK_SHARE: Final = 20
 _MASTER_LOOK_SOON: Final = 0.02
 # Time-out for calls of a roscore with parameters, which may be megabytes.
 _MASTER_ASK_TIMEOUT: Final = 10.0
+# Seconds for which changes of the graph are gathered for one line of the log, and nodes that it names.
+_GRAPH_LINE: Final = 1.0
+_GRAPH_NODES: Final = 5
 # Registrations in one call to a roscore, some 10 ms of its work.
 _MASTER_WRITES_AT_ONCE: Final = 64
 LOOPBACK: Final = "127.0.0.1"
+
+
+class GraphLog:
+    """Logs the changes of a graph: each one at debug, and at most once a second one line about all."""
+
+    def __init__(self) -> None:
+        self._changes: list[GraphChange] = []
+
+    def note(self, change: GraphChange) -> None:
+        """Log a change."""
+        _log.debug("= %s", change)
+        if not self._changes:
+            asyncio.get_running_loop().call_later(_GRAPH_LINE, self._tell)
+        self._changes.append(change)
+
+    def _tell(self) -> None:
+        changes, self._changes = self._changes, []
+        if len(changes) == 1:
+            _log.info("= %s", changes[0])
+            return
+        more = sum(change.added for change in changes)
+        nodes = list(dict.fromkeys(change.node for change in changes))
+        names = ", ".join(nodes[:_GRAPH_NODES]) + (", …" if len(nodes) > _GRAPH_NODES else "")
+        _log.info("= %d registrations more, %d less, of %d nodes: %s", more, len(changes) - more, len(nodes), names)
 
 
 class Core(Protocol):
@@ -134,9 +162,8 @@ class Core(Protocol):
         self.listeners.append(callback)
 
     def report(self, changes: Iterable[GraphChange]) -> None:
-        """Log changes and call the listeners, in order; an exception of one is logged, and affects no other."""
+        """Call the listeners with each change, in order; an exception of one is logged, and affects no other."""
         for change in changes:
-            _log.info("= %s %s %s of %s", "+" if change.added else "-", change.kind.value, change.name, change.node)
             for callback in self.listeners:
                 with logged_failure(_log, "a listener failed at %s", change):
                     callback(change)
@@ -200,7 +227,7 @@ class ExternalCore(Core):
         self._mirror = mirror.Mirror(yielder=yielding_to_data)
         self.liveness = Liveness(nodes=self._mirror.others, on_dead=self._dead)
         self.registrations = self._mirror.registrations
-        self.listeners = []
+        self.listeners = [GraphLog().note]
         self._writes: deque[mirror.Call] = deque()
         self._written = asyncio.Event()
         self._written.set()
@@ -227,7 +254,7 @@ class ExternalCore(Core):
         self._next_poll = self._loop.time()
         await self._poll()
         await self._flush()
-        self._task = self._loop.create_task(self._work(), name="external core")
+        self._task = keep_task(self._work, f"looking at the roscore {self.uri}")
         self.liveness.start()
 
     async def close(self) -> None:
@@ -245,10 +272,7 @@ class ExternalCore(Core):
                 _log.warning(
                     "! %d changes could not be sent to the roscore at %s [core-slow]", len(self._writes), self.uri
                 )
-        tasks = [task for task in (self._task, self._revival) if task is not None]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await end_tasks(self._task, self._revival)
         await self.liveness.close()
         self._problem = "the agent has ended"
         self._drop_writes()
@@ -312,14 +336,13 @@ class ExternalCore(Core):
                     return
                 if self._loop.time() >= self._next_poll:
                     await self._poll()
-            except Exception:  # noqa: BLE001 - a task's top: polling must go on
-                _log.exception("! looking at the roscore %s failed", self.uri)
+            except Exception:
                 self._seen = b""
-                self._next_poll = self._loop.time() + _MASTER_LOOK_MAX
+                raise
             if self._loop.time() - checked > limits.NODE_CHECK_INTERVAL:
                 checked = self._loop.time()
                 if self._mirror.dead and (self._revival is None or self._revival.done()):
-                    self._revival = self._loop.create_task(self._revive(dict(self._mirror.dead)), name="the dead")
+                    self._revival = start_task(self._revive(dict(self._mirror.dead)), "ask for nodes that left")
             if self._problem or not self._writes:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout_at(self._next_poll):

@@ -31,6 +31,7 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import Use, is_shortage
 from rmpa.runtime.kernel_tcp import ask_listening_ports
 from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
+from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -44,6 +45,8 @@ _log = logging.getLogger(__name__)
 # Time between the two refused connects that prove a node dead: it may be restarting its server.
 NODE_RECHECK_DELAY: Final = 0.2
 
+# Time for a connection that only shows that a node is there.
+_CONNECT_TIMEOUT: Final = 3.0
 # Concurrent attempts to reach unreachable nodes: each may hold a thread of the resolver for seconds.
 _NODE_UNREACHABLE_CHECKS: Final = 4
 # With this many updates queued for a node, only the latest of each parameter is kept; with fewer all of them.
@@ -156,7 +159,7 @@ class Liveness:
 
     def start(self) -> None:
         """Begin to check."""
-        self._task = asyncio.get_running_loop().create_task(self._check_all(), name="node liveness")
+        self._task = keep_task(self._check_all, "node liveness")
 
     async def close(self) -> None:
         """Stop checking; ``suspect`` does nothing from now on.
@@ -164,10 +167,7 @@ class Liveness:
         A call of ``ask_listening_ports`` cannot be stopped in its thread. It is waited for, as it has a socket open.
         """
         self._closed = True
-        tasks = [*self._checks.values(), *([self._task] if self._task is not None else [])]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await end_tasks(self._task, *self._checks.values())
         if self._ports is not None:
             await asyncio.wait([self._ports], timeout=runtime_limits.DRAIN_TIMEOUT)
 
@@ -176,8 +176,7 @@ class Liveness:
         api = self._nodes().get(node)
         if api is None or node in self._checks or self._closed:
             return
-        task = asyncio.get_running_loop().create_task(self._check(node, api), name=f"check {node}")
-        self._checks[node] = task
+        task = self._checks[node] = start_task(self._check(node, api), f"check {node}")
         task.add_done_callback(lambda _: self._checks.pop(node, None))
 
     async def _check_all(self) -> None:
@@ -273,12 +272,12 @@ async def try_connect(api: str) -> str:
     """
     try:
         host, port, _ = split_uri(api)
-        async with asyncio.timeout(limits.TCPROS_CONNECT_TIMEOUT):
+        async with asyncio.timeout(_CONNECT_TIMEOUT):
             sock = await connect(host, port, Use.CORE)
     except ConnectionRefusedError:
         raise
     except TimeoutError:
-        return f"no answer in {limits.TCPROS_CONNECT_TIMEOUT:g} s"
+        return f"no answer in {_CONNECT_TIMEOUT:g} s"
     except UnreachableError as error:
         return error.remedy or str(error)
     except OSError as error:
@@ -417,15 +416,12 @@ class Notifier:
             del queue[next(iter(queue))]
             self._counters.add("notify.dropped")
         if api not in self._tasks:
-            self._tasks[api] = asyncio.get_running_loop().create_task(self._empty(api, queue), name=f"notify {api}")
+            self._tasks[api] = start_task(self._empty(api, queue), f"notify {api}")
 
     async def close(self) -> None:
         """Stop at once; queued notifications are not sent."""
         self._closed = True
-        tasks = list(self._tasks.values())
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await end_tasks(*self._tasks.values())
 
     async def _empty(self, api: str, queue: _Queue) -> None:
         backoff = Backoff(_NOTIFY_RETRY_FIRST, _NOTIFY_RETRY_MAX, random.random)
@@ -444,8 +440,6 @@ class Notifier:
                         queue[key] = value
                         queue.move_to_end(key, last=False)
                     await asyncio.sleep(backoff.delay())
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! notifications to %s failed", api)
         finally:
             del self._queues[api], self._tasks[api]
 
@@ -456,7 +450,8 @@ class Notifier:
                 await self._shut_down(api, name, value)
             else:
                 _log.debug("> %s %s %s", api, method, name)
-                await call(api, method, MASTER_ID, name, value, use=Use.CORE)
+                # Given up earlier it might be carried out behind the next one, which is newer.
+                await call(api, method, MASTER_ID, name, value, timeout=limits.TCPROS_CONNECT_TIMEOUT, use=Use.CORE)
         except (UnreachableError, RosFault, RemoteProtocolError, LocalProtocolError) as error:
             self._counters.add("notify.failed")
             # A shortage is this process's, and is reported elsewhere: the node may be well.

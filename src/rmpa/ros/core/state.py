@@ -30,6 +30,7 @@ from rmpa.ros.wire.xmlrpc import RosFault, serialize_response
 from rmpa.runtime.accept import in_thread
 from rmpa.runtime.files import set_aside
 from rmpa.runtime.loop import yielding_to_data
+from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -214,7 +215,7 @@ class CoreState:
         """Begin to write changes; to be called once the core listens."""
         if text := self.restored():
             _log.info("= %s: %s", self.path, text)
-        self._writer = asyncio.get_running_loop().create_task(self._write_changes(), name="keep the core's state")
+        self._writer = keep_task(self._write_changes, "keep the core's state")
         self.note_change()
 
     def _read(self) -> StoredState:
@@ -242,7 +243,7 @@ class CoreState:
             at[node.api][name] = node
         if not at:
             return
-        asking = {asyncio.create_task(self._ask(api, at[api]), name=f"ask {api}") for api in at}
+        asking = {start_task(self._ask(api, at[api]), f"ask {api}") for api in at}
         _, self._asking = await asyncio.wait(asking, timeout=limits.CORE_STATE_ASK)
         self._carry_out()  # once for all: a list that lacks a publisher would end the connections to it
         for task in self._asking:
@@ -325,14 +326,10 @@ class CoreState:
         """Write what has changed, and that the core ended in order."""
         self._ending.set()
         self._news.set()
-        tasks = [*self._asking]
         if self._writer is not None:  # else another core may have the port, and so this file
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(asyncio.shield(self._writer), limits.CORE_STATE_CLOSE)
-            tasks.append(self._writer)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await end_tasks(self._writer, *self._asking)
 
     def _changed(self) -> bool:
         revision, tree = self._written
@@ -340,19 +337,16 @@ class CoreState:
 
     async def _write_changes(self) -> None:
         while True:
+            self.note_change()
             await self._news.wait()
             self._news.clear()
             await self._rest(CORE_STATE_GATHER)
             ended = self._ending.is_set()
-            try:
-                await self._write("" if ended else self._boot)
-            except Exception:  # noqa: BLE001 - a task's top
-                _log.exception("! keeping the core's state failed")
+            await self._write("" if ended else self._boot)
             if ended:
                 return
             rest = CORE_STATE_RETRY if self._problem else self._took * CORE_STATE_SHARE
             await self._rest(min(rest, _CORE_STATE_REST))
-            self.note_change()
 
     async def _rest(self, seconds: float) -> None:
         with contextlib.suppress(TimeoutError):

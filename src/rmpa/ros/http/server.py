@@ -20,6 +20,7 @@ import socket
 import struct
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterator
+from itertools import islice
 from typing import Final
 
 from rmpa.core.counters import Counters, RefusalLog, remedy
@@ -33,6 +34,7 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import DESCRIPTORS, Acceptor, Use
 from rmpa.runtime.kernel_tcp import program_at
 from rmpa.runtime.loop import yield_to_data
+from rmpa.runtime.tasks import OwnedTasks, start_task
 
 _log = logging.getLogger(__name__)
 
@@ -40,6 +42,8 @@ _log = logging.getLogger(__name__)
 _HTTP_PACE_MIN: Final = 64 * KIB
 # Time before the pace of a call is judged.
 _HTTP_SLOW_AFTER: Final = 1.0
+# Connections of which one gives way: judging thousands for each new one would take milliseconds.
+_EVICTED_OF: Final = 64
 # Connections accepted in one turn of the event loop, 40 microseconds each.
 _HTTP_ACCEPTS: Final = 4
 # Length of the listen queue: all nodes of a robot register at once, and a refused SYN is repeated after 1 s.
@@ -237,7 +241,7 @@ class HttpConnection(asyncio.Protocol):
         if isinstance(answer, bytes):
             self._reply(answer)
         else:
-            self._task = self._loop.create_task(self._wait(answer))
+            self._task = start_task(self._wait(answer), "answer a call")
 
     async def _wait(self, answer: Awaitable[bytes]) -> None:
         body = await answer
@@ -319,7 +323,7 @@ class XmlRpcServer:
         self._refusals = RefusalLog(_log, self.counters)
         self._use = use
         self._acceptor: Acceptor | None = None
-        self._arriving: set[asyncio.Task[None]] = set()
+        self._arriving = OwnedTasks()
         # In the order of their last use, which ``_evict`` needs.
         self._connections: dict[HttpConnection, None] = {}
         self._empty: asyncio.Future[None] | None = None
@@ -350,9 +354,7 @@ class XmlRpcServer:
         Args:
             sock: Non-blocking; owned from here on.
         """
-        task = asyncio.get_running_loop().create_task(self._connect(sock))
-        self._arriving.add(task)
-        task.add_done_callback(self._arriving.discard)
+        self._arriving.start(self._connect(sock), f"serve a connection of {self._name}", raises=(OSError,))
 
     async def _connect(self, sock: socket.socket) -> None:
         try:
@@ -389,14 +391,14 @@ class XmlRpcServer:
     def _evict(self) -> bool:
         """Close a connection for a new one; return whether there is one that is not being answered.
 
-        It is the slowest of those below ``_HTTP_PACE_MIN``; else the one that is idle for longest, whose client
-        reconnects by itself; else the slowest of all.
+        Of ``_EVICTED_OF`` that were not used for longest it is the slowest of those below ``_HTTP_PACE_MIN``; else
+        the one that is idle for longest, whose client reconnects by itself; else the slowest.
         """
         now = asyncio.get_running_loop().time()
-        idle = next((one for one in self._connections if one.idle), None)
-        stalled = [one for one in self._connections if not (one.idle or one.answering)]
-        slow = [one for one in stalled if one.slow(now)]
-        evicted = min(slow or stalled, key=lambda one: one.pace(now), default=None)
+        oldest = list(islice((one for one in self._connections if not one.answering), _EVICTED_OF))
+        idle = next((one for one in oldest if one.idle), None)
+        slow = [one for one in oldest if not one.idle and one.slow(now)]
+        evicted = min(slow or oldest, key=lambda one: one.pace(now), default=None)
         if idle is not None and not slow:
             evicted = idle
         if evicted is not None:

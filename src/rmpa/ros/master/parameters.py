@@ -55,6 +55,10 @@ class GraphChange:
     api: str
     type: str = ""
 
+    def __str__(self) -> str:
+        """``+ publisher /chatter of /talker``."""
+        return f"{'+' if self.added else '-'} {self.kind.value} {self.name} of {self.node}"
+
 
 @dataclass(frozen=True, slots=True)
 class GraphState:

@@ -25,9 +25,10 @@ from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.find import type_of_header
 from rmpa.ros.types.messages import HeaderNumbers, given_values
 from rmpa.ros.wire.tcpros import ANY, LENGTH, frame_message, printable
+from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Coroutine, Mapping
+    from collections.abc import AsyncIterator, Mapping
 
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.node.subscription import PublisherConnection
@@ -66,7 +67,7 @@ class MasterClient:
         # So that the end of one subscriber does not unregister the next one of its topic.
         self._registering = asyncio.Lock()
         # What is unregistered, also where the program does not wait for it any more.
-        self._unregistering: set[asyncio.Task[None]] = set()
+        self._unregistering = OwnedTasks()
         # Whether everything is unregistered, or has begun to be.
         self._ended = False
         # The parameters that are subscribed to, with what is told of their changes.
@@ -116,7 +117,7 @@ class MasterClient:
                 self._entries.remove(entry)
             entry.withdraw()
             if not isinstance(error, PeerRefused):  # the master may have registered it
-                self._in_background(self._unregister(entry))
+                self._unregistering.start(self._unregister(entry), f"unregister {entry.key}")
             raise
 
     def _check_open(self) -> None:
@@ -129,7 +130,8 @@ class MasterClient:
         """Unregister and close a publisher, subscriber or service; nothing happens if it is not registered."""
         if entry in self._entries:
             self._entries.remove(entry)
-            await asyncio.shield(self._in_background(self._remove(entry)))
+            # To its end, also where the caller is cancelled; the end of the node waits for it.
+            await asyncio.shield(self._unregistering.start(self._remove(entry), f"unregister {entry.key}"))
 
     async def _remove(self, entry: Publisher | Subscriber | Service) -> None:
         await self._unregister(entry)
@@ -140,13 +142,6 @@ class MasterClient:
             if not any((other.kind_name, other.key) == (entry.kind_name, entry.key) for other in self._entries):
                 with contextlib.suppress(RmpaError):
                     await self.call_master(f"unregister{entry.kind_name}", entry.key, entry.uri)
-
-    def _in_background(self, run: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Run it to its end, also where its caller is cancelled; the end of the node waits for it."""
-        task = asyncio.get_running_loop().create_task(run, name=f"unregister of {self.name}")
-        self._unregistering.add(task)
-        task.add_done_callback(self._unregistering.discard)
-        return task
 
     async def _register_again(self) -> None:
         """Register everything at a master that has been started again."""
@@ -170,14 +165,11 @@ class MasterClient:
             except RmpaError as error:
                 _log.debug("! %s: %s %s: %s", self.name, method, params, error)
 
+        calls = [unregister(f"unregister{entry.kind_name}", entry.key, entry.uri) for entry in self._entries]
+        calls += [unregister("unsubscribeParam", self.uri, key) for key in self._followed]
         try:
-            async with asyncio.timeout(NODE_UNREGISTER_TIMEOUT), asyncio.TaskGroup() as group:
-                for entry in self._entries:
-                    call = unregister(f"unregister{entry.kind_name}", entry.key, entry.uri)
-                    group.create_task(call, name=f"unregister {self.name}")
-                for key in self._followed:
-                    group.create_task(unregister("unsubscribeParam", self.uri, key), name=f"unregister {self.name}")
-                await asyncio.gather(*self._unregistering)
+            async with asyncio.timeout(NODE_UNREGISTER_TIMEOUT):
+                await asyncio.gather(*calls, *self._unregistering)
         except TimeoutError:
             _log.debug("! %s: the master at %s is slow; not everything is unregistered", self.name, self.master_uri)
 
@@ -205,7 +197,7 @@ class Service:
         self.kind = kind
         self._raw = raw
         self._handler = handler
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = OwnedTasks()
         self.endpoint = ServiceEndpoint(name, node.name, self._called, description=kind.describe(), timeout=timeout)
 
     @property
@@ -238,10 +230,7 @@ class Service:
         except Exception as error:  # noqa: BLE001 - the top of the user's code
             self._failed(call, error)
             return
-        task = asyncio.get_running_loop().create_task(self._respond(call, result), name=f"call of {self.name}")
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-        call.on_gone = task.cancel
+        call.on_gone = self._tasks.start(self._respond(call, result), f"call of {self.name}").cancel
 
     async def _respond(self, call: ServiceCall, result: Awaitable[Any]) -> None:
         try:

@@ -49,9 +49,10 @@ from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.types.find import find_service_type
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import ANY, TopicDescription
+from rmpa.runtime.tasks import OwnedTasks, keep_task, start_task
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
+    from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
     from types import TracebackType
 
     from rmpa.ros.types.installed import ServiceType
@@ -120,7 +121,7 @@ class Node(MasterClient):
         self._on_param_update = on_param_update
         self._signals = (signal.SIGINT, signal.SIGTERM) if handle_signals else ()
         self._rosout: RosoutHandler | None = None
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = OwnedTasks()
         self._closing: asyncio.Task[None] | None = None
         # The process of the master at which all is registered; ``None``: not all of it.
         self._master_pid: XmlRpcValue = None
@@ -161,7 +162,7 @@ class Node(MasterClient):
         loop = asyncio.get_running_loop()
         for number in self._signals:
             loop.add_signal_handler(number, self._begin_close)
-        self._start(self._watch_master(), f"watch master {self.name}")
+        self._tasks.add(keep_task(self._watch_master, f"watch master {self.name}"))
         return self
 
     async def __aexit__(
@@ -500,7 +501,7 @@ class Node(MasterClient):
                 except Exception:  # noqa: BLE001 - the top of the user's code
                     _log.exception("! %s: a timer of %g s failed", self.name, period)
 
-        return self._start(run(), f"timer of {self.name}")
+        return self._tasks.start(run(), f"timer of {self.name}")
 
     @cached_property
     def logger(self) -> logging.Logger:
@@ -568,12 +569,6 @@ class Node(MasterClient):
                 _log.exception("! %s: the callback for parameter %s failed", self.name, key)
         return bool(told)
 
-    def _start(self, run: Coroutine[Any, Any, None], name: str) -> asyncio.Task[None]:
-        task = asyncio.get_running_loop().create_task(run, name=name)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-        return task
-
     async def _stopped_before(self, due: float) -> bool:
         try:
             async with asyncio.timeout_at(due):
@@ -590,7 +585,7 @@ class Node(MasterClient):
 
     def _begin_close(self) -> asyncio.Task[None]:
         if self._closing is None:
-            self._closing = asyncio.get_running_loop().create_task(self._close(), name=f"close {self.name}")
+            self._closing = start_task(self._close(), f"close {self.name}")
         return self._closing
 
     async def _close(self) -> None:
@@ -598,10 +593,7 @@ class Node(MasterClient):
         if self._rosout is not None:
             await self._rosout.drained()
             self.logger.removeHandler(self._rosout)
-        if self._tasks:
-            for task in self._tasks:
-                task.cancel()
-            await asyncio.wait(self._tasks)
+        await self._tasks.close()
         await self._unregister_all()
         for entry in self._entries:
             if not isinstance(entry, Service):

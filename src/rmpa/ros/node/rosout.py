@@ -10,6 +10,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RmpaError
+from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -83,7 +84,7 @@ class RosoutHandler(logging.Handler):
         if self._publisher is not None:
             self._publish(self._publisher)
         elif self._task is None:
-            self._task = self._loop.create_task(self._start(), name=f"rosout of {self._node}")
+            self._task = keep_task(self._start, f"rosout of {self._node}")
 
     async def _start(self) -> None:
         publisher: Publisher | None = None

@@ -26,6 +26,7 @@ from rmpa.ros.wire import tcpros
 from rmpa.ros.wire.slave_api import TCPROS
 from rmpa.runtime.accept import OUT_OF_DESCRIPTORS, Use, is_shortage
 from rmpa.runtime.stream import Stream
+from rmpa.runtime.tasks import start_task
 
 Done = Callable[["tuple[bool, bytes | bytearray] | ServiceFailed"], None]
 
@@ -85,7 +86,7 @@ class ServiceConnection:
         md5sum: str = tcpros.ANY,
         persistent: bool = True,
         probe: bool = False,
-        timeout: float = limits.SERVICE_OPEN_TIMEOUT,  # noqa: ASYNC109 - the message names it
+        timeout: float = limits.TCPROS_CONNECT_TIMEOUT,  # noqa: ASYNC109 - the message names it
         on_closed: Callable[[], None] | None = None,
     ) -> Self:
         """Connect and exchange headers.
@@ -202,7 +203,7 @@ class ServiceConnection:
             self._timer = self._loop.call_later(timeout, self._timed_out, timeout)
         head = tcpros.LENGTH.pack(len(body))
         if len(body) > INLINE:
-            self._sending = self._loop.create_task(self._send_large(head, body), name=f"request of {self.service}")
+            self._sending = start_task(self._send_large(head, body), f"request of {self.service}")
         else:
             self._stream.send([head, body], BODIES)
 

@@ -15,6 +15,7 @@ from rmpa.ros import limits
 from rmpa.ros.wire import tcpros
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.loop import yield_to_data
+from rmpa.runtime.tasks import start_task
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -159,9 +160,7 @@ class ServiceEndpoint:
         if self.description is not None:
             client.open(self.description)
         elif self._describing is None:
-            self._describing = asyncio.get_running_loop().create_task(
-                self._fetch_description(), name=f"describe {self.service}"
-            )
+            self._describing = start_task(self._fetch_description(), f"describe {self.service}")
 
     def withdraw(self, text: str = "") -> None:
         """Close all connections; calls under way get an error with ``text``."""
@@ -186,7 +185,9 @@ class ServiceEndpoint:
 
     async def _fetch_description(self) -> None:
         name = f"service [{self.service}]"
-        answer: tcpros.ServiceDescription | str
+        answer: tcpros.ServiceDescription | str = (
+            f"{name}: [{self.caller_id}] failed to describe it; its log says why"
+        )
         try:
             async with asyncio.timeout(self.timeout):
                 answer = await self._describe() if self._describe is not None else f"{name} has no description yet"
@@ -194,11 +195,11 @@ class ServiceEndpoint:
             answer = f"{name}: its server did not describe it within {self.timeout:g} s"
         except RmpaError as error:
             answer = str(error)
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! %s could not be described", self.service)
-            answer = f"{name}: [{self.caller_id}] failed to describe it; its log says why"
         finally:
             self._describing = None
+            self._described(answer)
+
+    def _described(self, answer: tcpros.ServiceDescription | str) -> None:
         waiting = [client for client in self._clients if not client.opened]
         if isinstance(answer, str):
             self._each(waiting, lambda client: client.refuse(answer))
@@ -390,7 +391,7 @@ class _ClientConnection:
             self._proceed()
 
     def _send(self, head: bytes = b"", body: tcpros.Buffer = b"") -> None:
-        self._sending = self._loop.create_task(self._finish(head, body), name="service response")
+        self._sending = start_task(self._finish(head, body), f"response of {self._endpoint.service}")
 
     async def _finish(self, head: bytes, body: tcpros.Buffer) -> None:
         """Send a large reply, if there is one; once all is sent close, or go on with the next request."""

@@ -27,6 +27,7 @@ from rmpa.ros.wire.tcpros import (
 )
 from rmpa.runtime.accept import is_shortage
 from rmpa.runtime.stream import Stream
+from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
     import socket
@@ -176,7 +177,7 @@ class PublisherConnection(TopicConnection):
 
     def start(self) -> None:
         """Connect, in a task of its own."""
-        self._task = asyncio.get_running_loop().create_task(self._run(), name=f"subscribe {self.topic} {self.uri}")
+        self._task = keep_task(self._run, f"subscribe {self.topic} {self.uri}")
 
     def close(self) -> None:
         """Disconnect at once; no callback is called any more."""
@@ -212,17 +213,18 @@ class PublisherConnection(TopicConnection):
         except (OSError, RmpaError) as error:
             return OUT_OF_FILES if is_shortage(error) else str(error)
         try:
-            async with asyncio.timeout(limits.TCPROS_HANDSHAKE_TIMEOUT) as self._handshake:
+            async with asyncio.timeout(limits.TCPROS_CONNECT_TIMEOUT) as self._handshake:
                 ended = await self._ended
         except TimeoutError:
-            return f"no header from the publisher in {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s"
+            return f"no header from the publisher in {limits.TCPROS_CONNECT_TIMEOUT:g} s"
         finally:
             self._drop()
         self.malformed = isinstance(ended, RemoteProtocolError)
         return str(ended) if ended is not None else "the publisher closed the connection"
 
     async def _request_topic(self) -> tuple[str, int]:
-        reply = await call_api(self.uri, "requestTopic", self.request["callerid"], self.topic, [[TCPROS]])
+        params = self.request["callerid"], self.topic, [[TCPROS]]
+        reply = await call_api(self.uri, "requestTopic", *params, timeout=limits.TCPROS_CONNECT_TIMEOUT)
         match reply.value:
             case [str(protocol), str(host), int(port)] if reply.code == 1 and protocol == TCPROS:
                 if 0 < port <= _PORT_MAX:

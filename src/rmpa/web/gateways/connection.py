@@ -21,6 +21,7 @@ from aiohttp import WebSocketError, WSCloseCode, WSMsgType
 
 from rmpa.core.errors import RmpaError
 from rmpa.core.limits import KIB
+from rmpa.runtime.tasks import end_tasks, start_task
 from rmpa.web import limits
 from rmpa.web.gateways.frame_writer import FairQueue, FrameWriter, Opcode, OutFrame
 from rmpa.web.hub.hub import HubClient
@@ -347,7 +348,7 @@ class ClientConnection:
                 self._age = CommandAge(self.now())
                 works.append(("ask the age of", self._ask_age(self._age)))
             for name, work in works:
-                tasks.append(asyncio.get_running_loop().create_task(work, name=f"{name} {session.name}"))
+                tasks.append(start_task(work, f"{name} {session.name}"))
             await self._read(socket_)
         finally:
             try:
@@ -356,13 +357,10 @@ class ClientConnection:
                 for timer in (self._timer, self._close_timer):
                     if timer is not None:
                         timer.cancel()
-                for task in tasks:
-                    task.cancel()
                 session.hub.disconnect(session)
                 if self._out is not None:
                     self._out.close()
-                if tasks:
-                    await asyncio.wait(tasks)
+                await end_tasks(*tasks)
 
     async def _read(self, socket_: FrameSocket) -> None:
         async for message in socket_:
@@ -454,9 +452,9 @@ class ClientConnection:
                     await asyncio.sleep(0)
         except ConnectionError as error:
             _log.debug("= %s: %s", self._session.name, error)
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! writing to %s failed", self._session.name)
+        except Exception:
             self._abort()
+            raise
 
     @property
     def _gone(self) -> bool:

@@ -15,6 +15,7 @@ from aiohttp import WSCloseCode, web
 
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import PeerRefused
+from rmpa.runtime.tasks import start_task
 from rmpa.web import limits
 from rmpa.web.foxglove.channels import ChannelTable
 from rmpa.web.foxglove.protocol import SUBPROTOCOLS, choose_subprotocol
@@ -195,6 +196,12 @@ class Gateways:
     async def close(self) -> None:
         """Tell all clients that the server ends."""
         clients = [each for each in self._open.values() if each.prepared]
-        closing = [each.close(code=WSCloseCode.GOING_AWAY, message=b"the server ends") for each in clients]
-        await asyncio.gather(*closing, return_exceptions=True)
+        closing = [
+            start_task(
+                each.close(code=WSCloseCode.GOING_AWAY, message=b"the server ends"), "close", raises=(OSError,)
+            )
+            for each in clients
+        ]
+        if closing:
+            await asyncio.wait(closing)
         self._channels.close()

@@ -22,6 +22,7 @@ from rmpa.ros.types.installed import ServiceType, known_services
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.ros.wire.xmlrpc import RosReply, call_pieces
+from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 from rmpa.web import limits
 from rmpa.web.hub.node_link import Follower
 from rmpa.web.hub.services import SharedTasks
@@ -387,13 +388,11 @@ class GraphWatch(GraphTable):
 
     def start(self) -> None:
         """Begin, in a task."""
-        self._task = asyncio.get_running_loop().create_task(self._run(), name="watch the graph")
+        self._task = keep_task(self._run, "watch the graph")
 
     async def close(self) -> None:
         """End."""
-        if self._task is not None:
-            self._task.cancel()
-            await asyncio.wait([self._task])
+        await end_tasks(self._task)
 
     def look(self) -> None:
         """Read it soon: something has changed, or a client has come. Where ``take`` tells all that is not needed."""
@@ -447,13 +446,13 @@ class GraphWatch(GraphTable):
     async def find_all(self) -> None:
         """Find the types of all services, for ``limits.FIND_ALL_TIMEOUT``; of a server that does not tell none."""
         searches = [
-            asyncio.ensure_future(self._calls.find(each.name)) for each in self.services.values() if not each.type
+            start_task(self._calls.find(each.name), f"type of {each.name}", raises=(RmpaError,))
+            for each in self.services.values()
+            if not each.type
         ]
         if searches:
-            _, pending = await asyncio.wait(searches, timeout=limits.FIND_ALL_TIMEOUT)
-            for search in pending:
-                search.cancel()
-            await asyncio.gather(*searches, return_exceptions=True)
+            await asyncio.wait(searches, timeout=limits.FIND_ALL_TIMEOUT)
+            await end_tasks(*searches)
             self._found_types()
 
     # --- inside -----------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Self, TypeAlias, TypeVar
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.types.codec import codec_for
+from rmpa.runtime.tasks import OwnedTasks
 from rmpa.web import limits
 from rmpa.web.hub.graph import GraphWatch, TypeLibrary
 from rmpa.web.hub.node_link import CONTROL_REMEDY, EVERYTHING, READ_REMEDY, NodeLink
@@ -148,7 +149,7 @@ class HubClient:
         self.hub = hub
         self.name = name
         self.rights = rights
-        self.tasks: set[asyncio.Task[None]] = set()
+        self.tasks = OwnedTasks()
         self._open: weakref.WeakSet[_Closable] = weakref.WeakSet()
 
     def late(self) -> str:
@@ -286,22 +287,16 @@ class HubClient:
                     done(await work)
                 except RmpaError as error:
                     failed(error)
-            except Exception:  # noqa: BLE001 - a task's top
-                _log.exception("! a request of %s failed", self.name)
+            except Exception:
                 failed(RmpaError("the web server failed; its log says why"))
+                raise
 
-        def ended(task: asyncio.Task[None]) -> None:
-            work.close()  # of a client that has gone before it began
-            self.tasks.discard(task)
-
-        task = asyncio.get_running_loop().create_task(run(), name=f"request of {self.name}")
-        self.tasks.add(task)
-        task.add_done_callback(ended)
+        task = self.tasks.start(run(), f"request of {self.name}")
+        task.add_done_callback(lambda _: work.close())  # of a client that has gone before it began
 
     def end_all(self) -> None:
         """Close what is open, and give up what is under way."""
-        for task in self.tasks:
-            task.cancel()
+        self.tasks.cancel()
         for each in [*self._open]:
             each.close()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import functools
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias, TypeVar, Union
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros.master.parameters import canonical, leaves
+from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 from rmpa.web import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable
+    from collections.abc import Awaitable, Coroutine
 
     from rmpa.ros.node.node import Node, Publisher, Service, Subscriber
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
@@ -219,14 +220,11 @@ class NodeLink:
 
     def start(self) -> None:
         """Begin, in a task."""
-        self._task = asyncio.get_running_loop().create_task(self._run(), name="node of the web server")
+        self._task = keep_task(self._run, "the node of the web server")
 
     async def close(self) -> None:
         """End the node."""
-        if self._task is not None:
-            self._task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await self._task
+        await end_tasks(self._task)
 
     async def withdrawn(self) -> None:
         """Wait until all is withdrawn that has ended."""
@@ -271,17 +269,13 @@ class NodeLink:
                         self.on_node(node)
                         await node.stopped.wait()
                     finally:
-                        self.node = None
+                        self.node, self.problem = None, "the node was shut down, and is started again"
                         self._ready.clear()
                 _log.warning("! the node %s was shut down; it is started again [node-killed]", node.name)
-                self.problem = "the node was shut down, and is started again"
             except RmpaError as error:
                 if str(error) != self.problem:
                     _log.warning("! %s [%s]", error, error.code)
                 self.problem = str(error)
-            except Exception as error:  # noqa: BLE001 - a task's top: without it the server has no node until it ends
-                _log.exception("! the node of the web server failed")
-                self.problem = f"it failed: {error}"
             await asyncio.sleep(limits.NODE_RETRY)
 
 
@@ -312,8 +306,8 @@ class Registration(Generic[_T]):
         self._resting: asyncio.Future[Any] | None = None
         # What ``register`` returned, while it is registered.
         self.value: _T | None = None
-        work = self._run(link.ending.get(self._key))
-        self._task = asyncio.get_running_loop().create_task(work, name=f"register {kind} {name}")
+        run = functools.partial(self._run, link.ending.get(self._key))
+        self._task = keep_task(run, f"register {kind} {name}")
 
     def end(self) -> None:
         """Withdraw it, in its task."""
@@ -358,8 +352,8 @@ class Registration(Generic[_T]):
                 await value.close()
                 self._link.on_registration()
 
-    async def _rest(self, other: Awaitable[_U]) -> _U | None:
+    async def _rest(self, other: Coroutine[Any, Any, _U]) -> _U | None:
         """Wait for it, or until this is no longer wanted: then ``None``."""
-        self._resting = asyncio.ensure_future(other)
+        self._resting = start_task(other, self._task.get_name(), raises=(Exception,))
         await asyncio.wait([self._resting])
         return None if self._resting.cancelled() else self._resting.result()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
 import struct
 from collections.abc import Callable, Iterator, Mapping
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Final, cast
 
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.master.parameters import Parameters, leaves
+from rmpa.runtime.tasks import end_tasks, keep_task
 from rmpa.web import limits
 from rmpa.web.hub.node_link import Follower
 
@@ -113,9 +115,7 @@ class ParamMirror:
 
     async def close(self) -> None:
         """End the reading."""
-        if self._loading is not None:
-            self._loading.cancel()
-            await asyncio.wait([self._loading])
+        await end_tasks(self._loading)
 
     # --- inside -----------------------------------------------------------------------------------------------
 
@@ -138,7 +138,7 @@ class ParamMirror:
     def _load_from(self, node: Node) -> None:
         if self._loading is not None:
             self._loading.cancel()
-        self._loading = asyncio.get_running_loop().create_task(self._load(node), name="read the parameters")
+        self._loading = keep_task(functools.partial(self._load, node), "read the parameters")
 
     async def _load(self, node: Node) -> None:
         while True:

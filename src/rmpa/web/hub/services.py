@@ -16,6 +16,7 @@ from rmpa.ros import limits as ros_limits
 from rmpa.ros.node.endpoints import probe
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 from rmpa.ros.wire.tcpros import ANY
+from rmpa.runtime.tasks import end_tasks, start_task
 from rmpa.web import limits
 from rmpa.web.hub.node_link import Registration
 
@@ -40,8 +41,8 @@ class SharedTasks(Generic[_K, _T]):
         """The task that finds this; nothing need wait for it."""
         task = self._tasks.get(key)
         if task is None:
-            task = self._tasks[key] = asyncio.get_running_loop().create_task(find(), name=f"find {key}")
-            task.add_done_callback(functools.partial(self._ended, key))
+            task = self._tasks[key] = start_task(find(), f"find {key}", raises=(RmpaError,))
+            task.add_done_callback(lambda _: self._tasks.pop(key))
         return task
 
     async def get(self, key: _K, find: Callable[[], Coroutine[object, object, _T]]) -> _T:
@@ -50,15 +51,7 @@ class SharedTasks(Generic[_K, _T]):
 
     async def close(self) -> None:
         """End all."""
-        tasks = [*self._tasks.values()]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-
-    def _ended(self, key: _K, task: asyncio.Task[_T]) -> None:
-        del self._tasks[key]
-        if not task.cancelled():
-            task.exception()  # nothing may wait for it
+        await end_tasks(*self._tasks.values())
 
 
 _SCHEME: Final = "package://"

@@ -14,6 +14,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RmpaError
+from rmpa.runtime.tasks import end_tasks, keep_task
 from rmpa.web import limits
 from rmpa.web.monitor.messages import LOG_TOPIC
 from rmpa.web.monitor.questions import Answers
@@ -76,7 +77,7 @@ class MeshFeed:
 
     def start(self) -> None:
         """Begin to read snapshots."""
-        self._task = asyncio.get_running_loop().create_task(self._run(), name="monitor's state")
+        self._task = keep_task(self._run, "the state of the mesh for the pages")
 
     async def first(self) -> None:
         """Ask the agent once, for ``limits.SETTLE`` at most, so that a page is told its name."""
@@ -101,9 +102,7 @@ class MeshFeed:
     async def close(self) -> None:
         """End."""
         self._pages.clear()
-        if self._task is not None:
-            self._task.cancel()
-            await asyncio.wait([self._task])
+        await end_tasks(self._task)
 
     def details(self, kind: str, name: str) -> Tree | None:
         """All that is known of one thing; ``None`` where there is no such thing."""
@@ -119,10 +118,7 @@ class MeshFeed:
                 self._wake.clear()
                 await self._wake.wait()
             began = time.monotonic()
-            try:
-                self._take(await self._watch.reading())
-            except Exception:  # noqa: BLE001 - a task's top
-                _log.exception("! the state of the mesh could not be built")
+            self._take(await self._watch.reading())
             # A snapshot of thousands of topics takes time at both ends: at most a fifth of it is spent here.
             took = time.monotonic() - began
             await asyncio.sleep(

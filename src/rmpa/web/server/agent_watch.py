@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +15,7 @@ from rmpa.observe import limits as observe_limits
 from rmpa.observe.control import GraphRevision
 from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
 from rmpa.observe.control_stream import ControlStream
+from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 from rmpa.trust.permissions import TrustStatus
 from rmpa.web import limits
 
@@ -83,7 +85,7 @@ class AgentWatch:
             last, age = self._last.get(whole), limits.WEB_WHOLE_AGE if whole else limits.WEB_SNAPSHOT_AGE
             if last is not None and self._clock() - last.taken < age:
                 return last
-            self._pending[whole] = asyncio.create_task(self._ask(whole), name="agent watch")
+            self._pending[whole] = start_task(self._ask(whole), "read the agent's snapshot")
         return await asyncio.shield(self._pending[whole])  # a client that leaves must not end it for the others
 
     async def _ask(self, whole: bool) -> Reading:
@@ -206,13 +208,11 @@ class AgentFollower:
 
     def start(self, graph: GraphWatch) -> None:
         """Begin, in a task; ``graph`` takes the changes."""
-        self._task = self._loop.create_task(self._run(graph), name="follow the agent")
+        self._task = keep_task(functools.partial(self._run, graph), "follow the agent")
 
     async def close(self) -> None:
         """End."""
-        if self._task is not None:
-            self._task.cancel()
-            await asyncio.wait([self._task])
+        await end_tasks(self._task)
 
     def check(self, snapshot: Snapshot) -> None:
         """Check the agent that sent a snapshot; may be called in any thread.

@@ -10,13 +10,14 @@ import socket
 import ssl
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rmpa.config.module_name import module_dir, state_dir
 from rmpa.core.contract import Priority
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
 from rmpa.ros.node.node import Node
 from rmpa.runtime.process import feed_watchdog, notify_service_manager
+from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 from rmpa.trust.permissions import Permissions, server_names
 from rmpa.trust.store import CERTIFICATE, KEY
 from rmpa.web import limits
@@ -29,7 +30,7 @@ from rmpa.web.server.agent_watch import AgentFollower, AgentWatch, ControlReader
 from rmpa.web.server.app import WebServer
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Callable, Coroutine, Mapping
 
     from rmpa.config.settings import Settings, WebSettings
     from rmpa.core.contract import Contracts
@@ -168,13 +169,11 @@ class ServerCertificate:
     def start(self) -> None:
         """Begin to look at the files, in a task."""
         if self.context is not None:
-            self._task = asyncio.get_running_loop().create_task(self._watch(), name="watch the certificate")
+            self._task = keep_task(self._watch, "watch the certificate")
 
     async def close(self) -> None:
         """End."""
-        if self._task is not None:
-            self._task.cancel()
-            await asyncio.wait([self._task])
+        await end_tasks(self._task)
 
     def renew(self) -> bool:
         """Load the files if they have changed; return whether new connections get another certificate. It blocks."""
@@ -379,15 +378,13 @@ async def serve(
     return not stop.is_set()
 
 
-async def _first_of(*awaited: Awaitable[object]) -> None:
+async def _first_of(*awaited: Coroutine[Any, Any, object]) -> None:
     """Wait for one of several; the others are cancelled."""
-    waits = [asyncio.ensure_future(each) for each in awaited]
+    waits = [start_task(each, "what ends the web server") for each in awaited]
     try:
         await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
     finally:
-        for wait in waits:
-            wait.cancel()
-        await asyncio.wait(waits)
+        await end_tasks(*waits)
 
 
 async def _changed(setup: WebSetup, load: Callable[[], WebSetup], asked: asyncio.Event) -> None:
