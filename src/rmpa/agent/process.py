@@ -312,10 +312,11 @@ class WebProcess:
         ours = {} if self._environ is None else {k: v for k, v in self._environ.items() if k.startswith(_READ)}
         made_of = [__version__, words, dict(sorted(ours.items()))]
         with self._one, self._file.open("a+b") as file:
-            self._process = None
             if (former := _noted(file)) is not None:
                 pid, other = former
                 if other == made_of:
+                    if self._process is not None and self._process.pid != pid:
+                        self._process = None
                     _log.info("= rmpa web (process %d) goes on, of the agent before", pid)
                     os.kill(pid, signal.SIGHUP)  # what is in rmpa.toml may have changed
                     return pid
