@@ -59,7 +59,7 @@ class RouteSender:
 
     def __init__(self, link: PeerLink, route: int, contract: Contract, *, large: bool = False) -> None:
         self.contract = contract
-        self._depth = mesh_limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.depth
+        self._depth = mesh_limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.queue_depth
         self.sequence = 0
         self._loop = asyncio.get_running_loop()
         self._switch = LaneSwitch(contract, large=large)

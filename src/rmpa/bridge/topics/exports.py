@@ -196,7 +196,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
                 continue
             if route.live and route.epoch:
                 route.number = 0
-                self._do.suspend_route(source, peer, route.contract.outage)
+                self._do.suspend_route(source, peer, route.contract.resume_window)
             else:
                 self.end_route(source, peer)
             yield
@@ -212,7 +212,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
     def outage(self, peer: int) -> float:
         """The longest time, in seconds, for which messages are kept for a peer without a link; 0 if none are."""
         away = (route for flow in self._flows.values() if (route := flow.routes.get(peer)) and not route.number)
-        return max((route.contract.outage for route in away), default=0.0)
+        return max((route.contract.resume_window for route in away), default=0.0)
 
     def given_up(self, source: Source, peer: int) -> None:
         """End a suspended route, whose messages are not kept any more."""

@@ -166,7 +166,7 @@ class PeerTopic(PublicationEvents):
             flow = ImportFlow(self.publication, contract, time, counters, self.occurred, self.torn, past)
         self.flow, flow.contract = flow, contract
         goes_on = flow.bind(session.link, opened.route, opened.epoch, opened.first)
-        self.publication.bound(contract.depth)
+        self.publication.bound(contract.queue_depth)
         if contract.durability is Durability.TRANSIENT_LOCAL:
             self.publication.keep(contract.kept)
         if goes_on and not isinstance(opened.following, UnsetType):
