@@ -366,9 +366,8 @@ def test_a_peer_of_before_transports_relays() -> None:
 
 
 def test_a_peer_of_before_a_term_reads_the_others() -> None:
-    later = DEFAULT.replace(
-        b'"max_rate":null', b'"max_rate":null,"outage":60.0,"term_of_a_later_version":[1,{"a":"b"}]'
-    )
+    new = b'"outage":60.0,"term_of_a_later_version":[1,{"a":"b"}],"transport"'
+    later = DEFAULT.replace(b'"transport"', new)
     assert decode(OPEN + b"," + later + b"}") == OpenRoute(1, "/a", "/b", Contract(outage=60.0))
 
 

@@ -78,6 +78,15 @@ class Transport(StrEnum):
     AUTO = "auto"
 
 
+# The types of velocity commands, which replace each other: without a rule, ``depth`` is 1.
+VELOCITY_COMMANDS: Final = frozenset(
+    {
+        "geometry_msgs/Twist",
+        "geometry_msgs/TwistStamped",
+        "ackermann_msgs/AckermannDrive",
+        "ackermann_msgs/AckermannDriveStamped",
+    }
+)
 # ``[bridge] transport`` and ``[services] transport`` where nothing sets them.
 DEFAULT_TRANSPORT: Final = Transport.RELAY
 
@@ -118,6 +127,11 @@ class Contract:
     transport: Transport = Transport.RELAY
 
     @property
+    def newest_only(self) -> bool:
+        """Whether only the newest one counts of the messages that an outage has delayed."""
+        return self.depth == 1 and self.reliability is Reliability.BEST_EFFORT
+
+    @property
     def queue_depth(self) -> int:
         """``depth``, or its default."""
         return limits.ROUTE_QUEUE_MESSAGES if self.depth is UNSET else self.depth
@@ -153,20 +167,26 @@ _RANKS: Final = {
 }
 
 
-def combine(offered: Contract, requested: Contract) -> Contract:
+def combine(offered: Contract, requested: Contract, type_name: str = "") -> Contract:
     """The contract of a route: the stronger of the sender's and the receiver's values, key by key.
 
     Args:
         offered: The sender's contract for the topic.
         requested: The receiver's. Its deadline and its liveliness (kind and lease together) hold where it has them:
             it is the receiver that waits.
+        type_name: The type of a topic that is relayed. Velocity commands have a depth of 1 where neither side sets
+            one, unless they are kept: reliable, ``keep_all`` or ``transient_local``.
     """
     watched = requested if requested.liveliness_lease is not None else offered
     stronger = {key: max(getattr(offered, key), getattr(requested, key), key=rank) for key, rank in _RANKS.items()}
+    depth = _larger(offered.depth, requested.depth)
+    kept = (Reliability.RELIABLE, History.KEEP_ALL, Durability.TRANSIENT_LOCAL)
+    if depth is UNSET and type_name in VELOCITY_COMMANDS and not any(word in kept for word in stronger.values()):
+        depth = 1
     return replace(
         _DEFAULT,
         **stronger,
-        depth=_larger(offered.depth, requested.depth),
+        depth=depth,
         deadline=offered.deadline if requested.deadline is None else requested.deadline,
         lifespan=_smaller(offered.lifespan, requested.lifespan),
         liveliness=watched.liveliness,
@@ -271,6 +291,8 @@ class Contracts:
         """
         found: dict[str, tuple[object, str]] = {key: (getattr(self._default, key), "default") for key in KEYS}
         found |= {"depth": (_DEFAULT.queue_depth, "default"), "outage": (_DEFAULT.resume_window, "default")}
+        if type_name in VELOCITY_COMMANDS:
+            found["depth"] = (1, "default for velocity commands")
         if self._default.transport is not DEFAULT_TRANSPORT:
             found["transport"] = (self._default.transport, "[bridge] transport")
         for number, rule in enumerate(self._rules, 1):

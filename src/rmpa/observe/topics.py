@@ -279,7 +279,7 @@ class TopicFacts:
             for peer, contract in exports.absent(source).items():
                 if peer not in names or exports.contract(source, peer) is None:
                     name, seconds = self._bridge.topics.losses.away(peer)
-                    kept = shown_seconds(contract.resume_window)
+                    kept = shown_seconds(exports.routes(source)[peer].outage)
                     text = f"{name} is away for {shown_seconds(seconds)}; messages are kept for {kept}"
                     yield source.topic, self._route_to(peer, name, source, local, "away", contract, text), []
 

@@ -139,9 +139,11 @@ class Lane:
         self.link.log.append((self.name, "fence", route, number))
         self.link.fences.append((self.name, number))
 
-    def set_terms(self, route: int, depth: int, max_age: float | None, *, strict: bool) -> None:
+    def set_terms(
+        self, route: int, depth: int, max_age: float | None = None, *, above: int = 0, spared: bool = False
+    ) -> None:
         """Take a route's bounds."""
-        self.terms[route] = (depth, max_age, strict)
+        self.terms[route] = (depth, max_age, above, spared)
 
     def discard(self, route: int) -> None:
         """Let go of what waits of a route, and of its bounds."""

@@ -10,16 +10,17 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from itertools import islice
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Final
+
+from msgspec import UNSET
 
 from rmpa.bridge.data.route import EXPRESS, Downsampler, LaneSwitch
 from rmpa.core.contract import Contract, Durability, History, Reliability
-from rmpa.core.identity import SERIAL_MASK, is_earlier
+from rmpa.core.identity import SERIAL_MASK, is_earlier, serial_add
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ReliableSender
 from rmpa.ros import limits as ros_limits
-from rmpa.runtime import limits as runtime_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,10 +31,15 @@ if TYPE_CHECKING:
     from rmpa.ros.node.subscription import TopicConnection
     from rmpa.runtime.tls import Buffer
 
-# Age at which a best-effort message on the bulk lane is dropped in favour of a newer one of its topic (on the express
-# lane it is ``runtime.limits.STALE_AGE``). If a link is too slow for a topic, the newest message is sent.
-BULK_STALE_AGE: Final = 0.5
+    Keep = Callable[[bytes, int], object]
 
+# [Messages] Of a topic without a `depth`: age of a message in its queue beyond 4 MiB
+# At it: the oldest are dropped
+# Told in: `topic info`, `why` (*sent*), diagnostics
+# Why: A burst may take its time, and where the link is too slow for an image topic the images stay fresh.
+ROUTE_QUEUE_AGE: Final = 0.5
+# Nanoseconds: a link is silent for a second before it counts as lost; a connection that replaces it comes sooner.
+_RESENT_NS: Final = round(1.5 * mesh_limits.EXPRESS_LEASE * 1e9)
 _SMALL: Final = mesh_limits.EXPRESS_MESSAGE_MAX
 
 
@@ -43,32 +49,47 @@ class RouteSender:
     It is called for each message from the publisher's read callback. ``message`` has a short path for the usual case:
     a small message on the express lane, without down-sampling.
 
+    A link that falls silent loses what the kernel had taken. So the last messages are kept, and sent again over the
+    next link if the peer does not have them (``suspend``, ``resume``); what came in parts is not.
+
     Args:
         link: The link to the peer.
         route: The route's id.
         contract: The route's contract.
+        epoch: Identifies this numbering; see ``mesh.reliable``.
         large: Whether the source is known to have large messages.
 
     Attributes:
-        _held: Sequence, stamp and bytes of messages that wait until the lane has changed.
+        _held: Sequence, stamp and bytes of messages that wait until the lane has changed, or for the next link.
+        _sent: Likewise, of the last messages that were sent.
         _newest: Stamp and bytes of the message that down-sampling sends next.
         _direct: Whether ``message`` may take its short path for small messages.
+        lapse: When a suspended route of best effort ends.
     """
 
     reliable = False
+    lost = 0
 
-    def __init__(self, link: PeerLink, route: int, contract: Contract, *, large: bool = False) -> None:
+    def __init__(
+        self, link: PeerLink, route: int, contract: Contract, epoch: int = 0, *, large: bool = False
+    ) -> None:
         self.contract = contract
+        self.epoch = epoch
         self._depth = mesh_limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.queue_depth
+        chosen = contract.depth is not UNSET or contract.history is History.KEEP_ALL
+        self._max_bytes = mesh_limits.LANE_QUEUE_BYTES if chosen else mesh_limits.ROUTE_QUEUE_BYTES
         self.sequence = 0
         self._loop = asyncio.get_running_loop()
         self._switch = LaneSwitch(contract, large=large)
         self._held: deque[tuple[int, int, bytes]] = deque()
         self._held_bytes = 0
+        self._sent: deque[tuple[int, int, bytes]] = deque()
+        self._sent_bytes = 0
         self._downsampler = Downsampler(contract.max_rate) if contract.max_rate is not None else None
         self._newest: tuple[int, bytes] | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._direct = False
+        self.lapse: asyncio.TimerHandle | None = None
         self.link: PeerLink | None
         self._lane: LaneSender
         self._use(link, route)
@@ -82,7 +103,7 @@ class RouteSender:
         """Send one message; return how many older ones were dropped for it."""
         if self._direct and len(framed) <= _SMALL:
             self.sequence = sequence = self.sequence + 1 & SERIAL_MASK
-            return self._lane.send(self.route, sequence, stamp_ns, framed)
+            return self._transmit(sequence, stamp_ns, framed)
         if self._downsampler is not None and not self._downsampler.admit(self._loop.time()):
             self._newest = (stamp_ns, bytes(framed))  # in place of an older one, until the rate allows it
             if self._timer is None:
@@ -107,8 +128,36 @@ class RouteSender:
             self._use_lane()
             self._go_on()
 
+    @property
+    def last(self) -> int:
+        """The number of the last message."""
+        return self.sequence
+
+    @property
+    def following(self) -> int:
+        """The number of the message that is sent next over a new link, if the peer does not have it."""
+        return self._held[0][0] if self._held else serial_add(self.sequence, 1)
+
     def acknowledged(self, sequence: int) -> None:
         """Ignore an acknowledgement; only reliable routes need it."""
+
+    def suspend(self, keep: Keep | None = None) -> None:  # noqa: ARG002 - for reliable routes
+        """Keep messages while the link is gone, within the bounds of the queue, until ``resume`` or ``close``."""
+        self.link, self._direct = None, False
+        waiting, self._sent, self._held = chain(self._sent, self._held), deque(), deque()
+        self._sent_bytes = self._held_bytes = 0
+        for message in waiting:
+            self._hold(*message)
+
+    def resume(self, link: PeerLink, route: int, after: int) -> None:
+        """Continue on a new link; the peer has everything up to ``after``."""
+        if self.lapse is not None:
+            self.lapse.cancel()
+        while self._held and not is_earlier(after, self._held[0][0]):
+            self._held_bytes -= len(self._held.popleft()[2])
+        self._switch.restart()
+        self._use(link, route)
+        self._go_on()
 
     def lane_lost(self) -> None:
         """Handle the loss of the bulk lane's connection; it ends a change from that lane at once."""
@@ -122,16 +171,30 @@ class RouteSender:
         self.link = None
         self._direct = False
         self._held.clear()
-        if self._timer is not None:
-            self._timer.cancel()
+        for timer in (self._timer, self.lapse):
+            if timer is not None:
+                timer.cancel()
 
     # --- inside ---------------------------------------------------------------------------------------------
 
     def _send(self, stamp_ns: int, framed: Buffer) -> int:
         self.sequence = sequence = self.sequence + 1 & SERIAL_MASK
         if self._lane_for(len(framed)):
-            return self._lane.send(self.route, sequence, stamp_ns, framed)
+            return self._transmit(sequence, stamp_ns, framed)
         return self._hold(sequence, stamp_ns, bytes(framed))
+
+    def _transmit(self, sequence: int, stamp_ns: int, framed: Buffer) -> int:
+        """Sends a message, and keeps it for as long as the link may turn out to have been silent."""
+        sent = self._sent
+        sent.append((sequence, stamp_ns, bytes(framed)))
+        self._sent_bytes += len(framed)
+        while (
+            sent[0][1] < stamp_ns - _RESENT_NS
+            or len(sent) > self._depth
+            or (self._sent_bytes > self._max_bytes and len(sent) > 1)
+        ):
+            self._sent_bytes -= len(sent.popleft()[2])
+        return self._lane.send(self.route, sequence, stamp_ns, framed)
 
     def _send_newest(self, downsampler: Downsampler) -> None:
         self._timer = None
@@ -146,9 +209,7 @@ class RouteSender:
         self._held.append((sequence, stamp_ns, payload))
         self._held_bytes += len(payload)
         dropped = 0
-        while len(self._held) > 1 and (
-            len(self._held) > self._depth or self._held_bytes > mesh_limits.LANE_QUEUE_BYTES
-        ):
+        while len(self._held) > 1 and (len(self._held) > self._depth or self._held_bytes > self._max_bytes):
             self._held_bytes -= len(self._held.popleft()[2])
             dropped += 1
         return dropped
@@ -159,7 +220,7 @@ class RouteSender:
         for sequence, stamp_ns, payload in held:
             # A large message may have come during the change back to the express lane.
             if self._lane_for(len(payload)):
-                self._lane.send(self.route, sequence, stamp_ns, payload)
+                self._transmit(sequence, stamp_ns, payload)
             else:
                 self._hold(sequence, stamp_ns, payload)
 
@@ -200,9 +261,11 @@ class RouteSender:
             self._set_bounds(self.link)
 
     def _set_bounds(self, link: PeerLink) -> None:
-        lifespan = self.contract.lifespan
-        for lane, stale in ((link.express, runtime_limits.STALE_AGE), (link.bulk, BULK_STALE_AGE)):
-            lane.set_terms(self.route, self._depth, lifespan or stale, strict=lifespan is not None)
+        lifespan, above = self.contract.lifespan, 0
+        if lifespan is None and self._max_bytes < mesh_limits.LANE_QUEUE_BYTES:
+            lifespan, above = ROUTE_QUEUE_AGE, self._max_bytes
+        for lane in (link.express, link.bulk):
+            lane.set_terms(self.route, self._depth, lifespan, above=above)
 
 
 class ReliableRouteSender(RouteSender):
@@ -219,9 +282,9 @@ class ReliableRouteSender(RouteSender):
     reliable = True
 
     def __init__(self, link: PeerLink, route: int, contract: Contract, epoch: int, *, large: bool = False) -> None:
-        self._keep: Callable[[bytes, int], object] | None = None
+        self._keep: Keep | None = None
         self._reported = 0
-        super().__init__(link, route, contract, large=large)
+        super().__init__(link, route, contract, epoch, large=large)
         self.sender = ReliableSender(
             self._depth,
             mesh_limits.REPLAY_BYTES,
@@ -249,7 +312,22 @@ class ReliableRouteSender(RouteSender):
             self._use_lane()
         self._go_on()
 
-    def suspend(self, keep: Callable[[bytes, int], object] | None = None) -> None:
+    @property
+    def last(self) -> int:
+        """The number of the last message."""
+        return self.sender.last
+
+    @property
+    def following(self) -> int:
+        """The number of the message that is sent next over a new link, if the peer does not have it."""
+        return self.sender.following
+
+    @property
+    def lost(self) -> int:  # type: ignore[override] # counted by the numbering
+        """The number of messages that the peer will never get."""
+        return self.sender.lost
+
+    def suspend(self, keep: Keep | None = None) -> None:
         """Keep messages while the link is gone, until ``resume`` or until they are given up.
 
         Args:
@@ -303,7 +381,7 @@ class ReliableRouteSender(RouteSender):
     def _set_bounds(self, link: PeerLink) -> None:
         """Sets no bounds: a numbered message may not be dropped from a queue; the window bounds the queue."""
         for lane in (link.express, link.bulk):
-            lane.set_terms(self.route, mesh_limits.KEEP_ALL_MESSAGES, None, strict=False)
+            lane.set_terms(self.route, mesh_limits.KEEP_ALL_MESSAGES, spared=True)
 
 
 class ExportFlow:
@@ -355,7 +433,7 @@ class ExportFlow:
         if contract.reliability is Reliability.RELIABLE:
             sender = ReliableRouteSender(link, route, contract, epoch, large=self.large)
         else:
-            sender = RouteSender(link, route, contract, large=self.large)
+            sender = RouteSender(link, route, contract, epoch, large=self.large)
         if contract.durability is Durability.TRANSIENT_LOCAL:
             self.keep(contract.kept)
         # Messages kept only for another peer's contract are old data here, perhaps old commands.

@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.topics.imports import Imports
     from rmpa.bridge.topics.peer_topics import LossReports, PeerTopics
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.mesh.reliable import ReliableSender
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.subscription import TopicConnection
@@ -188,7 +187,7 @@ class LocalSubscriptions:
         """
         flow = self.flows[source]
         sender = flow.by_peer.get(peer)
-        if route.after is not None and isinstance(sender, ReliableRouteSender) and sender.sender.epoch == route.epoch:
+        if route.after is not None and sender is not None and sender.epoch == route.epoch:
             self._parked.claim((peer, source))
             self._timer.arm()
             try:
@@ -196,7 +195,7 @@ class LocalSubscriptions:
             except RemoteProtocolError:
                 flow.remove(peer)  # the caller closes the link; the next one gets a new numbering
                 raise
-            if missed := sender.missed():
+            if isinstance(sender, ReliableRouteSender) and (missed := sender.missed()):
                 self._losses.missed(source, peer, missed)
         else:
             self.remove_route(source, peer)
@@ -204,8 +203,8 @@ class LocalSubscriptions:
         self.senders[peer, route.number] = sender
 
     def suspend_route(self, source: Source, peer: int, outage: float) -> None:
-        """Keep a reliable source's messages for an absent peer, for a time in seconds; best effort keeps none."""
-        sender = self._sender_of(source, peer)
+        """Keep a source's messages for an absent peer, for a time in seconds."""
+        sender = self.sender_of(source, peer)
         self._forget(peer, sender)
         if isinstance(sender, ReliableRouteSender):
             key = (peer, source)
@@ -214,6 +213,10 @@ class LocalSubscriptions:
             if full := self._parked.park(key, sender.sender, loop.time() + outage):
                 loop.call_soon(self._give_up, full)  # later: the exports are at work on these routes now
             self._timer.arm()
+        elif sender is not None:
+            sender.suspend()
+            give_up = self._exports.given_up
+            sender.lapse = asyncio.get_running_loop().call_later(outage, give_up, source, peer)
 
     def back(self, peer: int) -> None:
         """Give a peer that has a link again ``mesh.limits.RESUME_CLAIM`` to open its suspended routes."""
@@ -230,16 +233,12 @@ class LocalSubscriptions:
         """End a source's route to a peer, if there is one, suspended or not."""
         self._parked.claim((peer, source))
         self._timer.arm()
-        if (sender := self._sender_of(source, peer)) is not None:
+        if (sender := self.sender_of(source, peer)) is not None:
             self._forget(peer, sender)
             self.flows[source].remove(peer)
 
-    def numbering(self, source: Source, peer: int) -> ReliableSender | None:
-        """The sender of a source's reliable route to a peer, suspended or not; ``None`` if there is none."""
-        sender = self._sender_of(source, peer)
-        return sender.sender if isinstance(sender, ReliableRouteSender) else None
-
-    def _sender_of(self, source: Source, peer: int) -> RouteSender | None:
+    def sender_of(self, source: Source, peer: int) -> RouteSender | None:
+        """The sender of a source's route to a peer, suspended or not; ``None`` if there is none."""
         flow = self.flows.get(source)
         return flow.by_peer.get(peer) if flow is not None else None
 
@@ -248,7 +247,7 @@ class LocalSubscriptions:
         for peer in dict.fromkeys(peer for peer, _ in keys):
             counts = {}
             for source in (source for one, source in keys if one == peer):
-                sender = self._sender_of(source, peer)
+                sender = self.sender_of(source, peer)
                 if isinstance(sender, ReliableRouteSender):
                     counts[source] = sender.missed() + sender.sender.pending
             self._losses.given_up(peer, counts)
@@ -290,7 +289,7 @@ class LocalSubscriptions:
         _log.log(logging.DEBUG if short else logging.INFO, "= %s: %s", source, reason)
         if flow.connection.malformed:
             self._out.warn("publisher.malformed", str(source), f"{source}: {reason}")
-        lasts = {peer: one.last for peer in flow.by_peer if (one := self.numbering(source, peer)) is not None}
+        lasts = {peer: sender.last for peer, sender in flow.by_peer.items()}
         self.disconnect(source)  # first: what follows may connect the source anew
         self._exports.lost(source, reason[: limits.CONTROL_TEXT_MAX], lasts)
         if not short:

@@ -124,11 +124,10 @@ class Topics(GraphPart, TopicEvents):
         super().link_down(session)
         peer = session.peer
         if interrupted := self.peers[peer].link_down():
-            # Best-effort messages published until the next link get no sequence: their loss cannot be counted.
             self._shared.counters.add("route.interrupted", interrupted)
         self._subscribers.link_down(peer)
         # Without a pause for data: among it could be the peer's new link, which must find all routes suspended.
-        deque(self.exports.link_away(peer), 0)
+        deque(self.exports.link_away(peer, briefly=session.link.silent), 0)
         if session.link.silent:
             # Most silences end soon with a new link, so nothing leaves the local graph yet.
             deque(self.imports.link_away(peer, briefly=True), 0)

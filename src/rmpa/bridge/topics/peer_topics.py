@@ -158,7 +158,9 @@ class PeerTopic(PublicationEvents):
         if flow is not None and flow.contract.reliability is Reliability.RELIABLE:
             past, missed_at = flow.watch, self.topic
         reliable = contract.reliability is Reliability.RELIABLE
-        if flow is None or not reliable or not flow.contract.same_route(contract):
+        cut = flow is not None and not reliable
+        # An older agent does not number best-effort routes: their epoch is 0, and each begins anew.
+        if flow is None or not flow.contract.same_route(contract) or not opened.epoch:
             if flow is not None:
                 flow.close()
             past = past if reliable else None
@@ -171,7 +173,7 @@ class PeerTopic(PublicationEvents):
             self.publication.keep(contract.kept)
         if goes_on and not isinstance(opened.following, UnsetType):
             flow.skip(opened.following)
-        elif reliable and not goes_on and (missed_at or opened.unknown is True):
+        elif not goes_on and (cut or (reliable and (missed_at or opened.unknown is True))):
             flow.missed_unknown("an agent was restarted, or the route had ended")
         about = opened.description
         text = about.definition.encode("latin-1").decode(errors="surrogateescape")
