@@ -358,7 +358,7 @@ class Ear:
         assert parcel is self._parcel
         return bool(self._half)
 
-    def hang_up(self) -> None:
+    def hang_up(self, *, drain: bool = False) -> None:
         """We were hung up on."""
         self.closed = True
         self._listener.ears.pop(self.publication, None)

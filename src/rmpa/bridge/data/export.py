@@ -88,6 +88,7 @@ class RouteSender:
         self._downsampler = Downsampler(contract.max_rate) if contract.max_rate is not None else None
         self._newest: tuple[int, bytes] | None = None
         self._timer: asyncio.TimerHandle | None = None
+        self._done: Callable[[], None] | None = None
         self._direct = False
         self.lapse: asyncio.TimerHandle | None = None
         self.link: PeerLink | None
@@ -125,8 +126,21 @@ class RouteSender:
     def fenced(self, number: int) -> None:
         """Take the peer's answer to a fence, and send what has waited over the new lane."""
         if self._switch.fenced(number):
-            self._use_lane()
-            self._go_on()
+            self._fence_over()
+
+    def drain(self, done: Callable[[], None]) -> None:
+        """Call ``done`` once the peer has all messages, or the route has ended; no further message follows."""
+        self._done = done
+        if self._newest is not None:
+            self._send(*self._newest)
+            self._newest = None
+        if self.link is not None and not self._switch.fencing:
+            self._begin_fence()
+
+    @property
+    def drained(self) -> bool:
+        """Whether nothing of the route is on its way any more."""
+        return self.link is None or not (self._switch.fencing or self._held)
 
     @property
     def last(self) -> int:
@@ -163,14 +177,15 @@ class RouteSender:
         """Handle the loss of the bulk lane's connection; it ends a change from that lane at once."""
         if self._switch.lane_lost():
             self._discard_bulk()
-            self._use_lane()
-            self._go_on()
+            self._fence_over()
 
     def close(self) -> None:
         """Send no more messages."""
         self.link = None
         self._direct = False
         self._held.clear()
+        if self._done is not None:
+            self._done()
         for timer in (self._timer, self.lapse):
             if timer is not None:
                 timer.cancel()
@@ -233,6 +248,17 @@ class RouteSender:
         self._begin_fence()
         return False
 
+    def _fence_over(self) -> None:
+        """Uses the lane that a fence was for; if no message is behind it, a draining route is empty."""
+        waited = bool(self._held)
+        self._use_lane()
+        self._go_on()
+        if self._done is not None and not self._switch.fencing:
+            if waited:
+                self._begin_fence()
+            else:
+                self._done()
+
     def _begin_fence(self) -> None:
         self._direct = False
         self._lane.fence(self.route, self._switch.fence())
@@ -293,6 +319,15 @@ class ReliableRouteSender(RouteSender):
             epoch,
         )
 
+    def drain(self, done: Callable[[], None]) -> None:
+        """Call ``done`` once the peer has all messages, or the route has ended; no further message follows."""
+        self._done = done
+
+    @property
+    def drained(self) -> bool:
+        """Whether nothing of the route is on its way any more."""
+        return self.sender.idle
+
     def begin(self, stamp_ns: int, size: int) -> None:
         """A message that may have to be sent again is needed whole."""
 
@@ -300,6 +335,8 @@ class ReliableRouteSender(RouteSender):
         """Forget the messages up to ``sequence``, which the peer has, and send what the window allows."""
         self.sender.acknowledged(sequence)
         self._go_on()
+        if self._done is not None:
+            self._done()
 
     def lane_lost(self) -> None:
         """Send the messages again that were on the lost bulk lane; the peer drops those that it has."""
@@ -392,6 +429,7 @@ class ExportFlow:
         _history: Bytes and stamps of the last messages, for routes that are opened later.
         _streaming: The senders that pass on the present message in parts, each with its lane.
         _whole: The present message so far, where a sender or the history needs it whole.
+        leaving: When the flow ends, once its publisher has.
         latching: Whether the publisher latches: a route opened later gets its last message, whatever the contract.
         large: Whether the publisher has sent a message that came in parts.
         oversized, oversized_bytes: Messages that were left out because they are too long; size of the last one, in
@@ -414,6 +452,8 @@ class ExportFlow:
         self.bytes = 0
         self.dropped = 0
         self.oversized = self.oversized_bytes = 0
+        self.leaving: asyncio.TimerHandle | None = None
+        self._over: Callable[[], None] | None = None
 
     def latch(self) -> None:
         """Keep the last message: the publisher latches."""
@@ -451,9 +491,29 @@ class ExportFlow:
             sender.close()
             self._senders = tuple(self.by_peer.values())
             self._streaming.pop(sender, None)
+            self._look_drained()
+
+    def drain(self, over: Callable[[], None]) -> None:
+        """Call ``over`` once all peers have all messages, for the publisher has ended; perhaps at once."""
+        self._over = over
+        for sender in self._senders:
+            sender.drain(self._look_drained)
+        self._look_drained()
+
+    def ended(self) -> None:
+        """Wait for nothing any more."""
+        self._over = None
+        if self.leaving is not None:
+            self.leaving.cancel()
+
+    def _look_drained(self) -> None:
+        if self._over is not None and all(sender.drained for sender in self._senders):
+            over, self._over = self._over, None
+            over()
 
     def close(self) -> None:
         """Remove all peers, and free the kept messages, which may be large."""
+        self.ended()
         for peer in tuple(self.by_peer):
             self.remove(peer)
         self._history.clear()

@@ -112,6 +112,7 @@ class LocalSubscriptions:
         out: Warns of publishers that break TCPROS.
         find: ``(node, slave API, topic)``: the topic of a proxy of this process, which is subscribed to without a
             socket; ``None`` for others.
+        on_over: Called once a publisher has gone, and all that it has published has crossed.
 
     Attributes:
         flows: The flow of each source that the agent is connected to, for snapshots.
@@ -125,11 +126,12 @@ class LocalSubscriptions:
         losses: LossReports,
         out: Effects,
         find: Callable[[str, str, str], Publication | None] = lambda *_: None,
+        on_over: Callable[[Source], None] = lambda _: None,
     ) -> None:
         self._core = shared.core
         self._node = shared.node
         self._exports, self._losses, self._out = exports, losses, out
-        self._find = find
+        self._find, self._on_over = find, on_over
         self.flows: dict[Source, ExportFlow] = {}
         self.senders: dict[tuple[int, int], RouteSender] = {}
         self._parked: ResumeTable[tuple[int, Source]] = ResumeTable()
@@ -172,12 +174,27 @@ class LocalSubscriptions:
         """Disconnect one publisher, and drop its routes."""
         if (flow := self.flows.get(source)) is not None:
             flow.connection.close()
+            flow.ended()
             for peer in list(flow.by_peer):
                 self.remove_route(source, peer)
             flow.close()
             del self.flows[source]
             if not any(one.topic == source.topic for one in self.flows):
                 self._core.call("unregisterSubscriber", OWN_NODE, source.topic, self._node.uri)
+
+    def leave(self, source: Source) -> bool:
+        """Let a publisher that has unregistered end its connection by itself, so that all that it has sent is read.
+
+        Returns:
+            Whether the source is still connected, and sent to a peer; the exports are told when it is lost.
+        """
+        flow = self.flows.get(source)
+        if flow is None or not flow.by_peer:
+            return False
+        if flow.leaving is None:
+            gone = lambda: self._gone(source, flow, "its publisher has gone")  # noqa: E731
+            flow.leaving = asyncio.get_running_loop().call_later(limits.ROUTE_END, gone)
+        return True
 
     def add_route(self, source: Source, peer: int, route: ExportRoute, link: PeerLink) -> None:
         """Send a source to one more peer, or resume its suspended route.
@@ -289,11 +306,21 @@ class LocalSubscriptions:
         _log.log(logging.DEBUG if short else logging.INFO, "= %s: %s", source, reason)
         if flow.connection.malformed:
             self._out.warn("publisher.malformed", str(source), f"{source}: {reason}")
+        flow.connection.close()
+        flow.ended()
+        flow.leaving = asyncio.get_running_loop().call_later(limits.ROUTE_DRAIN, self._over, source, flow, reason)
+        flow.drain(lambda: self._over(source, flow, reason))
+        if not short:
+            self._core.suspect(source.node)
+
+    def _over(self, source: Source, flow: ExportFlow, reason: str) -> None:
+        """Ends a source whose publisher has gone, and whose messages have crossed."""
+        if self.flows.get(source) is not flow:
+            return
         lasts = {peer: sender.last for peer, sender in flow.by_peer.items()}
         self.disconnect(source)  # first: what follows may connect the source anew
         self._exports.lost(source, reason[: limits.CONTROL_TEXT_MAX], lasts)
-        if not short:
-            self._core.suspect(source.node)
+        self._on_over(source)
 
 
 def is_watched(type_name: str) -> bool:

@@ -75,7 +75,9 @@ class Topics(GraphPart, TopicEvents):
         self.peers: dict[int, PeerTopics] = {}
         self._pasts: OrderedDict[str, dict[Source, tuple[QosWatch, str]]] = OrderedDict()
         self.losses = LossReports(shared, self.exports, self.peers, self)
-        self.outbound = LocalSubscriptions(shared, self.exports, self.losses, self, find)
+        self.outbound = LocalSubscriptions(
+            shared, self.exports, self.losses, self, find, lambda source: self.look((source.topic,))
+        )
         self._mismatches = Mismatches(self, self.exports, self.imports)
         self._subscribers = RemoteSubscribers(shared, self, self.exports, self.imports, self.peers)
         self.direct_exports = TopicGrants(shared, self.exports)
@@ -211,10 +213,13 @@ class Topics(GraphPart, TopicEvents):
     def _look_at(self, name: str) -> None:
         local, before = self._local.of(name), self._nodes.pop(name, ())
         publishers = local | self._local.relayed(name)
-        if publishers:
-            self._nodes[name] = tuple(publishers)
-        for node in dict.fromkeys((*before, *publishers)):
-            self.exports.put(Source(name, node), publishers.get(node))
+        nodes = dict.fromkeys((*before, *publishers))
+        leaving = [node for node in nodes if node not in publishers and self.outbound.leave(Source(name, node))]
+        if publishers or leaving:
+            self._nodes[name] = (*publishers, *leaving)
+        for node in nodes:
+            if node not in leaving:
+                self.exports.put(Source(name, node), publishers.get(node))
         self.imports.local_type(name, next((one.type for one in reversed(local.values())), None))
 
     def reconcile(self) -> None:

@@ -46,6 +46,10 @@ _NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
 _MESSAGES: Final = 0
 
 
+def _ended(*_: object) -> None:
+    """The ``on_end`` of a connection that no publication has any more."""
+
+
 class AcceptedConnection(Stream):
     """A connection that another node opened to a node of this process: a header comes, then messages or replies go.
 
@@ -121,9 +125,13 @@ class AcceptedConnection(Stream):
         self.send([encode_header(error_header(text))], URGENT)
         self.close()
 
-    def hang_up(self) -> None:
-        """Close at once, without a call of ``on_end``."""
-        self.close()
+    def hang_up(self, *, drain: bool = False) -> None:
+        """Close without a call of ``on_end``, at once or when all that waits is sent."""
+        self.on_end = _ended
+        if drain:
+            self.leave(limits.SUBSCRIBER_DRAIN)
+        else:
+            self.close()
 
     def _take(self, data: memoryview) -> tuple[int, int]:
         consumed = 0
@@ -393,10 +401,11 @@ class Publication:
         await asyncio.gather(*(connection.drained(timeout) for connection in self._connections))
 
     def withdraw(self) -> None:
-        """Close all connections without an event."""
+        """Close all connections without an event, once each has been sent what was published."""
         self.events = _NO_EVENTS
         self.latched, self._whole = (), None
-        self._end(self._connections)
+        self._end([connection for connection, _ in self._partial])
+        self._end(self._connections, drain=True)
 
     def _latch(self, framed: bytes) -> None:
         self.latched = (*self.latched, framed)[-self._keeps :]
@@ -420,7 +429,7 @@ class Publication:
             connection.send((framed,), _MESSAGES)
         return not connection.closed
 
-    def _end(self, connections: Sequence[SubscriberConnection]) -> None:
+    def _end(self, connections: Sequence[SubscriberConnection], *, drain: bool = False) -> None:
         """Close connections and forget them."""
         if not connections:
             return
@@ -430,7 +439,7 @@ class Publication:
         left = tuple(one for one in self._connections if one not in gone)
         ended, self._connections = len(left) < len(self._connections), left
         for connection in connections:
-            connection.hang_up()
+            connection.hang_up(drain=drain)
         self.events.listeners_changed()
         if ended and not left:
             self.events.last_subscriber()
