@@ -80,6 +80,17 @@ SERVER_LOOK: Final = 0.5
 SERVICE_LATENCIES: Final = 512
 # Nodes subscribed to one topic that are named to the agent of its publisher.
 AUDIENCE_MAX: Final = 64
+# Seconds for which a publisher is connected to once more for a subscriber that joins: a connect callback of roscpp
+# waits for its turn in the node.
+JOIN_WINDOW: Final = 3.0
+# Seconds for which a message of that connection waits for the same one on the agent's own.
+JOIN_HOLD: Final = 0.02
+# Messages for the joining subscriber alone that are remembered, in case all get them later.
+JOIN_REMEMBERED: Final = 256
+# [Graph] Subscribers of one peer that join topics here at the same time
+# At it: for further ones the publisher has no new connection
+# Told in: log (debug)
+JOINS_MAX: Final = 64
 # [Graph] Connections to action servers here for one peer's clients
 # At it: further clients are not seen by the server
 # Told in: log

@@ -25,6 +25,7 @@ from rmpa.ros import limits as ros_limits
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from rmpa.bridge.topics.joins import ServedJoin
     from rmpa.core.outbox import QueuedMessage
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
@@ -440,10 +441,11 @@ class ExportFlow:
 
     def __init__(self) -> None:
         self.by_peer: dict[int, RouteSender] = {}
-        self._senders: tuple[RouteSender, ...] = ()
+        self._senders: tuple[RouteSender | ServedJoin, ...] = ()
+        self._joins: list[tuple[RouteSender, ServedJoin]] = []
         self._history: deque[tuple[bytes, int]] = deque(maxlen=1)
         self._keeping = False
-        self._streaming: dict[RouteSender, tuple[LaneSender, QueuedMessage]] = {}
+        self._streaming: dict[RouteSender | ServedJoin, tuple[LaneSender, QueuedMessage]] = {}
         self._whole: bytearray | None = None
         self._size = self._received = self._stamp = 0
         self.latching = False
@@ -481,7 +483,7 @@ class ExportFlow:
         for framed, stamp in islice(self._history, max(0, len(self._history) - kept), None):
             sender.message(stamp, framed)
         self.by_peer[peer] = sender
-        self._senders = tuple(self.by_peer.values())
+        self._list_senders()
         return sender
 
     def remove(self, peer: int) -> None:
@@ -489,9 +491,31 @@ class ExportFlow:
         sender = self.by_peer.pop(peer, None)
         if sender is not None:
             sender.close()
-            self._senders = tuple(self.by_peer.values())
+            self._list_senders()
             self._streaming.pop(sender, None)
+            for common, join in list(self._joins):
+                if common is sender:
+                    join.close()
             self._look_drained()
+
+    @property
+    def latched(self) -> bytes:
+        """The last message that is kept; empty if there is none."""
+        return self._history[-1][0] if self._history else b""
+
+    def join(self, common: RouteSender, join: ServedJoin) -> None:
+        """Let a joining subscriber of a sender's peer see what all get."""
+        self._joins.append((common, join))
+        self._list_senders()
+
+    def leave(self, join: ServedJoin) -> None:
+        """The subscriber gets what all get."""
+        self._joins = [one for one in self._joins if one[1] is not join]
+        self._list_senders()
+        self._look_drained()
+
+    def _list_senders(self) -> None:
+        self._senders = (*self.by_peer.values(), *(join for _, join in self._joins))
 
     def drain(self, over: Callable[[], None]) -> None:
         """Call ``over`` once all peers have all messages, for the publisher has ended; perhaps at once."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge.data.quality import QosWatch, Quality
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.identity import SERIAL_MASK, is_earlier
+from rmpa.core.identity import SERIAL_MASK, is_earlier, serial_add
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.connection import DataHandler
@@ -140,6 +140,11 @@ class ImportFlow(DataHandler):
     def position(self) -> tuple[int, int] | None:
         """Epoch and sequence of the last message, after which a new link continues; ``None``: there is none."""
         return self._numbering.position() if self._epoch else None
+
+    @property
+    def delivering(self) -> int:
+        """The number of the message that is being delivered."""
+        return serial_add(self._numbering.next or 0, -1) if self._sequence is None else self._sequence
 
     def bind(self, link: PeerLink, route: int, epoch: int, first: int) -> bool:
         """Take the data of a route that was opened on a new link.

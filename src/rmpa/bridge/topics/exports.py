@@ -69,6 +69,7 @@ class ExportRoute:
         epoch: Identifies the numbering.
         after: Sequence of the last message that the peer has, if this continues a suspended route; else ``None``.
         unknown: Whether an earlier run of the peer's module may have missed messages.
+        shared: Whether the publisher was connected before.
     """
 
     number: int
@@ -80,6 +81,7 @@ class ExportRoute:
     epoch: int = 0
     after: int | None = None
     unknown: bool = False
+    shared: bool = False
 
     @property
     def reliable(self) -> bool:
@@ -256,7 +258,8 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
             if flow is None:
                 flow = self._flows[source] = _Flow(local.uri)
                 self._do.outbound.connect(source, local.uri)
-            flow.routes[peer] = self._route(peer, source, message, before)
+            route = flow.routes[peer] = self._route(peer, source, message, before)
+            route.shared = flow.description is not None
             self._start(source, flow)
             return
         self._out.send(peer, RouteClosed(number, why))
@@ -307,7 +310,8 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
             told = msgspec.structs.replace(about, latching=latching)
             opened = RouteOpened(route.number, told, route.contract, route.epoch)
             if route.after is None:
-                opened = msgspec.structs.replace(opened, unknown=route.unknown or msgspec.UNSET)
+                unset = msgspec.UNSET
+                opened = msgspec.structs.replace(opened, unknown=route.unknown or unset, shared=route.shared or unset)
             elif (sender := self._do.outbound.sender_of(source, peer)) is not None:
                 # The peer may have kept messages whose acknowledgement was lost; these are not sent again.
                 following, after = sender.following, route.after

@@ -442,6 +442,11 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         if (entry := self._peers[peer].routes.get(message.route)) is not None:
             self._fail(entry, message.reason, now, None if isinstance(message.last, UnsetType) else message.last)
 
+    def next_route(self, peer: int) -> int:
+        """A new number for a route of a peer's link."""
+        self._peers[peer].last_route += 1
+        return self._peers[peer].last_route
+
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, monotonic seconds; ``None`` if no timer runs."""
         while self._timers:

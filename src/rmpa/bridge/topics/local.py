@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge import limits
 from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender
@@ -145,18 +145,12 @@ class LocalSubscriptions:
 
     def connect(self, source: Source, uri: str) -> None:
         """Subscribe to a publisher at its slave API; the exports are told its header later, or that it is lost."""
-
-        def find() -> Callable[[InProcessConnection], None] | None:
-            publication = self._find(source.node, uri, source.topic)
-            return publication.attach if publication is not None else None
-
         if not any(one.topic == source.topic for one in self.flows):
             self._core.call("registerSubscriber", OWN_NODE, source.topic, "*", self._node.uri)
         _log.debug("> subscribe to %s at %s", source, uri)
         flow = self.flows[source] = ExportFlow()
-        kind = PublisherConnection if find() is None else InProcessConnection
-        flow.connection = kind(
-            source.topic,
+        flow.connection = self.connection(
+            source,
             uri,
             OWN_NODE,
             on_message=flow.message,
@@ -165,10 +159,18 @@ class LocalSubscriptions:
             on_refused=lambda text: self._gone(source, flow, f"its publisher refuses: {text}"),
             on_lost=lambda reason: self._gone(source, flow, reason),
             on_oversized=lambda size: self._losses.oversized(source, flow, size),
-            number=self._node.next_number(),
-            find=find,
         )
         flow.connection.start()
+
+    def connection(self, source: Source, uri: str, caller: str, **callbacks: Any) -> TopicConnection:
+        """A connection to a publisher, by a socket or within this process; see ``TopicConnection``."""
+
+        def find() -> Callable[[InProcessConnection], None] | None:
+            publication = self._find(source.node, uri, source.topic)
+            return publication.attach if publication is not None else None
+
+        kind = PublisherConnection if find() is None else InProcessConnection
+        return kind(source.topic, uri, caller, number=self._node.next_number(), find=find, **callbacks)
 
     def disconnect(self, source: Source) -> None:
         """Disconnect one publisher, and drop its routes."""
@@ -468,7 +470,7 @@ class RemoteSubscribers:
             return True
         if self._exports.description(source) is None:
             return True  # its publisher is not connected
-        names = {name for node in message.nodes if (name := self._name(session, node, source.topic))}
+        names = {name for node in message.nodes if (name := self.name(session, node, source.topic))}
         shown, most = self._shown.setdefault((session.peer, source), {}), limits.AUDIENCES_MAX
         for name in shown.keys() - names:
             shown.pop(name).close()
@@ -485,7 +487,7 @@ class RemoteSubscribers:
             del self._shown[session.peer, source]
         return True
 
-    def _name(self, session: PeerSession, node: str, topic: str) -> str:
+    def name(self, session: PeerSession, node: str, topic: str) -> str:
         """The local name of a peer's listener; empty for a proxy of a module that the peer may not speak for."""
         whose = proxied_node(node)
         if whose is None:

@@ -20,7 +20,14 @@ from rmpa.bridge.messages import CloseRoute, Mismatch, OpenRoute, RouteClosed, R
 from rmpa.bridge.topics.direct import TopicPaths
 from rmpa.bridge.topics.exports import Exports
 from rmpa.bridge.topics.imports import Imports
-from rmpa.bridge.topics.local import LocalSources, LocalSubscriptions, Mismatches, RemoteSubscribers
+from rmpa.bridge.topics.joins import Joins
+from rmpa.bridge.topics.local import (
+    LocalSources,
+    LocalSubscriptions,
+    Mismatches,
+    RemoteSubscribers,
+    compares_names,
+)
 from rmpa.bridge.topics.peer_topics import LossReports, PeerTopic, PeerTopics, TopicEvents
 from rmpa.core.contract import Priority
 from rmpa.core.errors import RemoteProtocolError
@@ -38,7 +45,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import ExportRoute
     from rmpa.bridge.topics.imports import RemoteTopic
-    from rmpa.ros.node.publication import Publication
+    from rmpa.ros.node.publication import Publication, Receiver, SubscriberConnection
     from rmpa.ros.wire.xmlrpc import RosReply
 
 _log = logging.getLogger(__name__)
@@ -80,6 +87,7 @@ class Topics(GraphPart, TopicEvents):
         )
         self._mismatches = Mismatches(self, self.exports, self.imports)
         self._subscribers = RemoteSubscribers(shared, self, self.exports, self.imports, self.peers)
+        self._joins = Joins(shared, self.exports, self.imports, self.outbound, self._subscribers)
         self.direct_exports = TopicGrants(shared, self.exports)
         self.direct_imports = TopicPaths(shared, self.warn, self.imports, self.peers)
         self._local = LocalSources(shared.core, shared.relay, lambda s: self.exports.description(s) is not None)
@@ -100,6 +108,7 @@ class Topics(GraphPart, TopicEvents):
         await self.direct_imports.close()
         await self.direct_exports.ports.close()
         self._subscribers.close()
+        self._joins.close()
         self.outbound.close()
 
     def reload(self) -> None:
@@ -128,6 +137,7 @@ class Topics(GraphPart, TopicEvents):
         if interrupted := self.peers[peer].link_down():
             self._shared.counters.add("route.interrupted", interrupted)
         self._subscribers.link_down(peer)
+        self._joins.link_down(peer)
         # Without a pause for data: among it could be the peer's new link, which must find all routes suspended.
         deque(self.exports.link_away(peer, briefly=session.link.silent), 0)
         if session.link.silent:
@@ -258,6 +268,10 @@ class Topics(GraphPart, TopicEvents):
     def mismatched(self, peer: int, source: Source, subscriber: str, text: str) -> None:
         """Tell the peer of a subscriber here whose definition does not fit its source."""
         self._mismatches.refused(peer, source, subscriber, text)
+
+    def join(self, topic: PeerTopic, connection: SubscriberConnection) -> Receiver | None:
+        """Let a publisher see a further subscriber; clients of actions are seen by their names."""
+        return None if compares_names(topic.type) else self._joins.join(topic.session, topic, connection)
 
     def listeners_changed(self, peer: int, source: Source) -> None:
         """Follow the local subscribers of a peer's source."""
