@@ -292,7 +292,7 @@ def test_who_knows_nothing_of_the_old_numbering_gets_a_new_one(flowing: Exports,
     flowing.link_away(1)
     flowing.link_up(1)
     assert flowing.opened(1, asked) == [
-        Send(1, RouteOpened(7, ABOUT, RELIABLE, 2)),
+        Send(1, RouteOpened(7, ABOUT, RELIABLE, 2, shared=True)),
         AddRoute(CMD, 1, 7, RELIABLE, 2),
     ]
     assert not flowing.outage(1)

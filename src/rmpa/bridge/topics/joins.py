@@ -68,8 +68,9 @@ def _digest(framed: Buffer) -> bytes:
 class ServedJoin:
     """The further connection to a publisher for one joining subscriber of a peer.
 
-    Its flow has it beside the senders, so that it sees what all get. A message of the further connection waits
-    ``limits.JOIN_HOLD`` for the same one of the agent's own connection; else it is for the subscriber alone.
+    Its flow has it beside the senders, so that it sees what all get. A message of the further connection waits for
+    the same one of the agent's own connection; if nothing comes there for ``limits.JOIN_HOLD``, or a later one does,
+    it is for the subscriber alone.
 
     Args:
         flow: What the agent gets of the publisher.
@@ -80,17 +81,20 @@ class ServedJoin:
 
     def __init__(self, flow: ExportFlow, common: RouteSender, own: RouteSender, over: Callable[[], None]) -> None:
         self._flow, self._common, self.own, self._over = flow, common, own, over
-        self.connection: TopicConnection
+        self.connection: TopicConnection | None = None
         self._loop = asyncio.get_running_loop()
         self._last = common.last
         self._latched = _digest(flow.latched) if flow.latching and flow.latched else b""
         # Digest and number of what all got and the subscriber did not yet.
         self._seen: deque[tuple[bytes, int]] = deque()
-        # Digest, number (if known), bytes and the end of the wait of what came by the further connection.
-        self._waiting: deque[tuple[bytes, int | None, bytes, float]] = deque()
+        # Digest, number (if known) and bytes of what came by the further connection.
+        self._waiting: deque[tuple[bytes, int | None, bytes]] = deque()
+        # When the last message came by either connection; whether one is coming by the agent's own.
+        self._came = 0.0
+        self._busy = False
         self._alone: deque[bytes] = deque(maxlen=limits.JOIN_REMEMBERED)
         self._timer: asyncio.TimerHandle | None = None
-        self._ended = self.drained = False
+        self._finishing = self._ended = self.drained = False
         self._end = self._loop.call_later(limits.JOIN_WINDOW, self.finish)
 
     # --- as a sender of the flow
@@ -99,14 +103,19 @@ class ServedJoin:
         """Note what all get."""
         if self._ended:
             return 0
-        digest, number = _digest(framed), self._common.last
+        digest, number, self._busy = _digest(framed), self._common.last, False
+        self._came = self._loop.time()
         if digest in self._alone:  # it came here so late that the subscriber has it
             self._alone.remove(digest)
             self._last = number
+            self._seen.clear()
         else:
-            for at, (other, known, whole, due) in enumerate(self._waiting):
+            for at, (other, known, whole) in enumerate(self._waiting):
                 if other == digest and known is None:
-                    self._waiting[at] = digest, number, whole, due
+                    self._waiting[at] = digest, number, whole
+                    # Published before the further connection stood.
+                    self._waiting.extendleft((*one, b"") for one in reversed(self._seen))
+                    self._seen.clear()
                     break
             else:
                 self._seen.append((digest, number))
@@ -114,7 +123,8 @@ class ServedJoin:
         return 0
 
     def begin(self, _stamp_ns: int, _size: int) -> None:
-        """A message is needed whole."""
+        """A message begins; it is needed whole."""
+        self._busy = True
 
     def drain(self, _done: Callable[[], None]) -> None:
         """The publisher has gone."""
@@ -136,47 +146,62 @@ class ServedJoin:
         digest = _digest(framed)
         if any(other == digest for other, _ in self._seen):
             while (one := self._seen.popleft())[0] != digest:
-                self._waiting.append((one[0], one[1], b"", 0.0))  # published before the further connection stood
-            self._waiting.append((digest, one[1], b"", 0.0))
+                self._waiting.append((*one, b""))
+            self._waiting.append((*one, b""))
         elif digest == self._latched:
             self._latched = b""  # the subscriber's agent has sent it
         else:
-            self._waiting.append((digest, None, bytes(framed), self._loop.time() + limits.JOIN_HOLD))
+            self._waiting.append((digest, None, bytes(framed)))
+            self._came = self._loop.time()
         self._flush()
 
     def finish(self, _reason: str = "") -> None:
         """Close the further connection, and say from where on the subscriber gets what all get."""
-        if self._ended:
+        if self._finishing:
             return
-        self._stop()
-        self._flush(all_of_it=True)
-        self._mark(_END, serial_add(self._last, 1))
-        self.own.drain(self.close)
+        self._finishing = True
+        self._disconnect()
+        self._end = self._loop.call_later(limits.JOIN_WINDOW, lambda: self._flush(all_of_it=True))
+        self._flush()
 
     # --- inside
 
-    def _stop(self) -> None:
-        self._ended = True
+    def _disconnect(self) -> None:
         self._end.cancel()
+        if self.connection is not None:
+            self.connection.close()
+
+    def _stop(self) -> None:
+        self._ended = self._finishing = True
+        self._disconnect()
         if self._timer is not None:
             self._timer.cancel()
-        self.connection.close()
 
     def _flush(self, *, all_of_it: bool = False) -> None:
-        now = self._loop.time()
+        if self._ended:
+            return
+        due = self._came + limits.JOIN_HOLD
+        known = any(number is not None for _, number, _ in self._waiting)
         while self._waiting:
-            digest, number, whole, due = self._waiting[0]
-            if number is None and due > now and not all_of_it:
-                if self._timer is None or self._timer.when() <= now:
+            digest, number, whole = self._waiting[0]
+            if number is None and not known and not all_of_it and (self._busy or self._loop.time() < due):
+                if self._timer is not None:
+                    self._timer.cancel()
+                if not self._busy:
                     self._timer = self._loop.call_at(due, self._flush)
                 return
             self._waiting.popleft()
-            if number is None:
+            if number is None and (known or not all_of_it):  # else it may still come for all
                 self._alone.append(digest)
                 self.own.message(time.time_ns(), whole)
-            else:
+            elif number is not None:
                 self._last = number
                 self._mark(_SAME, number)
+                known = any(number is not None for _, number, _ in self._waiting)
+        if self._finishing:
+            self._stop()
+            self._mark(_END, serial_add(self._last, 1))
+            self.own.drain(self.close)
 
     def _mark(self, kind: int, number: int) -> None:
         self.own.message(time.time_ns(), _MARK.pack(UINT32_MAX, kind, number))
@@ -364,6 +389,8 @@ class Joins:
         return joining
 
     async def _ask(self, session: PeerSession, joining: JoiningSubscriber, args: dict[str, Any]) -> None:
+        if joining.ended:  # with its link: the number is one of another route by now
+            return
         try:
             after = await self._shared.rpc.request(session, JOIN, args, limits.JOIN_WINDOW)
             joining.begin(messages.convert(JOIN, after, messages.Sequence))
