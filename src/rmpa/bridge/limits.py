@@ -85,6 +85,8 @@ AUDIENCE_MAX: Final = 64
 JOIN_WINDOW: Final = 3.0
 # Seconds for which a message of that connection waits for the same one on the agent's own.
 JOIN_HOLD: Final = 0.02
+# The latest messages of a latching publisher, which may send one of them once more to a new connection.
+JOIN_LATCHED: Final = 8
 # Messages for the joining subscriber alone that are remembered, in case all get them later.
 JOIN_REMEMBERED: Final = 256
 # [Graph] Subscribers of one peer that join topics here at the same time

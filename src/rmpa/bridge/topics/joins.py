@@ -84,7 +84,10 @@ class ServedJoin:
         self.connection: TopicConnection | None = None
         self._loop = asyncio.get_running_loop()
         self._last = common.last
-        self._latched = _digest(flow.latched) if flow.latching and flow.latched else b""
+        # What a latching publisher may repeat to a new connection: the subscriber has it from its own agent.
+        self._latched: deque[bytes] = deque(maxlen=limits.JOIN_LATCHED)
+        if flow.latching and flow.latched:
+            self._latched.append(_digest(flow.latched))
         # Digest and number of what all got and the subscriber did not yet.
         self._seen: deque[tuple[bytes, int]] = deque()
         # Digest, number (if known) and bytes of what came by the further connection.
@@ -105,6 +108,8 @@ class ServedJoin:
             return 0
         digest, number, self._busy = _digest(framed), self._common.last, False
         self._came = self._loop.time()
+        if self._flow.latching:
+            self._latched.append(digest)
         if digest in self._alone:  # it came here so late that the subscriber has it
             self._alone.remove(digest)
             self._last = number
@@ -148,9 +153,7 @@ class ServedJoin:
             while (one := self._seen.popleft())[0] != digest:
                 self._waiting.append((*one, b""))
             self._waiting.append((*one, b""))
-        elif digest == self._latched:
-            self._latched = b""  # the subscriber's agent has sent it
-        else:
+        elif digest not in self._latched:
             self._waiting.append((digest, None, bytes(framed)))
             self._came = self._loop.time()
         self._flush()
