@@ -146,6 +146,11 @@ class ServedJoin:
 
     # --- the further connection
 
+    def connected(self, _fields: object) -> None:
+        """The publisher has answered: it has ``limits.JOIN_WINDOW`` to say what it has to say."""
+        self._end.cancel()
+        self._end = self._loop.call_later(limits.JOIN_WINDOW, self.finish)
+
     def came(self, framed: Buffer) -> None:
         """Take a message of the further connection."""
         digest = _digest(framed)
@@ -235,7 +240,7 @@ class JoiningSubscriber(DataHandler):
         self._last: int | None = None
         self._after: int | None = None
         self.ended = False
-        self._timer = asyncio.get_running_loop().call_later(2 * limits.JOIN_WINDOW, self.release)
+        self._timer = asyncio.get_running_loop().call_later(3 * limits.JOIN_WINDOW, self.release)
 
     # --- as a subscriber of the publication
 
@@ -440,6 +445,7 @@ class Joins:
             flow.connection.uri,
             caller,
             on_message=join.came,
+            on_header=join.connected,
             on_refused=join.finish,
             on_lost=join.finish,
         )
