@@ -96,8 +96,8 @@ def _fuzz(data: bytes) -> None:
                 leg.lane_lost()
             elif what == b"r" and reliable:
                 links.append(_Link())
-                leg.suspend()  # type: ignore[attr-defined]
-                leg.resume(links[-1], 7, number)  # type: ignore[attr-defined]
+                leg.suspend()
+                leg.resume(links[-1], 7, number)
         except RemoteProtocolError as error:
             str(error)
     sent = [n for one in links for lane in (one.express, one.bulk) for n in lane.numbers if n > 0]

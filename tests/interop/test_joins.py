@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import pytest
 
 if TYPE_CHECKING:
-    from lab.bed.processes import Process
+    from lab.bed.processes import Event, Process
     from tests.interop.conftest import ModuleFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
@@ -19,12 +19,12 @@ DIRECT = f'[[contract]]\ntopics = ["{TOPIC}"]\ntransport = "direct"\n'
 
 def greeted(listener: Process, beyond: int = 0) -> dict[str, dict[str, int]]:
     """What a listener has heard of each source, once it has the greeting, and more than ``beyond`` messages."""
-    report = listener.wait_event(
-        "report",
-        where=lambda event: "2" in event["sources"] and event["sources"].get("1", {}).get("last", 0) > beyond,  # type: ignore[attr-defined]
-    )
-    found: dict[str, dict[str, int]] = report["sources"]  # type: ignore[assignment]
-    return found
+
+    def enough(event: Event) -> bool:
+        sources = cast("dict[str, dict[str, int]]", event["sources"])
+        return "2" in sources and sources.get("1", {}).get("last", 0) > beyond
+
+    return cast("dict[str, dict[str, int]]", listener.wait_event("report", where=enough)["sources"])
 
 
 @pytest.mark.parametrize(

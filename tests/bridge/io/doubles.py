@@ -104,7 +104,7 @@ class Lane:
     def __init__(self, link: Link, name: str) -> None:
         self.link = link
         self.name = name
-        self.terms: dict[int, tuple[int, float | None, bool]] = {}
+        self.terms: dict[int, tuple[int, float | None, int, bool]] = {}
         self._parts: dict[int, bytearray] = {}
 
     def send(self, route: int, sequence: int, stamp_ns: int, payload: bytes | bytearray | memoryview) -> int:

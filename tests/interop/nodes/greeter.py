@@ -3,25 +3,31 @@
 Events: ``up``; ``greeted`` with the count of new subscribers. ``--greeting`` is the size of what those get.
 """
 
+from __future__ import annotations
+
 import sys
 import threading
+from typing import TYPE_CHECKING
 
 import rospy
 from payload import Pattern, parser, say
 from std_msgs.msg import UInt8MultiArray
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
 # rospy writes each message into one buffer of its topic, whichever thread publishes it.
 _LOCK = threading.Lock()
 
 
-class Greeter(rospy.SubscribeListener):
+class Greeter(rospy.SubscribeListener):  # type: ignore[misc] # rospy is untyped
     """Greets each new subscriber."""
 
     def __init__(self, size: int) -> None:
         self._pattern = Pattern(size)
         self._count = 0
 
-    def peer_subscribe(self, _topic: str, _publish: object, peer_publish: object) -> None:
+    def peer_subscribe(self, _topic: str, _publish: object, peer_publish: Callable[[UInt8MultiArray], None]) -> None:
         with _LOCK:
             self._count += 1
             peer_publish(UInt8MultiArray(data=self._pattern.payload(2, self._count)))

@@ -183,7 +183,10 @@ def test_both_lanes_get_the_bounds(contract: Contract, terms: tuple[object, ...]
     assert link.express.terms == link.bulk.terms == {7: terms}
 
 
-def cut(sent: int, missed: int, after: int, contract: Contract = Contract(), *, size: int = 1) -> list[int]:
+BEST_EFFORT = Contract()
+
+
+def cut(sent: int, missed: int, after: int, contract: Contract = BEST_EFFORT, *, size: int = 1) -> list[int]:
     """The numbers that a second link carries, where the peer has what came up to ``after`` over the first one."""
     sender = RouteSender(Link(), 7, contract)
     for _ in range(sent):
