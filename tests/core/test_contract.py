@@ -181,6 +181,24 @@ def test_two_ends_agree(key: str, offered: object, requested: object, agreed: ob
     assert combine(*sides) == Contract(**{key: agreed})  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    ("side", "depth"),
+    [
+        (Contract(), 1),
+        (Contract(priority=Priority.HIGH, lifespan=0.5), 1),
+        (Contract(depth=limits.ROUTE_QUEUE_MESSAGES), limits.ROUTE_QUEUE_MESSAGES),
+        (Contract(reliability=Reliability.RELIABLE), UNSET),
+        (Contract(durability=Durability.TRANSIENT_LOCAL), UNSET),
+        (Contract(history=History.KEEP_ALL), UNSET),
+    ],
+)
+def test_of_velocity_commands_the_newest_counts_unless_a_side_wants_more(side: Contract, depth: object) -> None:
+    for sides in ((side, Contract()), (Contract(), side)):
+        assert combine(*sides, "geometry_msgs/Twist").depth == depth
+        assert combine(*sides, "geometry_msgs/Twist").newest_only is (depth == 1)
+        assert combine(*sides, "geometry_msgs/Pose").depth == side.depth
+
+
 def test_two_ends_agree_on_liveliness_and_its_lease() -> None:
     manual = Contract(liveliness=Liveliness.MANUAL_BY_TOPIC, liveliness_lease=1.0)
     assert combine(manual, Contract()) == manual
