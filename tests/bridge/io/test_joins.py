@@ -87,9 +87,12 @@ def test_a_publisher_that_is_silent_greets_too(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_latched_message_comes_once(seed: int) -> None:
+@pytest.mark.parametrize("greeting", [False, True])
+def test_a_latched_message_comes_once(seed: int, greeting: bool) -> None:
     async def scene(world: World) -> None:
         speaker, greeter = greets(world, "/plain", 100, latching=True)
+        if not greeting:
+            speaker.greets = None
         speaker.say(BIG)
         world.link()
         await world.rest(0.2)
@@ -98,7 +101,8 @@ def test_a_latched_message_comes_once(seed: int) -> None:
             listeners.append(world.listen(world.sides[1], "/plain"))
             await world.rest(1.0)
         assert [numbers(listener, speaker) for listener in listeners] == [[1]] * 3
-        assert sorted(numbers(listener, greeter)[-1] for listener in listeners) == [1, 2, 3]
+        greetings = [numbers(listener, greeter)[-1:] for listener in listeners]
+        assert sorted(greetings) == ([[1], [2], [3]] if greeting else [[]] * 3)
 
     play(seed, scene)
 
