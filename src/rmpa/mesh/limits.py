@@ -113,7 +113,12 @@ UNPROVEN_RATE: Final = 500.0
 # At it: the oldest message of the topic with the most bytes is dropped, reliable ones last
 # Told in: `topic info`, `why` (*sent*), diagnostics
 LANE_QUEUE_BYTES: Final = 64 * MIB
-# [Messages] Bytes of one topic without a `depth` that wait for a lane longer than half a second, or for a silent peer
+# [Messages] Age of the oldest message of a topic without a `depth` while more than 4 MiB of it wait for a slow link
+# At it: it is dropped
+# Told in: `topic info`, `why` (*sent*), diagnostics
+# Why: A burst may take its time, and where the link is too slow for an image topic the images stay fresh.
+ROUTE_QUEUE_AGE: Final = 0.5
+# [Messages] Bytes of a topic without a `depth` that wait for longer, or for a silent peer
 # At it: the oldest is dropped
 # Told in: `topic info`, `why` (*sent*), diagnostics
 # Why: As many as a TCP connection of a ROS node holds in the kernel.

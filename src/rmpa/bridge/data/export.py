@@ -34,11 +34,6 @@ if TYPE_CHECKING:
 
     Keep = Callable[[bytes, int], object]
 
-# [Messages] Of a topic without a `depth`: age of a message in its queue beyond 4 MiB
-# At it: the oldest are dropped
-# Told in: `topic info`, `why` (*sent*), diagnostics
-# Why: A burst may take its time, and where the link is too slow for an image topic the images stay fresh.
-ROUTE_QUEUE_AGE: Final = 0.5
 # Nanoseconds: a link is silent for a second before it counts as lost; a connection that replaces it comes sooner.
 _RESENT_NS: Final = round(1.5 * mesh_limits.EXPRESS_LEASE * 1e9)
 _SMALL: Final = mesh_limits.EXPRESS_MESSAGE_MAX
@@ -290,7 +285,7 @@ class RouteSender:
     def _set_bounds(self, link: PeerLink) -> None:
         lifespan, above = self.contract.lifespan, 0
         if lifespan is None and self._max_bytes < mesh_limits.LANE_QUEUE_BYTES:
-            lifespan, above = ROUTE_QUEUE_AGE, self._max_bytes
+            lifespan, above = mesh_limits.ROUTE_QUEUE_AGE, self._max_bytes
         for lane in (link.express, link.bulk):
             lane.set_terms(self.route, self._depth, lifespan, above=above)
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
-from rmpa.bridge.data.export import ROUTE_QUEUE_AGE, ExportFlow, ReliableRouteSender, RouteSender
+from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender, RouteSender
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, History, Reliability
 from rmpa.core.errors import RemoteProtocolError
@@ -160,7 +160,7 @@ def test_bulk_lost_without_a_fence_keeps_what_waits() -> None:
     assert link.log == [("bulk", "message", 7, 2)]
 
 
-DEFAULT = (core_limits.ROUTE_QUEUE_MESSAGES, ROUTE_QUEUE_AGE, mesh_limits.ROUTE_QUEUE_BYTES, False)
+DEFAULT = (core_limits.ROUTE_QUEUE_MESSAGES, mesh_limits.ROUTE_QUEUE_AGE, mesh_limits.ROUTE_QUEUE_BYTES, False)
 
 
 @pytest.mark.parametrize(
