@@ -113,7 +113,7 @@ UNPROVEN_RATE: Final = 500.0
 # At it: the oldest message of the topic with the most bytes is dropped, reliable ones last
 # Told in: `topic info`, `why` (*sent*), diagnostics
 LANE_QUEUE_BYTES: Final = 64 * MIB
-# [Messages] Age of the oldest message of a topic without a `depth` while more than 4 MiB of it wait for a slow link
+# [Messages] Time for which a message of a topic without a `depth` waits for a slow link while more than 4 MiB do
 # At it: it is dropped
 # Told in: `topic info`, `why` (*sent*), diagnostics
 # Why: A burst may take its time, and where the link is too slow for an image topic the images stay fresh.

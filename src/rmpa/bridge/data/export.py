@@ -11,7 +11,7 @@ import asyncio
 import time
 from collections import deque
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from msgspec import UNSET
 
@@ -25,7 +25,6 @@ from rmpa.ros import limits as ros_limits
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.topics.joins import ServedJoin
     from rmpa.core.outbox import QueuedMessage
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
@@ -185,8 +184,6 @@ class RouteSender:
         for timer in (self._timer, self.lapse):
             if timer is not None:
                 timer.cancel()
-
-    # --- inside ---------------------------------------------------------------------------------------------
 
     def _send(self, stamp_ns: int, framed: Buffer) -> int:
         self.sequence = sequence = self.sequence + 1 & SERIAL_MASK
@@ -392,8 +389,6 @@ class ReliableRouteSender(RouteSender):
         missed, self._reported = self.sender.lost - self._reported, self.sender.lost
         return missed
 
-    # --- inside ---------------------------------------------------------------------------------------------
-
     def _send(self, stamp_ns: int, framed: Buffer) -> int:
         before = self.sender.overflowed
         if self._keep is not None:
@@ -417,6 +412,17 @@ class ReliableRouteSender(RouteSender):
             lane.set_terms(self.route, mesh_limits.KEEP_ALL_MESSAGES, spared=True)
 
 
+class FlowSender(Protocol):
+    """What a flow passes its messages to: the route to a peer, or a subscriber that joins there."""
+
+    @property
+    def drained(self) -> bool: ...  # noqa: D102 - as of RouteSender
+    def message(self, stamp_ns: int, framed: Buffer) -> int: ...  # noqa: D102
+    def begin(self, stamp_ns: int, size: int) -> tuple[LaneSender, QueuedMessage] | None: ...  # noqa: D102
+    def drain(self, done: Callable[[], None]) -> None: ...  # noqa: D102
+    def close(self) -> None: ...  # noqa: D102
+
+
 class ExportFlow:
     """From one local publisher to the peers that want it, each by a route sender of its own.
 
@@ -436,11 +442,11 @@ class ExportFlow:
 
     def __init__(self) -> None:
         self.by_peer: dict[int, RouteSender] = {}
-        self._senders: tuple[RouteSender | ServedJoin, ...] = ()
-        self._joins: list[tuple[RouteSender, ServedJoin]] = []
+        self._senders: tuple[FlowSender, ...] = ()
+        self._joins: list[tuple[RouteSender, FlowSender]] = []
         self._history: deque[tuple[bytes, int]] = deque(maxlen=1)
         self._keeping = False
-        self._streaming: dict[RouteSender | ServedJoin, tuple[LaneSender, QueuedMessage]] = {}
+        self._streaming: dict[FlowSender, tuple[LaneSender, QueuedMessage]] = {}
         self._whole: bytearray | None = None
         self._size = self._received = self._stamp = 0
         self.latching = False
@@ -498,12 +504,12 @@ class ExportFlow:
         """The last message that is kept; empty if there is none."""
         return self._history[-1][0] if self._history else b""
 
-    def join(self, common: RouteSender, join: ServedJoin) -> None:
+    def join(self, common: RouteSender, join: FlowSender) -> None:
         """Let a joining subscriber of a sender's peer see what all get."""
         self._joins.append((common, join))
         self._list_senders()
 
-    def leave(self, join: ServedJoin) -> None:
+    def leave(self, join: FlowSender) -> None:
         """The subscriber gets what all get."""
         self._joins = [one for one in self._joins if one[1] is not join]
         self._list_senders()

@@ -97,7 +97,8 @@ class ServedJoin:
         self._busy = False
         self._alone: deque[bytes] = deque(maxlen=limits.JOIN_REMEMBERED)
         self._timer: asyncio.TimerHandle | None = None
-        self._finishing = self._ended = self.drained = False
+        self._finishing = self._ended = False
+        self.drained = False
         self._end = self._loop.call_later(limits.JOIN_WINDOW, self.finish)
 
     # --- as a sender of the flow
