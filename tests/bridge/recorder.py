@@ -213,7 +213,7 @@ class Out(Effects):
     def context(self) -> BridgeContext:
         return self.rules
 
-    def numbering(self, source: Source, peer: int) -> Any:
+    def sender_of(self, source: Source, peer: int) -> Any:
         return self._numbering(source, peer)
 
     def take(self) -> list[Any]:

@@ -49,9 +49,9 @@ from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.mesh import limits as mesh_limits
 
 DEFAULT = (
-    b'"contract":{"reliability":"best_effort","durability":"volatile","history":"keep_last","depth":1000,'
+    b'"contract":{"reliability":"best_effort","durability":"volatile","history":"keep_last",'
     b'"deadline":null,"lifespan":null,"liveliness":"automatic","liveliness_lease":null,"priority":"normal",'
-    b'"max_rate":null,"outage":30.0,"transport":"relay"}'
+    b'"max_rate":null,"transport":"relay"}'
 )
 STRICT = Contract(
     Reliability.RELIABLE,
@@ -311,7 +311,7 @@ def test_a_contract_that_no_file_could_have_is_the_peers_error(beginning: bytes,
 def test_a_release_that_knows_no_outage_goes_on_with_the_usual_one() -> None:
     message = decode(OPEN + b',"contract":{"reliability":"reliable"}}')
     assert isinstance(message, OpenRoute)
-    assert message.contract.outage == core_limits.RESUME_WINDOW
+    assert message.contract.resume_window == core_limits.RESUME_WINDOW
 
 
 @pytest.mark.parametrize(
@@ -366,7 +366,8 @@ def test_a_peer_of_before_transports_relays() -> None:
 
 
 def test_a_peer_of_before_a_term_reads_the_others() -> None:
-    later = DEFAULT.replace(b'"outage":30.0', b'"outage":60.0,"term_of_a_later_version":[1,{"a":"b"}]')
+    new = b'"outage":60.0,"term_of_a_later_version":[1,{"a":"b"}],"transport"'
+    later = DEFAULT.replace(b'"transport"', new)
     assert decode(OPEN + b"," + later + b"}") == OpenRoute(1, "/a", "/b", Contract(outage=60.0))
 
 

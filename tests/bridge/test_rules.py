@@ -134,7 +134,7 @@ def test_a_contract_is_that_of_the_name_here() -> None:
     say(exports, "/robot1/cmd")
     exports.opened(1, OpenRoute(1, "/cmd", "/n"))
     [opened, route] = exports.described(Source("/robot1/cmd", "/n"), ABOUT)
-    assert opened == Send(1, RouteOpened(1, ABOUT, Contract(priority=Priority.HIGH)))
+    assert opened == Send(1, RouteOpened(1, ABOUT, Contract(priority=Priority.HIGH), 1))
     assert isinstance(route, AddRoute)
 
 

@@ -137,7 +137,7 @@ def test_the_documentation_has_every_key_and_every_default() -> None:
             getattr(Contract(), key.removesuffix("_duration")) or ("unlimited" if key == "max_rate" else "infinite")
         )
         for key in TERMS
-    } | {"outage": f"{Contract().outage:g} s"}
+    } | {"depth": str(Contract().queue_depth), "outage": f"{Contract().resume_window:g} s"}
     assert {key: value for key, value in written.items() if key in defaults} == defaults
 
 

@@ -7,6 +7,7 @@ import dataclasses
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import UNSET
 
 from rmpa.core import limits
 from rmpa.core.contract import (
@@ -30,21 +31,23 @@ VALUES: dict[str, st.SearchStrategy[object]] = {
     "reliability": st.sampled_from(Reliability),
     "durability": st.sampled_from(Durability),
     "history": st.sampled_from(History),
-    "depth": st.integers(1, 10),
+    "depth": st.one_of(st.just(UNSET), st.integers(1, 10), st.just(limits.ROUTE_QUEUE_MESSAGES)),
     "deadline": SECONDS,
     "lifespan": SECONDS,
     "liveliness": st.sampled_from(Liveliness),
     "liveliness_lease": SECONDS,
     "priority": st.sampled_from(Priority),
     "max_rate": st.one_of(st.none(), st.sampled_from([1.0, 10.0])),
-    "outage": st.sampled_from([31.0, 300.0]),
+    "outage": st.sampled_from([UNSET, limits.RESUME_WINDOW, 31.0, 300.0]),
     "transport": st.sampled_from(Transport),
 }
+WRITTEN = {key: values.filter(lambda value: value is not UNSET) for key, values in VALUES.items()}
+DEFAULTS = {"depth": limits.ROUTE_QUEUE_MESSAGES, "outage": limits.RESUME_WINDOW}
 CONTRACTS = st.builds(Contract, **VALUES)
 GLOBS = st.lists(st.sampled_from(["/a", "/a/**", "/*", "/**", "/b/?"]), max_size=2, unique=True).map(tuple)
 TYPE_GLOBS = st.lists(st.sampled_from(["m/A", "m/*", "**", "n/B"]), max_size=2, unique=True).map(tuple)
 RULES = st.lists(
-    st.builds(ContractRule, GLOBS, TYPE_GLOBS, st.fixed_dictionaries({}, optional=VALUES)), max_size=3
+    st.builds(ContractRule, GLOBS, TYPE_GLOBS, st.fixed_dictionaries({}, optional=WRITTEN)), max_size=3
 ).map(tuple)
 TOPICS = st.sampled_from(["/a", "/a/x", "/b", "/b/c", "/c/d/e"])
 TYPES = st.sampled_from(["m/A", "m/B", "n/B", ""])
@@ -60,16 +63,23 @@ def test_no_rules_ask_for_nothing() -> None:
         Reliability.BEST_EFFORT,
         Durability.VOLATILE,
         History.KEEP_LAST,
-        limits.ROUTE_QUEUE_MESSAGES,
+        UNSET,
         None,
         None,
         Liveliness.AUTOMATIC,
         None,
         Priority.NORMAL,
         None,
-        limits.RESUME_WINDOW,
+        UNSET,
         Transport.RELAY,
     )
+    assert (Contract().queue_depth, Contract().resume_window) == (limits.ROUTE_QUEUE_MESSAGES, limits.RESUME_WINDOW)
+
+
+@pytest.mark.parametrize("depth", [1, limits.ROUTE_QUEUE_MESSAGES - 1, limits.ROUTE_QUEUE_MESSAGES])
+def test_a_depth_that_is_written_out_is_kept_for_late_subscribers(depth: int) -> None:
+    assert Contract(durability=Durability.TRANSIENT_LOCAL, depth=depth).kept == depth
+    assert Contract(durability=Durability.TRANSIENT_LOCAL).kept == 1
 
 
 def test_the_words_are_those_of_ros_2() -> None:
@@ -109,7 +119,8 @@ def test_the_contract_is_what_is_explained(rules: tuple[ContractRule, ...], topi
     contract = contracts.of(topic, type_name)
     assert contracts.of(topic, type_name) is contract or contract == Contract()
     for key, (value, why) in contracts.explain(topic, type_name).items():
-        assert getattr(contract, key) == value
+        set_ = getattr(contract, key)
+        assert set_ == value or (set_ is UNSET and value == DEFAULTS[key])
         setting = [
             number
             for number, rule in enumerate(rules, 1)
@@ -118,14 +129,16 @@ def test_the_contract_is_what_is_explained(rules: tuple[ContractRule, ...], topi
             and (not rule.types or any(matches(glob, type_name) for glob in rule.types))
         ]
         assert why.startswith(f"rule {setting[-1]}: " if setting else "default")
-        assert value == (rules[setting[-1] - 1].values[key] if setting else getattr(Contract(), key))
+        assert value == (
+            rules[setting[-1] - 1].values[key] if setting else DEFAULTS.get(key, getattr(Contract(), key))
+        )
 
 
 def test_invented_topics_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rmpa.core.contract.CONTRACTS_REMEMBERED", 3)
     contracts = Contracts((rule("/1", depth=1),))
     for number in range(10):
-        assert contracts.of(f"/{number}", "a/B").depth == (1 if number == 1 else limits.ROUTE_QUEUE_MESSAGES)
+        assert contracts.of(f"/{number}", "a/B").depth == (1 if number == 1 else UNSET)
     assert contracts._find.cache_info().currsize == 3
     assert contracts.of("/1", "a/B").depth == 1
 
@@ -142,6 +155,11 @@ def test_invented_topics_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch)
         ("outage", 2.0, None, 2.0),
         ("outage", None, 2.0, 2.0),
         ("outage", 1.0, 2.0, 2.0),
+        ("outage", limits.RESUME_WINDOW, 5.0, limits.RESUME_WINDOW),
+        ("outage", 5.0, limits.RESUME_WINDOW, limits.RESUME_WINDOW),
+        ("depth", 1, limits.ROUTE_QUEUE_MESSAGES, limits.ROUTE_QUEUE_MESSAGES),
+        ("depth", None, limits.ROUTE_QUEUE_MESSAGES, limits.ROUTE_QUEUE_MESSAGES),
+        ("depth", 1, None, 1),
         ("transport", Transport.AUTO, None, Transport.RELAY),
         ("transport", None, Transport.DIRECT, Transport.RELAY),
         ("transport", Transport.AUTO, Transport.AUTO, Transport.AUTO),
@@ -161,6 +179,24 @@ def test_invented_topics_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch)
 def test_two_ends_agree(key: str, offered: object, requested: object, agreed: object) -> None:
     sides = [Contract(**{} if value is None else {key: value}) for value in (offered, requested)]  # type: ignore[arg-type]
     assert combine(*sides) == Contract(**{key: agreed})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("side", "depth"),
+    [
+        (Contract(), 1),
+        (Contract(priority=Priority.HIGH, lifespan=0.5), 1),
+        (Contract(depth=limits.ROUTE_QUEUE_MESSAGES), limits.ROUTE_QUEUE_MESSAGES),
+        (Contract(reliability=Reliability.RELIABLE), UNSET),
+        (Contract(durability=Durability.TRANSIENT_LOCAL), UNSET),
+        (Contract(history=History.KEEP_ALL), UNSET),
+    ],
+)
+def test_of_velocity_commands_the_newest_counts_unless_a_side_wants_more(side: Contract, depth: object) -> None:
+    for sides in ((side, Contract()), (Contract(), side)):
+        assert combine(*sides, "geometry_msgs/Twist").depth == depth
+        assert combine(*sides, "geometry_msgs/Twist").newest_only is (depth == 1)
+        assert combine(*sides, "geometry_msgs/Pose").depth == side.depth
 
 
 def test_two_ends_agree_on_liveliness_and_its_lease() -> None:

@@ -137,6 +137,15 @@ def test_a_spared_key_loses_nothing_to_the_bound_of_all_keys() -> None:
     assert len(drain(box)) == 115
 
 
+def test_age_counts_only_above_so_many_bytes() -> None:
+    box = Outbox(10, 1000)
+    box.set_terms(1, 10, 0.5, above=20)
+    for _ in range(4):
+        box.push(bytes(10), 1, 1.0)
+    assert sum(map(len, box.head(now=9.0))) == 20
+    assert box.expired == {1: 2}
+
+
 def test_of_a_strict_key_all_that_is_too_old_goes() -> None:
     box = Outbox(10, 1000)
     box.set_terms(1, 10, 0.5, strict=True)

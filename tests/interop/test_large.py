@@ -139,8 +139,9 @@ def follows(module: Module, heard: dict[Path, Process], told: int) -> None:
     other.tell(f"{50 * MB} 1 0")
     for folder, listener in heard.items():
         report = arrived(listener, 2, last + 1)
-        assert counts_of(report, 1)["last"] == told
-        assert list(md5s(folder)) == [f"2-{last + 1}"]
+        # The kernel may have had the rest of it: then it comes whole.
+        assert counts_of(report, 1)["last"] in (told, told + 1)
+        assert set(md5s(folder)) - {f"1-{told + 1}"} == {f"2-{last + 1}"}
 
 
 def test_the_receiving_agent_dies_in_the_middle(modules: ModuleFactory, tmp_path: Path) -> None:

@@ -152,8 +152,8 @@ def test_after_an_outage_beyond_the_contract_messages_may_be_lost(modules: Modul
     eventually(lambda: "loss unknown 1 times" in b.agent.rmpa("why", "a:/chatter")[1], what="the loss in rmpa why")
 
 
-def test_best_effort_is_fresh_after_a_cut(modules: ModuleFactory, tmp_path: Path) -> None:
-    a, b = modules("a", "b")
+def test_a_topic_of_which_the_newest_counts_is_fresh_after_a_cut(modules: ModuleFactory, tmp_path: Path) -> None:
+    a, b = modules("a", "b", config='[[contract]]\ntopics = ["/chatter"]\ndepth = 1\n')
     heard = recorders(b)
     teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
     first = connected(teller, heard)
@@ -171,6 +171,24 @@ def test_best_effort_is_fresh_after_a_cut(modules: ModuleFactory, tmp_path: Path
         # Half a second of messages waited for the cable; they give way to those that follow.
         stale = [row for row in rows if row.age > 0.15]
         assert len(stale) <= 100, "a pause of a busy machine, and not the 1200 of both cuts"
+
+
+def test_best_effort_loses_nothing_in_a_cut_of_a_second(modules: ModuleFactory, tmp_path: Path) -> None:
+    """As under one roscore, whose connections stand such a cut."""
+    a, b = modules("a", "b")
+    heard = recorders(b)
+    teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
+    first = connected(teller, heard)
+    for listener in heard:
+        recorded(listener, tmp_path)
+    teller.tell("64 400 50")
+    for seconds in (0.1, 0.3, 0.5, 1.0):
+        time.sleep(0.5)
+        b.host.outage(seconds)
+    for listener in heard:
+        wait_last(listener, first + 400)
+        assert [row.sequence for row in recorded(listener, tmp_path)] == list(range(first + 1, first + 401))
+    assert route(b)["lost"] == 0
 
 
 def test_the_last_word_before_a_cut_still_counts(modules: ModuleFactory) -> None:

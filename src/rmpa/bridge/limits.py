@@ -11,6 +11,13 @@ from rmpa.core.limits import KIB, MIB
 
 # Seconds that a topic's route stays open after its last local subscriber left: a reconnecting node finds it open.
 ROUTE_LINGER: Final = 1.0
+# [Messages] Time for which a topic whose publisher has ended goes on, until all that it has published has crossed
+# At it: the rest is dropped and counted
+# Told in: `topic info` (*lost*), diagnostics
+# Why: 10 MB on a radio of 10 Mbit/s.
+ROUTE_DRAIN: Final = 10.0
+# Seconds for which a publisher that has unregistered, and whose connection stands, may go on to send.
+ROUTE_END: Final = 1.0
 # Entries that one advertisement of this module takes from the pending changes, which takes a millisecond; the rest
 # follows in later turns of the event loop.
 ADVERTISED_AT_ONCE: Final = 32
@@ -68,6 +75,19 @@ SERVER_LOOK: Final = 0.5
 SERVICE_LATENCIES: Final = 512
 # Nodes subscribed to one topic that are named to the agent of its publisher.
 AUDIENCE_MAX: Final = 64
+# Seconds for which a publisher is connected to once more for a subscriber that joins: a connect callback of roscpp
+# waits for its turn in the node.
+JOIN_WINDOW: Final = 3.0
+# Seconds for which a message of that connection waits for the same one on the agent's own.
+JOIN_HOLD: Final = 0.02
+# The latest messages of a latching publisher, which may send one of them once more to a new connection.
+JOIN_LATCHED: Final = 8
+# Messages for the joining subscriber alone that are remembered, in case all get them later.
+JOIN_REMEMBERED: Final = 256
+# [Graph] Subscribers of one peer that join topics here at the same time
+# At it: for further ones the publisher has no new connection
+# Told in: log (debug)
+JOINS_MAX: Final = 64
 # [Graph] Connections to action servers here for one peer's clients
 # At it: further clients are not seen by the server
 # Told in: log

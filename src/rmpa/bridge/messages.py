@@ -176,6 +176,7 @@ class RouteOpened(msgspec.Struct, frozen=True, tag_field="op", tag="opened"):
         first: The numbering's first sequence.
         following: If a reliable route continues: the sequence of the next message.
         unknown: Whether an earlier run of the subscribing agent may have missed messages; left out: no.
+        shared: Whether the agent was connected to the publisher before; left out: no.
     """
 
     route: Route
@@ -185,6 +186,7 @@ class RouteOpened(msgspec.Struct, frozen=True, tag_field="op", tag="opened"):
     first: Sequence = 1
     following: Sequence | msgspec.UnsetType = msgspec.UNSET
     unknown: bool | msgspec.UnsetType = msgspec.UNSET
+    shared: bool | msgspec.UnsetType = msgspec.UNSET
 
 
 class CloseRoute(msgspec.Struct, frozen=True, tag_field="op", tag="close"):

@@ -10,7 +10,7 @@ from enum import StrEnum
 from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Final, TypeVar
 
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 
 from rmpa.core import limits
 from rmpa.core.identity import matches
@@ -78,6 +78,15 @@ class Transport(StrEnum):
     AUTO = "auto"
 
 
+# The types of velocity commands, which replace each other: without a rule, ``depth`` is 1.
+VELOCITY_COMMANDS: Final = frozenset(
+    {
+        "geometry_msgs/Twist",
+        "geometry_msgs/TwistStamped",
+        "ackermann_msgs/AckermannDrive",
+        "ackermann_msgs/AckermannDriveStamped",
+    }
+)
 # ``[bridge] transport`` and ``[services] transport`` where nothing sets them.
 DEFAULT_TRANSPORT: Final = Transport.RELAY
 
@@ -90,14 +99,16 @@ class Contract:
         reliability: Whether messages survive the loss of a link.
         durability: Whether a late subscriber gets the last message.
         history: What a full queue keeps.
-        depth: Messages that wait for one slow receiver, at least 1.
+        depth: Messages that wait for one slow receiver, at least 1; not set: see ``queue_depth``. A term that is not
+            set is left out in messages between agents.
         deadline: The longest time from one message to the next, in seconds; ``None``: no bound.
         lifespan: Seconds after which a message is dropped; ``None``: never.
         liveliness: What shows that a source is alive.
         liveliness_lease: Seconds without a sign of life after which a source counts as dead; ``None``: never.
         priority: The lane.
         max_rate: The most messages a second; above it the newest ones are sent. ``None``: no bound.
-        outage: Seconds for which a reliable route keeps its messages when its link is lost.
+        outage: Seconds for which a reliable route keeps its messages when its link is lost; not set: see
+            ``resume_window``.
         transport: The path of the messages. The default is what agents mean that do not send this field, whatever
             ``DEFAULT_TRANSPORT`` is.
     """
@@ -105,20 +116,35 @@ class Contract:
     reliability: Reliability = Reliability.BEST_EFFORT
     durability: Durability = Durability.VOLATILE
     history: History = History.KEEP_LAST
-    depth: Depth = limits.ROUTE_QUEUE_MESSAGES
+    depth: Depth | UnsetType = UNSET
     deadline: Seconds | None = None
     lifespan: Seconds | None = None
     liveliness: Liveliness = Liveliness.AUTOMATIC
     liveliness_lease: Seconds | None = None
     priority: Priority = Priority.NORMAL
     max_rate: Rate | None = None
-    outage: Outage = limits.RESUME_WINDOW
+    outage: Outage | UnsetType = UNSET
     transport: Transport = Transport.RELAY
+
+    @property
+    def newest_only(self) -> bool:
+        """Whether only the newest one counts of the messages that an outage has delayed."""
+        return self.depth == 1 and self.reliability is Reliability.BEST_EFFORT
+
+    @property
+    def queue_depth(self) -> int:
+        """``depth``, or its default."""
+        return limits.ROUTE_QUEUE_MESSAGES if self.depth is UNSET else self.depth
+
+    @property
+    def resume_window(self) -> float:
+        """``outage``, or its default."""
+        return limits.RESUME_WINDOW if self.outage is UNSET else self.outage
 
     @property
     def kept(self) -> int:
         """Messages kept for late subscribers with ``transient_local``: one, as latching does, or ``depth`` if set."""
-        return 1 if self.depth == limits.ROUTE_QUEUE_MESSAGES else self.depth
+        return 1 if self.depth is UNSET else self.depth
 
     def same_route(self, other: Contract) -> bool:
         """Whether a relayed route of this contract can go on with the other: they differ at most in the transport."""
@@ -141,26 +167,32 @@ _RANKS: Final = {
 }
 
 
-def combine(offered: Contract, requested: Contract) -> Contract:
+def combine(offered: Contract, requested: Contract, type_name: str = "") -> Contract:
     """The contract of a route: the stronger of the sender's and the receiver's values, key by key.
 
     Args:
         offered: The sender's contract for the topic.
         requested: The receiver's. Its deadline and its liveliness (kind and lease together) hold where it has them:
             it is the receiver that waits.
+        type_name: The type of a topic that is relayed. Velocity commands have a depth of 1 where neither side sets
+            one, unless they are kept: reliable, ``keep_all`` or ``transient_local``.
     """
     watched = requested if requested.liveliness_lease is not None else offered
     stronger = {key: max(getattr(offered, key), getattr(requested, key), key=rank) for key, rank in _RANKS.items()}
+    depth = _larger(offered.depth, requested.depth)
+    kept = (Reliability.RELIABLE, History.KEEP_ALL, Durability.TRANSIENT_LOCAL)
+    if depth is UNSET and type_name in VELOCITY_COMMANDS and not any(word in kept for word in stronger.values()):
+        depth = 1
     return replace(
         _DEFAULT,
         **stronger,
-        depth=_larger(offered.depth, requested.depth, _DEFAULT.depth),
+        depth=depth,
         deadline=offered.deadline if requested.deadline is None else requested.deadline,
         lifespan=_smaller(offered.lifespan, requested.lifespan),
         liveliness=watched.liveliness,
         liveliness_lease=watched.liveliness_lease,
         max_rate=_smaller(offered.max_rate, requested.max_rate),
-        outage=_larger(offered.outage, requested.outage, _DEFAULT.outage),
+        outage=_larger(offered.outage, requested.outage),
     )
 
 
@@ -187,9 +219,11 @@ def needs_agents(contract: Contract) -> str:
     return ", ".join(terms)
 
 
-def _larger(one: _Number, other: _Number, default: _Number) -> _Number:
-    """The larger one; the default counts as not set."""
-    return max((value for value in (one, other) if value != default), default=default)
+def _larger(one: _Number | UnsetType, other: _Number | UnsetType) -> _Number | UnsetType:
+    """The larger one of those that are set."""
+    if one is UNSET or other is UNSET:
+        return other if one is UNSET else one
+    return max(one, other)
 
 
 def _smaller(one: float | None, other: float | None) -> float | None:
@@ -243,8 +277,11 @@ class Contracts:
         return self._find(topic, type_name) if self._rules else self._default
 
     def _combined(self, topic: str, type_name: str) -> Contract:
-        values = {key: value for key, (value, _) in self.explain(topic, type_name).items()}
-        return Contract(**values)  # type: ignore[arg-type] # as ContractRule.values promises
+        values: dict[str, object] = {}
+        for rule in self._rules:
+            if rule.fitting(topic, type_name) is not None:
+                values |= rule.values
+        return replace(self._default, **values)  # type: ignore[arg-type] # as ContractRule.values promises
 
     def explain(self, topic: str, type_name: str) -> dict[str, tuple[object, str]]:
         """Each key's value and where it comes from.
@@ -253,6 +290,9 @@ class Contracts:
             By key: the value, and ``rule 2: topics /cmd/**`` (counted from 1), ``[bridge] transport`` or ``default``.
         """
         found: dict[str, tuple[object, str]] = {key: (getattr(self._default, key), "default") for key in KEYS}
+        found |= {"depth": (_DEFAULT.queue_depth, "default"), "outage": (_DEFAULT.resume_window, "default")}
+        if type_name in VELOCITY_COMMANDS:
+            found["depth"] = (1, "default for velocity commands")
         if self._default.transport is not DEFAULT_TRANSPORT:
             found["transport"] = (self._default.transport, "[bridge] transport")
         for number, rule in enumerate(self._rules, 1):

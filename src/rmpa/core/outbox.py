@@ -72,6 +72,7 @@ class _KeyBounds:
     entries: int
     max_age: float | None = None
     strict: bool = False
+    above: int = 0
     spared: bool = False
 
 
@@ -139,7 +140,14 @@ class Outbox:
         self._max_bytes = max_bytes
 
     def set_terms(
-        self, key: int, max_entries: int, max_age: float | None = None, *, strict: bool = False, spared: bool = False
+        self,
+        key: int,
+        max_entries: int,
+        max_age: float | None = None,
+        *,
+        strict: bool = False,
+        above: int = 0,
+        spared: bool = False,
     ) -> None:
         """Give one key bounds of its own.
 
@@ -149,9 +157,10 @@ class Outbox:
             max_age: Seconds that an entry may wait; ``None``: no bound.
             strict: Whether the newest entry is dropped too when it is too old (a lifespan); otherwise the newest
                 entry is always sent.
+            above: Bytes of this key's entries up to which none is dropped for its age.
             spared: Whether ``max_bytes`` never drops an entry of this key, because its owner bounds the bytes.
         """
-        bounds = self._own_bounds[key] = _KeyBounds(max_entries, max_age, strict, spared)
+        bounds = self._own_bounds[key] = _KeyBounds(max_entries, max_age, strict, above, spared)
         if key in self._queues:
             self._queues[key].bounds = bounds
 
@@ -500,7 +509,7 @@ class Outbox:
         if bounds.max_age is None:
             return
         kept = 0 if bounds.strict else 1
-        while len(queue.messages) > kept:
+        while len(queue.messages) > kept and queue.size > bounds.above:
             message = queue.messages[0]
             if message.sent or message.pinned or now - message.born <= bounds.max_age:
                 return

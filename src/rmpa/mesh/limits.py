@@ -116,6 +116,16 @@ UNPROVEN_RATE: Final = 500.0
 # At it: the oldest message of the topic with the most bytes is dropped, reliable ones last
 # Told in: `topic info`, `why` (*sent*), diagnostics
 LANE_QUEUE_BYTES: Final = 64 * MIB
+# [Messages] Time for which a message of a topic without a `depth` waits for a slow link while more than 4 MiB do
+# At it: it is dropped
+# Told in: `topic info`, `why` (*sent*), diagnostics
+# Why: A burst may take its time, and where the link is too slow for an image topic the images stay fresh.
+ROUTE_QUEUE_AGE: Final = 0.5
+# [Messages] Bytes of a topic without a `depth` that wait for longer, or for a silent peer
+# At it: the oldest is dropped
+# Told in: `topic info`, `why` (*sent*), diagnostics
+# Why: As many as a TCP connection of a ROS node holds in the kernel.
+ROUTE_QUEUE_BYTES: Final = 4 * MIB
 # Messages up to this size are small: they use the express lane unless their contract says otherwise. A message of
 # this size takes 0.7 ms at 100 Mbit/s.
 EXPRESS_MESSAGE_MAX: Final = 8 * KIB

@@ -16,7 +16,6 @@ from rmpa.bridge.direct.paths import AGENTS
 from rmpa.bridge.peer_offers import CONFLICT, CROWDED
 from rmpa.bridge.policy import PolicyDecision
 from rmpa.config.rules import CLOCK
-from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract, Transport
 from rmpa.core.identity import is_own
 from rmpa.observe.peer_info import ContractTerm
@@ -280,7 +279,7 @@ class TopicFacts:
             for peer, contract in exports.absent(source).items():
                 if peer not in names or exports.contract(source, peer) is None:
                     name, seconds = self._bridge.topics.losses.away(peer)
-                    kept = shown_seconds(float(contract.outage or limits.RESUME_WINDOW))
+                    kept = shown_seconds(exports.routes(source)[peer].outage)
                     text = f"{name} is away for {shown_seconds(seconds)}; messages are kept for {kept}"
                     yield source.topic, self._route_to(peer, name, source, local, "away", contract, text), []
 

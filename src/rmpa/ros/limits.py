@@ -62,6 +62,9 @@ SUBSCRIBER_QUEUE_MESSAGES: Final = 1000
 # At it: the oldest is dropped
 # Told in: `topic info`, `why` (*reader*)
 SUBSCRIBER_QUEUE_BYTES: Final = 32 * MIB
+# Seconds for which a local subscriber whose publisher has ended gets what waits for it, as from a node
+# that ends, whose kernel sends on.
+SUBSCRIBER_DRAIN: Final = 10.0
 # [Messages] Latched messages of one source that are kept
 # At it: the newest are kept
 # Why: For late subscribers (durability transient_local), whatever the contract's depth.

@@ -49,7 +49,11 @@ SOCK_DIAG_BUFFER: Final = 64 * KIB
 SOCK_DIAG_DUMPS: Final = 3
 
 # --- mesh -------------------------------------------------------------------------------------------------------
-# Delay beyond which a best-effort message (held up by an outage) is dropped if a newer one of its topic follows.
+# [Messages] Time for which an outage may delay a message of a topic with a `depth` of 1, as velocity commands have by
+#   default
+# At it: it is dropped if a newer one follows
+# Told in: `topic info` (*lost*), `message.stale`
+# Why: A robot is to follow the present command, not each one of the last second.
 STALE_AGE: Final = 0.1
 # How long an agent that ends waits for its last bytes to be sent.
 DRAIN_TIMEOUT: Final = 1.0

@@ -101,6 +101,7 @@ class Stream:
         self._later: asyncio.Handle | None = None
         self._drained: asyncio.Future[None] | None = None
         self._report: asyncio.Handle | None = None
+        self._leaving: asyncio.TimerHandle | None = None
         self.bytes_in = 0
         self.bytes_out = 0
         # When bytes were last received (``loop.time()``), even if ``on_bytes`` was not called for them yet.
@@ -362,6 +363,14 @@ class Stream:
             self._report = None
         self._shut()
 
+    def leave(self, within: float) -> None:
+        """Close once all waiting bytes are sent, or after ``within`` seconds. ``on_close`` may be called."""
+        self._uncork()
+        if self.closed or not self._writing:
+            self.close()
+        else:
+            self._leaving = self._loop.call_later(within, self.close)
+
     def finish(self) -> None:
         """Half-close the socket once all waiting bytes are sent. Reading goes on.
 
@@ -391,8 +400,9 @@ class Stream:
         if self.closed:
             return
         self.closed = True
-        if self._later is not None:
-            self._later.cancel()
+        for handle in (self._later, self._leaving):
+            if handle is not None:
+                handle.cancel()
         self._loop.remove_reader(self._fd)
         if self._writing:
             self._loop.remove_writer(self._fd)
@@ -536,6 +546,8 @@ class Stream:
     def _all_sent(self) -> None:
         self._writing = False
         self._loop.remove_writer(self._fd)
+        if self._leaving is not None:
+            self.close()
         if self._finishing:
             self._shut_write()
         self._done_draining()

@@ -104,7 +104,7 @@ class Lane:
     def __init__(self, link: Link, name: str) -> None:
         self.link = link
         self.name = name
-        self.terms: dict[int, tuple[int, float | None, bool]] = {}
+        self.terms: dict[int, tuple[int, float | None, int, bool]] = {}
         self._parts: dict[int, bytearray] = {}
 
     def send(self, route: int, sequence: int, stamp_ns: int, payload: bytes | bytearray | memoryview) -> int:
@@ -139,9 +139,11 @@ class Lane:
         self.link.log.append((self.name, "fence", route, number))
         self.link.fences.append((self.name, number))
 
-    def set_terms(self, route: int, depth: int, max_age: float | None, *, strict: bool) -> None:
+    def set_terms(
+        self, route: int, depth: int, max_age: float | None = None, *, above: int = 0, spared: bool = False
+    ) -> None:
         """Take a route's bounds."""
-        self.terms[route] = (depth, max_age, strict)
+        self.terms[route] = (depth, max_age, above, spared)
 
     def discard(self, route: int) -> None:
         """Let go of what waits of a route, and of its bounds."""

@@ -183,6 +183,8 @@ class Speaker:
         topic: Which.
         node: Its name.
         latching: Whether it latches.
+        greets: As which it says one thing to each new connection alone.
+        greeting: How long that is.
     """
 
     side: Place
@@ -194,6 +196,8 @@ class Speaker:
     said: int = 0
     connections: list[PublisherConnection] = field(default_factory=list)
     last: bytes | None = None
+    greets: Speaker | None = None
+    greeting: int = 0
 
     def say(self, size: int) -> None:
         """Publish one more message."""
@@ -213,11 +217,11 @@ class PublisherConnection:
         _caller_id: str,
         *,
         on_message: Callable[[memoryview], None],
-        on_parts: Any,
-        on_header: Callable[[Mapping[str, str]], None],
+        on_parts: Any = None,
+        on_header: Callable[[Mapping[str, str]], None] = lambda _: None,
         on_refused: Callable[[str], None],
         on_lost: Callable[[str], None],
-        on_oversized: Callable[[int], None],
+        on_oversized: Callable[[int], None] = lambda _: None,
         number: int,
         find: object,
     ) -> None:
@@ -255,6 +259,9 @@ class PublisherConnection:
         )
         if self._speaker.latching and self._speaker.last is not None and not self._closed:
             self.take(self._speaker.last)
+        if (greeter := self._speaker.greets) is not None:
+            greeter.said += 1
+            self.take(payload(greeter.number, greeter.said, self._speaker.greeting))
 
     def take(self, framed: bytes) -> None:
         """The speaker has said something."""
@@ -270,7 +277,7 @@ class PublisherConnection:
         while not self._closed and (self._rest is not None or self._queue):
             if self._rest is None:
                 framed = self._queue.popleft()
-                if len(framed) <= core_limits.CUT_THROUGH_BYTES:
+                if len(framed) <= core_limits.CUT_THROUGH_BYTES or self._parts is None:
                     self._on_message(memoryview(bytearray(framed)))
                     continue
                 self._rest = memoryview(framed)
@@ -358,7 +365,7 @@ class Ear:
         assert parcel is self._parcel
         return bool(self._half)
 
-    def hang_up(self) -> None:
+    def hang_up(self, *, drain: bool = False) -> None:
         """We were hung up on."""
         self.closed = True
         self._listener.ears.pop(self.publication, None)

@@ -57,7 +57,7 @@ def unknown_at_receiver(side: Side) -> int:
 def lost_at_sender(side: Side) -> int:
     """What the sending module says is lost to its peer."""
     (attached,) = side.attached
-    numbering = side.bridge.topics.outbound.numbering(SURE, attached.peer)
+    numbering = side.bridge.topics.outbound.sender_of(SURE, attached.peer)
     return numbering.lost if numbering is not None else 0
 
 

@@ -95,10 +95,10 @@ def test_one_connection_on_demand_serves_all_subscribers(offering: Exports) -> N
     assert offering.opened(1, OpenRoute(7, "/cmd", "/joy")) == [Connect(CMD, JOY.uri)]
     assert offering.opened(2, OpenRoute(9, "/cmd", "/joy")) == []
     assert offering.described(CMD, ABOUT) == [
-        Send(1, RouteOpened(7, ABOUT)),
-        AddRoute(CMD, 1, 7, Contract()),
-        Send(2, RouteOpened(9, ABOUT)),
-        AddRoute(CMD, 2, 9, Contract()),
+        Send(1, RouteOpened(7, ABOUT, epoch=1)),
+        AddRoute(CMD, 1, 7, Contract(), 1),
+        Send(2, RouteOpened(9, ABOUT, epoch=2)),
+        AddRoute(CMD, 2, 9, Contract(), 2),
     ]
     assert offering.flowing(CMD) == (1, 2)
     assert offering.closed(1, CloseRoute(7)) == [RemoveRoute(CMD, 1, 7)]
@@ -151,7 +151,10 @@ def test_a_peer_gets_one_copy_of_a_source_however_often_it_asks(offering: Export
         assert isinstance(action, Send)
         assert isinstance(action.message, RouteClosed)
         assert action.message.route == route
-    assert offering.described(CMD, ABOUT) == [Send(1, RouteOpened(7, ABOUT)), AddRoute(CMD, 1, 7, Contract())]
+    assert offering.described(CMD, ABOUT) == [
+        Send(1, RouteOpened(7, ABOUT, epoch=1)),
+        AddRoute(CMD, 1, 7, Contract(), 1),
+    ]
     offering.closed(1, CloseRoute(7))
     assert offering.opened(1, OpenRoute(10, "/cmd", "/joy")) == [Connect(CMD, JOY.uri)]
 
@@ -289,7 +292,7 @@ def test_who_knows_nothing_of_the_old_numbering_gets_a_new_one(flowing: Exports,
     flowing.link_away(1)
     flowing.link_up(1)
     assert flowing.opened(1, asked) == [
-        Send(1, RouteOpened(7, ABOUT, RELIABLE, 2)),
+        Send(1, RouteOpened(7, ABOUT, RELIABLE, 2, shared=True)),
         AddRoute(CMD, 1, 7, RELIABLE, 2),
     ]
     assert not flowing.outage(1)

@@ -159,7 +159,7 @@ async def test_abandoned_message_is_not_delivered() -> None:
 async def test_each_route_has_its_own_bound_and_drops_its_own() -> None:
     async with linked_pair() as (one, other):
         lane = one.link(other).bulk
-        lane.set_terms(8, 2, None, strict=False)
+        lane.set_terms(8, 2, spared=True)
         lane.send(7, 0, 0, bytes(32 << 20))
         dropped = [lane.send(8, number, 0, b"%d" % number) for number in range(5)]
         assert dropped == [0, 0, 1, 1, 1]
@@ -414,7 +414,7 @@ async def test_fence_waits_for_the_lanes_connection() -> None:
         bulk_of(one.link(other)).sock.shutdown(socket.SHUT_RDWR)
         await until(lambda: bool(one.lanes_lost and other.lanes_lost), "cut")
         lane = one.link(other).bulk
-        lane.set_terms(7, 1, None, strict=False)
+        lane.set_terms(7, 1, spared=True)
         lane.send(7, 1, 0, b"dropped")
         lane.fence(7, 1)
         lane.send(7, 2, 0, b"kept")

@@ -10,16 +10,17 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from itertools import islice
-from typing import TYPE_CHECKING, Final
+from itertools import chain, islice
+from typing import TYPE_CHECKING, Final, Protocol
+
+from msgspec import UNSET
 
 from rmpa.bridge.data.route import EXPRESS, Downsampler, LaneSwitch
 from rmpa.core.contract import Contract, Durability, History, Reliability
-from rmpa.core.identity import SERIAL_MASK, is_earlier
+from rmpa.core.identity import SERIAL_MASK, is_earlier, serial_add
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ReliableSender
 from rmpa.ros import limits as ros_limits
-from rmpa.runtime import limits as runtime_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,10 +31,10 @@ if TYPE_CHECKING:
     from rmpa.ros.node.subscription import TopicConnection
     from rmpa.runtime.tls import Buffer
 
-# Age at which a best-effort message on the bulk lane is dropped in favour of a newer one of its topic (on the express
-# lane it is ``runtime.limits.STALE_AGE``). If a link is too slow for a topic, the newest message is sent.
-BULK_STALE_AGE: Final = 0.5
+    Keep = Callable[[bytes, int], object]
 
+# Nanoseconds: a link is silent for a second before it counts as lost; a connection that replaces it comes sooner.
+_RESENT_NS: Final = round(1.5 * mesh_limits.EXPRESS_LEASE * 1e9)
 _SMALL: Final = mesh_limits.EXPRESS_MESSAGE_MAX
 
 
@@ -43,32 +44,48 @@ class RouteSender:
     It is called for each message from the publisher's read callback. ``message`` has a short path for the usual case:
     a small message on the express lane, without down-sampling.
 
+    A link that falls silent loses what the kernel had taken. So the last messages are kept, and sent again over the
+    next link if the peer does not have them (``suspend``, ``resume``); what came in parts is not.
+
     Args:
         link: The link to the peer.
         route: The route's id.
         contract: The route's contract.
+        epoch: Identifies this numbering; see ``mesh.reliable``.
         large: Whether the source is known to have large messages.
 
     Attributes:
-        _held: Sequence, stamp and bytes of messages that wait until the lane has changed.
+        _held: Sequence, stamp and bytes of messages that wait until the lane has changed, or for the next link.
+        _sent: Likewise, of the last messages that were sent.
         _newest: Stamp and bytes of the message that down-sampling sends next.
         _direct: Whether ``message`` may take its short path for small messages.
+        lapse: When a suspended route of best effort ends.
     """
 
     reliable = False
+    lost = 0
 
-    def __init__(self, link: PeerLink, route: int, contract: Contract, *, large: bool = False) -> None:
+    def __init__(
+        self, link: PeerLink, route: int, contract: Contract, epoch: int = 0, *, large: bool = False
+    ) -> None:
         self.contract = contract
-        self._depth = mesh_limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.depth
+        self.epoch = epoch
+        self._depth = mesh_limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.queue_depth
+        chosen = contract.depth is not UNSET or contract.history is History.KEEP_ALL
+        self._max_bytes = mesh_limits.LANE_QUEUE_BYTES if chosen else mesh_limits.ROUTE_QUEUE_BYTES
         self.sequence = 0
         self._loop = asyncio.get_running_loop()
         self._switch = LaneSwitch(contract, large=large)
         self._held: deque[tuple[int, int, bytes]] = deque()
         self._held_bytes = 0
+        self._sent: deque[tuple[int, int, bytes]] = deque()
+        self._sent_bytes = 0
         self._downsampler = Downsampler(contract.max_rate) if contract.max_rate is not None else None
         self._newest: tuple[int, bytes] | None = None
         self._timer: asyncio.TimerHandle | None = None
+        self._done: Callable[[], None] | None = None
         self._direct = False
+        self.lapse: asyncio.TimerHandle | None = None
         self.link: PeerLink | None
         self._lane: LaneSender
         self._use(link, route)
@@ -82,7 +99,7 @@ class RouteSender:
         """Send one message; return how many older ones were dropped for it."""
         if self._direct and len(framed) <= _SMALL:
             self.sequence = sequence = self.sequence + 1 & SERIAL_MASK
-            return self._lane.send(self.route, sequence, stamp_ns, framed)
+            return self._transmit(sequence, stamp_ns, framed)
         if self._downsampler is not None and not self._downsampler.admit(self._loop.time()):
             self._newest = (stamp_ns, bytes(framed))  # in place of an older one, until the rate allows it
             if self._timer is None:
@@ -104,34 +121,88 @@ class RouteSender:
     def fenced(self, number: int) -> None:
         """Take the peer's answer to a fence, and send what has waited over the new lane."""
         if self._switch.fenced(number):
-            self._use_lane()
-            self._go_on()
+            self._fence_over()
+
+    def drain(self, done: Callable[[], None]) -> None:
+        """Call ``done`` once the peer has all messages, or the route has ended; no further message follows."""
+        self._done = done
+        if self._newest is not None:
+            self._send(*self._newest)
+            self._newest = None
+        if self.link is not None and not self._switch.fencing:
+            self._begin_fence()
+
+    @property
+    def drained(self) -> bool:
+        """Whether nothing of the route is on its way any more."""
+        return self.link is None or not (self._switch.fencing or self._held)
+
+    @property
+    def last(self) -> int:
+        """The number of the last message."""
+        return self.sequence
+
+    @property
+    def following(self) -> int:
+        """The number of the message that is sent next over a new link, if the peer does not have it."""
+        return self._held[0][0] if self._held else serial_add(self.sequence, 1)
 
     def acknowledged(self, sequence: int) -> None:
         """Ignore an acknowledgement; only reliable routes need it."""
+
+    def suspend(self, keep: Keep | None = None) -> None:  # noqa: ARG002 - for reliable routes
+        """Keep messages while the link is gone, within the bounds of the queue, until ``resume`` or ``close``."""
+        self.link, self._direct = None, False
+        waiting, self._sent, self._held = chain(self._sent, self._held), deque(), deque()
+        self._sent_bytes = self._held_bytes = 0
+        for message in waiting:
+            self._hold(*message)
+
+    def resume(self, link: PeerLink, route: int, after: int) -> None:
+        """Continue on a new link; the peer has everything up to ``after``."""
+        if self.lapse is not None:
+            self.lapse.cancel()
+        while self._held and not is_earlier(after, self._held[0][0]):
+            self._held_bytes -= len(self._held.popleft()[2])
+        self._switch.restart()
+        self._use(link, route)
+        self._go_on()
 
     def lane_lost(self) -> None:
         """Handle the loss of the bulk lane's connection; it ends a change from that lane at once."""
         if self._switch.lane_lost():
             self._discard_bulk()
-            self._use_lane()
-            self._go_on()
+            self._fence_over()
 
     def close(self) -> None:
         """Send no more messages."""
         self.link = None
         self._direct = False
         self._held.clear()
-        if self._timer is not None:
-            self._timer.cancel()
-
-    # --- inside ---------------------------------------------------------------------------------------------
+        if self._done is not None:
+            self._done()
+        for timer in (self._timer, self.lapse):
+            if timer is not None:
+                timer.cancel()
 
     def _send(self, stamp_ns: int, framed: Buffer) -> int:
         self.sequence = sequence = self.sequence + 1 & SERIAL_MASK
         if self._lane_for(len(framed)):
-            return self._lane.send(self.route, sequence, stamp_ns, framed)
+            return self._transmit(sequence, stamp_ns, framed)
         return self._hold(sequence, stamp_ns, bytes(framed))
+
+    def _transmit(self, sequence: int, stamp_ns: int, framed: Buffer) -> int:
+        """Sends a message, and keeps it for as long as the link may turn out to have been silent."""
+        sent = self._sent
+        sent.append((sequence, stamp_ns, bytes(framed)))
+        self._sent_bytes += len(framed)
+        while (
+            sent[0][1] < stamp_ns - _RESENT_NS
+            or len(sent) > self._depth
+            or (self._sent_bytes > self._max_bytes and len(sent) > 1)
+        ):
+            self._sent_bytes -= len(sent.popleft()[2])
+        return self._lane.send(self.route, sequence, stamp_ns, framed)
 
     def _send_newest(self, downsampler: Downsampler) -> None:
         self._timer = None
@@ -146,9 +217,7 @@ class RouteSender:
         self._held.append((sequence, stamp_ns, payload))
         self._held_bytes += len(payload)
         dropped = 0
-        while len(self._held) > 1 and (
-            len(self._held) > self._depth or self._held_bytes > mesh_limits.LANE_QUEUE_BYTES
-        ):
+        while len(self._held) > 1 and (len(self._held) > self._depth or self._held_bytes > self._max_bytes):
             self._held_bytes -= len(self._held.popleft()[2])
             dropped += 1
         return dropped
@@ -159,7 +228,7 @@ class RouteSender:
         for sequence, stamp_ns, payload in held:
             # A large message may have come during the change back to the express lane.
             if self._lane_for(len(payload)):
-                self._lane.send(self.route, sequence, stamp_ns, payload)
+                self._transmit(sequence, stamp_ns, payload)
             else:
                 self._hold(sequence, stamp_ns, payload)
 
@@ -171,6 +240,17 @@ class RouteSender:
             return True
         self._begin_fence()
         return False
+
+    def _fence_over(self) -> None:
+        """Uses the lane that a fence was for; if no message is behind it, a draining route is empty."""
+        waited = bool(self._held)
+        self._use_lane()
+        self._go_on()
+        if self._done is not None and not self._switch.fencing:
+            if waited:
+                self._begin_fence()
+            else:
+                self._done()
 
     def _begin_fence(self) -> None:
         self._direct = False
@@ -200,9 +280,11 @@ class RouteSender:
             self._set_bounds(self.link)
 
     def _set_bounds(self, link: PeerLink) -> None:
-        lifespan = self.contract.lifespan
-        for lane, stale in ((link.express, runtime_limits.STALE_AGE), (link.bulk, BULK_STALE_AGE)):
-            lane.set_terms(self.route, self._depth, lifespan or stale, strict=lifespan is not None)
+        lifespan, above = self.contract.lifespan, 0
+        if lifespan is None and self._max_bytes < mesh_limits.LANE_QUEUE_BYTES:
+            lifespan, above = mesh_limits.ROUTE_QUEUE_AGE, self._max_bytes
+        for lane in (link.express, link.bulk):
+            lane.set_terms(self.route, self._depth, lifespan, above=above)
 
 
 class ReliableRouteSender(RouteSender):
@@ -219,9 +301,9 @@ class ReliableRouteSender(RouteSender):
     reliable = True
 
     def __init__(self, link: PeerLink, route: int, contract: Contract, epoch: int, *, large: bool = False) -> None:
-        self._keep: Callable[[bytes, int], object] | None = None
+        self._keep: Keep | None = None
         self._reported = 0
-        super().__init__(link, route, contract, large=large)
+        super().__init__(link, route, contract, epoch, large=large)
         self.sender = ReliableSender(
             self._depth,
             mesh_limits.REPLAY_BYTES,
@@ -230,6 +312,15 @@ class ReliableRouteSender(RouteSender):
             epoch,
         )
 
+    def drain(self, done: Callable[[], None]) -> None:
+        """Call ``done`` once the peer has all messages, or the route has ended; no further message follows."""
+        self._done = done
+
+    @property
+    def drained(self) -> bool:
+        """Whether nothing of the route is on its way any more."""
+        return self.sender.idle
+
     def begin(self, stamp_ns: int, size: int) -> None:
         """A message that may have to be sent again is needed whole."""
 
@@ -237,6 +328,8 @@ class ReliableRouteSender(RouteSender):
         """Forget the messages up to ``sequence``, which the peer has, and send what the window allows."""
         self.sender.acknowledged(sequence)
         self._go_on()
+        if self._done is not None:
+            self._done()
 
     def lane_lost(self) -> None:
         """Send the messages again that were on the lost bulk lane; the peer drops those that it has."""
@@ -249,7 +342,22 @@ class ReliableRouteSender(RouteSender):
             self._use_lane()
         self._go_on()
 
-    def suspend(self, keep: Callable[[bytes, int], object] | None = None) -> None:
+    @property
+    def last(self) -> int:
+        """The number of the last message."""
+        return self.sender.last
+
+    @property
+    def following(self) -> int:
+        """The number of the message that is sent next over a new link, if the peer does not have it."""
+        return self.sender.following
+
+    @property
+    def lost(self) -> int:  # type: ignore[override] # counted by the numbering
+        """The number of messages that the peer will never get."""
+        return self.sender.lost
+
+    def suspend(self, keep: Keep | None = None) -> None:
         """Keep messages while the link is gone, until ``resume`` or until they are given up.
 
         Args:
@@ -281,8 +389,6 @@ class ReliableRouteSender(RouteSender):
         missed, self._reported = self.sender.lost - self._reported, self.sender.lost
         return missed
 
-    # --- inside ---------------------------------------------------------------------------------------------
-
     def _send(self, stamp_ns: int, framed: Buffer) -> int:
         before = self.sender.overflowed
         if self._keep is not None:
@@ -303,7 +409,18 @@ class ReliableRouteSender(RouteSender):
     def _set_bounds(self, link: PeerLink) -> None:
         """Sets no bounds: a numbered message may not be dropped from a queue; the window bounds the queue."""
         for lane in (link.express, link.bulk):
-            lane.set_terms(self.route, mesh_limits.KEEP_ALL_MESSAGES, None, strict=False)
+            lane.set_terms(self.route, mesh_limits.KEEP_ALL_MESSAGES, spared=True)
+
+
+class FlowSender(Protocol):
+    """What a flow passes its messages to: the route to a peer, or a subscriber that joins there."""
+
+    @property
+    def drained(self) -> bool: ...  # noqa: D102 - as of RouteSender
+    def message(self, stamp_ns: int, framed: Buffer) -> int: ...  # noqa: D102
+    def begin(self, stamp_ns: int, size: int) -> tuple[LaneSender, QueuedMessage] | None: ...  # noqa: D102
+    def drain(self, done: Callable[[], None]) -> None: ...  # noqa: D102
+    def close(self) -> None: ...  # noqa: D102
 
 
 class ExportFlow:
@@ -314,6 +431,7 @@ class ExportFlow:
         _history: Bytes and stamps of the last messages, for routes that are opened later.
         _streaming: The senders that pass on the present message in parts, each with its lane.
         _whole: The present message so far, where a sender or the history needs it whole.
+        leaving: When the flow ends, once its publisher has.
         latching: Whether the publisher latches: a route opened later gets its last message, whatever the contract.
         large: Whether the publisher has sent a message that came in parts.
         oversized, oversized_bytes: Messages that were left out because they are too long; size of the last one, in
@@ -324,10 +442,11 @@ class ExportFlow:
 
     def __init__(self) -> None:
         self.by_peer: dict[int, RouteSender] = {}
-        self._senders: tuple[RouteSender, ...] = ()
+        self._senders: tuple[FlowSender, ...] = ()
+        self._joins: list[tuple[RouteSender, FlowSender]] = []
         self._history: deque[tuple[bytes, int]] = deque(maxlen=1)
         self._keeping = False
-        self._streaming: dict[RouteSender, tuple[LaneSender, QueuedMessage]] = {}
+        self._streaming: dict[FlowSender, tuple[LaneSender, QueuedMessage]] = {}
         self._whole: bytearray | None = None
         self._size = self._received = self._stamp = 0
         self.latching = False
@@ -336,6 +455,8 @@ class ExportFlow:
         self.bytes = 0
         self.dropped = 0
         self.oversized = self.oversized_bytes = 0
+        self.leaving: asyncio.TimerHandle | None = None
+        self._over: Callable[[], None] | None = None
 
     def latch(self) -> None:
         """Keep the last message: the publisher latches."""
@@ -355,7 +476,7 @@ class ExportFlow:
         if contract.reliability is Reliability.RELIABLE:
             sender = ReliableRouteSender(link, route, contract, epoch, large=self.large)
         else:
-            sender = RouteSender(link, route, contract, large=self.large)
+            sender = RouteSender(link, route, contract, epoch, large=self.large)
         if contract.durability is Durability.TRANSIENT_LOCAL:
             self.keep(contract.kept)
         # Messages kept only for another peer's contract are old data here, perhaps old commands.
@@ -363,7 +484,7 @@ class ExportFlow:
         for framed, stamp in islice(self._history, max(0, len(self._history) - kept), None):
             sender.message(stamp, framed)
         self.by_peer[peer] = sender
-        self._senders = tuple(self.by_peer.values())
+        self._list_senders()
         return sender
 
     def remove(self, peer: int) -> None:
@@ -371,11 +492,53 @@ class ExportFlow:
         sender = self.by_peer.pop(peer, None)
         if sender is not None:
             sender.close()
-            self._senders = tuple(self.by_peer.values())
+            self._list_senders()
             self._streaming.pop(sender, None)
+            for common, join in list(self._joins):
+                if common is sender:
+                    join.close()
+            self._look_drained()
+
+    @property
+    def latched(self) -> bytes:
+        """The last message that is kept; empty if there is none."""
+        return self._history[-1][0] if self._history else b""
+
+    def join(self, common: RouteSender, join: FlowSender) -> None:
+        """Let a joining subscriber of a sender's peer see what all get."""
+        self._joins.append((common, join))
+        self._list_senders()
+
+    def leave(self, join: FlowSender) -> None:
+        """The subscriber gets what all get."""
+        self._joins = [one for one in self._joins if one[1] is not join]
+        self._list_senders()
+        self._look_drained()
+
+    def _list_senders(self) -> None:
+        self._senders = (*self.by_peer.values(), *(join for _, join in self._joins))
+
+    def drain(self, over: Callable[[], None]) -> None:
+        """Call ``over`` once all peers have all messages, for the publisher has ended; perhaps at once."""
+        self._over = over
+        for sender in self._senders:
+            sender.drain(self._look_drained)
+        self._look_drained()
+
+    def ended(self) -> None:
+        """Wait for nothing any more."""
+        self._over = None
+        if self.leaving is not None:
+            self.leaving.cancel()
+
+    def _look_drained(self) -> None:
+        if self._over is not None and all(sender.drained for sender in self._senders):
+            over, self._over = self._over, None
+            over()
 
     def close(self) -> None:
         """Remove all peers, and free the kept messages, which may be large."""
+        self.ended()
         for peer in tuple(self.by_peer):
             self.remove(peer)
         self._history.clear()

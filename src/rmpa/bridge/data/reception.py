@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import asyncio
 import math
+import sys
 import time
 from collections import Counter, deque
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.data.quality import QosWatch, Quality
-from rmpa.core.contract import Contract, Durability, Priority, Reliability
+from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.identity import SERIAL_MASK, is_earlier
+from rmpa.core.identity import SERIAL_MASK, is_earlier, serial_add
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.connection import DataHandler
@@ -110,7 +111,8 @@ class ImportFlow(DataHandler):
         self._loop = asyncio.get_running_loop()
         self._reliable = contract.reliability is Reliability.RELIABLE
         self._numbering = ReliableReceiver()
-        self._stale_ns = round((contract.lifespan or runtime_limits.STALE_AGE) * 1e9)
+        oldest = contract.lifespan or (runtime_limits.STALE_AGE if contract.newest_only else None)
+        self._stale_ns = sys.maxsize if oldest is None else round(oldest * 1e9)
         self._plain = not self._reliable
         self._replay: deque[bytes] | None = None
         self._sequence: int | None = None
@@ -136,8 +138,13 @@ class ImportFlow(DataHandler):
 
     @property
     def position(self) -> tuple[int, int] | None:
-        """Epoch and sequence of the last reliable message, after which a new link continues; else ``None``."""
-        return self._numbering.position() if self._reliable else None
+        """Epoch and sequence of the last message, after which a new link continues; ``None``: there is none."""
+        return self._numbering.position() if self._epoch else None
+
+    @property
+    def delivering(self) -> int:
+        """The number of the message that is being delivered."""
+        return serial_add(self._numbering.next or 0, -1) if self._sequence is None else self._sequence
 
     def bind(self, link: PeerLink, route: int, epoch: int, first: int) -> bool:
         """Take the data of a route that was opened on a new link.
@@ -167,7 +174,9 @@ class ImportFlow(DataHandler):
     def missed_unknown(self, why: str) -> None:
         """Record that an unknown number of messages may be lost; ``why`` is the reason."""
         self._counters.add("message.lost_unknown")
-        self._on_event(self.watch.lost_unknown(why, self._loop.time()))
+        occurred = self.watch.lost_unknown(why, self._loop.time())
+        if self._reliable:
+            self._on_event(occurred)
 
     def expect_replay(self, kept: Iterable[bytes]) -> None:
         """Leave out these messages, which the subscribers have, if the new route repeats them at its beginning."""
@@ -300,7 +309,7 @@ class ImportFlow(DataHandler):
         return False
 
     def _is_too_old(self, stamp_ns: int, now_ns: int) -> bool:
-        """Whether a message is certainly older than the lifespan, or than a best-effort one may be."""
+        """Whether a message is certainly older than the lifespan, or than ``STALE_AGE`` if only the newest counts."""
         error_ns = self._link_time.error_ns
         return error_ns is not None and now_ns - stamp_ns + self._link_time.ahead_ns > self._stale_ns + error_ns
 
@@ -318,9 +327,8 @@ class ImportFlow(DataHandler):
         It waits ``mesh.limits.STALE_HOLD`` for a newer one, and is delivered if none comes: the last command before a
         cable was pulled still counts.
         """
-        # The first messages of a route may be kept, old ones: at least one if the publisher latches.
-        kept = self.contract.kept if self.contract.durability is Durability.TRANSIENT_LOCAL else 1
-        if self._reliable or sequence <= kept or not self._is_too_old(stamp_ns, now_ns):
+        # The first message of a route may be a kept one, which is old.
+        if not self.contract.newest_only or sequence <= 1 or not self._is_too_old(stamp_ns, now_ns):
             return False
         sent_at = self._loop.time() - (now_ns - stamp_ns + self._link_time.ahead_ns) / 1e9
         held_up = self._link_time.resumed_at() - sent_at

@@ -86,7 +86,7 @@ class BodySender:
         self._large: deque[tuple[int, bytes, Buffer, Budget | None]] = deque()
         self._task: asyncio.Task[None] | None = None
         for lane in (link.express, link.bulk):
-            lane.set_terms(route, mesh_limits.KEEP_ALL_MESSAGES, None, strict=False)
+            lane.set_terms(route, mesh_limits.KEEP_ALL_MESSAGES, spared=True)
 
     def send(self, sequence: int, body: Buffer, head: bytes = b"", budget: Budget | None = None) -> bool:
         """Send one body; return whether it takes the bulk lane. After ``close`` it is dropped.

@@ -66,9 +66,10 @@ class ExportRoute:
         name: The peer's name.
         instance: The peer's run, as 32 hexadecimal digits.
         live: Whether data is sent on it yet.
-        epoch: Identifies the numbering of a reliable route; 0 for best effort.
+        epoch: Identifies the numbering.
         after: Sequence of the last message that the peer has, if this continues a suspended route; else ``None``.
         unknown: Whether an earlier run of the peer's module may have missed messages.
+        shared: Whether the publisher was connected before.
     """
 
     number: int
@@ -80,6 +81,17 @@ class ExportRoute:
     epoch: int = 0
     after: int | None = None
     unknown: bool = False
+    shared: bool = False
+
+    @property
+    def reliable(self) -> bool:
+        """Whether no message is to be lost."""
+        return self.contract.reliability is Reliability.RELIABLE
+
+    @property
+    def outage(self) -> float:
+        """For how many seconds its messages are kept without a link."""
+        return self.contract.resume_window if self.reliable else mesh_limits.SILENT_GRACE
 
 
 @dataclass(slots=True)
@@ -168,7 +180,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
         for source, flow in list(self._flows.items()):
             ours = context.contracts.of(source.topic, self.offered[source].type)
             for peer, route in list(flow.routes.items()):
-                contract = combine(ours, route.asked)
+                contract = combine(ours, route.asked, self.offered[source].type)
                 if why := context.gate.why_not(Access.SUBSCRIBE, route.name, source.topic):
                     self._ended_for(peer, source, why)
                 elif not contract.same_route(route.contract):
@@ -184,19 +196,20 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
         self._routes[peer] = {}
         super().link_up(peer, name, instance)
 
-    def link_away(self, peer: int) -> Iterator[None]:
+    def link_away(self, peer: int, *, briefly: bool = False) -> Iterator[None]:
         """Suspend the reliable routes of a peer that may come back, and end its other routes, one with each item.
 
-        A suspended route that the peer has not opened again over this link starts its outage anew.
+        With ``briefly`` the link fell silent, and all routes are suspended. A suspended route that the peer has not
+        opened again over this link starts its outage anew.
         """
         self.peers.pop(peer, None)
         self._routes.pop(peer, None)
         for source, flow in list(self._flows.items()):
             if (route := flow.routes.get(peer)) is None:
                 continue
-            if route.live and route.epoch:
+            if route.live and (route.reliable or briefly):
                 route.number = 0
-                self._do.suspend_route(source, peer, route.contract.outage)
+                self._do.suspend_route(source, peer, route.outage)
             else:
                 self.end_route(source, peer)
             yield
@@ -212,7 +225,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
     def outage(self, peer: int) -> float:
         """The longest time, in seconds, for which messages are kept for a peer without a link; 0 if none are."""
         away = (route for flow in self._flows.values() if (route := flow.routes.get(peer)) and not route.number)
-        return max((route.contract.outage for route in away), default=0.0)
+        return max((route.outage for route in away if route.reliable), default=0.0)
 
     def given_up(self, source: Source, peer: int) -> None:
         """End a suspended route, whose messages are not kept any more."""
@@ -245,23 +258,23 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
             if flow is None:
                 flow = self._flows[source] = _Flow(local.uri)
                 self._do.outbound.connect(source, local.uri)
-            flow.routes[peer] = self._route(peer, source, message, before)
+            route = flow.routes[peer] = self._route(peer, source, message, before)
+            route.shared = flow.description is not None
             self._start(source, flow)
             return
         self._out.send(peer, RouteClosed(number, why))
 
     def _route(self, peer: int, source: Source, message: OpenRoute, before: ExportRoute | None) -> ExportRoute:
         """The route that a peer asks for; it continues a suspended one of the same epoch and contract."""
-        told, asked = self.peers[peer], message.contract
-        contract = combine(self._out.context.contracts.of(source.topic, self.offered[source].type), asked)
+        told, asked, kind = self.peers[peer], message.contract, self.offered[source].type
+        contract = combine(self._out.context.contracts.of(source.topic, kind), asked, kind)
         route = ExportRoute(message.route, contract, asked, told.name, told.instance)
         route.unknown = self._cut.pop((told.name, source), told.instance) != told.instance
-        if contract.reliability is Reliability.RELIABLE:
-            if before is not None and before.epoch == message.epoch and before.contract.same_route(contract):
-                route.epoch, route.after = before.epoch, message.after
-            else:
-                self._epochs += 1
-                route.epoch = self._epochs
+        if before is not None and before.epoch == message.epoch and before.contract.same_route(contract):
+            route.epoch, route.after = before.epoch, message.after
+        else:
+            self._epochs += 1
+            route.epoch = self._epochs
         return route
 
     def closed(self, peer: int, message: CloseRoute) -> None:
@@ -281,7 +294,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
         Args:
             source: The source.
             reason: What happened, for users.
-            lasts: By peer: the last message of each reliable route.
+            lasts: By peer: the last message of each route.
         """
         self._end(source, reason, lasts or {})
 
@@ -297,10 +310,11 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
             told = msgspec.structs.replace(about, latching=latching)
             opened = RouteOpened(route.number, told, route.contract, route.epoch)
             if route.after is None:
-                opened = msgspec.structs.replace(opened, unknown=route.unknown or msgspec.UNSET)
-            elif (numbering := self._do.outbound.numbering(source, peer)) is not None:
+                unset = msgspec.UNSET
+                opened = msgspec.structs.replace(opened, unknown=route.unknown or unset, shared=route.shared or unset)
+            elif (sender := self._do.outbound.sender_of(source, peer)) is not None:
                 # The peer may have kept messages whose acknowledgement was lost; these are not sent again.
-                following, after = numbering.following, route.after
+                following, after = sender.following, route.after
                 following = following if is_later(following, after) else serial_add(after, 1)
                 opened = msgspec.structs.replace(opened, following=following)
             self._out.send(peer, opened)
@@ -320,7 +334,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
     def _forget(self, source: Source, peer: int, route: ExportRoute) -> None:
         if route.number:
             self._routes.get(peer, {}).pop(route.number, None)
-        else:
+        elif route.reliable:
             self._cut[route.name, source] = route.instance
             if len(self._cut) > mesh_limits.LOSSES_REMEMBERED:
                 self._cut.popitem(last=False)
@@ -342,8 +356,8 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
         flow = self._flows.pop(source, None)
         for peer, route in flow.routes.items() if flow is not None else ():
             last = lasts.get(peer) if lasts is not None else None
-            if lasts is None and (numbering := self._do.outbound.numbering(source, peer)) is not None:
-                last = numbering.last
+            if lasts is None and (sender := self._do.outbound.sender_of(source, peer)) is not None:
+                last = sender.last
             self._forget(source, peer, route)
             if route.number:
                 self._out.send(peer, RouteClosed(route.number, reason, msgspec.UNSET if last is None else last))

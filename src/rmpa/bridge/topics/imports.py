@@ -37,7 +37,6 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.peer_offers import CONFLICT, CROWDED, DENIED, ImportBook, Remote
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
-from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, Reliability
 from rmpa.core.counters import Backoff
 from rmpa.mesh import limits as mesh_limits
@@ -95,7 +94,7 @@ class RemoteTopic(Remote[Source]):
     @property
     def outage(self) -> float:
         """For how many seconds it outlives its link: the contract's outage, or the default if it is not reliable."""
-        return self.contract.outage if self.contract is not None and self.reliable else core_limits.RESUME_WINDOW
+        return (self.contract if self.contract is not None and self.reliable else Contract()).resume_window
 
     def outlives(self, *, silent: bool) -> bool:
         """Whether the source stays in the local graph when its peer's link is gone.
@@ -440,6 +439,11 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         """Handle a route that the peer has refused or closed; ignored if it was closed here meanwhile."""
         if (entry := self._peers[peer].routes.get(message.route)) is not None:
             self._fail(entry, message.reason, now, None if isinstance(message.last, UnsetType) else message.last)
+
+    def next_route(self, peer: int) -> int:
+        """A new number for a route of a peer's link."""
+        self._peers[peer].last_route += 1
+        return self._peers[peer].last_route
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, monotonic seconds; ``None`` if no timer runs."""

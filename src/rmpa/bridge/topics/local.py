@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge import limits
 from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.topics.imports import Imports
     from rmpa.bridge.topics.peer_topics import LossReports, PeerTopics
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.mesh.reliable import ReliableSender
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.subscription import TopicConnection
@@ -114,6 +113,7 @@ class LocalSubscriptions:
         out: Warns of publishers that break TCPROS.
         find: ``(node, slave API, topic)``: the topic of a proxy of this process, which is subscribed to without a
             socket; ``None`` for others.
+        on_over: Called once a publisher has gone, and all that it has published has crossed.
 
     Attributes:
         flows: The flow of each source that the agent is connected to, for snapshots.
@@ -127,11 +127,12 @@ class LocalSubscriptions:
         losses: LossReports,
         out: Effects,
         find: Callable[[str, str, str], Publication | None] = lambda *_: None,
+        on_over: Callable[[Source], None] = lambda _: None,
     ) -> None:
         self._core = shared.core
         self._node = shared.node
         self._exports, self._losses, self._out = exports, losses, out
-        self._find = find
+        self._find, self._on_over = find, on_over
         self.flows: dict[Source, ExportFlow] = {}
         self.senders: dict[tuple[int, int], RouteSender] = {}
         self._parked: ResumeTable[tuple[int, Source]] = ResumeTable()
@@ -145,18 +146,12 @@ class LocalSubscriptions:
 
     def connect(self, source: Source, uri: str) -> None:
         """Subscribe to a publisher at its slave API; the exports are told its header later, or that it is lost."""
-
-        def find() -> Callable[[InProcessConnection], None] | None:
-            publication = self._find(source.node, uri, source.topic)
-            return publication.attach if publication is not None else None
-
         if not any(one.topic == source.topic for one in self.flows):
             self._core.call("registerSubscriber", OWN_NODE, source.topic, "*", self._node.uri)
         _log.debug("> subscribe to %s at %s", source, uri)
         flow = self.flows[source] = ExportFlow()
-        kind = PublisherConnection if find() is None else InProcessConnection
-        flow.connection = kind(
-            source.topic,
+        flow.connection = self.connection(
+            source,
             uri,
             OWN_NODE,
             on_message=flow.message,
@@ -165,21 +160,44 @@ class LocalSubscriptions:
             on_refused=lambda text: self._gone(source, flow, f"its publisher refuses: {text}"),
             on_lost=lambda reason: self._gone(source, flow, reason),
             on_oversized=lambda size: self._losses.oversized(source, flow, size),
-            number=self._node.next_number(),
-            find=find,
         )
         flow.connection.start()
+
+    def connection(self, source: Source, uri: str, caller: str, **callbacks: Any) -> TopicConnection:
+        """A connection to a publisher, by a socket or within this process; see ``TopicConnection``."""
+
+        def find() -> Callable[[InProcessConnection], None] | None:
+            publication = self._find(source.node, uri, source.topic)
+            return publication.attach if publication is not None else None
+
+        kind = PublisherConnection if find() is None else InProcessConnection
+        return kind(source.topic, uri, caller, number=self._node.next_number(), find=find, **callbacks)
 
     def disconnect(self, source: Source) -> None:
         """Disconnect one publisher, and drop its routes."""
         if (flow := self.flows.get(source)) is not None:
             flow.connection.close()
+            flow.ended()
             for peer in list(flow.by_peer):
                 self.remove_route(source, peer)
             flow.close()
             del self.flows[source]
             if not any(one.topic == source.topic for one in self.flows):
                 self._core.call("unregisterSubscriber", OWN_NODE, source.topic, self._node.uri)
+
+    def leave(self, source: Source) -> bool:
+        """Let a publisher that has unregistered end its connection by itself, so that all that it has sent is read.
+
+        Returns:
+            Whether the source is still connected, and sent to a peer; the exports are told when it is lost.
+        """
+        flow = self.flows.get(source)
+        if flow is None or not flow.by_peer:
+            return False
+        if flow.leaving is None:
+            gone = lambda: self._gone(source, flow, "its publisher has gone")  # noqa: E731
+            flow.leaving = asyncio.get_running_loop().call_later(limits.ROUTE_END, gone)
+        return True
 
     def add_route(self, source: Source, peer: int, route: ExportRoute, link: PeerLink) -> None:
         """Send a source to one more peer, or resume its suspended route.
@@ -189,7 +207,7 @@ class LocalSubscriptions:
         """
         flow = self.flows[source]
         sender = flow.by_peer.get(peer)
-        if route.after is not None and isinstance(sender, ReliableRouteSender) and sender.sender.epoch == route.epoch:
+        if route.after is not None and sender is not None and sender.epoch == route.epoch:
             self._parked.claim((peer, source))
             self._timer.arm()
             try:
@@ -197,7 +215,7 @@ class LocalSubscriptions:
             except RemoteProtocolError:
                 flow.remove(peer)  # the caller closes the link; the next one gets a new numbering
                 raise
-            if missed := sender.missed():
+            if isinstance(sender, ReliableRouteSender) and (missed := sender.missed()):
                 self._losses.missed(source, peer, missed)
         else:
             self.remove_route(source, peer)
@@ -205,8 +223,8 @@ class LocalSubscriptions:
         self.senders[peer, route.number] = sender
 
     def suspend_route(self, source: Source, peer: int, outage: float) -> None:
-        """Keep a reliable source's messages for an absent peer, for a time in seconds; best effort keeps none."""
-        sender = self._sender_of(source, peer)
+        """Keep a source's messages for an absent peer, for a time in seconds."""
+        sender = self.sender_of(source, peer)
         self._forget(peer, sender)
         if isinstance(sender, ReliableRouteSender):
             key = (peer, source)
@@ -215,6 +233,10 @@ class LocalSubscriptions:
             if full := self._parked.park(key, sender.sender, loop.time() + outage):
                 loop.call_soon(self._give_up, full)  # later: the exports are at work on these routes now
             self._timer.arm()
+        elif sender is not None:
+            sender.suspend()
+            give_up = self._exports.given_up
+            sender.lapse = asyncio.get_running_loop().call_later(outage, give_up, source, peer)
 
     def back(self, peer: int) -> None:
         """Give a peer that has a link again ``mesh.limits.RESUME_CLAIM`` to open its suspended routes."""
@@ -231,16 +253,12 @@ class LocalSubscriptions:
         """End a source's route to a peer, if there is one, suspended or not."""
         self._parked.claim((peer, source))
         self._timer.arm()
-        if (sender := self._sender_of(source, peer)) is not None:
+        if (sender := self.sender_of(source, peer)) is not None:
             self._forget(peer, sender)
             self.flows[source].remove(peer)
 
-    def numbering(self, source: Source, peer: int) -> ReliableSender | None:
-        """The sender of a source's reliable route to a peer, suspended or not; ``None`` if there is none."""
-        sender = self._sender_of(source, peer)
-        return sender.sender if isinstance(sender, ReliableRouteSender) else None
-
-    def _sender_of(self, source: Source, peer: int) -> RouteSender | None:
+    def sender_of(self, source: Source, peer: int) -> RouteSender | None:
+        """The sender of a source's route to a peer, suspended or not; ``None`` if there is none."""
         flow = self.flows.get(source)
         return flow.by_peer.get(peer) if flow is not None else None
 
@@ -249,7 +267,7 @@ class LocalSubscriptions:
         for peer in dict.fromkeys(peer for peer, _ in keys):
             counts = {}
             for source in (source for one, source in keys if one == peer):
-                sender = self._sender_of(source, peer)
+                sender = self.sender_of(source, peer)
                 if isinstance(sender, ReliableRouteSender):
                     counts[source] = sender.missed() + sender.sender.pending
             self._losses.given_up(peer, counts)
@@ -291,11 +309,21 @@ class LocalSubscriptions:
         _log.log(logging.DEBUG if short else logging.INFO, "= %s: %s", source, reason)
         if flow.connection.malformed:
             self._out.warn("publisher.malformed", str(source), f"{source}: {reason}")
-        lasts = {peer: one.last for peer in flow.by_peer if (one := self.numbering(source, peer)) is not None}
-        self.disconnect(source)  # first: what follows may connect the source anew
-        self._exports.lost(source, reason[: limits.CONTROL_TEXT_MAX], lasts)
+        flow.connection.close()
+        flow.ended()
+        flow.leaving = asyncio.get_running_loop().call_later(limits.ROUTE_DRAIN, self._over, source, flow, reason)
+        flow.drain(lambda: self._over(source, flow, reason))
         if not short:
             self._core.suspect(source.node)
+
+    def _over(self, source: Source, flow: ExportFlow, reason: str) -> None:
+        """Ends a source whose publisher has gone, and whose messages have crossed."""
+        if self.flows.get(source) is not flow:
+            return
+        lasts = {peer: sender.last for peer, sender in flow.by_peer.items()}
+        self.disconnect(source)  # first: what follows may connect the source anew
+        self._exports.lost(source, reason[: limits.CONTROL_TEXT_MAX], lasts)
+        self._on_over(source)
 
 
 def is_watched(type_name: str) -> bool:
@@ -444,7 +472,7 @@ class RemoteSubscribers:
             return True
         if self._exports.description(source) is None:
             return True  # its publisher is not connected
-        names = {name for node in message.nodes if (name := self._name(session, node, source.topic))}
+        names = {name for node in message.nodes if (name := self.name(session, node, source.topic))}
         shown, most = self._shown.setdefault((session.peer, source), {}), limits.AUDIENCES_MAX
         for name in shown.keys() - names:
             shown.pop(name).close()
@@ -461,7 +489,7 @@ class RemoteSubscribers:
             del self._shown[session.peer, source]
         return True
 
-    def _name(self, session: PeerSession, node: str, topic: str) -> str:
+    def name(self, session: PeerSession, node: str, topic: str) -> str:
         """The local name of a peer's listener; empty for a proxy of a module that the peer may not speak for."""
         whose = proxied_node(node)
         if whose is None:

@@ -20,7 +20,14 @@ from rmpa.bridge.messages import CloseRoute, Mismatch, OpenRoute, RouteClosed, R
 from rmpa.bridge.topics.direct import TopicPaths
 from rmpa.bridge.topics.exports import Exports
 from rmpa.bridge.topics.imports import Imports
-from rmpa.bridge.topics.local import LocalSources, LocalSubscriptions, Mismatches, RemoteSubscribers
+from rmpa.bridge.topics.joins import Joins
+from rmpa.bridge.topics.local import (
+    LocalSources,
+    LocalSubscriptions,
+    Mismatches,
+    RemoteSubscribers,
+    compares_names,
+)
 from rmpa.bridge.topics.peer_topics import LossReports, PeerTopic, PeerTopics, TopicEvents
 from rmpa.core.contract import Priority
 from rmpa.core.errors import RemoteProtocolError
@@ -38,7 +45,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import ExportRoute
     from rmpa.bridge.topics.imports import RemoteTopic
-    from rmpa.ros.node.publication import Publication
+    from rmpa.ros.node.publication import Publication, Receiver, SubscriberConnection
     from rmpa.ros.wire.xmlrpc import RosReply
 
 _log = logging.getLogger(__name__)
@@ -75,9 +82,12 @@ class Topics(GraphPart, TopicEvents):
         self.peers: dict[int, PeerTopics] = {}
         self._pasts: OrderedDict[str, dict[Source, tuple[QosWatch, str]]] = OrderedDict()
         self.losses = LossReports(shared, self.exports, self.peers, self)
-        self.outbound = LocalSubscriptions(shared, self.exports, self.losses, self, find)
+        self.outbound = LocalSubscriptions(
+            shared, self.exports, self.losses, self, find, lambda source: self.look((source.topic,))
+        )
         self._mismatches = Mismatches(self, self.exports, self.imports)
         self._subscribers = RemoteSubscribers(shared, self, self.exports, self.imports, self.peers)
+        self._joins = Joins(shared, self.exports, self.imports, self.outbound, self._subscribers)
         self.direct_exports = TopicGrants(shared, self.exports)
         self.direct_imports = TopicPaths(shared, self.warn, self.imports, self.peers)
         self._local = LocalSources(shared.core, shared.relay, lambda s: self.exports.description(s) is not None)
@@ -98,6 +108,7 @@ class Topics(GraphPart, TopicEvents):
         await self.direct_imports.close()
         await self.direct_exports.ports.close()
         self._subscribers.close()
+        self._joins.close()
         self.outbound.close()
 
     def reload(self) -> None:
@@ -124,11 +135,11 @@ class Topics(GraphPart, TopicEvents):
         super().link_down(session)
         peer = session.peer
         if interrupted := self.peers[peer].link_down():
-            # Best-effort messages published until the next link get no sequence: their loss cannot be counted.
             self._shared.counters.add("route.interrupted", interrupted)
         self._subscribers.link_down(peer)
+        self._joins.link_down(peer)
         # Without a pause for data: among it could be the peer's new link, which must find all routes suspended.
-        deque(self.exports.link_away(peer), 0)
+        deque(self.exports.link_away(peer, briefly=session.link.silent), 0)
         if session.link.silent:
             # Most silences end soon with a new link, so nothing leaves the local graph yet.
             deque(self.imports.link_away(peer, briefly=True), 0)
@@ -212,10 +223,13 @@ class Topics(GraphPart, TopicEvents):
     def _look_at(self, name: str) -> None:
         local, before = self._local.of(name), self._nodes.pop(name, ())
         publishers = local | self._local.relayed(name)
-        if publishers:
-            self._nodes[name] = tuple(publishers)
-        for node in dict.fromkeys((*before, *publishers)):
-            self.exports.put(Source(name, node), publishers.get(node))
+        nodes = dict.fromkeys((*before, *publishers))
+        leaving = [node for node in nodes if node not in publishers and self.outbound.leave(Source(name, node))]
+        if publishers or leaving:
+            self._nodes[name] = (*publishers, *leaving)
+        for node in nodes:
+            if node not in leaving:
+                self.exports.put(Source(name, node), publishers.get(node))
         self.imports.local_type(name, next((one.type for one in reversed(local.values())), None))
 
     def reconcile(self) -> None:
@@ -254,6 +268,10 @@ class Topics(GraphPart, TopicEvents):
     def mismatched(self, peer: int, source: Source, subscriber: str, text: str) -> None:
         """Tell the peer of a subscriber here whose definition does not fit its source."""
         self._mismatches.refused(peer, source, subscriber, text)
+
+    def join(self, topic: PeerTopic, connection: SubscriberConnection) -> Receiver | None:
+        """Let a publisher see a further subscriber; clients of actions are seen by their names."""
+        return None if compares_names(topic.type) else self._joins.join(topic.session, topic, connection)
 
     def listeners_changed(self, peer: int, source: Source) -> None:
         """Follow the local subscribers of a peer's source."""

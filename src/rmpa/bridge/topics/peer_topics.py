@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports
     from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.ros.node.publication import Receiver, SubscriberConnection
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.xmlrpc import RosReply
 
@@ -52,6 +53,10 @@ class TopicEvents:
 
     def mismatched(self, peer: int, source: Source, subscriber: str, text: str) -> None:
         """The type or definition of a local subscriber does not fit; the subscriber's name and the reason."""
+
+    def join(self, topic: PeerTopic, connection: SubscriberConnection) -> Receiver | None:  # noqa: ARG002
+        """A further subscriber connects to an open topic; see ``PublicationEvents``."""
+        return None
 
     def listeners_changed(self, peer: int, source: Source) -> None:
         """The set of local subscribers has changed."""
@@ -129,6 +134,15 @@ class PeerTopic(PublicationEvents):
         """The peer may have to know their names."""
         self._peer.part.listeners_changed(self._peer.session.peer, self.source)
 
+    def join(self, connection: SubscriberConnection) -> Receiver | None:
+        """The publisher may have something to say to it alone."""
+        return self._peer.part.join(self, connection)
+
+    @property
+    def session(self) -> PeerSession:
+        """The peer."""
+        return self._peer.session
+
     def request(self, caller: str) -> Awaitable[RosReply | None] | None:
         """A subscriber may get a direct connection."""
         return self._peer.part.request(self._peer.session.peer, self.source, caller)
@@ -155,10 +169,13 @@ class PeerTopic(PublicationEvents):
         """
         contract, flow, session = opened.contract, self.flow, self._peer.session
         past, missed_at = self._peer.pasts.pop(self.source, (None, ""))
+        known = flow is not None
         if flow is not None and flow.contract.reliability is Reliability.RELIABLE:
             past, missed_at = flow.watch, self.topic
         reliable = contract.reliability is Reliability.RELIABLE
-        if flow is None or not reliable or not flow.contract.same_route(contract):
+        cut = flow is not None and not reliable
+        # An older agent does not number best-effort routes: their epoch is 0, and each begins anew.
+        if flow is None or not flow.contract.same_route(contract) or not opened.epoch:
             if flow is not None:
                 flow.close()
             past = past if reliable else None
@@ -166,12 +183,12 @@ class PeerTopic(PublicationEvents):
             flow = ImportFlow(self.publication, contract, time, counters, self.occurred, self.torn, past)
         self.flow, flow.contract = flow, contract
         goes_on = flow.bind(session.link, opened.route, opened.epoch, opened.first)
-        self.publication.bound(contract.depth)
+        self.publication.bound(contract.queue_depth)
         if contract.durability is Durability.TRANSIENT_LOCAL:
             self.publication.keep(contract.kept)
         if goes_on and not isinstance(opened.following, UnsetType):
             flow.skip(opened.following)
-        elif reliable and not goes_on and (missed_at or opened.unknown is True):
+        elif not goes_on and (cut or (reliable and (missed_at or opened.unknown is True))):
             flow.missed_unknown("an agent was restarted, or the route had ended")
         about = opened.description
         text = about.definition.encode("latin-1").decode(errors="surrogateescape")
@@ -179,6 +196,8 @@ class PeerTopic(PublicationEvents):
             self.torn()
         if not goes_on:
             flow.expect_replay(self.publication.latched)
+        if opened.shared is True and not known:
+            self.publication.join()
         return flow
 
     def end(self, *, missed: bool, gone: bool = True) -> None:

@@ -22,9 +22,10 @@ from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from msgspec import UNSET
+
 from rmpa.core.contract import Durability, History, Liveliness, Reliability
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.limits import ROUTE_QUEUE_MESSAGES
 from rmpa.gateway import limits
 from rmpa.gateway.zenoh.threads import PRIORITIES, ZenohQos
 
@@ -243,7 +244,7 @@ def ros2_qos(contracts: Contracts, topic: str, type_name: str, *, latching: bool
         Ros2Reliability.BEST_EFFORT if best_effort else Ros2Reliability.RELIABLE,
         Ros2Durability.TRANSIENT_LOCAL if kept else Ros2Durability.VOLATILE,
         Ros2History.KEEP_ALL if contract.history is History.KEEP_ALL else Ros2History.KEEP_LAST,
-        contract.kept if kept else DEFAULT_DEPTH if contract.depth == ROUTE_QUEUE_MESSAGES else contract.depth,
+        contract.kept if kept else DEFAULT_DEPTH if contract.depth is UNSET else contract.depth,
         _nanoseconds(contract.deadline),
         _nanoseconds(contract.lifespan),
         Ros2Liveliness.MANUAL_BY_TOPIC if manual else Ros2Liveliness.AUTOMATIC,
@@ -263,7 +264,7 @@ def zenoh_qos(contract: Contract, qos: Ros2Qos) -> ZenohQos:
         reliable=reliable,
         block=reliable,
         priority=PRIORITIES[contract.priority],
-        messages=contract.depth,
+        messages=contract.queue_depth,
         cache=qos.depth if qos.latched else 0,
     )
 

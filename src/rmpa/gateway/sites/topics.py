@@ -105,7 +105,7 @@ def qos_of(contract: Contract, *, latching: bool = False, large: bool = False) -
         reliable=True,
         block=False,
         priority=PRIORITIES[Priority.LOW if large and contract.priority is Priority.NORMAL else contract.priority],
-        messages=contract.depth,
+        messages=contract.queue_depth,
         bytes=limits.RELIABLE_BYTES if contract.reliability is Reliability.RELIABLE else limits.BEST_EFFORT_BYTES,
         cache=1 if latching else 0,
     )
@@ -148,7 +148,7 @@ class SiteDialect:
         """
         del keeps
         reliable = self._contract.reliability is Reliability.RELIABLE
-        return max(_TAP_LINGER, self._contract.outage if reliable else 0.0)
+        return max(_TAP_LINGER, self._contract.resume_window if reliable else 0.0)
 
     def told(self, problem: str) -> None:
         """``rmpa why`` tells it, and no log."""

@@ -129,13 +129,14 @@ class LaneSender:
             self.outbox.push(frame, route, self._loop.time(), pinned=True)
             self._on_wanted()
 
-    def set_terms(self, route: int, depth: int, max_age: float | None, *, strict: bool) -> None:
+    def set_terms(
+        self, route: int, depth: int, max_age: float | None = None, *, above: int = 0, spared: bool = False
+    ) -> None:
         """Bound the waiting messages of one route; see ``core.outbox``.
 
-        Without ``max_age`` the route is a reliable one: its sender's window bounds it, and the bound on the bytes of
-        all routes drops none of its messages.
+        ``above`` as there; 0: also the newest message is dropped beyond ``max_age``, which is a lifespan.
         """
-        self.outbox.set_terms(route, depth, max_age, strict=strict, spared=max_age is None)
+        self.outbox.set_terms(route, depth, max_age, strict=not above, above=above, spared=spared)
 
     def discard(self, route: int) -> int:
         """Drop the waiting messages of a route, and its bounds; the route stays open. Returns their number."""

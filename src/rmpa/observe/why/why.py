@@ -365,7 +365,7 @@ class WhyService:
         decision = exports.decision(session.peer, source)
         if decision is None:  # it has just come, or cannot be reached
             decision = self._bridge.context.policy.judge(source.topic, kind, source.node)
-        numbering, contract = outbound.numbering(source, session.peer), exports.contract(source, session.peer)
+        sender, contract = outbound.sender_of(source, session.peer), exports.contract(source, session.peer)
         reliable = contract is not None and contract.reliability is Reliability.RELIABLE
         lost = self._core.unreachable().get(source.node) if flow is None or not flow.messages else None
         figures = {} if flow is None else {n: getattr(flow, n) for n in ("messages", "oversized", "oversized_bytes")}
@@ -378,7 +378,7 @@ class WhyService:
             offered=exports.offer(session.peer, source) is not None,
             route="open" if session.peer in exports.flowing(source) else "opening" if contract is not None else "",
             dropped=flow.dropped if flow is not None and not reliable else 0,
-            lost=numbering.lost if numbering is not None else 0,
+            lost=sender.lost if sender is not None else 0,
             beyond=exports.limit if source in exports.beyond else 0,
             unreachable=f"{lost.api}: {lost.problem}" if lost is not None else "",
             **figures,

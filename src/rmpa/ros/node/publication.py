@@ -10,7 +10,7 @@ import asyncio
 import logging
 import socket
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
 
 from rmpa.core.counters import logged_failure
 from rmpa.core.outbox import URGENT, Outbox
@@ -44,6 +44,10 @@ _log = logging.getLogger(__name__)
 _NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
 # The outbox key of messages.
 _MESSAGES: Final = 0
+
+
+def _ended(*_: object) -> None:
+    """The ``on_end`` of a connection that no publication has any more."""
 
 
 class AcceptedConnection(Stream):
@@ -121,9 +125,13 @@ class AcceptedConnection(Stream):
         self.send([encode_header(error_header(text))], URGENT)
         self.close()
 
-    def hang_up(self) -> None:
-        """Close at once, without a call of ``on_end``."""
-        self.close()
+    def hang_up(self, *, drain: bool = False) -> None:
+        """Close without a call of ``on_end``, at once or when all that waits is sent."""
+        self.on_end = _ended
+        if drain:
+            self.leave(limits.SUBSCRIBER_DRAIN)
+        else:
+            self.close()
 
     def _take(self, data: memoryview) -> tuple[int, int]:
         consumed = 0
@@ -161,12 +169,35 @@ class PublicationEvents:
     def listeners_changed(self) -> None:
         """``Publication.listeners`` has changed."""
 
+    def join(self, connection: SubscriberConnection) -> Receiver | None:  # noqa: ARG002 - of those who override it
+        """A subscriber connects to a topic that is served; return what takes the messages in its place."""
+        return None
+
     def request(self, caller: str) -> Awaitable[RosReply | None] | None:  # noqa: ARG002 - of those who override it
         """Answer the ``requestTopic`` of a subscriber with this caller id.
 
         Its reply of ``None`` is the publication's own address. ``None`` instead of an awaitable: no need to wait.
         """
         return None
+
+
+class Receiver(Protocol):
+    """What takes the messages of a publication: a subscriber, or what stands for one."""
+
+    def send(self, parts: Sequence[Buffer], key: int) -> int:
+        """Take one message."""
+
+    def open(self, key: int, size: int) -> QueuedMessage:
+        """A message of ``size`` bytes begins."""
+
+    def extend(self, message: QueuedMessage, data: Buffer) -> int:
+        """Take a part of it."""
+
+    def abandon(self, message: QueuedMessage) -> bool:
+        """Its rest will not come; return whether the connection must be closed for that."""
+
+    def close(self) -> None:
+        """End."""
 
 
 _NO_EVENTS: Final = PublicationEvents()
@@ -214,10 +245,13 @@ class Publication:
         self._queue_messages = queue_messages
         self._queue_bytes = queue_bytes
         self._connections: tuple[SubscriberConnection, ...] = ()
+        # What takes messages in the place of subscribers.
+        self._joining: dict[SubscriberConnection, Receiver] = {}
+        self._receivers: tuple[Receiver, ...] = ()
         # The message in progress: the bytes to come, the subscribers that have its beginning, and, if it will be
         # latched, what has come.
         self._left = 0
-        self._partial: Sequence[tuple[SubscriberConnection, QueuedMessage]] = ()
+        self._partial: Sequence[tuple[Receiver, QueuedMessage]] = ()
         self._whole: bytearray | None = None
         self._dropped_before = 0
         if description is not None:
@@ -269,7 +303,10 @@ class Publication:
             return
         self._connections += (connection,)
         if self.description is not None:
+            if (receiver := self.events.join(connection)) is not None:
+                self._joining[connection] = receiver
             self.events.listeners_changed()
+        self._list_receivers()
         if len(self._connections) == 1:
             self.events.first_subscriber()
 
@@ -294,6 +331,7 @@ class Publication:
                 with logged_failure(_log, "%s: subscriber %s failed", self.topic, printable(connection.caller_id)):
                     if self._admit(connection):
                         self._connections += (connection,)
+            self._list_receivers()
             if connections:
                 self.events.listeners_changed()
                 if not self._connections:
@@ -320,8 +358,8 @@ class Publication:
         if self.description.latching:
             self._latch(bytes(framed))
         parts, dropped = (framed,), 0
-        for connection in self._connections:
-            dropped += connection.send(parts, _MESSAGES)
+        for receiver in self._receivers:
+            dropped += receiver.send(parts, _MESSAGES)
         return dropped
 
     def begin(self, size: int) -> None:
@@ -331,13 +369,13 @@ class Publication:
         """
         self._left = size
         if self.description is not None:
-            self._partial = [(connection, connection.open(_MESSAGES, size)) for connection in self._connections]
+            self._partial = [(receiver, receiver.open(_MESSAGES, size)) for receiver in self._receivers]
             self._whole = bytearray() if self.description.latching else None
 
     def extend(self, part: Buffer) -> None:
         """Send the next part to all subscribers that have the message's beginning."""
-        for connection, message in self._partial:
-            connection.extend(message, part)
+        for receiver, message in self._partial:
+            receiver.extend(message, part)
         self.bytes += len(part)
         self._left -= len(part)
         if self._whole is not None:
@@ -345,14 +383,14 @@ class Publication:
         if self._left:
             return
         self.messages += 1
-        served = {connection for connection, _ in self._partial}
+        served = {receiver for receiver, _ in self._partial}
         self._partial = ()
         if self._whole is not None:
             framed, self._whole = bytes(self._whole), None
             self._latch(framed)
-            for connection in self._connections:
-                if connection not in served:
-                    connection.send((framed,), _MESSAGES)
+            for receiver in self._receivers:
+                if receiver not in served:
+                    receiver.send((framed,), _MESSAGES)
 
     def abort(self) -> int:
         """Give up the message in progress, whose rest will not arrive.
@@ -362,10 +400,25 @@ class Publication:
         Returns:
             The number of disconnected subscribers: if any, the owner should register the topic again.
         """
-        broken = [connection for connection, message in self._partial if connection.abandon(message)]
+        broken = {receiver for receiver, message in self._partial if receiver.abandon(message)}
         self._partial, self._whole = (), None
-        self._end(broken)
+        self._end([one for one in self._connections if one in broken])
         return len(broken)
+
+    def join(self) -> None:
+        """Treat all present subscribers as new ones."""
+        for connection in self._connections:
+            if connection not in self._joining and (receiver := self.events.join(connection)) is not None:
+                self._joining[connection] = receiver
+        self._list_receivers()
+
+    def joined(self, connection: SubscriberConnection) -> None:
+        """Send to a subscriber itself from now on."""
+        if self._joining.pop(connection, None) is not None:
+            self._list_receivers()
+
+    def _list_receivers(self) -> None:
+        self._receivers = tuple(self._joining.get(one, one) for one in self._connections)
 
     def bound(self, messages: int) -> None:
         """Set the bound on messages queued for one slow subscriber."""
@@ -393,10 +446,12 @@ class Publication:
         await asyncio.gather(*(connection.drained(timeout) for connection in self._connections))
 
     def withdraw(self) -> None:
-        """Close all connections without an event."""
+        """Close all connections without an event, once each has been sent what was published."""
         self.events = _NO_EVENTS
         self.latched, self._whole = (), None
-        self._end(self._connections)
+        begun = {receiver for receiver, _ in self._partial}
+        self._end([one for one in self._connections if one in begun])
+        self._end(self._connections, drain=True)
 
     def _latch(self, framed: bytes) -> None:
         self.latched = (*self.latched, framed)[-self._keeps :]
@@ -420,17 +475,20 @@ class Publication:
             connection.send((framed,), _MESSAGES)
         return not connection.closed
 
-    def _end(self, connections: Sequence[SubscriberConnection]) -> None:
+    def _end(self, connections: Sequence[SubscriberConnection], *, drain: bool = False) -> None:
         """Close connections and forget them."""
         if not connections:
             return
         gone = set(connections)
+        for receiver in [self._joining.pop(one) for one in connections if one in self._joining]:
+            receiver.close()
         self._dropped_before += sum(one.dropped for one in gone)
         self._partial = [each for each in self._partial if each[0] not in gone]
         left = tuple(one for one in self._connections if one not in gone)
         ended, self._connections = len(left) < len(self._connections), left
+        self._list_receivers()
         for connection in connections:
-            connection.hang_up()
+            connection.hang_up(drain=drain)
         self.events.listeners_changed()
         if ended and not left:
             self.events.last_subscriber()

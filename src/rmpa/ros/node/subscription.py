@@ -404,7 +404,7 @@ class InProcessConnection(TopicConnection):
         self.refused = text
         self._on_refused(text)
 
-    def hang_up(self) -> None:
+    def hang_up(self, *, drain: bool = False) -> None:  # noqa: ARG002 - nothing waits
         """End the connection, and report it in the next turn of the loop."""
         if not self.closed:
             self._detach()

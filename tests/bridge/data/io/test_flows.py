@@ -466,6 +466,7 @@ def test_late_message_does_not_disturb_one_in_parts(contract: Contract) -> None:
 
 OLD = runtime_limits.STALE_AGE + 0.01
 HOLD = mesh_limits.STALE_HOLD
+NEWEST = Contract(depth=1)
 
 
 def burst(inlet: Inlet, clock: Clock, ages: list[float], first: int = 2) -> None:
@@ -475,7 +476,7 @@ def burst(inlet: Inlet, clock: Clock, ages: list[float], first: int = 2) -> None
 
 
 def test_of_what_an_outage_held_up_the_newest_counts(clock: Clock) -> None:
-    inlet = Inlet(error=0.001, first=2)
+    inlet = Inlet(NEWEST, error=0.001, first=2)
     burst(inlet, clock, [9.0, 8.0, 7.0, 0.01, 0.0])
     assert inlet.got == [b"\5", b"\6"]
     clock.advance(1.0)
@@ -485,7 +486,7 @@ def test_of_what_an_outage_held_up_the_newest_counts(clock: Clock) -> None:
 
 
 def test_last_command_before_an_outage_is_delivered(clock: Clock) -> None:
-    inlet = Inlet(error=0.001, first=2)
+    inlet = Inlet(NEWEST, error=0.001, first=2)
     burst(inlet, clock, [9.0, 8.0, 7.0])
     assert inlet.got == []
     clock.advance(HOLD + 0.001)
@@ -500,7 +501,7 @@ def test_last_command_before_an_outage_is_delivered(clock: Clock) -> None:
 
 def test_the_hold_is_counted_from_the_first_of_the_burst(clock: Clock) -> None:
     """A source that stays late for ever must not be held for ever."""
-    inlet = Inlet(error=0.001, first=2)
+    inlet = Inlet(NEWEST, error=0.001, first=2)
     for sequence in range(2, 60):
         burst(inlet, clock, [2.0], first=sequence)
         clock.advance(HOLD / 3)
@@ -511,7 +512,7 @@ def test_the_hold_is_counted_from_the_first_of_the_burst(clock: Clock) -> None:
 
 @pytest.mark.parametrize(("error", "age"), [(None, 60.0), (1.0, 1.0), (0.001, 0.1), (0.001, -5.0)])
 def test_message_of_uncertain_age_is_not_held(clock: Clock, error: float | None, age: float) -> None:
-    inlet = Inlet(error=error, first=2)
+    inlet = Inlet(NEWEST, error=error, first=2)
     burst(inlet, clock, [age])
     assert inlet.got == [b"\2"]
     assert inlet.counts == (0, 0, 0, 0)
@@ -519,7 +520,7 @@ def test_message_of_uncertain_age_is_not_held(clock: Clock, error: float | None,
 
 @pytest.mark.parametrize("ahead", [-3600.0, 3600.0])
 def test_the_peers_clock_is_what_dates_its_messages(clock: Clock, ahead: float) -> None:
-    inlet = Inlet(error=0.001, ahead=ahead, first=2)
+    inlet = Inlet(NEWEST, error=0.001, ahead=ahead, first=2)
     inlet.message(2, b"new", stamp_ns=clock.wall_ns() + round(ahead * 1e9))
     assert inlet.got == [b"new"]
     inlet.message(3, b"old", stamp_ns=clock.wall_ns() + round((ahead - OLD) * 1e9))
@@ -531,7 +532,7 @@ def test_the_peers_clock_is_what_dates_its_messages(clock: Clock, ahead: float) 
 @pytest.mark.parametrize("resumed", [-math.inf, -5.0])
 def test_what_no_silence_held_up_is_not_thrown_away(clock: Clock, resumed: float) -> None:
     """A slow link, a full buffer, a process that got no CPU: late, but all that there is."""
-    inlet = Inlet(error=0.001, first=2)
+    inlet = Inlet(NEWEST, error=0.001, first=2)
     inlet.resumed = clock.now + resumed
     burst(inlet, clock, [3.0, 0.9, 0.5])
     assert inlet.got == [b"\2", b"\3", b"\4"]
@@ -539,24 +540,29 @@ def test_what_no_silence_held_up_is_not_thrown_away(clock: Clock, resumed: float
 
 
 def test_messages_from_before_a_silence_are_stale(clock: Clock) -> None:
-    inlet = Inlet(error=0.001, first=2)
+    inlet = Inlet(NEWEST, error=0.001, first=2)
     inlet.resumed = clock.now - 0.5
     burst(inlet, clock, [0.9, 0.7, 0.55, 0.3])  # the third was held up for 50 ms, and by us for the rest
     assert inlet.got == [b"\4", b"\5"]
     assert inlet.counts == (0, 0, 2, 0)
 
 
-@pytest.mark.parametrize(
-    ("contract", "kept"), [(BEST, 1), (KEPT, 1), (Contract(durability=Durability.TRANSIENT_LOCAL, depth=3), 3)]
-)
-def test_kept_messages_are_as_old_as_they_are(clock: Clock, contract: Contract, kept: int) -> None:
-    inlet = Inlet(contract, error=0.001)
-    burst(inlet, clock, [60.0] * (kept + 2), first=1)
-    assert inlet.got == [bytes([n + 1]) for n in range(kept)]
+@pytest.mark.parametrize("contract", [BEST, Contract(depth=2), Contract(depth=1, reliability=Reliability.RELIABLE)])
+def test_all_that_an_outage_held_up_counts_without_a_depth_of_one(clock: Clock, contract: Contract) -> None:
+    inlet = Inlet(contract, error=0.001, first=2)
+    burst(inlet, clock, [9.0, 8.0, 7.0])
+    assert inlet.got == [b"\2", b"\3", b"\4"]
+    assert inlet.counts == (0, 0, 0, 0)
+
+
+def test_a_kept_message_is_as_old_as_it_is(clock: Clock) -> None:
+    inlet = Inlet(NEWEST, error=0.001)
+    burst(inlet, clock, [60.0] * 3, first=1)
+    assert inlet.got == [b"\1"]
 
 
 def test_large_message_replaces_a_held_one(clock: Clock) -> None:
-    inlet = Inlet(error=0.001, first=2)
+    inlet = Inlet(NEWEST, error=0.001, first=2)
     burst(inlet, clock, [9.0])
     inlet.parts(3, bytes(BIG), 50, end=1, stamp_ns=clock.wall_ns())
     clock.advance(1.0)
@@ -591,7 +597,7 @@ def test_a_lifespan_counts_whatever_held_the_message_up(clock: Clock) -> None:
 
 
 def test_closed_nothing_happens_any_more(clock: Clock) -> None:
-    inlet = Inlet(error=0.001, first=2)
+    inlet = Inlet(NEWEST, error=0.001, first=2)
     burst(inlet, clock, [9.0])
     inlet.parts(3, bytes(BIG), 50, end=1)
     burst(inlet, clock, [9.0, 8.0], first=4)

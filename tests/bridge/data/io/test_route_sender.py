@@ -10,12 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
-from rmpa.bridge.data.export import BULK_STALE_AGE, ExportFlow, ReliableRouteSender, RouteSender
+from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender, RouteSender
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, History, Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.mesh import limits as mesh_limits
-from rmpa.runtime import limits as runtime_limits
 from tests.bridge.io.doubles import Clock, Link, running
 
 if TYPE_CHECKING:
@@ -109,7 +108,7 @@ def test_held_messages_keep_to_the_depth(history: History, kept: int) -> None:
 
 
 def test_held_bytes_are_bounded(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mesh_limits, "LANE_QUEUE_BYTES", 1000)
+    monkeypatch.setattr(mesh_limits, "ROUTE_QUEUE_BYTES", 1000)
     link, sender = fresh(best_effort, large=True)
     assert sender.message(0, bytes(400)) == 0
     assert sender.message(0, bytes(400)) == 0
@@ -148,7 +147,7 @@ def test_lost_bulk_lane_delivers_nothing_late(clock: Clock) -> None:
     sender.fenced(number)
     sender.message(0, SMALL)
     assert link.numbers == list(range(1, ROW + 3))
-    assert link.bulk.terms[7] == (core_limits.ROUTE_QUEUE_MESSAGES, BULK_STALE_AGE, False), "they hold on"
+    assert link.bulk.terms[7] == DEFAULT, "they hold on"
 
 
 def test_bulk_lost_without_a_fence_keeps_what_waits() -> None:
@@ -161,33 +160,66 @@ def test_bulk_lost_without_a_fence_keeps_what_waits() -> None:
     assert link.log == [("bulk", "message", 7, 2)]
 
 
+DEFAULT = (core_limits.ROUTE_QUEUE_MESSAGES, mesh_limits.ROUTE_QUEUE_AGE, mesh_limits.ROUTE_QUEUE_BYTES, False)
+
+
 @pytest.mark.parametrize(
-    ("contract", "depth", "ages", "strict"),
+    ("contract", "terms"),
     [
-        (Contract(), core_limits.ROUTE_QUEUE_MESSAGES, (runtime_limits.STALE_AGE, BULK_STALE_AGE), False),
-        (Contract(depth=3), 3, (runtime_limits.STALE_AGE, BULK_STALE_AGE), False),
-        (Contract(depth=3, lifespan=0.5), 3, (0.5, 0.5), True),
-        (
-            Contract(depth=3, history=History.KEEP_ALL),
-            mesh_limits.KEEP_ALL_MESSAGES,
-            (runtime_limits.STALE_AGE, BULK_STALE_AGE),
-            False,
-        ),
+        (Contract(), DEFAULT),
+        (Contract(depth=3), (3, None, 0, False)),
+        (Contract(depth=core_limits.ROUTE_QUEUE_MESSAGES), (core_limits.ROUTE_QUEUE_MESSAGES, None, 0, False)),
+        (Contract(lifespan=0.5), (core_limits.ROUTE_QUEUE_MESSAGES, 0.5, 0, False)),
+        (Contract(depth=3, history=History.KEEP_ALL), (mesh_limits.KEEP_ALL_MESSAGES, None, 0, False)),
         (
             Contract(depth=3, lifespan=0.5, reliability=Reliability.RELIABLE),
-            mesh_limits.KEEP_ALL_MESSAGES,
-            (None, None),
-            False,
+            (mesh_limits.KEEP_ALL_MESSAGES, None, 0, True),
         ),
     ],
 )
-def test_both_lanes_get_the_bounds(
-    contract: Contract, depth: int, ages: tuple[float | None, ...], strict: bool
-) -> None:
+def test_both_lanes_get_the_bounds(contract: Contract, terms: tuple[object, ...]) -> None:
     link = Link()
     ExportFlow().add(1, link, 7, contract, 1)
-    assert link.express.terms == {7: (depth, ages[0], strict)}
-    assert link.bulk.terms == {7: (depth, ages[1], strict)}
+    assert link.express.terms == link.bulk.terms == {7: terms}
+
+
+BEST_EFFORT = Contract()
+
+
+def cut(sent: int, missed: int, after: int, contract: Contract = BEST_EFFORT, *, size: int = 1) -> list[int]:
+    """The numbers that a second link carries, where the peer has what came up to ``after`` over the first one."""
+    sender = RouteSender(Link(), 7, contract)
+    for _ in range(sent):
+        sender.message(0, bytes(size))
+    sender.suspend()
+    for _ in range(missed):
+        sender.message(0, bytes(size))
+    link = Link()
+    following = sender.following
+    sender.resume(link, 8, after)
+    sender.message(0, bytes(size))
+    assert not link.numbers or following <= link.numbers[0]
+    assert sender.last == sent + missed + 1
+    return link.numbers
+
+
+def test_what_a_silent_link_did_not_deliver_goes_over_the_next_one() -> None:
+    assert cut(5, 3, after=2) == [3, 4, 5, 6, 7, 8, 9]
+    assert cut(5, 0, after=5) == [6]
+    assert cut(0, 2, after=0) == [1, 2, 3]
+
+
+def test_without_a_link_the_depth_bounds_what_waits() -> None:
+    assert cut(5, 3, after=2, contract=Contract(depth=2)) == [7, 8, 9]
+    assert cut(5, 0, after=2, contract=Contract(depth=1)) == [5, 6]
+
+
+def test_what_was_sent_long_ago_is_not_kept() -> None:
+    sender = RouteSender(Link(), 7, Contract())
+    sender.message(0, b"")
+    sender.message(10**10, b"")
+    sender.suspend()
+    assert sender.following == 2
 
 
 def test_sequences_wrap() -> None:

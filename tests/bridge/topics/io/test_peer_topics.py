@@ -88,6 +88,7 @@ class Proxied:
             mismatched=lambda _peer, _source, _who, text: pytest.fail(text),
             occurred=lambda _peer, _source, occurred: self.occurred.append((self.loop.time(), occurred)),
             listeners_changed=lambda _peer, _source: None,
+            join=lambda _topic, _connection: None,
             request=lambda *_: None,
         )
         shared = SimpleNamespace(core=core, counters=Counters())
