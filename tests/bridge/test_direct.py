@@ -184,10 +184,10 @@ def test_a_contract_that_no_rule_can_make_is_refused(contract: object) -> None:
         read_ask(WANT._asdict() | {"contract": contract})
 
 
-# docs/guides/contracts.md lists every condition of direct transport, by the word that the commands show.
+# docs/guides/direct-transport.md lists every condition of direct transport, by the word that the commands show.
 
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "guides" / "contracts.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "guides" / "direct-transport.md"
 
 
 def _first_column(section: str) -> list[str]:
@@ -196,8 +196,8 @@ def _first_column(section: str) -> list[str]:
 
 
 def test_every_condition_and_transport_is_documented() -> None:
-    assert sorted(_first_column("### When it is relayed all the same")) == sorted(Condition)
-    assert sorted(_first_column("## Which transport when")) == sorted(Transport)
+    assert sorted(_first_column("## When it is relayed all the same")) == sorted(Condition)
+    assert sorted(_first_column("# Direct transport")) == sorted(Transport)
 
 
 # docs/design/introspection.md lists every counter of direct transport.
