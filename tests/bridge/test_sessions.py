@@ -317,14 +317,6 @@ async def test_a_proxy_that_cannot_be_made_is_tried_again() -> None:
     assert world.nodes.open == []
 
 
-async def test_a_relayed_node_has_the_name_of_its_own_module() -> None:
-    world = World()
-    world.proxies.names["/rmpa/other/n"] = "/rmpa/other/n"
-    world.hold("/rmpa/other/n", "topic /a")
-    assert await world.settled() == ["topic /a at /rmpa/other/n"]
-    await world.proxies.close()
-
-
 # How proxies listen: together where nodes of this machine alone reach them, and apart where that cannot be.
 
 

@@ -386,7 +386,8 @@ def may_have(instance: str, origin: Origin) -> bool:
 class RelayPaths:
     """The receiving side: selects the path to each module, its own link first, else the best relay.
 
-    The best relay has the shortest path; among equal ones, the lowest GUID. All sources of a module use one path.
+    The best relay has the shortest path; among equal ones, the lowest GUID. A peer counts while it has a link and has
+    told all that it offers.
 
     Args:
         may_relay: Whether a peer, by its name, may be a relay at all.
@@ -395,6 +396,7 @@ class RelayPaths:
         instance: Our own, as 32 hexadecimal digits.
         reached_here: Instances that this module reaches by itself, outside the mesh: a gateway's sites.
         _linked: By number of a peer with a link of its own: its name, its instance, and its rank among relays.
+        _ready: The peers that have a link and have told all that they offer.
         _ways: By instance and relay: the origin as the relay offered it last, and the number of its sources there.
     """
 
@@ -403,6 +405,7 @@ class RelayPaths:
         self.instance = ""
         self.reached_here: set[str] = set()
         self._linked: dict[int, tuple[str, str, int]] = {}
+        self._ready: set[int] = set()
         self._ways: dict[str, dict[int, tuple[Origin, int]]] = {}
 
     def __iter__(self) -> Iterator[tuple[Origin, str]]:
@@ -427,8 +430,16 @@ class RelayPaths:
         self._linked[peer] = name, instance, rank
         return {instance}
 
+    def ready(self, peer: int, *, ready: bool) -> set[str]:
+        """Note whether a peer has a link and has told all; return the instances whose path may have changed."""
+        if ready is (peer in self._ready) or peer not in self._linked:
+            return set()
+        (self._ready.add if ready else self._ready.discard)(peer)
+        return {self._linked[peer][1]} | {instance for instance, ways in self._ways.items() if peer in ways}
+
     def unlinked(self, peer: int) -> set[str]:
         """Forget a peer and all paths through it; return the instances whose path may have changed."""
+        self._ready.discard(peer)
         gone = self._linked.pop(peer, None)
         changed = {gone[1]} if gone is not None else set()
         for instance, ways in list(self._ways.items()):
@@ -455,8 +466,8 @@ class RelayPaths:
             del self._ways[origin.instance]
         return self._best(origin.instance) != before
 
-    def why_not(self, peer: int, origin: Origin) -> str:
-        """Why a relayed source of a peer is hidden, or empty."""
+    def objection(self, origin: Origin) -> str:
+        """Why no relay's source of a module is shown, or empty."""
         if origin.instance == self.instance:
             return "it is ours, and came back by a relay"
         if self.instance in origin.path:
@@ -465,16 +476,26 @@ class RelayPaths:
             return f"{origin.name} is reached from here"
         if self._direct(origin):
             return f"{origin.name} has a link of its own"
+        return ""
+
+    def why_not(self, peer: int, origin: Origin) -> str:
+        """Why a relayed source of a peer is hidden, or empty."""
+        if why := self.objection(origin):
+            return why
         best = self._best(origin.instance)
         if best is not None and best != peer:
             return f"{origin.name} is reached by way of {self._linked[best][0]}"
         return ""
 
+    def rank(self, peer: int, origin: Origin | None) -> tuple[bool, int, int, int]:
+        """Sorts the ways to a source: those that work, then links, then relays by their paths, then by GUID."""
+        return peer not in self._ready, len(origin.path) if origin is not None else 0, self._linked[peer][2], peer
+
     def _direct(self, origin: Origin) -> bool:
         # Every member of a mesh hears the instances of the others, and may claim one; see Identity.is_same_run.
-        return any((name, instance) == (origin.name, origin.instance) for name, instance, _ in self._linked.values())
+        return any(self._linked[peer][:2] == (origin.name, origin.instance) for peer in self._ready)
 
     def _best(self, instance: str) -> int | None:
         ways = self._ways.get(instance, {})
         relays = (peer for peer in ways if self._may_relay(self._linked[peer][0]))
-        return min(relays, key=lambda peer: (len(ways[peer][0].path), self._linked[peer][2], peer), default=None)
+        return min(relays, key=lambda peer: self.rank(peer, ways[peer][0]), default=None)

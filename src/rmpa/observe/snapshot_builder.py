@@ -194,7 +194,7 @@ class SnapshotBuilder:
         """The agent itself."""
         endpoint, bridge, core = self._parts.endpoint(), self._parts.bridge, self._parts.core
         identity, _, discovery = endpoint or (None, None, None)
-        proxies = sum(len(session.proxies) for session in bridge.sessions)
+        proxies = bridge.sessions.proxy_count
         now, rss = time.monotonic(), None
         with contextlib.suppress(OSError):  # no file descriptor is left to read /proc
             if now - self._cpu_known >= 1.0:  # the kernel counts in ticks of 10 ms

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.messages import OpenRoute, encode
+from rmpa.bridge.messages import OpenRoute, Source, encode
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, ContractRule, Durability, Priority, Reliability
 from rmpa.mesh import limits as mesh_limits
@@ -165,7 +165,8 @@ async def a_lie(world: World) -> None:
     end = a.link
     assert end is not None
     end.expects_the_worst = True
-    lie = OpenRoute(1, "/sure", "/one", Contract(reliability=Reliability.RELIABLE), epoch=1, after=99)
+    epoch = a.bridge.topics.outbound.flows[Source("/sure", "/one")].epoch
+    lie = OpenRoute(1, "/sure", "/one", Contract(reliability=Reliability.RELIABLE), epoch=epoch, after=99)
     end.receive(Frame(FrameKind.CONTROL, encode(lie)))
     assert "resumes message 99" in end.aborted
     world.link()

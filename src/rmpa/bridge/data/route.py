@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.contract import Priority
+from rmpa.core.contract import History, Priority
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Lane
 
@@ -27,6 +27,11 @@ if TYPE_CHECKING:
 
 EXPRESS: Final = Lane.EXPRESS
 BULK: Final = Lane.BULK
+
+
+def kept_for(contract: Contract) -> int:
+    """How many messages a contract keeps while they cannot be sent."""
+    return limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.depth
 
 
 class LaneSwitch:

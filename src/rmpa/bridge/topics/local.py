@@ -17,12 +17,14 @@ import logging
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
-from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender
+from rmpa.bridge.data.export import ExportFlow, RelayedFlow, ReliableRouteSender
 from rmpa.bridge.messages import Audience, Description, Mismatch, Source, encode, is_crossing_name
 from rmpa.bridge.topics.exports import LocalSource
+from rmpa.bridge.topics.peer_topics import PeerTopic
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import OWN_NODE, is_own, is_type_name, proxied_node, proxy_name
+from rmpa.core.limits import UINT32_MAX
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ResumeTable
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
@@ -34,7 +36,7 @@ from rmpa.runtime.loop import MachineTimer
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from rmpa.bridge.data.export import RouteSender
+    from rmpa.bridge.data.export import RouteBegin, RouteSender
     from rmpa.bridge.messages import Message
     from rmpa.bridge.offers import Effects
     from rmpa.bridge.policy import Relay
@@ -131,6 +133,8 @@ class LocalSubscriptions:
         self._node = shared.node
         self._exports, self._losses, self._out = exports, losses, out
         self._find = find
+        # Random, so that no earlier run of this agent, and no other agent, is likely to have had it.
+        self._epoch = int(shared.rng() * UINT32_MAX)
         self.flows: dict[Source, ExportFlow] = {}
         self.senders: dict[tuple[int, int], RouteSender] = {}
         self._parked: ResumeTable[tuple[int, Source]] = ResumeTable()
@@ -152,8 +156,10 @@ class LocalSubscriptions:
         if not any(one.topic == source.topic for one in self.flows):
             self._core.call("registerSubscriber", OWN_NODE, source.topic, "*", self._node.uri)
         _log.debug("> subscribe to %s at %s", source, uri)
-        flow = self.flows[source] = ExportFlow()
-        kind = PublisherConnection if find() is None else InProcessConnection
+        publication = self._find(source.node, uri, source.topic)
+        kind = PublisherConnection if publication is None else InProcessConnection
+        relayed = publication is not None and isinstance(publication.events, PeerTopic)
+        flow = self.flows[source] = (RelayedFlow if relayed else ExportFlow)(self._new_epoch)
         flow.connection = kind(
             source.topic,
             uri,
@@ -169,6 +175,11 @@ class LocalSubscriptions:
         )
         flow.connection.start()
 
+    def _new_epoch(self) -> int:
+        """A number that identifies a numbering; not 0."""
+        self._epoch = self._epoch % UINT32_MAX + 1
+        return self._epoch
+
     def disconnect(self, source: Source) -> None:
         """Disconnect one publisher, and drop its routes."""
         if (flow := self.flows.get(source)) is not None:
@@ -180,7 +191,11 @@ class LocalSubscriptions:
             if not any(one.topic == source.topic for one in self.flows):
                 self._core.call("unregisterSubscriber", OWN_NODE, source.topic, self._node.uri)
 
-    def add_route(self, source: Source, peer: int, route: ExportRoute, link: PeerLink) -> None:
+    def begins(self, source: Source, peer: int, route: ExportRoute) -> RouteBegin:
+        """Where a route to a peer begins."""
+        return self.flows[source].begins(peer, route.contract, route.position)
+
+    def add_route(self, source: Source, peer: int, route: ExportRoute, begin: RouteBegin, link: PeerLink) -> None:
         """Send a source to one more peer, or resume its suspended route.
 
         Raises:
@@ -188,11 +203,11 @@ class LocalSubscriptions:
         """
         flow = self.flows[source]
         sender = flow.by_peer.get(peer)
-        if route.after is not None and isinstance(sender, ReliableRouteSender) and sender.sender.epoch == route.epoch:
+        if begin.resumed and isinstance(sender, ReliableRouteSender) and route.position is not None:
             self._parked.claim((peer, source))
             self._timer.arm()
             try:
-                sender.resume(link, route.number, route.after)
+                sender.resume(link, route.number, route.position[1])
             except RemoteProtocolError:
                 flow.remove(peer)  # the caller closes the link; the next one gets a new numbering
                 raise
@@ -200,7 +215,7 @@ class LocalSubscriptions:
                 self._losses.missed(source, peer, missed)
         else:
             self.remove_route(source, peer)
-            sender = flow.add(peer, link, route.number, route.contract, route.epoch)
+            sender = flow.add(peer, link, route.number, route.contract, begin)
         self.senders[peer, route.number] = sender
 
     def suspend_route(self, source: Source, peer: int, outage: float) -> None:
@@ -279,9 +294,18 @@ class LocalSubscriptions:
         if description.problem:
             self._gone(source, self.flows[source], description.problem)
             return
+        flow = self.flows[source]
+        if isinstance(flow, RelayedFlow):
+            self._follow(flow, source)
         if description.latching:
-            self.flows[source].latch()
+            flow.latch()
         self._exports.described(source, description)
+
+    def _follow(self, flow: RelayedFlow, source: Source) -> None:
+        """Takes the numbers of the route that a relayed source comes by."""
+        publication = self._find(source.node, flow.connection.uri, source.topic)
+        if publication is not None and isinstance(publication.events, PeerTopic) and publication.events.flow:
+            flow.follow(publication.events.flow, publication.latched)
 
     def _gone(self, source: Source, flow: ExportFlow, reason: str) -> None:
         if self.flows.get(source) is not flow:
@@ -290,7 +314,10 @@ class LocalSubscriptions:
         _log.log(logging.DEBUG if short else logging.INFO, "= %s: %s", source, reason)
         if flow.connection.malformed:
             self._out.warn("publisher.malformed", str(source), f"{source}: {reason}")
-        lasts = {peer: one.last for peer in flow.by_peer if (one := self.numbering(source, peer)) is not None}
+        if isinstance(flow, RelayedFlow):
+            flow.catch_up()
+        numbered = flow.by_peer if flow.complete else ()
+        lasts = {peer: one.last for peer in numbered if (one := self.numbering(source, peer)) is not None}
         self.disconnect(source)  # first: what follows may connect the source anew
         self._exports.lost(source, reason[: limits.CONTROL_TEXT_MAX], lasts)
         if not short:

@@ -21,7 +21,7 @@ from rmpa.bridge.topics.direct import TopicPaths
 from rmpa.bridge.topics.exports import Exports
 from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.local import LocalSources, LocalSubscriptions, Mismatches, RemoteSubscribers
-from rmpa.bridge.topics.peer_topics import LossReports, PeerTopic, PeerTopics, TopicEvents
+from rmpa.bridge.topics.peer_topics import LossReports, PeerTopics, TopicEvents
 from rmpa.core.contract import Priority
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import is_own
@@ -32,6 +32,7 @@ from rmpa.runtime.loop import yield_to_data
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
+    from rmpa.bridge.data.export import RouteBegin
     from rmpa.bridge.data.quality import QosEvent, QosWatch
     from rmpa.bridge.messages import Message
     from rmpa.bridge.sessions import PeerSession
@@ -156,11 +157,11 @@ class Topics(GraphPart, TopicEvents):
         peer = session.peer
         super().gone(session)
         self.outbound.gone(peer)
+        self._freeing.append(self.imports.link_down(peer))
         topics = self.peers.pop(peer)
         self._mismatches.peer_gone(session.link.name)
         self.run(self.exports.link_down(peer))
         self._shared.relay.peer_gone(peer)
-        self._freeing.append(self.imports.link_down(peer))
         self.schedule()
         topics.close()
 
@@ -262,13 +263,13 @@ class Topics(GraphPart, TopicEvents):
 
     # --- effects of the exports --------------------------------------------------------------------------------
 
-    def add_route(self, source: Source, peer: int, route: ExportRoute) -> None:
+    def add_route(self, source: Source, peer: int, route: ExportRoute, begin: RouteBegin) -> None:
         """Begin to send a source's messages to a peer; first those that its contract or publisher keeps."""
         session = self._shared.sessions.get(peer)
         if session is None:
             return
         try:
-            self.outbound.add_route(source, peer, route, session.link)
+            self.outbound.add_route(source, peer, route, begin, session.link)
             self.losses.tell_oversized(source, self.outbound.flows[source], peer)
         except RemoteProtocolError as error:
             # Caught here: the caller may be handling another peer's event. The next link gets a new numbering.
@@ -291,19 +292,45 @@ class Topics(GraphPart, TopicEvents):
     # --- effects of the imports --------------------------------------------------------------------------------
 
     def position(self, entry: RemoteTopic) -> tuple[int, int] | None:
-        """Epoch and last message of a reliable route that outlived its link, or ``None``."""
-        return topics.position(entry.wire) if (topics := self.peers.get(entry.peer)) is not None else None
+        """Epoch and last message of a source, behind which a route goes on, by this way or another; or ``None``."""
+        carrier = self.imports.carrier(entry)
+        topics = self.peers.get(carrier.peer) if carrier is not None else None
+        if carrier is None or topics is None or (topic := topics.topics.get(carrier.wire)) is None:
+            return None
+        if topic.flow is not None:
+            return topic.flow.position
+        return self.exports.position(Source(topic.topic, topic.node.name))  # a relay has what its peer has
 
     def publish(self, entry: RemoteTopic) -> None:
         """Publish a peer's source at its proxy, in a later turn of the loop."""
-        session, topics, source = self._shared.sessions.get(entry.peer), self.peers.get(entry.peer), entry.wire
+        session, topics = self._shared.sessions.get(entry.peer), self.peers.get(entry.peer)
         if session is not None and topics is not None:
-            name = self._shared.sessions.proxy_name(session, source.node, entry.origin)
-            place = (entry.name, name)
-            self._shared.relay.pass_on(session.peer, session.link.identity, source, place, entry.origin)
-            topic = PeerTopic(topics, entry)
-            session.proxies.hold(source.node, source, topic.ready, topic.left)
+            proxies, node = self._shared.sessions.proxies(session, entry.node, entry.origin)
+            self._pass_on(entry, session)
+            topics.publish(entry, proxies, node)
             self.direct_imports.shown(entry)
+
+    def moved(self, old: RemoteTopic, new: RemoteTopic) -> None:
+        """Let another way carry a source, whose proxy and subscribers stay."""
+        session, before = self._shared.sessions.get(new.peer), self.peers[old.peer]
+        if session is not None and (topic := before.held.get(old.wire)) is not None:
+            topic.move(self.peers[new.peer], new.wire)
+            self._pass_on(new, session)
+            self._shared.relay.gone(old.peer, old.wire)
+            self.direct_imports.hidden(old)
+            self.direct_imports.shown(new)
+            self.look((new.name,))
+
+    def path_changed(self, entry: RemoteTopic) -> None:
+        """Offer what is relayed with the path that it has now."""
+        if entry.shown and (session := self._shared.sessions.get(entry.peer)) is not None:
+            self._pass_on(entry, session)
+            self.look((entry.name,))
+
+    def _pass_on(self, entry: RemoteTopic, session: PeerSession) -> None:
+        name = self._shared.sessions.proxy_name(session, entry.node, entry.origin)
+        place = (entry.name, name)
+        self._shared.relay.pass_on(session.peer, session.link.identity, entry.wire, place, entry.origin)
 
     def retract(self, entry: RemoteTopic) -> None:
         """Remove a peer's source from the local graph: unregister it and close its sockets."""

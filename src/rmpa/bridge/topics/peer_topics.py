@@ -20,7 +20,7 @@ from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Needs
 from rmpa.core.contract import Durability, Reliability
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.identity import serial_add
+from rmpa.core.identity import OWN_NODE, serial_add
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.node.publication import Publication, PublicationEvents
@@ -28,12 +28,13 @@ from rmpa.ros.wire.tcpros import TopicDescription, printable
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Mapping
+    from collections.abc import Awaitable, Callable, Mapping
 
     from rmpa.bridge.data.export import ExportFlow
     from rmpa.bridge.data.quality import QosEvent, QosWatch
     from rmpa.bridge.messages import RouteOpened
     from rmpa.bridge.offers import Effects
+    from rmpa.bridge.proxies import PeerProxies
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports
@@ -65,10 +66,10 @@ class TopicEvents:
 
 
 class PeerTopic(PublicationEvents):
-    """One source of a peer at its proxy: the publication, and the flow of its route.
+    """One source at its proxy: the publication, and the flow of its route, whichever peer carries it.
 
     Args:
-        peer: All topics of the peer.
+        peer: All topics of the peer that carries it.
         entry: The source.
 
     Attributes:
@@ -76,7 +77,7 @@ class PeerTopic(PublicationEvents):
         flow: The flow of its route: the open one, or the one that outlived its link.
     """
 
-    __slots__ = ("_peer", "flow", "node", "publication", "source", "topic", "type")
+    __slots__ = ("_peer", "flow", "node", "publication", "release", "source", "topic", "type")
 
     def __init__(self, peer: PeerTopics, entry: RemoteTopic) -> None:
         self._peer = peer
@@ -84,7 +85,20 @@ class PeerTopic(PublicationEvents):
         self.topic = entry.name
         self.node: SlaveNode
         self.publication: Publication
+        self.release: Callable[[], None]
         self.flow: ImportFlow | None = None
+
+    def move(self, peer: PeerTopics, source: Source) -> None:
+        """Let another peer carry it, which calls it ``source``."""
+        before, was = self._peer, self.source
+        before.held.pop(was, None)
+        registered = before.topics.pop(was, None)
+        self._peer, self.source = peer, source
+        peer.held[source] = self
+        if registered is not None:
+            peer.topics[source] = self
+        if was in before.pasts:
+            peer.pasts[source] = before.pasts.pop(was)
 
     # --- at the proxy ------------------------------------------------------------------------------------------
 
@@ -158,14 +172,27 @@ class PeerTopic(PublicationEvents):
         if flow is not None and flow.contract.reliability is Reliability.RELIABLE:
             past, missed_at = flow.watch, self.topic
         reliable = contract.reliability is Reliability.RELIABLE
-        if flow is None or not reliable or not flow.contract.same_route(contract):
+        had = flow.position if flow is not None else None
+        continues = had is not None and had[0] == opened.epoch
+        if flow is None or not flow.contract.same_route(contract) or not (reliable or continues):
             if flow is not None:
                 flow.close()
-            past = past if reliable else None
-            time, counters = session.time, self._peer.counters
-            flow = ImportFlow(self.publication, contract, time, counters, self.occurred, self.torn, past)
-        self.flow, flow.contract = flow, contract
+            flow = ImportFlow(
+                self.publication,
+                contract,
+                session.time,
+                self._peer.counters,
+                self.occurred,
+                self.torn,
+                past if reliable else None,
+                numbering=flow.numbering if flow is not None and continues else None,
+                relays=self._peer.relays,
+            )
+        is_other = flow is not self.flow
+        self.flow, flow.contract, flow.link_time = flow, contract, session.time
         goes_on = flow.bind(session.link, opened.route, opened.epoch, opened.first)
+        if self._peer.relays and self.publication.description is not None and (is_other or not goes_on):
+            self.publication.hang_up(OWN_NODE)  # what is relayed has other numbers from now on
         self.publication.bound(contract.depth)
         if contract.durability is Durability.TRANSIENT_LOCAL:
             self.publication.keep(contract.kept)
@@ -215,17 +242,19 @@ class PeerTopics:
             and its topic while a local node listens, so that messages are missed. It outlives the session.
 
     Attributes:
-        topics: Those that are registered.
+        held: Those that the peer carries, with their proxies.
+        topics: Those of them that are registered.
         flows: The flow of each open route, by its id.
     """
 
     def __init__(
         self, shared: Shared, part: TopicEvents, session: PeerSession, pasts: dict[Source, tuple[QosWatch, str]]
     ) -> None:
-        self.core, self.counters = shared.core, shared.counters
+        self.core, self.counters, self.relays = shared.core, shared.counters, shared.relay.enabled
         self.part = part
         self.session = session
         self.pasts = pasts
+        self.held: dict[Source, PeerTopic] = {}
         self.topics: dict[Source, PeerTopic] = {}
         self.flows: dict[int, ImportFlow] = {}
 
@@ -244,6 +273,12 @@ class PeerTopics:
         flow = self.flow(source)
         return flow.watch if flow is not None else self.pasts.get(source, (None, ""))[0]
 
+    def publish(self, entry: RemoteTopic, proxies: PeerProxies, node: str) -> None:
+        """Publish a source at the proxy of its node, in a later turn of the loop."""
+        topic = self.held[entry.wire] = PeerTopic(self, entry)
+        topic.release = lambda: proxies.release(node, topic.topic)
+        proxies.hold(node, topic.topic, topic.ready, topic.left)
+
     def position(self, source: Source) -> tuple[int, int] | None:
         """Epoch and last sequence from which a reliable source's next route continues; ``None``: it begins anew."""
         flow = self.flow(source)
@@ -253,7 +288,8 @@ class PeerTopics:
         """Retract a source: its data stops at once, its registration in a later turn of the loop."""
         if (topic := self.topics.get(source)) is not None:
             topic.end(missed=True)
-        self.session.proxies.release(source.node, source)
+        if (held := self.held.pop(source, None)) is not None:
+            held.release()
 
     def describe(self, source: Source, opened: RouteOpened) -> None:
         """Prepare for data on a newly opened route, and answer the waiting subscribers with its description."""
@@ -271,6 +307,7 @@ class PeerTopics:
             return
         if flow is not None and last is not None:
             flow.skip(serial_add(last, 1))
+            flow.complete = True
         topic.end(missed=missed and last is None)
         topic.publication.forget_latched()
 
@@ -291,9 +328,12 @@ class PeerTopics:
                 topic.register()
 
     def close(self) -> None:
-        """End all flows, and remember the events of the reliable ones; the publications go with the proxies."""
+        """Retract all topics, and remember the events of the reliable ones."""
         for topic in self.topics.values():
             topic.end(missed=True, gone=False)
+        for topic in self.held.values():
+            topic.release()
+        self.held.clear()
         for route in self.flows:
             self.session.link.routes.pop(route, None)
         self.flows.clear()

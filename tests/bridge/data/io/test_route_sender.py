@@ -185,7 +185,7 @@ def test_both_lanes_get_the_bounds(
     contract: Contract, depth: int, ages: tuple[float | None, ...], strict: bool
 ) -> None:
     link = Link()
-    ExportFlow().add(1, link, 7, contract, 1)
+    ExportFlow().add(1, link, 7, contract)
     assert link.express.terms == {7: (depth, ages[0], strict)}
     assert link.bulk.terms == {7: (depth, ages[1], strict)}
 
@@ -230,7 +230,7 @@ def test_parts_go_as_they_come_once_the_lane_is_right() -> None:
 def test_aborted_message_uses_its_number() -> None:
     link, flow = Link(), ExportFlow()
     flow.large = True
-    sender = flow.add(1, link, 7, Contract(), 0)
+    sender = flow.add(1, link, 7, Contract())
     answer(link, sender)
     flow.begin(BIG)
     flow.part(memoryview(bytes(10)))
