@@ -135,7 +135,7 @@ def _is_same(entry: Remote[Any], offer: Any) -> bool:
     """Whether an offer is what an entry was made of, perhaps by another path."""
     one, other = entry.origin, offer.origin
     if one is not None and other is not None:
-        one = msgspec.structs.replace(one, path=other.path)
+        one = msgspec.structs.replace(one, guid=other.guid, path=other.path)
     return entry.node == offer.node and one == other and entry.type == getattr(offer, "type", None)
 
 

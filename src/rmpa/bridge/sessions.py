@@ -305,7 +305,15 @@ class PeerSessions:
     # --- links ---------------------------------------------------------------------------------------------------
 
     def link_up(self, link: PeerLink) -> None:
-        """Attach a link to the session that waits for it, or begin a session."""
+        """Attach a link to the session that waits for it, or begin a session.
+
+        A peer that has another address is linked anew before the end of its old link is noticed.
+        """
+        old = next((one.link for one in self.linked() if one.link.identity.is_same_run(link.identity)), None)
+        if old is not None:
+            old.silent = True
+            self.link_down(old)
+            old.close(f"{link.name} has another address")
         session = self._waiting_for(link)
         if session is not None:
             session.link, session.state, session.wait = link, PeerState.LINKED, None
