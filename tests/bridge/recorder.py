@@ -233,8 +233,9 @@ class Out(Effects):
     def context(self) -> BridgeContext:
         return self.rules
 
-    def numbering(self, source: Source, peer: int) -> Any:
-        return self._numbering(source, peer)
+    def last(self, source: Source, peer: int) -> int | None:
+        numbering = self._numbering(source, peer)
+        return numbering.last if numbering is not None else None
 
     def begins(self, source: Source, peer: int, route: ExportRoute) -> RouteBegin:
         """Each source has one numbering, which begins when it is connected; suspended senders say where they are."""

@@ -1,13 +1,17 @@
 """A source keeps its numbers whichever way it takes: cables and relays come and go, and addresses change.
 
-What is counted is what a listener at ``m4`` got of a talker at ``m1``, over a cable of their own or by ``m2`` or ``m3``.
+What is counted is what a listener at ``m4`` got of a talker at ``m1``, over their own cable or by ``m2`` or ``m3``.
 """
 
 from __future__ import annotations
 
+import os
+import random
 import subprocess
 import time
-from typing import TYPE_CHECKING, Final
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
@@ -18,11 +22,11 @@ from tests.interop.test_subnetworks import RELAY, full_mesh
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from lab.bed.namespaces import Lab
+    from lab.bed.namespaces import Host, Lab
     from lab.bed.processes import Event
     from tests.interop.conftest import AgentFactory, ShellFactory
 
-pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(900)]
 
 SURE: Final = '[[contract]]\ntopics = ["/sure", "/map"]\nreliability = "reliable"\ndepth = 5000\n'
 DIRECT, FIRST, SECOND = 0, 1, 2
@@ -95,11 +99,27 @@ class Triangle:
         return report, took
 
 
-TOPICS: Final[dict[str, dict[str, object]]] = {
+TOPICS: Final[dict[str, dict[str, Any]]] = {
     "/sure": {"rate": 50},
     "/plain": {"rate": 50},
     "/map": {"rate": 50, "count": 1, "latch": True},
 }
+
+
+def readdress(host: Host, place: int, last: int, before: float = 0.0) -> None:
+    """Give a host another address on one cable; the new one may be there for a while before the old one goes."""
+    cable = host.cables[place]
+    old, new = cable.address, f"{cable.address.rpartition('.')[0]}.{last}"
+    # Else the kernel takes the second address of a network away with the first one.
+    keep = f"net.ipv4.conf.{cable.interface}.promote_secondaries=1"
+    subprocess.run(host.command(["sysctl", "-qw", keep]), check=True)
+    if not before:
+        host.ip("address", "del", f"{old}/24", "dev", cable.interface)
+    host.ip("address", "add", f"{new}/24", "dev", cable.interface)
+    if before:
+        time.sleep(before)
+        host.ip("address", "del", f"{old}/24", "dev", cable.interface)
+    host.cables[place] = replace(cable, address=new)
 
 
 def test_a_relay_takes_over_at_once_when_a_cable_is_pulled(
@@ -138,19 +158,36 @@ def test_an_address_that_changes_loses_nothing(
 ) -> None:
     """As DHCP does it; also when the new address is there before the old one goes."""
     triangle = Triangle(lab, agent, shell, unplugged=(FIRST, SECOND))
-    host = (triangle.m1 if who == "m1" else triangle.m4).host
-    cable = host.cables[0]
+    module = triangle.m1 if who == "m1" else triangle.m4
+    triangle.after(lambda: readdress(module.host, 0, 77, before), 300)
 
-    def change() -> None:
-        old, new = cable.address, cable.address.rpartition(".")[0] + ".77"
-        if before:
-            # Else the kernel takes the second address of a network away with the first one.
-            keep = f"net.ipv4.conf.{cable.interface}.promote_secondaries=1"
-            subprocess.run(host.command(["sysctl", "-qw", keep]), check=True)
-            host.ip("address", "add", f"{new}/24", "dev", cable.interface)
-            time.sleep(before)
-        host.ip("address", "del", f"{old}/24", "dev", cable.interface)
-        if not before:
-            host.ip("address", "add", f"{new}/24", "dev", cable.interface)
 
-    triangle.after(change, 300)
+SECONDS: Final = float(os.environ.get("RMPA_PATHS_SECONDS", "40"))
+"""How long cables and addresses change at random; ten minutes are ``make paths``."""
+
+
+def test_cables_relays_and_addresses_change_at_random(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:
+    """A way is left at any time, so nothing may be lost."""
+    triangle, rng = Triangle(lab, agent, shell), random.Random(os.environ.get("RMPA_PATHS_SEED", "1"))
+    out: set[int] = set()
+    addresses, until = 100, time.monotonic() + SECONDS
+    while time.monotonic() < until:
+        relay = rng.choice([triangle.m2, triangle.m3])
+        way = rng.choice([DIRECT, FIRST, SECOND])
+        match rng.randrange(5):
+            case 0:
+                addresses += 1
+                module = rng.choice([triangle.m1, triangle.m4])
+                triangle.after(partial(readdress, module.host, rng.randrange(3), addresses), 50)
+            case 1 if not out:
+                triangle.after(relay.agent.terminate, 150)
+                relay.agent.restart()
+            case _ if way in out:
+                out.remove(way)
+                triangle.after(partial(triangle.restore, way), rng.choice([10, 100, 300]))
+            case _ if len(out) < 2:
+                out.add(way)
+                triangle.after(partial(triangle.cut, way), rng.choice([10, 100, 300]))
+    for way in out:
+        triangle.restore(way)
+    triangle.after(lambda: None, 300)

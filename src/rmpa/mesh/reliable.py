@@ -25,7 +25,6 @@ from collections.abc import Hashable
 from itertools import islice
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
 
-from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import SERIAL_HALF, SERIAL_MASK, is_earlier, is_later, serial_add, serial_distance
 from rmpa.mesh import limits
 
@@ -168,14 +167,11 @@ class ReliableSender:
     def acknowledged(self, sequence: int) -> None:
         """Handle an acknowledgement of all messages up to ``sequence``; ignored if it is old or there is no link.
 
-        Raises:
-            RemoteProtocolError: ``sequence`` was never sent.
+        The receiver may have more than was sent here, by another path.
         """
         ahead = sequence - self.confirmed & SERIAL_MASK
-        if not self._linked or not 0 < ahead < SERIAL_HALF:
-            return
-        self._check(ahead, sequence, "acknowledges")
-        self._forget(ahead)
+        if self._linked and 0 < ahead < SERIAL_HALF:
+            self._forget(min(ahead, self._highest - self.confirmed & SERIAL_MASK))
 
     def suspend(self) -> None:
         """Handle the end of the link: unacknowledged messages will be sent again. Without effect if repeated."""
@@ -188,18 +184,14 @@ class ReliableSender:
         """Continue over a new link after the last message that the receiver has.
 
         Args:
-            after: The receiver's position: it has all messages up to this sequence, perhaps by another path.
-
-        Raises:
-            RemoteProtocolError: ``after`` was never offered, or is before the last acknowledgement; nothing has
-                changed.
+            after: The receiver's position: it has all messages up to this sequence, perhaps by another path. One from
+                before the last acknowledgement is old.
         """
         ahead = serial_distance(self.confirmed, after)
-        if ahead <= serial_distance(self.confirmed, self.last):
-            self._sent_up_to(after)
-        self._check(ahead, after, "resumes")
         self.suspend()
-        self._forget(ahead)
+        if ahead < SERIAL_HALF:
+            self._forget(min(ahead, serial_distance(self.confirmed, self.last)))
+        self._sent_up_to(self.confirmed)
         self.overflowed += len(self._dropped_in_flight)
         self._dropped_in_flight.clear()
         self._in_flight_bytes = 0
@@ -219,11 +211,6 @@ class ReliableSender:
     def _sent_up_to(self, sequence: int) -> None:
         if sequence - self._highest & SERIAL_MASK < SERIAL_HALF:
             self._highest = sequence & SERIAL_MASK
-
-    def _check(self, ahead: int, sequence: int, verb: str) -> None:
-        if ahead > self._highest - self.confirmed & SERIAL_MASK:
-            known = f"sent up to {self._highest}, acknowledged up to {self.confirmed}"
-            raise RemoteProtocolError(f"a receiver {verb} message {sequence}, of those {known}")
 
     def _forget(self, ahead: int) -> None:
         """Drop the messages of the next ``ahead`` sequences, which have arrived.

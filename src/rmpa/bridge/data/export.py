@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from rmpa.bridge.data.route import EXPRESS, Downsampler, LaneSwitch, kept_for
 from rmpa.core.contract import Contract, Durability, Reliability
-from rmpa.core.identity import SERIAL_MASK, is_earlier, is_later, serial_add
+from rmpa.core.identity import SERIAL_MASK, is_later, serial_add
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import HistoryCache, ReliableSender
 from rmpa.ros import limits as ros_limits
@@ -279,16 +279,8 @@ class ReliableRouteSender(RouteSender):
         self.sender.suspend()
 
     def resume(self, link: PeerLink, route: int, after: int) -> None:
-        """Continue on a new link; the peer has everything up to ``after``.
-
-        If a later message is already acknowledged, that one counts: with two links at once, the older one's request
-        may come last.
-
-        Raises:
-            RemoteProtocolError: ``after`` was never sent.
-        """
-        known = self.sender.confirmed
-        self.sender.resume(known if is_earlier(after, known) else after)
+        """Continue on a new link; the peer has everything up to ``after``."""
+        self.sender.resume(after)
         self._keep = None
         self._switch.restart()
         self._use(link, route)

@@ -341,8 +341,8 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
         flow = self._flows.pop(source, None)
         for peer, route in flow.routes.items() if flow is not None else ():
             last = lasts.get(peer) if lasts is not None else None
-            if lasts is None and (numbering := self._do.outbound.numbering(source, peer)) is not None:
-                last = numbering.last
+            if lasts is None:
+                last = self._do.outbound.last(source, peer)
             self._forget(source, peer, route)
             if route.number:
                 self._out.send(peer, RouteClosed(route.number, reason, msgspec.UNSET if last is None else last))

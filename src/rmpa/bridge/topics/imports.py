@@ -264,7 +264,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
 
     def _went(self, entry: RemoteTopic, reason: str) -> None:  # noqa: ARG002 - as of ImportBook
         self._hand_over(entry)
-        self._close(entry)
+        self._close(entry, missed=entry.wanted)
         self._unlist(entry)
         if entry.shown:
             self._retract(entry)
@@ -581,7 +581,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             self._out.send(entry.peer, CloseRoute(entry.route))
             self._do.detach(entry, missed=missed)
         elif entry.wanted and entry.until is None:
-            self._do.detach(entry)  # it waited for a new link
+            self._do.detach(entry, missed=missed)  # it waited for a new link
         entry.route, entry.open, entry.until, entry.backoff = 0, False, None, None
 
     def _fail(self, entry: RemoteTopic, reason: str, now: float, last: int | None = None) -> None:

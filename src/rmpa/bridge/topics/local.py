@@ -22,7 +22,6 @@ from rmpa.bridge.messages import Audience, Description, Mismatch, Source, encode
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.bridge.topics.peer_topics import PeerTopic
 from rmpa.config.peer_rules import Access
-from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import OWN_NODE, is_own, is_type_name, proxied_node, proxy_name
 from rmpa.core.limits import UINT32_MAX
 from rmpa.mesh import limits as mesh_limits
@@ -196,21 +195,13 @@ class LocalSubscriptions:
         return self.flows[source].begins(peer, route.contract, route.position)
 
     def add_route(self, source: Source, peer: int, route: ExportRoute, begin: RouteBegin, link: PeerLink) -> None:
-        """Send a source to one more peer, or resume its suspended route.
-
-        Raises:
-            RemoteProtocolError: The peer resumes after a message that was never sent.
-        """
+        """Send a source to one more peer, or resume its suspended route."""
         flow = self.flows[source]
         sender = flow.by_peer.get(peer)
         if begin.resumed and isinstance(sender, ReliableRouteSender) and route.position is not None:
             self._parked.claim((peer, source))
             self._timer.arm()
-            try:
-                sender.resume(link, route.number, route.position[1])
-            except RemoteProtocolError:
-                flow.remove(peer)  # the caller closes the link; the next one gets a new numbering
-                raise
+            sender.resume(link, route.number, route.position[1])
             if missed := sender.missed():
                 self._losses.missed(source, peer, missed)
         else:
@@ -254,6 +245,11 @@ class LocalSubscriptions:
         sender = self._sender_of(source, peer)
         return sender.sender if isinstance(sender, ReliableRouteSender) else None
 
+    def last(self, source: Source, peer: int) -> int | None:
+        """The last message of a reliable route whose publisher has gone; ``None``: others may have been lost."""
+        numbering = self.numbering(source, peer)
+        return numbering.last if numbering is not None and self.flows[source].complete else None
+
     def _sender_of(self, source: Source, peer: int) -> RouteSender | None:
         flow = self.flows.get(source)
         return flow.by_peer.get(peer) if flow is not None else None
@@ -295,17 +291,23 @@ class LocalSubscriptions:
             self._gone(source, self.flows[source], description.problem)
             return
         flow = self.flows[source]
-        if isinstance(flow, RelayedFlow):
-            self._follow(flow, source)
+        if isinstance(flow, RelayedFlow) and not self._follows(flow, source, fields):
+            return
         if description.latching:
             flow.latch()
         self._exports.described(source, description)
 
-    def _follow(self, flow: RelayedFlow, source: Source) -> None:
-        """Takes the numbers of the route that a relayed source comes by."""
+    def _follows(self, flow: RelayedFlow, source: Source, fields: Mapping[str, str]) -> bool:
+        """Whether the route that a relayed source comes by gives it its numbers; else it does when it is open."""
         publication = self._find(source.node, flow.connection.uri, source.topic)
-        if publication is not None and isinstance(publication.events, PeerTopic) and publication.events.flow:
-            flow.follow(publication.events.flow, publication.latched)
+        topic = publication.events if publication is not None else None
+        if publication is None or not isinstance(topic, PeerTopic):
+            return False
+        if topic.flow is None:
+            topic.on_open = lambda: self._header(source, fields) if self.flows.get(source) is flow else None
+            return False
+        flow.follow(topic.flow, publication.latched)
+        return True
 
     def _gone(self, source: Source, flow: ExportFlow, reason: str) -> None:
         if self.flows.get(source) is not flow:
@@ -316,8 +318,7 @@ class LocalSubscriptions:
             self._out.warn("publisher.malformed", str(source), f"{source}: {reason}")
         if isinstance(flow, RelayedFlow):
             flow.catch_up()
-        numbered = flow.by_peer if flow.complete else ()
-        lasts = {peer: one.last for peer in numbered if (one := self.numbering(source, peer)) is not None}
+        lasts = {peer: last for peer in flow.by_peer if (last := self.last(source, peer)) is not None}
         self.disconnect(source)  # first: what follows may connect the source anew
         self._exports.lost(source, reason[: limits.CONTROL_TEXT_MAX], lasts)
         if not short:

@@ -23,7 +23,6 @@ from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.local import LocalSources, LocalSubscriptions, Mismatches, RemoteSubscribers
 from rmpa.bridge.topics.peer_topics import LossReports, PeerTopics, TopicEvents
 from rmpa.core.contract import Priority
-from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import is_own
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
@@ -33,12 +32,13 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
     from rmpa.bridge.data.export import RouteBegin
-    from rmpa.bridge.data.quality import QosEvent, QosWatch
+    from rmpa.bridge.data.quality import QosEvent
     from rmpa.bridge.messages import Message
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import ExportRoute
     from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.bridge.topics.peer_topics import Pasts
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.wire.xmlrpc import RosReply
 
@@ -74,7 +74,7 @@ class Topics(GraphPart, TopicEvents):
     def __init__(self, shared: Shared, find: Callable[[str, str, str], Publication | None]) -> None:
         super().__init__(shared, Exports, Imports)
         self.peers: dict[int, PeerTopics] = {}
-        self._pasts: OrderedDict[str, dict[Source, tuple[QosWatch, str]]] = OrderedDict()
+        self._pasts: OrderedDict[str, Pasts] = OrderedDict()
         self.losses = LossReports(shared, self.exports, self.peers, self)
         self.outbound = LocalSubscriptions(shared, self.exports, self.losses, self, find)
         self._mismatches = Mismatches(self, self.exports, self.imports)
@@ -114,11 +114,15 @@ class Topics(GraphPart, TopicEvents):
             _log.info("= %s is back: reliable topics go on", name)
             self.outbound.back(peer)
         else:
-            pasts = self._pasts[name] = self._pasts.pop(name, {})
-            if len(self._pasts) > mesh_limits.ABSENT_PEERS_MAX:
-                self._pasts.popitem(last=False)
-            self.peers[peer] = PeerTopics(self._shared, self, session, pasts)
+            self.peers[peer] = PeerTopics(self._shared, self, session, self._pasts_of)
         super().link_up(session)
+
+    def _pasts_of(self, name: str) -> Pasts:
+        """What is remembered of the reliable sources of a module."""
+        pasts = self._pasts[name] = self._pasts.pop(name, {})
+        if len(self._pasts) > mesh_limits.ABSENT_PEERS_MAX:
+            self._pasts.popitem(last=False)
+        return pasts
 
     def link_down(self, session: PeerSession) -> None:
         """Suspend the peer's routes; after silence its sources stay in the local graph for ``SILENT_GRACE``."""
@@ -268,13 +272,8 @@ class Topics(GraphPart, TopicEvents):
         session = self._shared.sessions.get(peer)
         if session is None:
             return
-        try:
-            self.outbound.add_route(source, peer, route, begin, session.link)
-            self.losses.tell_oversized(source, self.outbound.flows[source], peer)
-        except RemoteProtocolError as error:
-            # Caught here: the caller may be handling another peer's event. The next link gets a new numbering.
-            self.refuse(session, error)
-            asyncio.get_running_loop().call_soon(self.exports.end_route, source, peer)
+        self.outbound.add_route(source, peer, route, begin, session.link)
+        self.losses.tell_oversized(source, self.outbound.flows[source], peer)
 
     def suspend_route(self, source: Source, peer: int, outage: float) -> None:
         """Keep the unacknowledged and all further messages of a route for an absent peer, for a time in seconds."""

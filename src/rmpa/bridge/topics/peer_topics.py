@@ -45,6 +45,10 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
+# What is remembered of the reliable sources of a module, by topic here and node there; see ``PeerTopics``.
+Pasts = dict[Source, tuple["QosWatch", str]]
+
+
 class TopicEvents:
     """What the topics of peers tell the part that has them; for subclasses. All give the peer and its source."""
 
@@ -75,18 +79,35 @@ class PeerTopic(PublicationEvents):
     Attributes:
         topic: The name in the local graph.
         flow: The flow of its route: the open one, or the one that outlived its link.
+        on_open: Called when its route is open, where this module has to pass it on since before.
     """
 
-    __slots__ = ("_peer", "flow", "node", "publication", "release", "source", "topic", "type")
+    __slots__ = (
+        "_key",
+        "_pasts",
+        "_peer",
+        "flow",
+        "node",
+        "on_open",
+        "publication",
+        "release",
+        "source",
+        "topic",
+        "type",
+    )
 
     def __init__(self, peer: PeerTopics, entry: RemoteTopic) -> None:
         self._peer = peer
         self.source, self.type = entry.wire, entry.type
         self.topic = entry.name
+        # Where its events are remembered, by its names in its module and here: another peer may carry it next.
+        self._pasts = peer.pasts(entry.module[1])
+        self._key = Source(entry.name, entry.node if entry.origin is None else entry.origin.node)
         self.node: SlaveNode
         self.publication: Publication
         self.release: Callable[[], None]
         self.flow: ImportFlow | None = None
+        self.on_open: Callable[[], object] | None = None
 
     def move(self, peer: PeerTopics, source: Source) -> None:
         """Let another peer carry it, which calls it ``source``."""
@@ -97,8 +118,6 @@ class PeerTopic(PublicationEvents):
         peer.held[source] = self
         if registered is not None:
             peer.topics[source] = self
-        if was in before.pasts:
-            peer.pasts[source] = before.pasts.pop(was)
 
     # --- at the proxy ------------------------------------------------------------------------------------------
 
@@ -149,6 +168,11 @@ class PeerTopic(PublicationEvents):
 
     # --- the flow ----------------------------------------------------------------------------------------------
 
+    @property
+    def watch(self) -> QosWatch | None:
+        """The watch of its flow, or of the last one of a reliable source."""
+        return self.flow.watch if self.flow is not None else self._pasts.get(self._key, (None, ""))[0]
+
     def occurred(self, event: QosEvent) -> None:
         """An event of the contract."""
         self._peer.part.occurred(self._peer.session.peer, self.source, event)
@@ -168,7 +192,7 @@ class PeerTopic(PublicationEvents):
         The count of a reliable source goes on in any case. Where it cannot know what was lost, that is an event.
         """
         contract, flow, session = opened.contract, self.flow, self._peer.session
-        past, missed_at = self._peer.pasts.pop(self.source, (None, ""))
+        past, missed_at = self._pasts.pop(self._key, (None, ""))
         if flow is not None and flow.contract.reliability is Reliability.RELIABLE:
             past, missed_at = flow.watch, self.topic
         reliable = contract.reliability is Reliability.RELIABLE
@@ -191,7 +215,8 @@ class PeerTopic(PublicationEvents):
         is_other = flow is not self.flow
         self.flow, flow.contract, flow.link_time = flow, contract, session.time
         goes_on = flow.bind(session.link, opened.route, opened.epoch, opened.first)
-        if self._peer.relays and self.publication.description is not None and (is_other or not goes_on):
+        renumbered = (is_other or not goes_on) and self.publication.description is not None
+        if self._peer.relays and renumbered and self.on_open is None:
             self.publication.hang_up(OWN_NODE)  # what is relayed has other numbers from now on
         self.publication.bound(contract.depth)
         if contract.durability is Durability.TRANSIENT_LOCAL:
@@ -206,6 +231,9 @@ class PeerTopic(PublicationEvents):
             self.torn()
         if not goes_on:
             flow.expect_replay(self.publication.latched)
+        on_open, self.on_open = self.on_open, None
+        if on_open is not None:
+            on_open()
         return flow
 
     def end(self, *, missed: bool, gone: bool = True) -> None:
@@ -216,13 +244,13 @@ class PeerTopic(PublicationEvents):
             gone: Whether the source leaves the graph or its route has ended: lost liveliness does not wait for its
                 lease.
         """
-        flow, self.flow, pasts = self.flow, None, self._peer.pasts
+        flow, self.flow, pasts, key = self.flow, None, self._pasts, self._key
         if flow is None:
-            if not missed and self.source in pasts:
-                pasts[self.source] = pasts[self.source][0], ""
+            if not missed and key in pasts:
+                pasts[key] = pasts[key][0], ""
             return
         if flow.contract.reliability is Reliability.RELIABLE and (missed or flow.watch.counts):
-            pasts[self.source] = flow.watch, self.topic if missed else ""
+            pasts[key] = flow.watch, self.topic if missed else ""
             if len(pasts) > mesh_limits.LOSSES_REMEMBERED:
                 del pasts[next(iter(pasts))]
         if gone:
@@ -238,8 +266,8 @@ class PeerTopics:
         shared: What the parts share.
         part: Is told of demand, of listeners and of events.
         session: The peer: its proxies, its link with the handlers of its routes, and its time.
-        pasts: Of each reliable source of the module that had a flow and has none now: its watch, for its next flow,
-            and its topic while a local node listens, so that messages are missed. It outlives the session.
+        pasts: Returns, by the name of a module, of each of its reliable sources that had a flow and has none now: its
+            watch, for its next flow, and its topic while a local node listens, so that messages are missed.
 
     Attributes:
         held: Those that the peer carries, with their proxies.
@@ -248,7 +276,7 @@ class PeerTopics:
     """
 
     def __init__(
-        self, shared: Shared, part: TopicEvents, session: PeerSession, pasts: dict[Source, tuple[QosWatch, str]]
+        self, shared: Shared, part: TopicEvents, session: PeerSession, pasts: Callable[[str], Pasts]
     ) -> None:
         self.core, self.counters, self.relays = shared.core, shared.counters, shared.relay.enabled
         self.part = part
@@ -270,8 +298,9 @@ class PeerTopics:
 
     def watch(self, source: Source) -> QosWatch | None:
         """The watch of a source's flow, or of the last one of a reliable source."""
-        flow = self.flow(source)
-        return flow.watch if flow is not None else self.pasts.get(source, (None, ""))[0]
+        if (held := self.held.get(source)) is not None:
+            return held.watch
+        return self.pasts(self.session.link.name).get(source, (None, ""))[0]
 
     def publish(self, entry: RemoteTopic, proxies: PeerProxies, node: str) -> None:
         """Publish a source at the proxy of its node, in a later turn of the loop."""

@@ -13,7 +13,6 @@ from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 from rmpa.bridge.data.export import BULK_STALE_AGE, ExportFlow, ReliableRouteSender, RouteSender
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, History, Reliability
-from rmpa.core.errors import RemoteProtocolError
 from rmpa.mesh import limits as mesh_limits
 from rmpa.runtime import limits as runtime_limits
 from tests.bridge.io.doubles import Clock, Link, running
@@ -338,13 +337,6 @@ def test_bulk_lost_on_the_way_back_uses_the_express_lane(clock: Clock) -> None:
     assert link.log == [("bulk", "discard", 7)] + [
         ("express", "message", 7, number) for number in range(101, ROW + 2)
     ]
-
-
-def test_acknowledgement_of_unsent_messages_is_an_error() -> None:
-    _, sender = fresh(reliable)
-    sender.message(0, SMALL)
-    with pytest.raises(RemoteProtocolError):
-        sender.acknowledged(2)
 
 
 def test_later_acknowledgement_outweighs_the_position() -> None:
