@@ -304,6 +304,11 @@ def test_the_way_is_told_and_what_came_round_is_not_shown() -> None:
     assert not ways.why_not(1, origin(1, 2))
     assert ways.count(1, origin(1, 2), -1)
     assert list(ways) == []
+    assert ways.lost == {"m1": "r"}, "for `rmpa why`, which names the relay"
+    assert ways.count(1, origin(1, 2), 1)
+    assert ways.lost == {}
+    ways.unlinked(1)
+    assert ways.lost == {"m1": "r"}
 
 
 def test_a_peer_that_claims_the_run_of_a_relayed_module_does_not_hide_it() -> None:

@@ -5,7 +5,6 @@ What is counted is what a listener at ``m4`` got of a talker at ``m1``, over the
 
 from __future__ import annotations
 
-import os
 import random
 import subprocess
 import time
@@ -162,15 +161,14 @@ def test_an_address_that_changes_loses_nothing(
     triangle.after(lambda: readdress(module.host, 0, 77, before), 300)
 
 
-SECONDS: Final = float(os.environ.get("RMPA_PATHS_SECONDS", "40"))
-"""How long cables and addresses change at random; ten minutes are ``make paths``."""
-
-
-def test_cables_relays_and_addresses_change_at_random(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:
+@pytest.mark.parametrize("seconds", [30.0, pytest.param(600.0, marks=pytest.mark.long)])
+def test_cables_relays_and_addresses_change_at_random(
+    lab: Lab, agent: AgentFactory, shell: ShellFactory, seconds: float
+) -> None:
     """A way is left at any time, so nothing may be lost."""
-    triangle, rng = Triangle(lab, agent, shell), random.Random(os.environ.get("RMPA_PATHS_SEED", "1"))
+    triangle, rng = Triangle(lab, agent, shell), random.Random(seconds)
     out: set[int] = set()
-    addresses, until = 100, time.monotonic() + SECONDS
+    addresses, until = 100, time.monotonic() + seconds
     while time.monotonic() < until:
         relay = rng.choice([triangle.m2, triangle.m3])
         way = rng.choice([DIRECT, FIRST, SECOND])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections import defaultdict
+from collections import OrderedDict, defaultdict
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
@@ -19,6 +19,7 @@ from rmpa.config.settings import TimeSettings
 from rmpa.config.values import PEER
 from rmpa.core.counters import Counters
 from rmpa.core.identity import NEVER_CROSSING, is_own, matches
+from rmpa.mesh import limits as mesh_limits
 from rmpa.trust.permissions import PermissionDecision, prohibition, refusal
 
 if TYPE_CHECKING:
@@ -395,6 +396,7 @@ class RelayPaths:
     Attributes:
         instance: Our own, as 32 hexadecimal digits.
         reached_here: Instances that this module reaches by itself, outside the mesh: a gateway's sites.
+        lost: The relay that brought a module last, by the names of both, of each that no relay brings any more.
         _linked: By number of a peer with a link of its own: its name, its instance, and its rank among relays.
         _ready: The peers that have a link and have told all that they offer.
         _ways: By instance and relay: the origin as the relay offered it last, and the number of its sources there.
@@ -404,6 +406,7 @@ class RelayPaths:
         self._may_relay = may_relay
         self.instance = ""
         self.reached_here: set[str] = set()
+        self.lost: OrderedDict[str, str] = OrderedDict()
         self._linked: dict[int, tuple[str, str, int]] = {}
         self._ready: set[int] = set()
         self._ways: dict[str, dict[int, tuple[Origin, int]]] = {}
@@ -443,11 +446,18 @@ class RelayPaths:
         gone = self._linked.pop(peer, None)
         changed = {gone[1]} if gone is not None else set()
         for instance, ways in list(self._ways.items()):
-            if ways.pop(peer, None) is not None:
+            if (way := ways.pop(peer, None)) is not None:
                 changed.add(instance)
                 if not ways:
-                    del self._ways[instance]
+                    self._lose(way[0], gone)
         return changed
+
+    def _lose(self, origin: Origin, relay: tuple[str, str, int] | None) -> None:
+        """Note that no relay brings a module any more."""
+        del self._ways[origin.instance]
+        self.lost[origin.name] = relay[0] if relay is not None else ""
+        if len(self.lost) > mesh_limits.MODULES_MAX:
+            self.lost.popitem(last=False)
 
     def count(self, peer: int, origin: Origin, more: int) -> bool:
         """Count a source of a module that a peer offers (1) or offers no longer (-1).
@@ -462,8 +472,9 @@ class RelayPaths:
         known, count = ways.pop(peer, (origin, 0))
         if count + more > 0:
             ways[peer] = origin if more > 0 else known, count + more
+            self.lost.pop(origin.name, None)
         if not ways:
-            del self._ways[origin.instance]
+            self._lose(origin, self._linked[peer])
         return self._best(origin.instance) != before
 
     def objection(self, origin: Origin) -> str:

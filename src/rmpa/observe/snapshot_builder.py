@@ -163,6 +163,7 @@ class SnapshotBuilder:
             taken=time.time(),
             peers=known,
             strangers=strangers,
+            lost=dict(self._parts.bridge.topics.imports.ways.lost),
             topics=self.topics.infos(topics),
             services=self._services(services),
             topics_left=topics_left,

@@ -142,6 +142,10 @@ def peer_stages(snapshot: Snapshot, name: str) -> tuple[Check, ...]:
     peer, agent = find_peer(snapshot, name), snapshot.agent
     if peer is None and (strangers := _fitting(snapshot.strangers, name)):
         return (Check.from_message("peer", FAIL, f"{name} is {strangers[0].last_error}"),)
+    if peer is None and (relay := snapshot.lost.get(name)):
+        text = f"{name} was reached by way of {relay}, which does not pass on what it publishes any more"
+        remedy = f"start {relay} again or see `rmpa peer info {relay}`; or give {name} a link of its own"
+        return (Check("peer", FAIL, text, remedy),)
     if peer is None:
         known = [p.name for p in snapshot.peers]
         text = f"{agent.name} knows no peer {name!r} (domain {agent.domain}, looking on "
