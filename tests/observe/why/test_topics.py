@@ -350,6 +350,14 @@ def test_a_module_behind_a_relay_that_is_gone_is_missed_with_the_relay() -> None
     assert found.remedy.startswith("start base again")
 
 
+def test_a_relay_that_is_away_is_what_fails() -> None:
+    behind, relay = peer(name="pad", state="relayed", via="base", link=None), unlinked("waiting", name="base")
+    known = msgspec.structs.replace(SNAPSHOT, peers=(behind, relay))
+    *_, link = peer_stages(known, "pad")
+    assert link.level is CheckLevel.FAIL
+    assert link.text == "no link of its own, and base, which passes on what it publishes, is away"
+
+
 _names = st.text(max_size=20)
 _sources = st.builds(
     PublisherReport,

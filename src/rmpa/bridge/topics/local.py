@@ -255,14 +255,18 @@ class LocalSubscriptions:
         return flow.by_peer.get(peer) if flow is not None else None
 
     def _give_up(self, keys: list[tuple[int, Source]]) -> None:
-        """Reports routes whose messages are not kept any more for absent peers."""
+        """Reports routes whose messages are not kept any more for absent peers.
+
+        What a relay does not keep is not lost yet: the peer may get it by another path, and counts what it misses.
+        """
         for peer in dict.fromkeys(peer for peer, _ in keys):
             counts = {}
             for source in (source for one, source in keys if one == peer):
                 sender = self._sender_of(source, peer)
                 if isinstance(sender, ReliableRouteSender):
                     counts[source] = sender.missed() + sender.sender.pending
-            self._losses.given_up(peer, counts)
+            own = {one: count for one, count in counts.items() if not isinstance(self.flows[one], RelayedFlow)}
+            self._losses.given_up(peer, own)
             for source in counts:
                 self._exports.given_up(source, peer)
 
