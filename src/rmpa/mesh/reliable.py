@@ -293,11 +293,13 @@ class ReliableReceiver:
 
     Attributes:
         next: The sequence that comes next; a receiver that takes a message with this one by itself adds 1.
+        complete: Whether the publisher has gone, and ``next`` is behind its last message.
     """
 
     def __init__(self, epoch: int | None = None, first: int | None = None) -> None:
         self._epoch = epoch
         self.next = first
+        self.complete = False
         self._unacknowledged = 0
         self._unacknowledged_bytes = 0
         self._unacknowledged_since = 0.0

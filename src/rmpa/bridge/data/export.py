@@ -561,7 +561,7 @@ class RelayedFlow(ExportFlow):
     @property
     def complete(self) -> bool:
         """As of ``ExportFlow``; what a relay has got last need not be the publisher's last message."""
-        return self._source is not None and self._source.complete
+        return self._source is not None and self._source.numbering.complete
 
     def keep(self, latched: int, depth: int = 0) -> None:
         """As of ``ExportFlow``; what the flow that the messages come by keeps is not kept twice."""

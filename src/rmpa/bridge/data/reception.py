@@ -91,7 +91,6 @@ class ImportFlow(DataHandler):
             ones, or twice), ``stale`` (delayed by an outage, dropped for newer ones), ``expired`` (after their
             lifespan).
         history: The last messages of a reliable source, where this module may pass them on.
-        complete: Whether the publisher has gone, and it is known which message was its last one.
         oversized, oversized_bytes: Messages that the publisher's agent left out because they are too long; size of
             the last one, in bytes.
     """
@@ -131,9 +130,8 @@ class ImportFlow(DataHandler):
         self._held: tuple[asyncio.TimerHandle, int, bytes] | None = None
         self.told: tuple[str, ...] = ()
         self._link: PeerLink
-        self.route = self.epoch = self._first = 0
+        self.route = self.epoch = 0
         self._had = 0
-        self.complete = False
         self._ack_timer: asyncio.TimerHandle | None = None
         self.quality = Quality()
         self.watch = QosWatch(contract, self._loop.time(), past)
@@ -174,7 +172,6 @@ class ImportFlow(DataHandler):
         """
         position = self.numbering.position()
         self._link, self.route, self.epoch = link, route, epoch
-        self._first = first
         self.told = ()
         self.torn()
         self._stop_ack_timer()
@@ -347,8 +344,9 @@ class ImportFlow(DataHandler):
         """
         # The first messages of a route may be kept, old ones: at least one if the publisher latches.
         kept = self.contract.kept if self.contract.durability is Durability.TRANSIENT_LOCAL else 1
-        late = serial_distance(self._first, sequence) >= kept
-        if self._reliable or not late or not self._is_too_old(stamp_ns, now_ns):
+        if self._reliable or not self._is_too_old(stamp_ns, now_ns):
+            return False
+        if serial_distance(self._had, sequence) <= kept:
             return False
         sent_at = self._loop.time() - (now_ns - stamp_ns + self.link_time.ahead_ns) / 1e9
         held_up = self.link_time.resumed_at() - sent_at

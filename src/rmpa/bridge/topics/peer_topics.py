@@ -336,7 +336,7 @@ class PeerTopics:
             return
         if flow is not None and last is not None:
             flow.skip(serial_add(last, 1))
-            flow.complete = True
+            flow.numbering.complete = True
         topic.end(missed=missed and last is None)
         topic.publication.forget_latched()
 

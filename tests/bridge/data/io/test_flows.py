@@ -263,7 +263,7 @@ class Inlet:
         output = cast("Any", self.outlet)
         self.flow = ImportFlow(output, contract, self.time, self.counters, lambda _: None, self.torn)
         self.begin(0, first)
-        self.flow._first = 1  # what comes later is not one that the publisher has kept
+        self.flow._had = 0  # what comes after the first is not one that the publisher has kept
 
     def begin(self, epoch: int, first: int) -> bool:
         """The route is opened on a link; returns whether its numbering goes on."""
