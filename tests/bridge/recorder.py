@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rmpa.bridge.context import BridgeContext, Names, ServiceRules
-from rmpa.bridge.data.export import RouteBegin
+from rmpa.bridge.data.route import RouteBegin
 from rmpa.bridge.messages import Source
 from rmpa.bridge.offers import Effects
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy

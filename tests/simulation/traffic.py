@@ -9,8 +9,9 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender, RouteBegin
+from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender
 from rmpa.bridge.data.reception import ImportFlow, LinkTime
+from rmpa.bridge.data.route import RouteBegin
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.counters import Counters
 from rmpa.core.identity import serial_add

@@ -10,9 +10,9 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
-from rmpa.bridge.data.route import EXPRESS, Downsampler, LaneSwitch, kept_for
+from rmpa.bridge.data.route import EXPRESS, Downsampler, LaneSwitch, RouteBegin, kept_for
 from rmpa.core.contract import Contract, Durability, Reliability
 from rmpa.core.identity import SERIAL_MASK, is_later, serial_add
 from rmpa.mesh import limits as mesh_limits
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from rmpa.core.outbox import QueuedMessage
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.mesh.reliable import Outgoing
     from rmpa.ros.node.subscription import TopicConnection
     from rmpa.runtime.tls import Buffer
 
@@ -314,24 +313,6 @@ class ReliableRouteSender(RouteSender):
         """Sets no bounds: a numbered message may not be dropped from a queue; the window bounds the queue."""
         for lane in (link.express, link.bulk):
             lane.set_terms(self.route, mesh_limits.KEEP_ALL_MESSAGES, None, strict=False)
-
-
-class RouteBegin(NamedTuple):
-    """Where a route begins.
-
-    Args:
-        epoch: Its numbering; 0 if its numbers mean nothing beyond it.
-        first: The sequence of its first message.
-        goes_on: Whether the peer has what is before ``first``, or misses it for good.
-        kept: The messages to be sent at once.
-        resumed: Whether a suspended sender goes on.
-    """
-
-    epoch: int
-    first: int
-    goes_on: bool = False
-    kept: tuple[Outgoing, ...] = ()
-    resumed: bool = False
 
 
 class ExportFlow:

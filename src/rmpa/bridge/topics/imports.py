@@ -8,9 +8,8 @@ for::
       │ unwanted        ▼                   ▼
       └────────────── waiting ◄─────────────┘    time ──► opening
 
-A source may be offered by several peers: by its module itself, and by relays. One of them *carries* it: it is shown,
-and has the subscribers. When another one is the better way, its route is opened behind the last message that came,
-and it carries the source from the moment when that is open; the old way is used until then.
+Several peers may offer a source: its module itself, and relays. One of them *carries* it: it is shown, and has the
+subscribers. A better way opens its route behind the last message that came, and carries the source from then on.
 
 The cost of a method depends on its arguments, not on the number of peers and sources. Sources are keyed by their wire
 names; all arguments about the local graph use the names there (``bridge.proxies``).
@@ -408,14 +407,13 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 return f"time comes from {source.node} of {name} already, and has one source", True
         return "", False
 
-    # --- which way carries it ------------------------------------------------------------------------------------
-
     def _choose(self, entry: RemoteTopic) -> None:
         """Let the best way carry a source, by the facts of now; call it whenever one has changed."""
         ways, carrier = self._ways[entry.key], self.carrier(entry)
         best = self._best(ways)
+        outranked = self._outranked(best) if best is not None else ""
         for way in ways:
-            way.hidden = way.objection or (self._outranked(best) if best is not None and way is not best else "")
+            way.hidden = way.objection or ("" if way is best else outranked)
             if way is not best and way is not carrier and way.wanted:
                 self._close(way)
                 way.wanted = False
@@ -446,20 +444,16 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         wanted, old.wanted = old.wanted, False
         self._do.moved(old, new)
         self._close(old)
-        if new.open or not wanted:
-            new.wanted = wanted
-        elif not new.wanted:
-            new.wanted = True
+        if wanted and not new.open and not new.wanted:
             self._wait(new, -math.inf)
+        new.wanted = wanted
         self._show_behind(old)
 
     def _hand_over(self, entry: RemoteTopic) -> None:
         """Let another way carry a source at once, if there is one: this one ends."""
-        others = self._ways[entry.key]
-        if entry.shown and len(others) > 1:
-            other = self._best(way for way in others if way is not entry)
-            if other is not None:
-                self._move(entry, other)
+        others = [way for way in self._ways[entry.key] if way is not entry] if entry.shown else ()
+        if (other := self._best(others)) is not None:
+            self._move(entry, other)
 
     def _hand_all_over(self, peer: int) -> None:
         if (known := self._peers.get(peer)) is not None:

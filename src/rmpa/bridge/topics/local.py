@@ -35,7 +35,8 @@ from rmpa.runtime.loop import MachineTimer
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from rmpa.bridge.data.export import RouteBegin, RouteSender
+    from rmpa.bridge.data.export import RouteSender
+    from rmpa.bridge.data.route import RouteBegin
     from rmpa.bridge.messages import Message
     from rmpa.bridge.offers import Effects
     from rmpa.bridge.policy import Relay

@@ -31,8 +31,8 @@ from rmpa.runtime.loop import yield_to_data
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
-    from rmpa.bridge.data.export import RouteBegin
     from rmpa.bridge.data.quality import QosEvent
+    from rmpa.bridge.data.route import RouteBegin
     from rmpa.bridge.messages import Message
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
