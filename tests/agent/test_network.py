@@ -65,17 +65,20 @@ class Endpoint:
             raise OSError(errno.EMFILE, "the interfaces cannot be listed")
         self.port = port
         self.displaced = network.move
-        self.started = self.closed = False
+        self.started = self.closed = self.moves = False
         made.append(self)
 
     async def start(self) -> None:
         if Endpoint.failing:
             Endpoint.failing -= 1
-            raise StartError("mesh port", "taken")
+            raise (
+                OSError(errno.EMFILE, "too many open files") if Endpoint.failing else StartError("mesh port", "taken")
+            )
         await asyncio.sleep(1.0)
         self.started = True
 
-    async def close(self) -> None:
+    async def close(self, *, moves: bool = False) -> None:
+        self.moves = moves
         await asyncio.sleep(1.0)
         self.closed = True
 
@@ -100,6 +103,7 @@ def test_a_move_goes_on_until_the_agent_is_in_the_network_again(joined: Callable
         made[0].displaced()
         await asyncio.sleep(3 * JOIN_RETRY + 10.0)
         assert [one.closed for one in made] == [True, True, True, False]
+        assert made[0].moves
         assert sut.endpoint is not None
         assert made[-1].started
         await sut.close()

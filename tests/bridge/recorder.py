@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rmpa.bridge.context import BridgeContext, Names, ServiceRules
+from rmpa.bridge.data.route import RouteBegin
 from rmpa.bridge.messages import Source
 from rmpa.bridge.offers import Effects
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.messages import Description, Message, Origin, RouteOpened
     from rmpa.bridge.services.bodies import LocalService
     from rmpa.bridge.services.books import RemoteService
-    from rmpa.bridge.topics.exports import LocalSource
+    from rmpa.bridge.topics.exports import ExportRoute, LocalSource
     from rmpa.bridge.topics.imports import RemoteTopic
     from rmpa.ros.wire.tcpros import ServiceDescription
 
@@ -80,6 +81,20 @@ class Publish(NamedTuple):
 class Retract(NamedTuple):
     peer: int
     source: Source
+
+
+class Moved(NamedTuple):
+    old: int
+    left: Source
+    new: int
+    source: Source
+    origin: Origin | None
+
+
+class PathChanged(NamedTuple):
+    peer: int
+    wire: Source | str
+    origin: Origin
 
 
 class Describe(NamedTuple):
@@ -171,11 +186,15 @@ _EFFECTS: Final[dict[str, Callable[..., Any]]] = {
     "warn": Warn,
     "connect": Connect,
     "disconnect": Disconnect,
-    "add_route": lambda s, peer, r: AddRoute(s, peer, r.number, r.contract, r.epoch, r.after),
+    "add_route": lambda s, peer, r, b: AddRoute(
+        s, peer, r.number, r.contract, b.epoch, r.position[1] if r.position is not None and b.goes_on else None
+    ),
     "remove_route": RemoveRoute,
     "suspend_route": SuspendRoute,
     "publish": lambda e: Publish(e.peer, e.wire, e.type, e.name if e.name != e.wire.topic else "", e.origin),
     "retract": lambda e: Retract(e.peer, e.wire),
+    "moved": lambda old, new: Moved(old.peer, old.wire, new.peer, new.wire, new.origin),
+    "path_changed": lambda e: PathChanged(e.peer, e.wire, e.origin),
     "describe": _described,
     "detach": _detached,
     "probe": Probe,
@@ -207,14 +226,25 @@ class Out(Effects):
         self.outbound = self.serving = self
         self.direct_exports = SimpleNamespace(server_gone=lambda _: None)
         self.done: list[Any] = []
+        self.epochs: dict[Source, int] = {}
         self._position = position
 
     @property
     def context(self) -> BridgeContext:
         return self.rules
 
-    def sender_of(self, source: Source, peer: int) -> Any:
-        return self._numbering(source, peer)
+    def last(self, source: Source, peer: int) -> int | None:
+        numbering = self._numbering(source, peer)
+        return numbering.last if numbering is not None else None
+
+    def begins(self, source: Source, peer: int, route: ExportRoute) -> RouteBegin:
+        """Each source has one numbering, which begins when it is connected; suspended senders say where they are."""
+        numbering = self._numbering(source, peer)
+        epoch = self.epochs.setdefault(source, len(self.epochs) + 1)
+        if route.position is None or route.position[0] != epoch:
+            return RouteBegin(epoch, 1)
+        following = numbering.following if numbering is not None else 0
+        return RouteBegin(epoch, max(following, route.position[1] + 1), goes_on=True)
 
     def take(self) -> list[Any]:
         """What was done since the last call."""

@@ -153,7 +153,7 @@ def changes(
     made: Heard[str, Any, str], *added: str, removed: tuple[str, ...] = (), full: bool = False, more: bool = False
 ) -> list[tuple[str, str | None]]:
     message = AdvertiseServices(tuple(ServiceOffer(name, "/n") for name in added), removed, full, more)
-    book: Any = SimpleNamespace(_peers={1: made})
+    book: Any = SimpleNamespace(_peers={1: made}, _ready=lambda _: None)
     return [(wire, offer and offer.service) for wire, offer in ImportBook.changes(book, 1, message)]
 
 

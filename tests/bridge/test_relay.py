@@ -22,6 +22,8 @@ from rmpa.config.settings import ServiceSettings
 from tests.bridge.recorder import (
     Exports,
     Imports,
+    Moved,
+    PathChanged,
     PeerServiceRules,
     Provide,
     Publish,
@@ -152,10 +154,11 @@ class Map:
             self.act(here, module.service_exports.link_down(number))
             self.act(here, module.service_imports.gone(number))
             self.act(here, module.exports.link_down(number))
+            self.act(here, module.imports.link_down(number))
             module.relay.peer_gone(number)
-            for key in [key for key in module.shown if key[0] == number]:  # its proxies are closed
+            for key in [key for key in module.shown if key[0] == number]:  # it is retracted with its peer
                 module.dirty.add(module.shown.pop(key)[0])
-            self.act(here, module.imports.link_down(number) or [Warn("", "", "its proxies are closed")])
+            self.act(here, [Warn("", "", "its topics are retracted")])
 
     def act(self, here: int, actions: Sequence[Any]) -> None:
         module = self.modules[here]
@@ -170,6 +173,20 @@ class Map:
                     place = (topic or source.topic, f"/rmpa/{whose.name}{whose.node}")
                     module.relay.shown(peer, source, place, whose)
                     module.shown[peer, source] = place
+                case Moved(old, left, new, source, whose):
+                    place = module.shown[new, source] = module.shown.pop((old, left))
+                    module.relay.shown(new, source, place, whose or module.direct(new, source.node))
+                    module.relay.gone(old, left)
+                    module.dirty.add(place[0])
+                case PathChanged(peer, Source() as source, whose) if (peer, source) in module.shown:
+                    module.relay.shown(peer, source, module.shown[peer, source], whose)
+                case PathChanged(peer, str(service), whose) if (peer, service) in module.provided:
+                    place = module.provided[peer, service]
+                    node = next(
+                        one.node for _, one in module.service_imports if (one.peer, one.wire) == (peer, service)
+                    )
+                    source = Source(f"service {service}", node)
+                    module.relay.shown(peer, source, (f"service {service}", place[1]), whose)
                 case Retract(peer, source):
                     module.relay.gone(peer, source)
                     module.dirty.add(module.shown.pop((peer, source))[0])
@@ -278,6 +295,7 @@ def test_the_way_is_told_and_what_came_round_is_not_shown() -> None:
     ways = RelayPaths()
     ways.instance = instance(9)
     ways.linked(1, "r", instance(2), 2)
+    ways.ready(1, ready=True)
     assert not ways.count(1, origin(9, 2), 1)
     assert ways.why_not(1, origin(9, 2)) == "it is ours, and came back by a relay"
     assert not ways.count(1, origin(1, 9, 2), 1)
@@ -286,6 +304,11 @@ def test_the_way_is_told_and_what_came_round_is_not_shown() -> None:
     assert not ways.why_not(1, origin(1, 2))
     assert ways.count(1, origin(1, 2), -1)
     assert list(ways) == []
+    assert ways.lost == {"m1": "r"}, "for `rmpa why`, which names the relay"
+    assert ways.count(1, origin(1, 2), 1)
+    assert ways.lost == {}
+    ways.unlinked(1)
+    assert ways.lost == {"m1": "r"}
 
 
 def test_a_peer_that_claims_the_run_of_a_relayed_module_does_not_hide_it() -> None:
@@ -293,11 +316,14 @@ def test_a_peer_that_claims_the_run_of_a_relayed_module_does_not_hide_it() -> No
     ways = RelayPaths()
     ways.instance = instance(9)
     ways.linked(1, "r", instance(2), 2)
+    ways.ready(1, ready=True)
     ways.count(1, origin(1, 2), 1)
     ways.linked(2, "thief", instance(1), 1)
+    ways.ready(2, ready=True)
     assert not ways.why_not(1, origin(1, 2))
     assert list(ways) == [(origin(1, 2), "r")]
     ways.linked(3, "m1", instance(1), 1)
+    ways.ready(3, ready=True)
     assert ways.why_not(1, origin(1, 2)) == "m1 has a link of its own"
     assert list(ways) == []
 
@@ -306,7 +332,9 @@ def test_a_peer_that_may_not_relay_does_not_rename_a_module() -> None:
     ways = RelayPaths(lambda name: name == "r")
     ways.instance = instance(9)
     ways.linked(1, "r", instance(2), 2)
+    ways.ready(1, ready=True)
     ways.linked(2, "liar", instance(3), 3)
+    ways.ready(2, ready=True)
     renamed = msgspec.structs.replace(origin(1, 3), name="other")
     ways.count(2, renamed, 1)
     ways.count(1, origin(1, 2), 1)

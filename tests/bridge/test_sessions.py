@@ -80,6 +80,10 @@ class Link:
         self.routes: dict[int, object] = {}
         self.silent = silent
         self.crashed = False
+        self.closed = ""
+
+    def close(self, reason: str) -> None:
+        self.closed = reason
 
 
 class Scene:
@@ -140,6 +144,18 @@ class Broken(Part):
 
     def grace_over(self, session: PeerSession) -> bool:
         raise ZeroDivisionError
+
+
+def test_a_run_at_another_address_goes_on_before_the_end_of_its_old_link_is_noticed() -> None:
+    async def scene(made: Scene) -> None:
+        old = made.link()
+        made.link(host="10.0.0.2")
+        assert made.states() == [PeerState.LINKED]
+        assert cast("Link", old).closed == "far has another address"
+        made.sessions.link_down(old)
+        assert made.states() == [PeerState.LINKED]
+
+    assert play(scene, 30.0)[:3] == ["up 1", "down", "up 1"]
 
 
 def test_a_part_that_fails_does_not_keep_the_next_ones_from_being_told(caplog: pytest.LogCaptureFixture) -> None:
@@ -314,14 +330,6 @@ async def test_a_proxy_that_cannot_be_made_is_tried_again() -> None:
     await world.proxies.close()
     assert world.happened == ["topic /a left"]
     assert world.nodes.open == []
-
-
-async def test_a_relayed_node_has_the_name_of_its_own_module() -> None:
-    world = World()
-    world.proxies.names["/rmpa/other/n"] = "/rmpa/other/n"
-    world.hold("/rmpa/other/n", "topic /a")
-    assert await world.settled() == ["topic /a at /rmpa/other/n"]
-    await world.proxies.close()
 
 
 # How proxies listen: together where nodes of this machine alone reach them, and apart where that cannot be.

@@ -19,7 +19,7 @@ from rmpa.bridge.messages import RouteOpened, Source
 from rmpa.bridge.proxies import PeerProxies, ProxyNodes
 from rmpa.bridge.sessions import PeerSession
 from rmpa.bridge.topics.imports import RemoteTopic
-from rmpa.bridge.topics.peer_topics import PeerTopic, PeerTopics, TopicEvents
+from rmpa.bridge.topics.peer_topics import Pasts, PeerTopics, TopicEvents
 from rmpa.core.counters import Counters
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.ros.core.embedded import RosCore
@@ -220,13 +220,13 @@ async def proxied(core: RosCore, listener: Process, closing: AsyncExitStack) -> 
     """A peer's side with one source, and a listener of that source that is connected to its proxy."""
     proxies = PeerProxies("/rmpa/peer", ProxyNodes(core))
     closing.push_async_callback(proxies.close)
-    shared = SimpleNamespace(core=core, counters=Counters())
+    shared = SimpleNamespace(core=core, counters=Counters(), relay=SimpleNamespace(enabled=False))
     session = PeerSession(1, cast("PeerLink", SimpleNamespace(routes={})), proxies)
-    inbound = PeerTopics(cast("Shared", shared), TopicEvents(), session, {})
+    pasts: Pasts = {}
+    inbound = PeerTopics(cast("Shared", shared), TopicEvents(), session, lambda _: pasts)
     closing.callback(inbound.close)
-    entry = RemoteTopic(peer=1, wire=SOURCE, name=SOURCE.topic, node=SOURCE.node, type=BYTES)
-    topic = PeerTopic(inbound, entry)
-    proxies.hold(SOURCE.node, SOURCE, topic.ready, topic.left)
+    entry = RemoteTopic(peer=1, wire=SOURCE, name=SOURCE.topic, node=SOURCE.node, type=BYTES, module=("", "peer"))
+    inbound.publish(entry, proxies, SOURCE.node)
     await until(lambda: (p := inbound.publication(SOURCE)) is not None and p.subscribers)
     return inbound, listener
 

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender
 from rmpa.bridge.data.reception import ImportFlow, LinkTime
+from rmpa.bridge.data.route import RouteBegin
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.counters import Counters
+from rmpa.core.identity import serial_add
 from rmpa.mesh.frames import FrameKind
 from tests.bridge.io.doubles import Outlet
 from tests.simulation.mesh_peer import MeshPeer
@@ -238,8 +240,9 @@ class TrafficPeer(MeshPeer):
         else:
             self._epoch += 1
             self.first[link.identity.instance] = self._next + 1
-            self._send_message(link, op="opened", epoch=self._epoch, first=1, **contract)
-            sender = self.exports.add(peer, link, 1, self.contract, self._epoch)
+            begin = RouteBegin(self._epoch, serial_add(self.exports.number, 1))
+            self._send_message(link, op="opened", epoch=begin.epoch, first=begin.first, **contract)
+            sender = self.exports.add(peer, link, 1, self.contract, begin)
         self.senders[link, 1] = sender
 
     def _begin(self, link: PeerLink, said: dict[str, Any]) -> None:

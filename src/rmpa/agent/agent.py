@@ -2,7 +2,7 @@
 
 That place is a GUID and a mesh port, with discovery and mesh, wired to the bridge. When the machine loses the address
 in the GUID (an agent that started before the network did has 127.0.0.1), the agent leaves with a goodbye and joins
-under a new GUID. Its core and the local graph do not notice.
+under a new GUID. It stays the same run, so peers go on where they were. Its core and the local graph do not notice.
 """
 
 from __future__ import annotations
@@ -89,15 +89,15 @@ class NetworkEndpoint:
         settings, bridge, trust, clock = network.settings, network.bridge, network.trust, SystemClock()
         self._network = network
         self._bridge = bridge
+        usable = choose(list_interfaces(), settings.interfaces)
         tcp, udp = open_mesh_port(port)
         self.port: int = tcp.getsockname()[1]
-        usable = choose(list_interfaces(), settings.interfaces)
         address = pick_address(usable)
         # Seconds modulo 18 hours, so that a restart gets a higher number; the random instance id decides in doubt.
         incarnation = clock.wall_ns() // 1_000_000_000 % (1 << 16)
         self.identity = Identity(
             Guid.of(address, self.port, incarnation),
-            os.urandom(limits.INSTANCE_ID_BYTES),
+            network.instance,
             settings.name,
             settings.domain,
             further_addresses(usable, address),
@@ -138,11 +138,11 @@ class NetworkEndpoint:
         await self.discovery.start()
         _log.info("= %s, domain %d: peers can find it", self.identity, self.identity.domain)
 
-    async def close(self) -> None:
-        """Send the goodbye, and close the links in order."""
+    async def close(self, *, moves: bool = False) -> None:
+        """Send the goodbye, and close the links in order; ``moves``: the agent is back at once, elsewhere."""
         await self.discovery.close()
         self._udp.close()
-        await self.mesh.close()
+        await self.mesh.close(moves=moves)
 
     def _event(self, event: PeerEvent) -> None:
         identity = event.identity
@@ -192,6 +192,7 @@ class Network:
         trust: This module's part in a secured mesh; ``None``: trust is off.
 
     Attributes:
+        instance: This run, wherever it is in the network.
         endpoint: The place now; ``None`` before the start, and while the agent moves.
     """
 
@@ -199,6 +200,7 @@ class Network:
         self.settings = settings
         self.bridge = bridge
         self.trust = trust
+        self.instance: Final = os.urandom(limits.INSTANCE_ID_BYTES)
         self._moving: asyncio.Task[None] | None = None
         self._over = asyncio.Event()
         self.endpoint: NetworkEndpoint | None = None
@@ -234,12 +236,12 @@ class Network:
             await self._leave()
             raise
 
-    async def _leave(self) -> None:
+    async def _leave(self, *, moves: bool = False) -> None:
         if self.endpoint is not None:
             endpoint, self.endpoint = self.endpoint, None
             if self.trust is not None:
                 self.trust.identity = None
-            await endpoint.close()
+            await endpoint.close(moves=moves)
 
     def move(self) -> None:
         """Take a new GUID, with an address that the machine has."""
@@ -253,7 +255,7 @@ class Network:
             joined = False
             while not joined and not self._over.is_set():
                 try:
-                    await self._leave()
+                    await self._leave(moves=True)
                     await self._join(port)
                     joined = True
                 except Exception as error:  # noqa: BLE001 - until it has joined, no change of an address is noticed

@@ -179,9 +179,10 @@ class Nodes(Part):
         self._shown[session.peer] = wanted
 
     def gone(self, session: PeerSession) -> None:
-        """Forget a peer; its proxies go with its session."""
+        """Forget a peer."""
         self._told.pop(session.peer, None)
-        self._shown.pop(session.peer, None)
+        for node in self._shown.pop(session.peer, ()):
+            session.proxies.release(node, _HELD)
 
     def _show(self, proxy: SlaveNode) -> None:
         proxy.add_service(ServiceEndpoint(_service(proxy), proxy.name, _answer, description=GET))

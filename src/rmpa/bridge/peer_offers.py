@@ -7,6 +7,8 @@ from collections import Counter, OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
 
+import msgspec
+
 from rmpa.bridge import limits
 from rmpa.bridge.offers import KeyT, OfferT, wire_of
 from rmpa.bridge.policy import RelayPaths
@@ -61,12 +63,14 @@ class Heard(Generic[KeyT, EntryT, OfferT]):
 
     Args:
         name: The peer's name.
+        instance: Its run, as 32 hexadecimal digits.
         entries: What is taken of its offers, by name on the wire.
         refused: The offers beyond the limit, at most ``limits.REFUSED_MAX``; further ones come with its next link.
         doubtful: What was offered over the last link and is not confirmed over the present one.
         shown: How many entries of each node are in the local graph.
         crowded: The nodes without a place, and the entries of each that wait for one (ordered: taking the first item
             of a plain dict passes over all that were taken before it).
+        complete: Whether it has told all that it offers.
         away: Whether the peer has no link but may come back.
         silent: Whether its last link ended by silence.
         rank: The value of its GUID.
@@ -75,11 +79,13 @@ class Heard(Generic[KeyT, EntryT, OfferT]):
     """
 
     name: str
+    instance: str = ""
     entries: dict[KeyT, EntryT] = field(default_factory=dict)
     refused: OrderedDict[KeyT, OfferT] = field(default_factory=OrderedDict)
     doubtful: set[KeyT] = field(default_factory=set)
     shown: Counter[str] = field(default_factory=Counter)
     crowded: OrderedDict[str, dict[EntryT, None]] = field(default_factory=OrderedDict)
+    complete: bool = False
     away: bool = False
     silent: bool = False
     rank: int = 0
@@ -126,8 +132,11 @@ class Heard(Generic[KeyT, EntryT, OfferT]):
 
 
 def _is_same(entry: Remote[Any], offer: Any) -> bool:
-    """Whether an offer is what an entry was made of."""
-    return entry.node == offer.node and entry.origin == offer.origin and entry.type == getattr(offer, "type", None)
+    """Whether an offer is what an entry was made of, perhaps by another path."""
+    one, other = entry.origin, offer.origin
+    if one is not None and other is not None:
+        one = msgspec.structs.replace(one, guid=other.guid, path=other.path)
+    return entry.node == offer.node and one == other and entry.type == getattr(offer, "type", None)
 
 
 class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
@@ -203,10 +212,10 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
             instance: Its run, as 32 hexadecimal digits: what relays offer of it is hidden while it has a link.
             rank: The value of its GUID.
         """
-        known = self._peers.setdefault(peer, Heard(name=name))
+        known = self._peers.setdefault(peer, Heard(name=name, instance=instance))
         known.away, known.silent, known.rank, known.routes, known.last_route = False, False, rank, {}, 0
-        if instance:
-            self._ways_changed(self.ways.linked(peer, name, instance, rank))
+        self._ways_changed(self.ways.linked(peer, name, instance, rank))
+        self._ready(peer)
 
     def changes(self, peer: int, message: Advertise | AdvertiseServices) -> Iterator[tuple[KeyT, OfferT | None]]:
         """The changes of an advertisement, each with its name on the wire; removals, ``None``, go first.
@@ -225,6 +234,14 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
             known.doubtful = set()
         yield from ((name, None) for name in removed)
         yield from ((wire_of(offer), offer) for offer in added)
+        if not message.more and self._peers.get(peer) is known:
+            known.complete = True
+            self._ready(peer)
+
+    def _ready(self, peer: int) -> None:
+        """Judge again what other peers bring, if a peer has become a way or is none any more."""
+        known = self._peers[peer]
+        self._ways_changed(self.ways.ready(peer, ready=known.complete and not known.away))
 
     def take_in(self, peer: int, wire: KeyT, offer: OfferT | None, now: float) -> None:
         """Apply one change of an advertisement: an offer, or ``None`` for what is offered no more."""
@@ -250,6 +267,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         wire = wire_of(offer)
         entry = known.entries.get(wire)
         if entry is not None and _is_same(entry, offer):
+            self._by_path(entry, cast("Any", offer).origin)
             self._came_again(entry, now)
             return
         if entry is not None:
@@ -263,6 +281,17 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         if entry.origin is not None and self.ways.count(peer, entry.origin, 1):
             self._ways_changed({entry.origin.instance})
         self._judge(entry)
+
+    def _by_path(self, entry: EntryT, origin: Origin | None) -> None:
+        """Note by which relays an entry comes now."""
+        if origin is None or origin == entry.origin:
+            return
+        if entry.origin is not None:
+            self.ways.count(entry.peer, entry.origin, -1)
+        entry.origin = origin
+        self.ways.count(entry.peer, origin, 1)
+        self._ways_changed({origin.instance})
+        self._do.path_changed(entry)
 
     def _warn_limit(self, peer: str, kind: str, limit: int) -> None:
         text = f"{peer} has more than limits.{kind} = {limit} of this module; the rest is refused until there is "

@@ -51,7 +51,7 @@ class ProxyNamespaces:
     def add(self, peer: int, identity: Identity) -> str:
         """Return the namespace of a peer, which is reserved until ``remove``."""
         instance = identity.instance.hex()
-        prefix = proxy_prefix(identity, self._taken(instance))
+        prefix = self._relayed.get(instance) or proxy_prefix(identity, self._taken(instance))
         self._linked[peer] = (instance, prefix)
         return prefix
 
@@ -71,15 +71,17 @@ class ProxyNamespaces:
         prefix = self._relayed.get(origin.instance)
         if prefix is None:
             module = Identity(Guid.parse(origin.guid), bytes.fromhex(origin.instance), origin.name)
-            prefix = self._relayed[origin.instance] = proxy_prefix(module, self._taken(origin.instance))
+            linked = (prefix for instance, prefix in self._linked.values() if instance == origin.instance)
+            prefix = next(linked, None) or proxy_prefix(module, self._taken(origin.instance))
+            self._relayed[origin.instance] = prefix
         return proxy_name(prefix, origin.node)
 
-    def forget_unused(self, names: Collection[str]) -> None:
-        """Forget the relayed modules that have no proxy among ``names``."""
+    def forget_unused(self, prefixes: Collection[str]) -> None:
+        """Forget the relayed modules whose namespace is not among those with a proxy."""
         self._relayed = {
             instance: prefix
             for instance, prefix in self._relayed.items()
-            if instance in self._reserved or any(name.startswith(f"{prefix}/") for name in names)
+            if instance in self._reserved or prefix in prefixes
         }
 
     def _taken(self, instance: str) -> set[str]:
@@ -179,7 +181,7 @@ class ProxyNodes:
         return node.publication(topic) if node is not None and node.uri == uri else None
 
 
-# --- The nodes in the local graph that stand for the nodes of one peer ----------------------------------------------
+# --- The nodes in the local graph that stand for the nodes of one module, whichever peers bring it -----------------
 
 
 # What a topic or service does at its proxy: ``ready(proxy)`` registers it there, ``left(proxy)`` removes it.
@@ -191,23 +193,25 @@ async def _refuse_to_end(node: str, _caller: str, _reason: str) -> RosReply:
 
 
 class PeerProxies:
-    """The proxies of one peer; each exists while a topic or service holds it.
+    """The proxies of one module; each exists while a topic or service holds it.
+
+    It does not matter by which peer a topic or service comes. Where another peer brings it in the same turn of the
+    loop, the proxy stays.
 
     Making a proxy may bind sockets, which takes a turn of the loop. Therefore one task makes what stands in the graph
     equal to what is wanted there, in the order of the calls.
 
     Args:
-        prefix: The namespace of this peer's proxies.
+        prefix: The namespace of this module's proxies.
         nodes: Makes the proxies.
-        on_kill: ``(node, caller id, reason) -> reply``: called when the proxy of this peer's node is asked to end.
+        on_kill: ``(node, caller id, reason) -> reply``: called when the proxy of this module's node is asked to end.
 
     Attributes:
-        _wanted: By the peer's node: the topics and services that hold its proxy, by key.
+        _wanted: By the module's node: the topics and services that hold its proxy, by key.
         _held: What of them stands at the proxy.
         _changed: The keys of which what is wanted, or what stands, has changed.
         _failed: The nodes of which a change failed; ``reconcile`` tries again.
         problems: Why the proxy of a node could not be made, as text by node.
-        names: Names of the proxies of relayed nodes, by the peer's node; all others are named with ``prefix``.
         _task: Carries out the changes; ``None`` while there are none.
     """
 
@@ -226,22 +230,26 @@ class PeerProxies:
         self._changed: dict[str, dict[Hashable, None]] = {}
         self._failed: set[str] = set()
         self.problems: dict[str, str] = {}
-        self.names: dict[str, str] = {}
         self._task: asyncio.Task[None] | None = None
 
     def __len__(self) -> int:
         return len(self._proxies)
 
     def __iter__(self) -> Iterator[tuple[str, SlaveNode]]:
-        """Each node of the peer that has a proxy, and the proxy."""
+        """Each node of the module that has a proxy, and the proxy."""
         return iter(self._proxies.items())
 
+    @property
+    def used(self) -> bool:
+        """Whether a proxy exists, or is wanted."""
+        return bool(self._proxies or self._wanted or self._task)
+
     def name(self, node: str) -> str:
-        """The name of the proxy of one of the peer's nodes."""
-        return self.names.get(node) or proxy_name(self.prefix, node)
+        """The name of the proxy of one of the module's nodes."""
+        return proxy_name(self.prefix, node)
 
     def get(self, node: str) -> SlaveNode | None:
-        """The proxy of one of the peer's nodes; ``None`` if it does not exist."""
+        """The proxy of one of the module's nodes; ``None`` if it does not exist."""
         return self._proxies.get(node)
 
     def hold(
@@ -254,7 +262,7 @@ class PeerProxies:
         """Keep a proxy for a node because of one topic or service, until ``release``.
 
         Args:
-            node: In the peer's graph.
+            node: In the module's graph.
             key: Identifies the topic or service for ``release``.
             ready: ``(proxy)``: called in a later turn of the loop, when the proxy exists, to register it there.
             left: ``(proxy)``: called afterwards to remove it; the proxy may be closed then.
@@ -271,12 +279,11 @@ class PeerProxies:
         self._change(node, (key,))
 
     def reconcile(self) -> None:
-        """Try failed proxies again, and forget names and problems of nodes that have gone."""
+        """Try failed proxies again, and forget problems of nodes that have gone."""
         if self._changed:
             return
-        if self.names or self.problems:
+        if self.problems:
             there = self._proxies.keys() | self._wanted.keys()
-            self.names = {node: name for node, name in self.names.items() if node in there}
             self.problems = {node: text for node, text in self.problems.items() if node in there}
         failed, self._failed = self._failed, set()
         for node in failed:

@@ -14,6 +14,7 @@ from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.bridge.proxies import PeerProxies, ProxyNamespaces
 from rmpa.core.counters import logged_failure
 from rmpa.mesh import limits as mesh_limits
+from rmpa.ros.wire.xmlrpc import RosReply
 from rmpa.runtime.loop import MachineTimer, yield_to_data
 from rmpa.runtime.tasks import OwnedTasks
 
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.proxies import ProxyNodes
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.master.parameters import GraphChange
-    from rmpa.ros.wire.xmlrpc import RosReply
 
 # A peer whose agent died keeps its proxies in the local graph for this long: it may be started again at once.
 AWAY_GRACE: Final = 0.5
@@ -61,7 +61,7 @@ class PeerSession:
     Args:
         peer: Its number in this agent; never used again for another run.
         link: Its link, or the last one while it has none.
-        proxies: The nodes that stand for its nodes in the local graph.
+        proxies: The nodes that stand for its nodes in the local graph; those of the module, whichever peers bring it.
         time: The time base of its link: the offset between its clock and the local one.
         state: Whether it has a link.
         away_since: When its last link ended, monotonic seconds.
@@ -245,12 +245,18 @@ class PeerSessions:
         self._by_number: dict[int, PeerSession] = {}
         self._by_link: dict[PeerLink, PeerSession] = {}
         self._namespaces = ProxyNamespaces()
-        self._closing = OwnedTasks()
+        # By run and name of the module: it may be a peer, or reached by relays, or both.
+        self._modules: dict[tuple[str, str], PeerProxies] = {}
         self._timer = MachineTimer(self._next_timer, self._handle_timer)
 
     def __iter__(self) -> Iterator[PeerSession]:
         """Every session, with a link or waiting for one."""
         return iter(list(self._by_number.values()))
+
+    @property
+    def proxy_count(self) -> int:
+        """The number of proxies, of all modules."""
+        return sum(map(len, self._modules.values()))
 
     def linked(self) -> Iterator[PeerSession]:
         """The sessions that have a link."""
@@ -264,20 +270,51 @@ class PeerSessions:
         """The session that a link belongs to; ``None`` once the link is gone."""
         return self._by_link.get(link)
 
+    def proxies(self, session: PeerSession, node: str, origin: Origin | None) -> tuple[PeerProxies, str]:
+        """The proxies of the module that a peer's node belongs to, and the node's name in that module.
+
+        Args:
+            session: The peer.
+            node: The node, in the peer's graph.
+            origin: Its module and node, if the peer relays it.
+        """
+        if origin is None:
+            return session.proxies, node
+        prefix = self._namespaces.relayed_name(origin)[: -len(origin.node)]
+        return self._proxies_of(origin.instance, origin.name, prefix), origin.node
+
     def proxy_name(self, session: PeerSession, node: str, origin: Origin | None) -> str:
         """The name of the proxy of a peer's node, or, with ``origin``, of a node that the peer relays."""
-        if origin is not None:
-            session.proxies.names[node] = self._namespaces.relayed_name(origin)
-        return session.proxies.name(node)
+        return session.proxies.name(node) if origin is None else self._namespaces.relayed_name(origin)
 
     def reserved_name(self, origin: Origin) -> str:
         """The name of the proxy of a node that this module reaches outside the mesh; its namespace stays reserved."""
         return self._namespaces.relayed_name(origin, reserve=True)
 
+    def _proxies_of(self, instance: str, name: str, prefix: str) -> PeerProxies:
+        async def kill(node: str, caller: str, reason: str) -> RosReply:
+            for session in self.linked():
+                if session.proxies is proxies:
+                    return await self._on_kill(session, node, caller, reason)
+            return RosReply(0, f"{node} is a node of {name}, to which there is no link: ask there", 0)
+
+        if (found := self._modules.get((instance, name))) is not None:
+            return found
+        proxies = self._modules[instance, name] = PeerProxies(prefix, self._nodes, kill)
+        return proxies
+
     # --- links ---------------------------------------------------------------------------------------------------
 
     def link_up(self, link: PeerLink) -> None:
-        """Attach a link to the session that waits for it, or begin a session."""
+        """Attach a link to the session that waits for it, or begin a session.
+
+        A peer that has another address is linked anew before the end of its old link is noticed.
+        """
+        old = next((one.link for one in self.linked() if one.link.identity.is_same_run(link.identity)), None)
+        if old is not None:
+            old.silent = True
+            self.link_down(old)
+            old.close(f"{link.name} has another address")
         session = self._waiting_for(link)
         if session is not None:
             session.link, session.state, session.wait = link, PeerState.LINKED, None
@@ -291,9 +328,7 @@ class PeerSessions:
     def _begin(self, link: PeerLink) -> PeerSession:
         peer = next(self._numbers)
         prefix = self._namespaces.add(peer, link.identity)
-        proxies = PeerProxies(
-            prefix, self._nodes, lambda node, caller, reason: self._on_kill(session, node, caller, reason)
-        )
+        proxies = self._proxies_of(link.identity.instance.hex(), link.identity.name, prefix)
         session = self._by_number[peer] = PeerSession(peer, link, proxies)
         return session
 
@@ -367,15 +402,17 @@ class PeerSessions:
             call_each(self._parts, lambda part: part.link_down(session))
         call_each(self._parts, lambda part: part.gone(session))
         self._namespaces.remove(session.peer)
-        self._closing.start(session.proxies.close(), f"retract {session.proxies.prefix}")
 
     async def close(self) -> None:
         """End every session, and wait until all proxies are closed."""
         self._timer.close()
         for session in self:
             self._end(session)
-        if self._closing:
-            await asyncio.wait(self._closing)
+        closing = OwnedTasks()
+        for proxies in self._modules.values():
+            closing.start(proxies.close(), f"retract {proxies.prefix}")
+        if closing:
+            await asyncio.wait(closing)
 
     # --- the rest ------------------------------------------------------------------------------------------------
 
@@ -402,7 +439,10 @@ class PeerSessions:
             yield_to_data()
             if session.linked and now - session.link.touched_at >= mesh_limits.REST_AFTER:
                 session.link.need(needed=self._depends(session))
-        for session in self:
+        linked = {id(session.proxies) for session in self}
+        for module, proxies in list(self._modules.items()):
             yield_to_data()
-            session.proxies.reconcile()
-        self._namespaces.forget_unused({name for session in self for name in session.proxies.names.values()})
+            proxies.reconcile()
+            if not proxies.used and id(proxies) not in linked:
+                del self._modules[module]
+        self._namespaces.forget_unused({proxies.prefix for proxies in self._modules.values()})

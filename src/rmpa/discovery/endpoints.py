@@ -306,6 +306,8 @@ class EndpointTable(dict[int, Endpoint]):
             peer = other.current
             if mine is None or peer is None or other is endpoint or not (other.member is not None or other.own):
                 continue
+            if peer.identity.instance == mine.identity.instance:
+                continue  # it has another address
             newer, older = (mine, peer) if (mine.since, other.own) >= (peer.since, endpoint.own) else (peer, mine)
             if older.linked or older.last_seen >= newer.since:  # this agent itself counts as linked
                 pairs.append((newer, older))

@@ -404,9 +404,10 @@ class MembershipProtocol:
         self._endpoints.remove(place)
 
     def _remove_predecessors(self, endpoint: Endpoint, peer: PeerInstance) -> None:
-        """Remove the former run of an agent that was killed and started again at another port.
+        """Remove the former run of an agent that was killed and started again at another port, or the former place.
 
-        It has the same name and address, and no link. If it is alive after all, its next beacon brings it back.
+        It has the same name, the same address or instance, and no link. If it is alive after all, its next beacon
+        brings it back.
         """
         for other in self._endpoints.with_name(peer.identity.name):
             former = other.current
@@ -415,7 +416,10 @@ class MembershipProtocol:
                 and other is not endpoint
                 and not former.linked
                 and former.last_seen < peer.since
-                and former.identity.guid.address == peer.identity.guid.address
+                and (
+                    former.identity.guid.address == peer.identity.guid.address
+                    or former.identity.instance == peer.identity.instance
+                )
             ):
                 self._remove(former.identity.guid.place, MOVED)
 

@@ -109,6 +109,7 @@ class ConnectionProtocol:
         doubted: Whether this process was stopped for longer than the lease that it promised: unless the remote side
             was stopped too, it has ended the connection, and given up what it asked in it. True until a ping from
             after that is answered.
+        moves: Once closed: whether the side that has left is back at once, at another address.
         output: The bytes that ``take_output`` returns.
     """
 
@@ -139,7 +140,7 @@ class ConnectionProtocol:
         phase = int.from_bytes(ours.instance[:2], "big") / 65536 * limits.IDLE_KEEPALIVE_INTERVAL
         lease = limits.BULK_LEASE if lane == Lane.BULK else limits.EXPRESS_LEASE
         self.keepalive = Keepalive(lease, now, acceptor=not dialled, phase=phase)
-        self.doubted = False
+        self.doubted = self.moves = False
         self.output = bytearray()
         self._proof: int | None = None
         # Bytes that are still missing of a data frame whose first bytes were handed on.
@@ -278,11 +279,18 @@ class ConnectionProtocol:
         """
         return Frame(FrameKind.CONTROL, payload, stamp_ns=self._wall_ns()).serialize()
 
-    def close(self, reason: str, now: float) -> None:
-        """Send a bye; ``lost`` or the timer then leads to ``closed``. Without effect once closing."""
+    def close(self, reason: str, now: float, *, moves: bool = False) -> None:
+        """Send a bye; ``lost`` or the timer then leads to ``closed``. Without effect once closing.
+
+        Args:
+            reason: Why, for people.
+            now: Monotonic seconds.
+            moves: Whether this side is back at once, at another address.
+        """
         if self.state < ConnectionState.CLOSING:
             if self.up:
-                self._send(frames.bye(reason, stamp_ns=self._wall_ns()))
+                self._send(frames.bye(reason, stamp_ns=self._wall_ns(), moves=moves))
+            self.moves = moves
             self._close(reason, now)
 
     def lost(self, reason: str) -> None:
@@ -413,6 +421,7 @@ class ConnectionProtocol:
                 if self.keepalive.settle():
                     self._send_pace(now)
             case FrameKind.BYE:
+                self.moves = bool(route & frames.MOVES)
                 self._end(f"{self.name} left: {frames.parse_text(payload)}")
             case FrameKind.REFUSE:
                 refuse = Refuse.parse(payload)

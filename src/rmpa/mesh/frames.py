@@ -186,9 +186,13 @@ def parse_pong(payload: Buffer) -> tuple[int, int]:
     return t1, t2
 
 
-def bye(reason: str, *, stamp_ns: int = 0) -> Frame:
+# The route field of a bye whose sender is back at once, at another address.
+MOVES: Final = 1
+
+
+def bye(reason: str, *, stamp_ns: int = 0, moves: bool = False) -> Frame:
     """The last frame of a connection."""
-    return Frame(FrameKind.BYE, text_payload(reason), stamp_ns=stamp_ns)
+    return Frame(FrameKind.BYE, text_payload(reason), route=MOVES if moves else 0, stamp_ns=stamp_ns)
 
 
 def text_payload(text: str) -> bytes:

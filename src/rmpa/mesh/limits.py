@@ -153,6 +153,11 @@ KEEP_ALL_MESSAGES: Final = 1_000_000
 # At it: the oldest messages are given up and counted
 # Told in: at both ends: `topic info` (*lost*), `why` (*sent*, *contract*), diagnostics, log
 REPLAY_BYTES: Final = 64 * MIB
+# [Messages] Bytes of a reliable topic that are kept for a peer that goes on by another path
+# At it: older messages may be lost when a path changes, and are counted
+# Told in: at the receiver: `topic info` (*lost*), `why` (*contract*), diagnostics, log
+# Why: What a relay had acknowledged and not passed on when it died: two seconds at 8 MB/s.
+HISTORY_BYTES: Final = 16 * MIB
 # The shortest lease; a shorter one that a peer claims is raised to it, because no network can keep it.
 LINK_LEASE_MIN: Final = 0.1
 # The longest lease; a longer one that a peer claims is lowered to it.

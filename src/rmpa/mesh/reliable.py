@@ -12,18 +12,19 @@ A message counts as received when its last fragment is received; a message that 
 start. Messages that the sender dropped at its bounds show as a gap in the sequence, so the receiver knows exactly how
 many messages will never arrive.
 
-Sequence numbers have 32 bits and wrap (``core.identity``). An *epoch* identifies one run of a numbering: after a
-sender was given up, the next one has another epoch. Methods that run for each message contain the serial arithmetic
-inline, for speed.
+Sequence numbers have 32 bits and wrap (``core.identity``). The numbers are those of the stream, not of the path: an
+*epoch* identifies one numbering of one publisher's messages, at its origin, and each sender of them uses it, so a
+receiver may go on over another path. Methods that run for each message contain the serial arithmetic inline, for
+speed.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Hashable
+from itertools import islice
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
 
-from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import SERIAL_HALF, SERIAL_MASK, is_earlier, is_later, serial_add, serial_distance
 from rmpa.mesh import limits
 
@@ -62,7 +63,7 @@ class ReliableSender:
         window_messages: Messages that may be sent and not acknowledged, at least 1. It should be at least twice
             ``limits.ACK_MESSAGES``; otherwise the sender waits for delayed acknowledgements.
         window_bytes: Bytes that may be sent and not acknowledged; it should be at least twice ``limits.ACK_BYTES``.
-        epoch: The epoch of this numbering; no other sender of this source to this peer may have had it.
+        epoch: The epoch of this numbering.
         first: The first message's sequence.
 
     Attributes:
@@ -138,6 +139,11 @@ class ReliableSender:
             self._drop_oldest()
             count -= 1
 
+    def skip(self, sequence: int) -> None:
+        """Give the next message this sequence: those before it were lost on the way here, and show as a gap."""
+        if is_later(sequence, self._next):
+            self._next = sequence
+
     def take(self) -> Outgoing | None:
         """Return the next message if it may be sent now, and count it as sent; without a link none may."""
         in_flight = len(self._dropped_in_flight) + len(self._sent)
@@ -161,14 +167,11 @@ class ReliableSender:
     def acknowledged(self, sequence: int) -> None:
         """Handle an acknowledgement of all messages up to ``sequence``; ignored if it is old or there is no link.
 
-        Raises:
-            RemoteProtocolError: ``sequence`` was never sent.
+        The receiver may have more than was sent here, by another path.
         """
         ahead = sequence - self.confirmed & SERIAL_MASK
-        if not self._linked or not 0 < ahead < SERIAL_HALF:
-            return
-        self._check(ahead, sequence, "acknowledges")
-        self._forget(ahead)
+        if self._linked and 0 < ahead < SERIAL_HALF:
+            self._forget(min(ahead, self._highest - self.confirmed & SERIAL_MASK))
 
     def suspend(self) -> None:
         """Handle the end of the link: unacknowledged messages will be sent again. Without effect if repeated."""
@@ -181,15 +184,14 @@ class ReliableSender:
         """Continue over a new link after the last message that the receiver has.
 
         Args:
-            after: The receiver's position: it has all messages up to this sequence.
-
-        Raises:
-            RemoteProtocolError: ``after`` was never sent, or is before the last acknowledgement; nothing has changed.
+            after: The receiver's position: it has all messages up to this sequence, perhaps by another path. One from
+                before the last acknowledgement is old.
         """
         ahead = serial_distance(self.confirmed, after)
-        self._check(ahead, after, "resumes")
         self.suspend()
-        self._forget(ahead)
+        if ahead < SERIAL_HALF:
+            self._forget(min(ahead, serial_distance(self.confirmed, self.last)))
+        self._sent_up_to(self.confirmed)
         self.overflowed += len(self._dropped_in_flight)
         self._dropped_in_flight.clear()
         self._in_flight_bytes = 0
@@ -209,11 +211,6 @@ class ReliableSender:
     def _sent_up_to(self, sequence: int) -> None:
         if sequence - self._highest & SERIAL_MASK < SERIAL_HALF:
             self._highest = sequence & SERIAL_MASK
-
-    def _check(self, ahead: int, sequence: int, verb: str) -> None:
-        if ahead > self._highest - self.confirmed & SERIAL_MASK:
-            known = f"sent up to {self._highest}, acknowledged up to {self.confirmed}"
-            raise RemoteProtocolError(f"a receiver {verb} message {sequence}, of those {known}")
 
     def _forget(self, ahead: int) -> None:
         """Drop the messages of the next ``ahead`` sequences, which have arrived.
@@ -247,6 +244,42 @@ class ReliableSender:
             self.overflowed += 1
 
 
+class HistoryCache:
+    """The last messages of one stream, for receivers that come later, or come back by another path.
+
+    Attributes:
+        latched: How many messages are kept for late receivers, whatever their size.
+        depth: How many are kept for receivers that have those before, within ``limits.HISTORY_BYTES``.
+    """
+
+    def __init__(self) -> None:
+        self.latched = self.depth = 0
+        self._kept: deque[Outgoing] = deque()
+        self._bytes = 0
+
+    def append(self, sequence: int, stamp_ns: int, payload: bytes) -> None:
+        """Keep one more message, and drop those beyond the bounds."""
+        self._kept.append(Outgoing(sequence, stamp_ns, payload))
+        self._bytes += len(payload)
+        while (count := len(self._kept)) > self.latched and (
+            count > self.depth or self._bytes > limits.HISTORY_BYTES
+        ):
+            self._bytes -= len(self._kept.popleft().payload)
+
+    def newest(self, count: int) -> list[Outgoing]:
+        """The last messages, at most ``count``, the oldest first."""
+        return list(islice(self._kept, max(0, len(self._kept) - count), None))
+
+    def after(self, sequence: int) -> list[Outgoing]:
+        """The messages that are kept of those behind ``sequence``, the oldest first."""
+        return [message for message in self._kept if is_later(message.sequence, sequence)]
+
+    def clear(self) -> None:
+        """Free the messages, which may be large."""
+        self._kept.clear()
+        self._bytes = 0
+
+
 class ReliableReceiver:
     """The receiving half: accepts each message once, in order, and counts exactly the messages that never arrive.
 
@@ -260,11 +293,13 @@ class ReliableReceiver:
 
     Attributes:
         next: The sequence that comes next; a receiver that takes a message with this one by itself adds 1.
+        complete: Whether the publisher has gone, and ``next`` is behind its last message.
     """
 
     def __init__(self, epoch: int | None = None, first: int | None = None) -> None:
         self._epoch = epoch
         self.next = first
+        self.complete = False
         self._unacknowledged = 0
         self._unacknowledged_bytes = 0
         self._unacknowledged_since = 0.0

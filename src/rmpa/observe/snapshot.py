@@ -392,6 +392,7 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
         services_left: Services, likewise.
         strangers: Modules that are heard and are not of this mesh, in the states ``pending``, ``revoked`` and
             ``foreign``. ``last_error`` says what to do; nothing that they say of themselves is proved.
+        lost: The relay that brought a module last, by the names of both, of each that no relay brings any more.
     """
 
     agent: AgentInfo
@@ -406,6 +407,7 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
     topics_left: int = 0
     services_left: int = 0
     strangers: tuple[PeerInfo, ...] = ()
+    lost: dict[str, str] = {}
 
 
 class FollowedInfo(msgspec.Struct, kw_only=True, frozen=True):

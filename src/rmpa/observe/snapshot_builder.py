@@ -163,6 +163,7 @@ class SnapshotBuilder:
             taken=time.time(),
             peers=known,
             strangers=strangers,
+            lost=dict(self._parts.bridge.topics.imports.ways.lost),
             topics=self.topics.infos(topics),
             services=self._services(services),
             topics_left=topics_left,
@@ -194,7 +195,7 @@ class SnapshotBuilder:
         """The agent itself."""
         endpoint, bridge, core = self._parts.endpoint(), self._parts.bridge, self._parts.core
         identity, _, discovery = endpoint or (None, None, None)
-        proxies = sum(len(session.proxies) for session in bridge.sessions)
+        proxies = bridge.sessions.proxy_count
         now, rss = time.monotonic(), None
         with contextlib.suppress(OSError):  # no file descriptor is left to read /proc
             if now - self._cpu_known >= 1.0:  # the kernel counts in ticks of 10 ms

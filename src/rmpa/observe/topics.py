@@ -174,7 +174,8 @@ class TopicFacts:
         flow, publication = topics.flow(source), topics.publication(source)
         about, now = entry.description, self._clock.now()
         latched = about.latching if about is not None else False
-        problem = session.proxies.problems.get(source.node, "")
+        proxies, node = self._bridge.sessions.proxies(session, source.node, entry.origin)
+        problem = proxies.problems.get(node, "")
         if not problem and entry.state != "open":
             problem = entry.problem
         figures = {}

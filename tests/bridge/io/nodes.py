@@ -164,6 +164,10 @@ class Node:
         """As SlaveNode's."""
         return next(Node.numbers)
 
+    def publication(self, topic: str) -> Publication | None:
+        """As SlaveNode's."""
+        return self.open.get(topic)
+
     def add_publication(self, publication: Publication) -> None:
         """As SlaveNode's."""
         self.open[publication.topic] = publication

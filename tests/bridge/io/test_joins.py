@@ -55,6 +55,8 @@ def test_each_subscriber_of_a_module_is_a_new_connection(seed: int, topic: str, 
         listeners = []
         for _ in range(4):
             listeners.append(world.listen(world.sides[1], topic))
+            if len(listeners) == 1:
+                await world.rest(1.0)  # what is said to the first one goes to those that join while it is on its way
             await said(world, speaker, world.rng.randint(1, 12))
         await world.rest(limits.JOIN_WINDOW + 3.0)
         await said(world, speaker, 3)

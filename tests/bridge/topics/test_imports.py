@@ -294,7 +294,7 @@ def test_what_is_offered_no_more_goes_when_the_whole_offer_is_there(flowing: Imp
     [(wire, offer)] = flowing.changes(1, Advertise(added=(ODOM,), full=True, more=True))
     assert flowing.take_in(1, wire, offer, 10.0) == [Publish(1, ODOM.source, "a/B")]
     assert state(flowing) == "waiting"
-    assert flowing.advertised(1, Advertise(), 10.0) == [Detach(1, CMD, 0), Retract(1, CMD)]
+    assert flowing.advertised(1, Advertise(), 10.0) == [Detach(1, CMD, 0, missed=True), Retract(1, CMD)]
 
 
 def test_a_peer_that_is_back_is_no_problem_any_more(flowing: Imports) -> None:

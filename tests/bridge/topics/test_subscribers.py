@@ -276,10 +276,12 @@ async def test_a_route_that_is_opened_while_the_end_of_the_last_one_is_told_has_
     def lost(source: Source, _reason: str, _lasts: object) -> None:
         publications.append(Publication("/chatter", "/talker", STRING))
         subscriptions.connect(SOURCE, SUBSCRIBER)
-        subscriptions.add_route(source, 1, ExportRoute(7, Contract(), Contract(), "", ""), cast("Any", link))
+        route = ExportRoute(7, Contract(), Contract(), "", "")
+        begin = subscriptions.begins(source, 1, route)
+        subscriptions.add_route(source, 1, route, begin, cast("Any", link))
 
     exports = SimpleNamespace(described=lambda _, description: described.append(description), lost=lost)
-    shared: Any = SimpleNamespace(core=core, node=node)
+    shared: Any = SimpleNamespace(core=core, node=node, rng=lambda: 0.5)
     unused = cast("Any", None)
     subscriptions = LocalSubscriptions(shared, cast("Any", exports), unused, unused, lambda *_: publications[-1])
     subscriptions.connect(SOURCE, SUBSCRIBER)

@@ -14,7 +14,7 @@ from rmpa.observe import limits as observe_limits
 from rmpa.observe.peer_info import Check, CheckLevel, LinkInfo, PeerInfo
 from rmpa.observe.snapshot import FilesInfo, RouteInfo, SampleSpread, Snapshot, SubscriberTransport
 from rmpa.observe.why.diagnosis import Diagnosis, PublisherReport, TopicAtPublisher
-from rmpa.observe.why.stages import Arrival, Ends, diagnose_topic
+from rmpa.observe.why.stages import Arrival, Ends, diagnose_topic, peer_stages
 from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:
@@ -342,6 +342,20 @@ def test_a_peer_is_found_by_guid_and_a_typo_gets_a_hint() -> None:
     found = one(Case(), "joystik")
     assert found.failed is not None
     assert found.failed.remedy.startswith("did you mean joystick?")
+
+
+def test_a_module_behind_a_relay_that_is_gone_is_missed_with_the_relay() -> None:
+    (found, *_) = peer_stages(msgspec.structs.replace(SNAPSHOT, peers=(), lost={"pad": "base"}), "pad")
+    assert found.text == "pad was reached by way of base, which does not pass on what it publishes any more"
+    assert found.remedy.startswith("start base again")
+
+
+def test_a_relay_that_is_away_is_what_fails() -> None:
+    behind, relay = peer(name="pad", state="relayed", via="base", link=None), unlinked("waiting", name="base")
+    known = msgspec.structs.replace(SNAPSHOT, peers=(behind, relay))
+    *_, link = peer_stages(known, "pad")
+    assert link.level is CheckLevel.FAIL
+    assert link.text == "no link of its own, and base, which passes on what it publishes, is away"
 
 
 _names = st.text(max_size=20)

@@ -10,21 +10,22 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from itertools import chain, islice
+from itertools import chain
 from typing import TYPE_CHECKING, Final, Protocol
 
 from msgspec import UNSET
 
-from rmpa.bridge.data.route import EXPRESS, Downsampler, LaneSwitch
+from rmpa.bridge.data.route import EXPRESS, Downsampler, LaneSwitch, RouteBegin, kept_for
 from rmpa.core.contract import Contract, Durability, History, Reliability
-from rmpa.core.identity import SERIAL_MASK, is_earlier, serial_add
+from rmpa.core.identity import SERIAL_MASK, is_earlier, is_later, serial_add
 from rmpa.mesh import limits as mesh_limits
-from rmpa.mesh.reliable import ReliableSender
+from rmpa.mesh.reliable import HistoryCache, ReliableSender
 from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Container, Sequence
 
+    from rmpa.bridge.data.reception import ImportFlow
     from rmpa.core.outbox import QueuedMessage
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
@@ -51,7 +52,8 @@ class RouteSender:
         link: The link to the peer.
         route: The route's id.
         contract: The route's contract.
-        epoch: Identifies this numbering; see ``mesh.reliable``.
+        epoch: Identifies the numbering; see ``mesh.reliable``.
+        first: The sequence of the first message.
         large: Whether the source is known to have large messages.
 
     Attributes:
@@ -66,14 +68,21 @@ class RouteSender:
     lost = 0
 
     def __init__(
-        self, link: PeerLink, route: int, contract: Contract, epoch: int = 0, *, large: bool = False
+        self,
+        link: PeerLink,
+        route: int,
+        contract: Contract,
+        epoch: int = 0,
+        first: int = 1,
+        *,
+        large: bool = False,
     ) -> None:
         self.contract = contract
         self.epoch = epoch
-        self._depth = mesh_limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.queue_depth
+        self._depth = kept_for(contract)
         chosen = contract.depth is not UNSET or contract.history is History.KEEP_ALL
         self._max_bytes = mesh_limits.LANE_QUEUE_BYTES if chosen else mesh_limits.ROUTE_QUEUE_BYTES
-        self.sequence = 0
+        self.sequence = serial_add(first, -1)
         self._loop = asyncio.get_running_loop()
         self._switch = LaneSwitch(contract, large=large)
         self._held: deque[tuple[int, int, bytes]] = deque()
@@ -117,6 +126,11 @@ class RouteSender:
             return None
         self.sequence = self.sequence + 1 & SERIAL_MASK
         return self._lane, self._lane.open(self.route, size, self.sequence, stamp_ns)
+
+    def skip(self, sequence: int) -> None:
+        """Give the next message this sequence: those before it were lost, or not sent to this peer."""
+        if self._downsampler is None:
+            self.sequence = serial_add(sequence, -1)
 
     def fenced(self, number: int) -> None:
         """Take the peer's answer to a fence, and send what has waited over the new lane."""
@@ -294,22 +308,26 @@ class ReliableRouteSender(RouteSender):
         link: The link to the peer.
         route: The route's id.
         contract: The route's contract.
-        epoch: Identifies this numbering; see ``mesh.reliable``.
+        epoch: Identifies the numbering; see ``mesh.reliable``.
+        first: The sequence of the first message.
         large: Whether the source is known to have large messages.
     """
 
     reliable = True
 
-    def __init__(self, link: PeerLink, route: int, contract: Contract, epoch: int, *, large: bool = False) -> None:
+    def __init__(
+        self, link: PeerLink, route: int, contract: Contract, epoch: int, first: int = 1, *, large: bool = False
+    ) -> None:
         self._keep: Keep | None = None
         self._reported = 0
-        super().__init__(link, route, contract, epoch, large=large)
+        super().__init__(link, route, contract, epoch, first, large=large)
         self.sender = ReliableSender(
             self._depth,
             mesh_limits.REPLAY_BYTES,
             mesh_limits.RELIABLE_WINDOW_MESSAGES,
             mesh_limits.RELIABLE_WINDOW_BYTES,
             epoch,
+            first=first,
         )
 
     def drain(self, done: Callable[[], None]) -> None:
@@ -318,8 +336,13 @@ class ReliableRouteSender(RouteSender):
 
     @property
     def drained(self) -> bool:
-        """Whether nothing of the route is on its way any more."""
-        return self.sender.idle
+        """Whether nothing of the route is on its way any more; an absent peer is not waited for."""
+        return self.link is None or self.sender.idle
+
+    def skip(self, sequence: int) -> None:
+        """As of ``RouteSender``."""
+        if self._downsampler is None:
+            self.sender.skip(sequence)
 
     def begin(self, stamp_ns: int, size: int) -> None:
         """A message that may have to be sent again is needed whole."""
@@ -369,16 +392,8 @@ class ReliableRouteSender(RouteSender):
         self.sender.suspend()
 
     def resume(self, link: PeerLink, route: int, after: int) -> None:
-        """Continue on a new link; the peer has everything up to ``after``.
-
-        If a later message is already acknowledged, that one counts: with two links at once, the older one's request
-        may come last.
-
-        Raises:
-            RemoteProtocolError: ``after`` was never sent.
-        """
-        known = self.sender.confirmed
-        self.sender.resume(known if is_earlier(after, known) else after)
+        """Continue on a new link; the peer has everything up to ``after``."""
+        self.sender.resume(after)
         self._keep = None
         self._switch.restart()
         self._use(link, route)
@@ -418,6 +433,7 @@ class FlowSender(Protocol):
     @property
     def drained(self) -> bool: ...  # noqa: D102 - as of RouteSender
     def message(self, stamp_ns: int, framed: Buffer) -> int: ...  # noqa: D102
+    def skip(self, sequence: int) -> None: ...  # noqa: D102
     def begin(self, stamp_ns: int, size: int) -> tuple[LaneSender, QueuedMessage] | None: ...  # noqa: D102
     def drain(self, done: Callable[[], None]) -> None: ...  # noqa: D102
     def close(self) -> None: ...  # noqa: D102
@@ -426,9 +442,15 @@ class FlowSender(Protocol):
 class ExportFlow:
     """From one local publisher to the peers that want it, each by a route sender of its own.
 
+    The messages are numbered here, once for all peers, so that a peer can go on by another path. Only a route with a
+    ``max_rate``, whose peer gets some of them, has numbers of its own.
+
+    Args:
+        new_epoch: Returns the epoch of a new numbering.
+
     Attributes:
         connection: To the publisher.
-        _history: Bytes and stamps of the last messages, for routes that are opened later.
+        history: The last messages, for routes that are opened later.
         _streaming: The senders that pass on the present message in parts, each with its lane.
         _whole: The present message so far, where a sender or the history needs it whole.
         leaving: When the flow ends, once its publisher has.
@@ -440,11 +462,13 @@ class ExportFlow:
 
     connection: TopicConnection
 
-    def __init__(self) -> None:
+    def __init__(self, new_epoch: Callable[[], int] = int) -> None:
+        self._new_epoch = new_epoch
+        self.epoch = new_epoch()
         self.by_peer: dict[int, RouteSender] = {}
         self._senders: tuple[FlowSender, ...] = ()
         self._joins: list[tuple[RouteSender, FlowSender]] = []
-        self._history: deque[tuple[bytes, int]] = deque(maxlen=1)
+        self.history = HistoryCache()
         self._keeping = False
         self._streaming: dict[FlowSender, tuple[LaneSender, QueuedMessage]] = {}
         self._whole: bytearray | None = None
@@ -458,31 +482,75 @@ class ExportFlow:
         self.leaving: asyncio.TimerHandle | None = None
         self._over: Callable[[], None] | None = None
 
+    @property
+    def number(self) -> int:
+        """The number of the last message."""
+        return self.messages & SERIAL_MASK
+
+    @property
+    def complete(self) -> bool:
+        """Whether the last message is the publisher's last one, if the publisher has gone."""
+        return True
+
     def latch(self) -> None:
         """Keep the last message: the publisher latches."""
         self.latching = True
         self.keep(1)
 
-    def keep(self, depth: int) -> None:
-        """Keep at least the last ``depth`` messages, at most ``ros.limits.LATCHED_MAX``, for routes opened later."""
-        self._keeping = True
-        if depth > (self._history.maxlen or 0):
-            self._history = deque(self._history, maxlen=min(depth, ros_limits.LATCHED_MAX))
+    def keep(self, latched: int, depth: int = 0) -> None:
+        """Keep at least the last messages for routes opened later.
 
-    def add(self, peer: int, link: PeerLink, route: int, contract: Contract, epoch: int) -> RouteSender:
-        """Send to one more peer; first the kept messages that its contract, or the latching publisher, allows."""
+        Args:
+            latched: For late subscribers, at most ``ros.limits.LATCHED_MAX``.
+            depth: For peers of a reliable route that go on by another path.
+        """
+        self._keeping = True
+        self.history.latched = max(self.history.latched, min(latched, ros_limits.LATCHED_MAX))
+        self.history.depth = max(self.history.depth, depth)
+
+    def begins(self, peer: int, contract: Contract, position: tuple[int, int] | None) -> RouteBegin:
+        """Where a route to a peer begins: behind what the peer has, else with what late subscribers get.
+
+        Args:
+            peer: The peer.
+            contract: The route's.
+            position: The epoch and the last message that the peer has of this source.
+        """
+        sender, reliable = self.by_peer.get(peer), contract.reliability is Reliability.RELIABLE
+        epoch, after = position or (0, 0)
+        if sender is not None and sender.epoch == epoch != 0 and sender.contract.same_route(contract):
+            # The peer may have kept messages whose acknowledgement was lost; these are not sent again.
+            first = sender.following if is_later(sender.following, after) else serial_add(after, 1)
+            return RouteBegin(epoch, first, goes_on=True, resumed=True)
+        # Messages kept only for another peer's contract are old data here, perhaps old commands.
+        late = contract.kept if contract.durability is Durability.TRANSIENT_LOCAL else int(self.latching)
+        kept = self.history.newest(late)
+        if contract.max_rate is not None:
+            return RouteBegin(self._new_epoch(), 1, kept=tuple(kept))
+        goes_on = epoch == self.epoch != 0
+        if goes_on:
+            behind = self.history.after(after)
+            kept = behind if reliable else behind[max(0, len(behind) - late) :]
+        first = kept[0].sequence if kept else serial_add(self.number, 1)
+        return RouteBegin(self.epoch, first, goes_on=goes_on, kept=tuple(kept))
+
+    def add(
+        self, peer: int, link: PeerLink, route: int, contract: Contract, begin: RouteBegin | None = None
+    ) -> RouteSender:
+        """Send to one more peer, first the kept messages; ``begin`` is what ``begins`` has said."""
         self.remove(peer)
+        begin = begin or self.begins(peer, contract, None)
         sender: RouteSender
         if contract.reliability is Reliability.RELIABLE:
-            sender = ReliableRouteSender(link, route, contract, epoch, large=self.large)
+            sender = ReliableRouteSender(link, route, contract, begin.epoch, begin.first, large=self.large)
+            self.keep(0, kept_for(contract))
         else:
-            sender = RouteSender(link, route, contract, epoch, large=self.large)
+            sender = RouteSender(link, route, contract, begin.epoch, begin.first, large=self.large)
         if contract.durability is Durability.TRANSIENT_LOCAL:
             self.keep(contract.kept)
-        # Messages kept only for another peer's contract are old data here, perhaps old commands.
-        kept = contract.kept if contract.durability is Durability.TRANSIENT_LOCAL else int(self.latching)
-        for framed, stamp in islice(self._history, max(0, len(self._history) - kept), None):
-            sender.message(stamp, framed)
+        for message in begin.kept:
+            sender.skip(message.sequence)
+            sender.message(message.stamp_ns, message.payload)
         self.by_peer[peer] = sender
         self._list_senders()
         return sender
@@ -502,7 +570,8 @@ class ExportFlow:
     @property
     def latched(self) -> bytes:
         """The last message that is kept; empty if there is none."""
-        return self._history[-1][0] if self._history else b""
+        kept = self.history.newest(1)
+        return kept[0].payload if kept else b""
 
     def join(self, common: RouteSender, join: FlowSender) -> None:
         """Let a joining subscriber of a sender's peer see what all get."""
@@ -541,7 +610,7 @@ class ExportFlow:
         self.ended()
         for peer in tuple(self.by_peer):
             self.remove(peer)
-        self._history.clear()
+        self.history.clear()
         self._whole = None
 
     def message(self, framed: memoryview) -> None:
@@ -549,12 +618,13 @@ class ExportFlow:
         stamp = time.time_ns()
         self.messages += 1
         self.bytes += len(framed)
+        if self._keeping:
+            self._keep(stamp, bytes(framed))
+            return
         for sender in self._senders:
             dropped = sender.message(stamp, framed)
             if dropped:
                 self.dropped += dropped
-        if self._keeping:
-            self._history.append((bytes(framed), stamp))
 
     def begin(self, size: int) -> None:
         """Begin a message of ``size`` bytes, length field included, that comes in parts."""
@@ -585,11 +655,105 @@ class ExportFlow:
         self.messages += 1
         self.bytes += self._size
         streamed, self._streaming = self._streaming, {}
-        if self._whole is None:
+        whole, self._whole = self._whole, None
+        if whole is not None:
+            self._keep(self._stamp, bytes(whole), streamed)
             return
-        whole, self._whole = bytes(self._whole), None
+        for sender in self._senders:
+            if sender not in streamed:  # it came during the message
+                sender.skip(serial_add(self.number, 1))
+
+    def _keep(self, stamp: int, framed: bytes, streamed: Container[FlowSender] = ()) -> None:
+        """Sends a complete message to those that have not got it in parts, and keeps it for others."""
         for sender in self._senders:
             if sender not in streamed:
-                self.dropped += sender.message(self._stamp, whole)
+                self.dropped += sender.message(stamp, framed)
         if self._keeping:
-            self._history.append((whole, self._stamp))
+            self.history.append(self.number, stamp, framed)
+
+
+class RelayedFlow(ExportFlow):
+    """From a proxy to the peers that a relay passes it on to, with the numbers of the messages at their origin.
+
+    What the proxy says first to a new subscriber is known already, by the numbers.
+
+    Args:
+        new_epoch: As of ``ExportFlow``.
+    """
+
+    def __init__(self, new_epoch: Callable[[], int]) -> None:
+        super().__init__(new_epoch)
+        self._source: ImportFlow | None = None
+        self._number = 0
+        self._ignoring = False
+
+    @property
+    def number(self) -> int:
+        """The number of the last message."""
+        return self._number
+
+    def follow(self, source: ImportFlow, latched: Sequence[bytes]) -> None:
+        """Take the numbering of the flow by which the messages come; the proxy has its header now.
+
+        Args:
+            source: The flow.
+            latched: The messages that the proxy keeps for late subscribers.
+        """
+        self._source, self._number = source, source.number
+        self.epoch = source.epoch or self.epoch
+        if source.history is not None:
+            self.history = source.history
+            return
+        self.keep(len(latched))
+        for place, framed in enumerate(latched, 1):
+            self.history.append(serial_add(self._number, place - len(latched)), time.time_ns(), framed)
+
+    @property
+    def complete(self) -> bool:
+        """As of ``ExportFlow``; what a relay has got last need not be the publisher's last message."""
+        return self._source is not None and self._source.numbering.complete
+
+    def keep(self, latched: int, depth: int = 0) -> None:
+        """As of ``ExportFlow``; what the flow that the messages come by keeps is not kept twice."""
+        super().keep(latched, depth)
+        self._keeping = self._source is None or self.history is not self._source.history
+
+    def message(self, framed: memoryview) -> None:
+        """Pass one message on, unless it is one that the proxy has kept."""
+        if self._advance():
+            super().message(framed)
+
+    def begin(self, size: int) -> None:
+        """Begin a message that comes in parts, likewise."""
+        self._ignoring = not self._advance()
+        if not self._ignoring:
+            super().begin(size)
+
+    def part(self, part: memoryview) -> None:
+        """As of ``ExportFlow``."""
+        if not self._ignoring:
+            super().part(part)
+
+    def abort(self) -> None:
+        """As of ``ExportFlow``; the connection goes on, and so do the numbers."""
+        for sender in self._senders:
+            if sender not in self._streaming:
+                sender.skip(serial_add(self._number, 1))
+        super().abort()
+
+    def catch_up(self) -> None:
+        """Let the peers' numbers include what was lost on the way here."""
+        if self._source is not None and is_later(self._source.number, self._number):
+            self._number = self._source.number
+            for sender in self._senders:
+                sender.skip(serial_add(self._number, 1))
+
+    def _advance(self) -> bool:
+        """Whether the message that comes is a new one; what was lost before it is a gap for the peers too."""
+        if self._source is None or (number := self._source.number) == self._number:
+            return False
+        if number != serial_add(self._number, 1):
+            for sender in self._senders:
+                sender.skip(number)
+        self._number = number
+        return True

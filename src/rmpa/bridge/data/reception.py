@@ -14,14 +14,15 @@ from collections import Counter, deque
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.data.quality import QosWatch, Quality
+from rmpa.bridge.data.route import kept_for
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.identity import SERIAL_MASK, is_earlier, serial_add
+from rmpa.core.identity import SERIAL_MASK, is_earlier, is_later, serial_add, serial_distance
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.connection import DataHandler
 from rmpa.mesh.frames import FrameKind
-from rmpa.mesh.reliable import ReliableReceiver
+from rmpa.mesh.reliable import HistoryCache, ReliableReceiver
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.runtime import limits as runtime_limits
@@ -78,6 +79,8 @@ class ImportFlow(DataHandler):
         on_event: Called with what happened to the contract, and with losses of a reliable route.
         on_torn: Called when subscribers were disconnected in the middle of a message, so that they connect again.
         past: The watch of a reliable source from before this route.
+        numbering: That of the flow before this one, of another contract, if it goes on.
+        relays: Whether this module may pass the messages on.
 
     Attributes:
         _replay: Kept messages that the subscribers already have, and that the new route may repeat.
@@ -88,6 +91,7 @@ class ImportFlow(DataHandler):
         counts: Messages that were not delivered: ``lost`` in the sender's queue or on a link, ``late`` (behind newer
             ones, or twice), ``stale`` (delayed by an outage, dropped for newer ones), ``expired`` (after their
             lifespan).
+        history: The last messages of a reliable source, where this module may pass them on.
         oversized, oversized_bytes: Messages that the publisher's agent left out because they are too long; size of
             the last one, in bytes.
     """
@@ -101,16 +105,23 @@ class ImportFlow(DataHandler):
         on_event: Callable[[QosEvent], None],
         on_torn: Callable[[], None],
         past: QosWatch | None = None,
+        *,
+        numbering: ReliableReceiver | None = None,
+        relays: bool = False,
     ) -> None:
         self._on_event = on_event
         self._on_torn = on_torn
         self._output = output
         self.contract = contract
-        self._link_time = link_time
+        self.link_time = link_time
         self._counters = counters
         self._loop = asyncio.get_running_loop()
         self._reliable = contract.reliability is Reliability.RELIABLE
-        self._numbering = ReliableReceiver()
+        self.numbering = numbering or ReliableReceiver()
+        self.history: HistoryCache | None = None
+        if relays and self._reliable:
+            self.history = HistoryCache()
+            self.history.latched, self.history.depth = contract.kept, kept_for(contract)
         oldest = contract.lifespan or (runtime_limits.STALE_AGE if contract.newest_only else None)
         self._stale_ns = sys.maxsize if oldest is None else round(oldest * 1e9)
         self._plain = not self._reliable
@@ -121,7 +132,8 @@ class ImportFlow(DataHandler):
         self._held: tuple[asyncio.TimerHandle, int, bytes] | None = None
         self.told: tuple[str, ...] = ()
         self._link: PeerLink
-        self.route = self._epoch = 0
+        self.route = self.epoch = 0
+        self._had = 0
         self._ack_timer: asyncio.TimerHandle | None = None
         self.quality = Quality()
         self.watch = QosWatch(contract, self._loop.time(), past)
@@ -138,16 +150,18 @@ class ImportFlow(DataHandler):
 
     @property
     def position(self) -> tuple[int, int] | None:
-        """Epoch and sequence of the last message, after which a new link continues; ``None``: there is none."""
-        return self._numbering.position() if self._epoch else None
+        """Epoch and sequence of the last message, after which a new route continues; ``None``: it cannot."""
+        return self.numbering.position() if self.epoch else None
 
     @property
-    def delivering(self) -> int:
-        """The number of the message that is being delivered."""
-        return serial_add(self._numbering.next or 0, -1) if self._sequence is None else self._sequence
+    def number(self) -> int:
+        """The number of the message that is delivered now, or was delivered last."""
+        if self._sequence is not None:
+            return self._sequence
+        return serial_add(self.numbering.next or 0, -1)
 
     def bind(self, link: PeerLink, route: int, epoch: int, first: int) -> bool:
-        """Take the data of a route that was opened on a new link.
+        """Take the data of a route that was opened, on a new link or by another path.
 
         Args:
             link: The link, to which messages of a reliable route are acknowledged.
@@ -156,19 +170,21 @@ class ImportFlow(DataHandler):
             first: Its first sequence.
 
         Returns:
-            Whether the numbering of the earlier link goes on.
+            Whether the numbering of the earlier route goes on.
         """
-        position, self._link, self.route, self._epoch = self.position, link, route, epoch
+        position = self.numbering.position()
+        self._link, self.route, self.epoch = link, route, epoch
         self.told = ()
         self.torn()
         self._stop_ack_timer()
-        self._numbering.begin(epoch, first)
+        self.numbering.begin(epoch, first)
+        self._had = self.number
         self._tell(self.watch.link_up(self._loop.time()))
-        return position is not None and position[0] == epoch
+        return position is not None and position[0] == epoch != 0
 
     def skip(self, following: int) -> None:
         """Count the messages before ``following``, the next one that the sender announces, as missed."""
-        if count := self._numbering.skip(following):
+        if count := self.numbering.skip(following):
             self._missing(count)
 
     def missed_unknown(self, why: str) -> None:
@@ -197,8 +213,8 @@ class ImportFlow(DataHandler):
         size = len(framed)
         if size < _PREFIX_SIZE or LENGTH.unpack_from(framed)[0] != size - _PREFIX_SIZE:
             raise RemoteProtocolError(f"a data frame of {size} bytes does not hold one message")
-        now_ns, numbering = time.time_ns(), self._numbering
-        age_ns = now_ns - stamp_ns + self._link_time.ahead_ns
+        now_ns, numbering = time.time_ns(), self.numbering
+        age_ns = now_ns - stamp_ns + self.link_time.ahead_ns
         if self._plain and sequence == numbering.next and age_ns <= self._stale_ns:
             numbering.next = sequence + 1 & SERIAL_MASK
         elif not self._admits(sequence, stamp_ns, framed, now_ns):
@@ -270,6 +286,8 @@ class ImportFlow(DataHandler):
         """Whether a message is delivered that is not plain, not the next one, or perhaps too old."""
         if not self._accept(sequence, len(framed)):
             return False
+        if self.history is not None:
+            self.history.append(sequence, now_ns, bytes(framed))
         if self._reliable and self._replay is None and self.contract.lifespan is None:
             return True
         admits = not (
@@ -285,14 +303,15 @@ class ImportFlow(DataHandler):
     def _accept(self, sequence: int, size: int) -> bool:
         """Whether a complete message is a new one. In any case a reliable one is acknowledged."""
         now = self._loop.time()
-        gap = self._numbering.accept(sequence, self._epoch, now, size)
-        due = self._numbering.next_timer() if self._reliable else None
+        gap = self.numbering.accept(sequence, self.epoch, now, size)
+        due = self.numbering.next_timer() if self._reliable else None
         if due is not None and due <= now:
             self._acknowledge(now)
         elif due is not None and self._ack_timer is None:
             self._ack_timer = self._loop.call_at(due, self._acknowledge, due)
         if gap is None:
-            self._count("late")
+            if is_later(sequence, self._had):  # else a new path repeats what had come by the old one
+                self._count("late")
             return False
         if self._sequence is not None:
             self.torn()  # its lane is gone, though this side has not noticed yet
@@ -310,8 +329,8 @@ class ImportFlow(DataHandler):
 
     def _is_too_old(self, stamp_ns: int, now_ns: int) -> bool:
         """Whether a message is certainly older than the lifespan, or than ``STALE_AGE`` if only the newest counts."""
-        error_ns = self._link_time.error_ns
-        return error_ns is not None and now_ns - stamp_ns + self._link_time.ahead_ns > self._stale_ns + error_ns
+        error_ns = self.link_time.error_ns
+        return error_ns is not None and now_ns - stamp_ns + self.link_time.ahead_ns > self._stale_ns + error_ns
 
     def _is_expired(self, stamp_ns: int, now_ns: int) -> bool:
         """Whether a message is beyond the contract's lifespan."""
@@ -327,12 +346,13 @@ class ImportFlow(DataHandler):
         It waits ``mesh.limits.STALE_HOLD`` for a newer one, and is delivered if none comes: the last command before a
         cable was pulled still counts.
         """
-        # The first message of a route may be a kept one, which is old.
-        if not self.contract.newest_only or sequence <= 1 or not self._is_too_old(stamp_ns, now_ns):
+        if not self.contract.newest_only or not self._is_too_old(stamp_ns, now_ns):
             return False
-        sent_at = self._loop.time() - (now_ns - stamp_ns + self._link_time.ahead_ns) / 1e9
-        held_up = self._link_time.resumed_at() - sent_at
-        if held_up * 1e9 <= self._stale_ns + (self._link_time.error_ns or 0):
+        if serial_distance(self._had, sequence) <= 1:  # the first message of a route may be a kept one, which is old
+            return False
+        sent_at = self._loop.time() - (now_ns - stamp_ns + self.link_time.ahead_ns) / 1e9
+        held_up = self.link_time.resumed_at() - sent_at
+        if held_up * 1e9 <= self._stale_ns + (self.link_time.error_ns or 0):
             return False
         if self._held is None:
             timer = self._loop.call_later(mesh_limits.STALE_HOLD, self._deliver_held)
@@ -358,7 +378,7 @@ class ImportFlow(DataHandler):
 
     def _acknowledge(self, now: float) -> None:
         self._stop_ack_timer()
-        if (sequence := self._numbering.due_ack(now)) is not None:
+        if (sequence := self.numbering.due_ack(now)) is not None:
             self._link.mark(FrameKind.ACK, self.route, sequence)
 
     # --- messages in parts -----------------------------------------------------------------------------------------
@@ -370,7 +390,7 @@ class ImportFlow(DataHandler):
         size = _PREFIX_SIZE + LENGTH.unpack_from(part)[0]
         if size > ros_limits.MESSAGE_MAX:
             raise LimitExceeded("message", size, ros_limits.MESSAGE_MAX)
-        if self._numbering.gap(sequence, self._epoch) is None:
+        if self.numbering.gap(sequence, self.epoch) is None:
             self._accept(sequence, 0)
             return
         self.torn()
@@ -378,6 +398,7 @@ class ImportFlow(DataHandler):
             self._accept(sequence, 0)
             return
         self._drop_held()
+        self._sequence = sequence
         if self._reliable or any(len(kept) == size for kept in self._replay or ()):
             # Delivered whole only. A reliable message may be sent again, so no subscriber may have a part of it; and
             # only the whole message shows whether it repeats a kept one.
@@ -385,7 +406,7 @@ class ImportFlow(DataHandler):
         else:
             self._replay = None
             self._output.begin(size)
-        self._sequence, self._size, self._received = sequence, size, 0
+        self._size, self._received = size, 0
         self._judge()
 
     def _complete(self, sequence: int, stamp_ns: int) -> None:
@@ -394,7 +415,11 @@ class ImportFlow(DataHandler):
         is_new = self._accept(sequence, self._size)
         if whole is None:
             self._note(stamp_ns, now_ns, self._size)
-        elif is_new and not self._is_expired(stamp_ns, now_ns) and not self._is_replay(whole):
+            self._judge()
+            return
+        if is_new and self.history is not None:
+            self.history.append(sequence, now_ns, bytes(whole))
+        if is_new and not self._is_expired(stamp_ns, now_ns) and not self._is_replay(whole):
             self._deliver(whole, stamp_ns)
         self._judge()
 

@@ -16,17 +16,41 @@ A new route begins on the express lane, after the control frame that opens it.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from rmpa.core.contract import Priority
+from rmpa.core.contract import History, Priority
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Lane
 
 if TYPE_CHECKING:
     from rmpa.core.contract import Contract
+    from rmpa.mesh.reliable import Outgoing
 
 EXPRESS: Final = Lane.EXPRESS
 BULK: Final = Lane.BULK
+
+
+def kept_for(contract: Contract) -> int:
+    """How many messages a contract keeps while they cannot be sent."""
+    return limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.queue_depth
+
+
+class RouteBegin(NamedTuple):
+    """Where a route begins.
+
+    Args:
+        epoch: Its numbering; 0 if its numbers mean nothing beyond it.
+        first: The sequence of its first message.
+        goes_on: Whether the peer has what is before ``first``, or misses it for good.
+        kept: The messages to be sent at once.
+        resumed: Whether a suspended sender goes on.
+    """
+
+    epoch: int
+    first: int
+    goes_on: bool = False
+    kept: tuple[Outgoing, ...] = ()
+    resumed: bool = False
 
 
 class LaneSwitch:

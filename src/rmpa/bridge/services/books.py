@@ -273,6 +273,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         """Close the routes of a peer whose link is gone; its services stay in the graph until ``gone``."""
         if (known := self._peers.get(peer)) is not None:
             known.away = True
+            self._ready(peer)
             for remote in list(known.routes.values()):
                 self._end(remote, f"the link to {known.name} was lost")
 
@@ -396,10 +397,10 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         for waiting in self._peers[peer].admitted(self._out.context.settings.limits.nodes):
             self._choose(waiting.name)
 
-    def _rank(self, remote: RemoteService) -> tuple[bool, int, int]:
-        """Sorts the claims to a name: modules of this mesh before what gateways reach, then by GUID."""
-        outside = remote.origin is not None and is_outside(remote.origin)
-        return outside, self._peers[remote.peer].rank, remote.peer
+    def _rank(self, remote: RemoteService) -> tuple[bool, bool, int, int]:
+        """Sorts the claims to a name: modules of this mesh go first, then links that work, then by GUID."""
+        known, outside = self._peers[remote.peer], remote.origin is not None and is_outside(remote.origin)
+        return outside, known.away, known.rank, remote.peer
 
     def _own_first(self, service: str) -> str:
         node = self._local.get(service)

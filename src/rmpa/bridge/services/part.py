@@ -251,12 +251,22 @@ class Services(GraphPart):
         session = self._shared.sessions.get(peer)
         if session is None:
             return
-        name = self._shared.sessions.proxy_name(session, node, remote.origin)
-        source, place = Source(f"service {service}", node), service_place(service, name)
-        self._shared.relay.pass_on(session.peer, session.link.identity, source, place, remote.origin)
+        proxies, owner = self._shared.sessions.proxies(session, node, remote.origin)
+        self._pass_on(remote, session)
         shown = self._shown[remote] = ShownService(remote, session)
-        session.proxies.hold(node, f"service {service}", lambda proxy: self._expose(shown, proxy))
+        proxies.hold(owner, f"service {service}", lambda proxy: self._expose(shown, proxy))
         self.direct_imports.shown(remote)
+
+    def path_changed(self, remote: RemoteService) -> None:
+        """Offer what is relayed with the path that it has now."""
+        if remote.shown and (session := self._shared.sessions.get(remote.peer)) is not None:
+            self._pass_on(remote, session)
+            self.look((remote.name,))
+
+    def _pass_on(self, remote: RemoteService, session: PeerSession) -> None:
+        name = self._shared.sessions.proxy_name(session, remote.node, remote.origin)
+        source, place = Source(f"service {remote.name}", remote.node), service_place(remote.name, name)
+        self._shared.relay.pass_on(session.peer, session.link.identity, source, place, remote.origin)
 
     def _expose(self, shown: ShownService, proxy: SlaveNode) -> None:
         """Register a service at its proxy, which exists now; do nothing if the service was withdrawn meanwhile."""
@@ -305,7 +315,8 @@ class Services(GraphPart):
         if (proxy := shown.proxy) is not None:
             self._core.call("unregisterService", proxy.name, remote.name, proxy.service_uri)
             proxy.remove_service(remote.name, text)
-        shown.session.proxies.release(remote.node, f"service {remote.name}")
+        proxies, owner = self._shared.sessions.proxies(shown.session, remote.node, remote.origin)
+        proxies.release(owner, f"service {remote.name}")
 
     def forget_about(self, remote: RemoteService) -> None:
         """What is known of a shown service may no longer be true."""

@@ -37,7 +37,6 @@ from rmpa.bridge.offers import Effects, OfferBook
 from rmpa.bridge.policy import Local, PolicyDecision
 from rmpa.config.peer_rules import Access
 from rmpa.core.contract import Contract, Durability, Reliability, combine
-from rmpa.core.identity import is_later, serial_add
 from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
@@ -66,8 +65,7 @@ class ExportRoute:
         name: The peer's name.
         instance: The peer's run, as 32 hexadecimal digits.
         live: Whether data is sent on it yet.
-        epoch: Identifies the numbering.
-        after: Sequence of the last message that the peer has, if this continues a suspended route; else ``None``.
+        position: Epoch and last message that the peer has of the source, by this or another path; ``None``: nothing.
         unknown: Whether an earlier run of the peer's module may have missed messages.
         shared: Whether the publisher was connected before.
     """
@@ -78,20 +76,19 @@ class ExportRoute:
     name: str
     instance: str
     live: bool = False
-    epoch: int = 0
-    after: int | None = None
+    position: tuple[int, int] | None = None
     unknown: bool = False
     shared: bool = False
-
-    @property
-    def reliable(self) -> bool:
-        """Whether no message is to be lost."""
-        return self.contract.reliability is Reliability.RELIABLE
 
     @property
     def outage(self) -> float:
         """For how many seconds its messages are kept without a link."""
         return self.contract.resume_window if self.reliable else mesh_limits.SILENT_GRACE
+
+    @property
+    def reliable(self) -> bool:
+        """Whether each message is kept until the peer has it."""
+        return self.contract.reliability is Reliability.RELIABLE
 
 
 @dataclass(slots=True)
@@ -117,7 +114,6 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
         super().__init__(out)
         self._routes: dict[int, dict[int, Source]] = {}
         self._flows: dict[Source, _Flow] = {}
-        self._epochs = 0
         self._cut: OrderedDict[tuple[str, Source], str] = OrderedDict()
 
     # --- for others ----------------------------------------------------------------------------------------------
@@ -258,24 +254,25 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
             if flow is None:
                 flow = self._flows[source] = _Flow(local.uri)
                 self._do.outbound.connect(source, local.uri)
-            route = flow.routes[peer] = self._route(peer, source, message, before)
+            route = flow.routes[peer] = self._route(peer, source, message)
             route.shared = flow.description is not None
             self._start(source, flow)
             return
         self._out.send(peer, RouteClosed(number, why))
 
-    def _route(self, peer: int, source: Source, message: OpenRoute, before: ExportRoute | None) -> ExportRoute:
-        """The route that a peer asks for; it continues a suspended one of the same epoch and contract."""
+    def _route(self, peer: int, source: Source, message: OpenRoute) -> ExportRoute:
+        """The route that a peer asks for."""
         told, asked, kind = self.peers[peer], message.contract, self.offered[source].type
         contract = combine(self._out.context.contracts.of(source.topic, kind), asked, kind)
         route = ExportRoute(message.route, contract, asked, told.name, told.instance)
         route.unknown = self._cut.pop((told.name, source), told.instance) != told.instance
-        if before is not None and before.epoch == message.epoch and before.contract.same_route(contract):
-            route.epoch, route.after = before.epoch, message.after
-        else:
-            self._epochs += 1
-            route.epoch = self._epochs
+        route.position = (message.epoch, message.after) if message.epoch else None
         return route
+
+    def position(self, source: Source) -> tuple[int, int] | None:
+        """What a peer has of a source whose publisher is not connected yet; a relay's own route begins behind it."""
+        waiting = (route.position for route in self.routes(source).values() if not route.live)
+        return min((position for position in waiting if position is not None), default=None)
 
     def closed(self, peer: int, message: CloseRoute) -> None:
         """End a route that a peer closes; one that is not open is ignored, since both ends may close it at once."""
@@ -308,17 +305,14 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
             route.live = True
             latching = about.latching or route.contract.durability is Durability.TRANSIENT_LOCAL
             told = msgspec.structs.replace(about, latching=latching)
-            opened = RouteOpened(route.number, told, route.contract, route.epoch)
-            if route.after is None:
-                unset = msgspec.UNSET
+            begin, unset = self._do.outbound.begins(source, peer, route), msgspec.UNSET
+            opened = RouteOpened(route.number, told, route.contract, begin.epoch, begin.first)
+            if begin.goes_on:
+                opened = msgspec.structs.replace(opened, following=begin.first)
+            else:
                 opened = msgspec.structs.replace(opened, unknown=route.unknown or unset, shared=route.shared or unset)
-            elif (sender := self._do.outbound.sender_of(source, peer)) is not None:
-                # The peer may have kept messages whose acknowledgement was lost; these are not sent again.
-                following, after = sender.following, route.after
-                following = following if is_later(following, after) else serial_add(after, 1)
-                opened = msgspec.structs.replace(opened, following=following)
             self._out.send(peer, opened)
-            self._do.add_route(source, peer, route)
+            self._do.add_route(source, peer, route, begin)
 
     def end_route(self, source: Source, peer: int) -> ExportRoute | None:
         """End the route to one peer, if there is one; a source without any is disconnected."""
@@ -356,8 +350,8 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
         flow = self._flows.pop(source, None)
         for peer, route in flow.routes.items() if flow is not None else ():
             last = lasts.get(peer) if lasts is not None else None
-            if lasts is None and (sender := self._do.outbound.sender_of(source, peer)) is not None:
-                last = sender.last
+            if lasts is None:
+                last = self._do.outbound.last(source, peer)
             self._forget(source, peer, route)
             if route.number:
                 self._out.send(peer, RouteClosed(route.number, reason, msgspec.UNSET if last is None else last))

@@ -8,6 +8,9 @@ for::
       │ unwanted        ▼                   ▼
       └────────────── waiting ◄─────────────┘    time ──► opening
 
+Several peers may offer a source: its module itself, and relays. One of them *carries* it: it is shown, and has the
+subscribers. A better way opens its route behind the last message that came, and carries the source from then on.
+
 The cost of a method depends on its arguments, not on the number of peers and sources. Sources are keyed by their wire
 names; all arguments about the local graph use the names there (``bridge.proxies``).
 """
@@ -15,6 +18,7 @@ names; all arguments about the local graph use the names there (``bridge.proxies
 from __future__ import annotations
 
 import itertools
+import math
 import sys
 from dataclasses import dataclass
 from heapq import heappop, heappush
@@ -42,17 +46,23 @@ from rmpa.core.counters import Backoff
 from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping
+    from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from rmpa.bridge.offers import Effects
 
 
+# What a source is, whichever peer offers it: the run and the name of its module, its node there, and its topic here.
+StreamKey = tuple[str, str, str, str]
+
+
 @dataclass(slots=True, eq=False, kw_only=True)
 class RemoteTopic(Remote[Source]):
-    """One source of one peer.
+    """One source as one peer offers it.
 
     Args:
-        hidden: Why it is not in the local graph, or empty.
+        module: The run and the name of the module that publishes it.
+        objection: Why it is not in the local graph, whichever others offer it, or empty.
+        hidden: Why it is not in the local graph: that, or who carries it; or empty.
         wanted: Whether a local node listens.
         route: The route's id while it is requested or open, else 0.
         open: Whether the peer has opened the route.
@@ -66,6 +76,8 @@ class RemoteTopic(Remote[Source]):
     """
 
     type: str
+    module: tuple[str, str]
+    objection: str = ""
     hidden: str = ""
     wanted: bool = False
     route: int = 0
@@ -76,6 +88,11 @@ class RemoteTopic(Remote[Source]):
     description: Description | None = None
     backoff: Backoff | None = None
     direct: bool = False
+
+    @property
+    def key(self) -> StreamKey:
+        """What it is, whichever peer offers it."""
+        return *self.module, self.node if self.origin is None else self.origin.node, self.name
 
     @property
     def state(self) -> str:
@@ -101,10 +118,10 @@ class RemoteTopic(Remote[Source]):
 
         Only a source with a listener does. A reliable one stays, so that no message is lost. A latched one stays if
         the link fell silent (``silent``): its subscribers stay connected and do not get the same message again when
-        the peer is back, and new subscribers get it meanwhile. A relayed one does not stay, because another relay may
-        offer it. A source with direct subscribers stays if only its agent has died: its messages go on.
+        the peer is back, and new subscribers get it meanwhile. A source with direct subscribers stays if only its
+        agent has died: its messages go on.
         """
-        if self.direct or not self.wanted or self.origin is not None:
+        if self.direct or not self.wanted:
             return self.direct
         latching = self.description is not None and self.description.latching
         return self.reliable or (silent and latching)
@@ -115,6 +132,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
 
     Attributes:
         _topics: The sources of each peer by their local topic (dicts, for their order).
+        _ways: What the peers offer of each source (dicts, for their order).
         _timers: A heap; an item that is not its source's time any more is skipped.
     """
 
@@ -123,6 +141,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     def __init__(self, out: Effects) -> None:
         super().__init__(out)
         self._topics: dict[int, dict[str, dict[Source, None]]] = {}
+        self._ways: dict[StreamKey, dict[RemoteTopic, None]] = {}
         self._local_types: dict[str, str] = {}
         self._timers: list[tuple[float, int, RemoteTopic]] = []
         self._serials = itertools.count()
@@ -136,6 +155,10 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     def get(self, peer: int, source: Source) -> RemoteTopic | None:
         """One known source."""
         return known.entries.get(source) if (known := self._peers.get(peer)) is not None else None
+
+    def carrier(self, entry: RemoteTopic) -> RemoteTopic | None:
+        """The way by which a source comes; ``None`` if it is not in the local graph."""
+        return next((one for one in self._ways.get(entry.key, ()) if one.shown), None)
 
     def knows(self, source: Source) -> bool:
         """Whether any peer offers a source."""
@@ -163,8 +186,11 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         known.away, known.silent, known.routes = True, known.silent or briefly, {}
         if not briefly:
             known.give_up()
+        self._ready(peer)
         for entry in list(known.entries.values()):
             keep = briefly or entry.outlives(silent=known.silent)
+            if not keep:
+                self._hand_over(entry)
             if entry.route:
                 # A lingering route has no listener, so it is not continued.
                 self._do.detach(entry, keep=keep and entry.wanted, missed=entry.wanted and not keep)
@@ -188,12 +214,14 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             self._outlived(entry)
 
     def _outlived(self, entry: RemoteTopic) -> None:
+        self._hand_over(entry)
         entry.wanted = False  # its flow ends with its publication
         self._drop(entry, "")
 
     def detached(self, peer: int) -> None:
         """Detach the open routes of a peer for which nothing waits; ``link_down`` is called next."""
         known = self._peers[peer]
+        self._hand_all_over(peer)
         for entry in known.routes.values():
             self._do.detach(entry, missed=entry.wanted)
         known.routes = {}
@@ -204,8 +232,11 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         The peer is unknown as soon as this returns; closing its proxies takes its sources out of the local graph. Its
         entries are freed as the items are taken, because freeing thousands at once takes long.
         """
+        self._hand_all_over(peer)
         known = self._peers.pop(peer, None)
         self._topics.pop(peer, None)
+        for entry in known.entries.values() if known is not None else ():
+            self._forget_way(entry)
         self._ways_changed(self.ways.unlinked(peer))
         for other, source in list(self.at(CLOCK)):
             self._judge_at(other, source)
@@ -216,9 +247,12 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     def _entry(self, peer: int, offer: TopicOffer) -> RemoteTopic:
         # Many sources share the names of nodes and types, and each is kept once.
         source, kind = Source(offer.topic, sys.intern(offer.node)), sys.intern(offer.type)
-        name = self.name_here(peer, source.topic, offer.origin)
-        entry = RemoteTopic(peer=peer, wire=source, name=name, node=source.node, origin=offer.origin, type=kind)
-        self._topics.setdefault(peer, {}).setdefault(name, {})[source] = None
+        name, origin, known = self.name_here(peer, source.topic, offer.origin), offer.origin, self._peers[peer]
+        module = (known.instance, known.name) if origin is None else (origin.instance, origin.name)
+        entry = RemoteTopic(
+            peer=peer, wire=source, name=name, node=source.node, origin=origin, type=kind, module=module
+        )
+        self._list(entry)
         return entry
 
     def _came_again(self, entry: RemoteTopic, now: float) -> None:
@@ -227,12 +261,24 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         self.follow(entry, now)
 
     def _went(self, entry: RemoteTopic, reason: str) -> None:  # noqa: ARG002 - as of ImportBook
-        self._close(entry)
+        self._hand_over(entry)
+        self._close(entry, missed=entry.wanted)
         self._unlist(entry)
         if entry.shown:
             self._retract(entry)
 
+    def _list(self, entry: RemoteTopic) -> None:
+        self._topics.setdefault(entry.peer, {}).setdefault(entry.name, {})[entry.wire] = None
+        self._ways.setdefault(entry.key, {})[entry] = None
+
+    def _forget_way(self, entry: RemoteTopic) -> None:
+        ways = self._ways[entry.key]
+        del ways[entry]
+        if not ways:
+            del self._ways[entry.key]
+
     def _unlist(self, entry: RemoteTopic) -> None:
+        self._forget_way(entry)
         topics = self._topics[entry.peer]
         del topics[entry.name][entry.wire]
         if not topics[entry.name]:
@@ -272,7 +318,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 self._hide(entry)
             self._unlist(entry)
             entry.name = name
-            self._topics[entry.peer].setdefault(name, {})[entry.wire] = None
+            self._list(entry)
         self._judge(entry)
         contract = self._out.context.contracts.of(entry.name, entry.type)
         if entry.route and not (entry.asked is not None and entry.asked.same_route(contract)):
@@ -285,15 +331,11 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
 
     def _judge(self, entry: RemoteTopic) -> None:
         known, before = self._peers[entry.peer], entry.cause
-        entry.hidden, entry.cause = self.why_hidden(entry)
+        entry.objection, entry.cause = self.why_hidden(entry)
         known.wait(entry, crowded=entry.cause == CROWDED)
-        if entry.hidden and entry.shown:
-            self._hide(entry)
-        elif not entry.hidden and not entry.shown:
-            known.show(entry)
-            self._do.publish(entry)
+        self._choose(entry)
         if entry.cause != before and CONFLICT in {entry.cause, before}:
-            text = entry.hidden if entry.cause == CONFLICT else ""
+            text = entry.objection if entry.cause == CONFLICT else ""
             if text:
                 counter = "clock.second" if entry.name == CLOCK else "mismatch.type"
                 self._out.warn(counter, str(entry.wire), f"{entry.wire}: {text}")
@@ -305,9 +347,9 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             self._warn_limit(known.name, "nodes", self._out.context.settings.limits.nodes)
 
     def why_hidden(self, entry: RemoteTopic) -> tuple[str, str]:
-        """Why a source is not in the local graph, and the cause (see ``Remote``); empty if it is."""
+        """Why a source may not be in the local graph, and the cause (see ``Remote``); empty if it may."""
         context, origin, topic = self._out.context, entry.origin, entry.name
-        if origin is not None and (why := self.ways.why_not(entry.peer, origin)):
+        if origin is not None and (why := self.ways.objection(origin)):
             return why, ""
         if topic == CLOCK:
             why, conflict = self._why_no_time(entry)
@@ -365,6 +407,61 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 return f"time comes from {source.node} of {name} already, and has one source", True
         return "", False
 
+    def _choose(self, entry: RemoteTopic) -> None:
+        """Let the best way carry a source, by the facts of now; call it whenever one has changed."""
+        ways, carrier = self._ways[entry.key], self.carrier(entry)
+        best = self._best(ways)
+        outranked = self._outranked(best) if best is not None else ""
+        for way in ways:
+            way.hidden = way.objection or ("" if way is best else outranked)
+            if way is not best and way is not carrier and way.wanted:
+                self._close(way)
+                way.wanted = False
+        if carrier is None and best is not None:
+            self._peers[best.peer].show(best)
+            self._do.publish(best)
+        elif carrier is not None and best is None:
+            self._hide(carrier)
+        elif carrier is not best and carrier is not None and best is not None:
+            if not carrier.wanted or carrier.cause == DENIED:
+                self._move(carrier, best)
+            elif not best.wanted:
+                best.wanted = True
+                self._wait(best, -math.inf)  # its route is opened in the next turn of the loop
+
+    def _best(self, ways: Iterable[RemoteTopic]) -> RemoteTopic | None:
+        free = (way for way in ways if not way.objection)
+        return min(free, key=lambda way: self.ways.rank(way.peer, way.origin), default=None)
+
+    def _outranked(self, best: RemoteTopic) -> str:
+        module, name = best.module[1], self._peers[best.peer].name
+        return f"{module} has a link of its own" if best.origin is None else f"{module} is reached by way of {name}"
+
+    def _move(self, old: RemoteTopic, new: RemoteTopic) -> None:
+        """Let another way carry a source: the subscribers, the position and what is kept for late ones stay."""
+        self._peers[old.peer].hide(old)
+        self._peers[new.peer].show(new)
+        wanted, old.wanted = old.wanted, False
+        self._do.moved(old, new)
+        self._close(old)
+        if wanted and not new.open and not new.wanted:
+            self._wait(new, -math.inf)
+        new.wanted = wanted
+        self._show_behind(old)
+
+    def _hand_over(self, entry: RemoteTopic) -> None:
+        """Let another way carry a source at once, if there is one: this one ends."""
+        others = [way for way in self._ways[entry.key] if way is not entry] if entry.shown else ()
+        if (other := self._best(others)) is not None:
+            self._move(entry, other)
+
+    def _hand_all_over(self, peer: int) -> None:
+        if (known := self._peers.get(peer)) is not None:
+            known.away = True
+            self._ready(peer)
+            for entry in list(known.entries.values()):
+                self._hand_over(entry)
+
     def _hide(self, entry: RemoteTopic) -> None:
         self._close(entry)
         entry.wanted = False
@@ -372,13 +469,17 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
 
     def _retract(self, entry: RemoteTopic) -> None:
         """Take a source out of the local graph, and show those that could not stand beside it."""
-        known = self._peers[entry.peer]
-        known.hide(entry)
+        self._peers[entry.peer].hide(entry)
         self._do.retract(entry)
+        self._show_behind(entry)
+
+    def _show_behind(self, entry: RemoteTopic) -> None:
+        """Show what could not stand beside an entry that is shown no more."""
+        known = self._peers[entry.peer]
         if entry.name == CLOCK:
             behind = [(peer, source) for peer, source in self.at(CLOCK) if (peer, source) != (entry.peer, entry.wire)]
         else:
-            same = self._topics[entry.peer].get(entry.name, ())
+            same = self._topics.get(entry.peer, {}).get(entry.name, ())
             behind = [(entry.peer, s) for s in same if s.node == entry.node and s != entry.wire]
         for peer, source in behind:
             self._judge_at(peer, source)
@@ -416,6 +517,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             self._close(entry)
         entry.wanted = wanted
         self.follow(entry, now)
+        self._choose(entry)
 
     def opened(self, peer: int, message: RouteOpened, now: float) -> None:
         """Take the peer's answer that a route is open; ignored if the route was closed here meanwhile.
@@ -433,6 +535,8 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             return
         entry.open, entry.until, entry.problem, entry.backoff = True, None, "", None
         entry.description, entry.contract = message.description, message.contract
+        if (carrier := self.carrier(entry)) is not None and carrier is not entry:
+            self._move(carrier, entry)
         self._do.describe(entry, message)
 
     def closed(self, peer: int, message: RouteClosed, now: float) -> None:
@@ -473,14 +577,19 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             self._out.send(entry.peer, CloseRoute(entry.route))
             self._do.detach(entry, missed=missed)
         elif entry.wanted and entry.until is None:
-            self._do.detach(entry)  # it waited for a new link
+            self._do.detach(entry, missed=missed)  # it waited for a new link
         entry.route, entry.open, entry.until, entry.backoff = 0, False, None, None
 
     def _fail(self, entry: RemoteTopic, reason: str, now: float, last: int | None = None) -> None:
         """A route is refused or lost: it is opened again after the back-off if a node still listens."""
         self._peers[entry.peer].routes.pop(entry.route, None)
-        self._do.detach(entry, missed=entry.wanted, last=last)
+        if last is None:
+            self._hand_over(entry)
+        # Where its publisher may be there still, the next route goes on behind what has come.
+        keep = last is None and entry.wanted and entry.reliable
+        self._do.detach(entry, keep=keep, missed=entry.wanted, last=last)
         entry.route, entry.open, entry.until, entry.problem = 0, False, None, reason
+        self._choose(entry)
         if entry.wanted:
             if entry.backoff is None:
                 entry.backoff = Backoff(mesh_limits.BACKOFF_FIRST, mesh_limits.BACKOFF_MAX, self._out.rng)

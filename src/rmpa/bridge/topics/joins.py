@@ -9,7 +9,8 @@ once more, for a short time, and the subscriber gets what comes there instead of
       ◄── on the route ``own``: a message of that connection, or the number of the same message on ``route``
       ◄── at the end: the number from which the subscriber gets what comes on ``route``
 
-The messages of both connections are compared byte by byte (by a digest), so a message that all get crosses once.
+The messages of both connections are compared byte by byte (by a digest), so a message that all get crosses once. What
+was sent to the module before the further connection stood, and is still on its way, the joining subscriber gets too.
 """
 
 from __future__ import annotations
@@ -132,6 +133,9 @@ class ServedJoin:
     def begin(self, _stamp_ns: int, _size: int) -> None:
         """A message begins; it is needed whole."""
         self._busy = True
+
+    def skip(self, _sequence: int) -> None:
+        """What was lost before the next message was lost for all."""
 
     def drain(self, _done: Callable[[], None]) -> None:
         """The publisher has gone."""
@@ -271,7 +275,7 @@ class JoiningSubscriber(DataHandler):
         if self.ended:
             self._connection.send((framed,), _MESSAGES)
             return
-        number = self._flow.delivering
+        number = self._flow.number
         if self._after is not None and not is_later(number, self._after):
             self._connection.send((framed,), _MESSAGES)
             return

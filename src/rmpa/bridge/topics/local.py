@@ -17,13 +17,14 @@ import logging
 from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge import limits
-from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender
+from rmpa.bridge.data.export import ExportFlow, RelayedFlow, ReliableRouteSender
 from rmpa.bridge.messages import Audience, Description, Mismatch, Source, encode, is_crossing_name
 from rmpa.bridge.topics.exports import LocalSource
+from rmpa.bridge.topics.peer_topics import PeerTopic
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
-from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import OWN_NODE, is_own, is_type_name, proxied_node, proxy_name
+from rmpa.core.limits import UINT32_MAX
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ResumeTable
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from rmpa.bridge.data.export import RouteSender
+    from rmpa.bridge.data.route import RouteBegin
     from rmpa.bridge.messages import Message
     from rmpa.bridge.offers import Effects
     from rmpa.bridge.policy import Relay
@@ -133,6 +135,8 @@ class LocalSubscriptions:
         self._node = shared.node
         self._exports, self._losses, self._out = exports, losses, out
         self._find, self._on_over = find, on_over
+        # Random, so that no earlier run of this agent, and no other agent, is likely to have had it.
+        self._epoch = int(shared.rng() * UINT32_MAX)
         self.flows: dict[Source, ExportFlow] = {}
         self.senders: dict[tuple[int, int], RouteSender] = {}
         self._parked: ResumeTable[tuple[int, Source]] = ResumeTable()
@@ -149,7 +153,9 @@ class LocalSubscriptions:
         if not any(one.topic == source.topic for one in self.flows):
             self._core.call("registerSubscriber", OWN_NODE, source.topic, "*", self._node.uri)
         _log.debug("> subscribe to %s at %s", source, uri)
-        flow = self.flows[source] = ExportFlow()
+        publication = self._find(source.node, uri, source.topic)
+        relayed = publication is not None and isinstance(publication.events, PeerTopic)
+        flow = self.flows[source] = (RelayedFlow if relayed else ExportFlow)(self._new_epoch)
         flow.connection = self.connection(
             source,
             uri,
@@ -172,6 +178,11 @@ class LocalSubscriptions:
 
         kind = PublisherConnection if find() is None else InProcessConnection
         return kind(source.topic, uri, caller, number=self._node.next_number(), find=find, **callbacks)
+
+    def _new_epoch(self) -> int:
+        """A number that identifies a numbering; not 0."""
+        self._epoch = self._epoch % UINT32_MAX + 1
+        return self._epoch
 
     def disconnect(self, source: Source) -> None:
         """Disconnect one publisher, and drop its routes."""
@@ -199,27 +210,23 @@ class LocalSubscriptions:
             flow.leaving = asyncio.get_running_loop().call_later(limits.ROUTE_END, gone)
         return True
 
-    def add_route(self, source: Source, peer: int, route: ExportRoute, link: PeerLink) -> None:
-        """Send a source to one more peer, or resume its suspended route.
+    def begins(self, source: Source, peer: int, route: ExportRoute) -> RouteBegin:
+        """Where a route to a peer begins."""
+        return self.flows[source].begins(peer, route.contract, route.position)
 
-        Raises:
-            RemoteProtocolError: The peer resumes after a message that was never sent.
-        """
+    def add_route(self, source: Source, peer: int, route: ExportRoute, begin: RouteBegin, link: PeerLink) -> None:
+        """Send a source to one more peer, or resume its suspended route."""
         flow = self.flows[source]
         sender = flow.by_peer.get(peer)
-        if route.after is not None and sender is not None and sender.epoch == route.epoch:
+        if begin.resumed and sender is not None and route.position is not None:
             self._parked.claim((peer, source))
             self._timer.arm()
-            try:
-                sender.resume(link, route.number, route.after)
-            except RemoteProtocolError:
-                flow.remove(peer)  # the caller closes the link; the next one gets a new numbering
-                raise
+            sender.resume(link, route.number, route.position[1])
             if isinstance(sender, ReliableRouteSender) and (missed := sender.missed()):
                 self._losses.missed(source, peer, missed)
         else:
             self.remove_route(source, peer)
-            sender = flow.add(peer, link, route.number, route.contract, route.epoch)
+            sender = flow.add(peer, link, route.number, route.contract, begin)
         self.senders[peer, route.number] = sender
 
     def suspend_route(self, source: Source, peer: int, outage: float) -> None:
@@ -257,20 +264,29 @@ class LocalSubscriptions:
             self._forget(peer, sender)
             self.flows[source].remove(peer)
 
+    def last(self, source: Source, peer: int) -> int | None:
+        """The last message of a route whose publisher has gone; ``None``: others may have been lost."""
+        sender = self.sender_of(source, peer)
+        return sender.last if sender is not None and self.flows[source].complete else None
+
     def sender_of(self, source: Source, peer: int) -> RouteSender | None:
         """The sender of a source's route to a peer, suspended or not; ``None`` if there is none."""
         flow = self.flows.get(source)
         return flow.by_peer.get(peer) if flow is not None else None
 
     def _give_up(self, keys: list[tuple[int, Source]]) -> None:
-        """Reports routes whose messages are not kept any more for absent peers."""
+        """Reports routes whose messages are not kept any more for absent peers.
+
+        What a relay does not keep is not lost yet: the peer may get it by another path, and counts what it misses.
+        """
         for peer in dict.fromkeys(peer for peer, _ in keys):
             counts = {}
             for source in (source for one, source in keys if one == peer):
                 sender = self.sender_of(source, peer)
                 if isinstance(sender, ReliableRouteSender):
                     counts[source] = sender.missed() + sender.sender.pending
-            self._losses.given_up(peer, counts)
+            own = {one: count for one, count in counts.items() if not isinstance(self.flows[one], RelayedFlow)}
+            self._losses.given_up(peer, own)
             for source in counts:
                 self._exports.given_up(source, peer)
 
@@ -298,9 +314,24 @@ class LocalSubscriptions:
         if description.problem:
             self._gone(source, self.flows[source], description.problem)
             return
+        flow = self.flows[source]
+        if isinstance(flow, RelayedFlow) and not self._follows(flow, source, fields):
+            return
         if description.latching:
-            self.flows[source].latch()
+            flow.latch()
         self._exports.described(source, description)
+
+    def _follows(self, flow: RelayedFlow, source: Source, fields: Mapping[str, str]) -> bool:
+        """Whether the route that a relayed source comes by gives it its numbers; else it does when it is open."""
+        publication = self._find(source.node, flow.connection.uri, source.topic)
+        topic = publication.events if publication is not None else None
+        if publication is None or not isinstance(topic, PeerTopic):
+            return False
+        if topic.flow is None:
+            topic.on_open = lambda: self._header(source, fields) if self.flows.get(source) is flow else None
+            return False
+        flow.follow(topic.flow, publication.latched)
+        return True
 
     def _gone(self, source: Source, flow: ExportFlow, reason: str) -> None:
         if self.flows.get(source) is not flow:
@@ -311,8 +342,12 @@ class LocalSubscriptions:
             self._out.warn("publisher.malformed", str(source), f"{source}: {reason}")
         flow.connection.close()
         flow.ended()
-        flow.leaving = asyncio.get_running_loop().call_later(limits.ROUTE_DRAIN, self._over, source, flow, reason)
-        flow.drain(lambda: self._over(source, flow, reason))
+        if isinstance(flow, RelayedFlow):  # nothing waits: the peers may have what follows by another path
+            flow.catch_up()
+            self._over(source, flow, reason)
+        else:
+            flow.leaving = asyncio.get_running_loop().call_later(limits.ROUTE_DRAIN, self._over, source, flow, reason)
+            flow.drain(lambda: self._over(source, flow, reason))
         if not short:
             self._core.suspect(source.node)
 
@@ -320,7 +355,7 @@ class LocalSubscriptions:
         """Ends a source whose publisher has gone, and whose messages have crossed."""
         if self.flows.get(source) is not flow:
             return
-        lasts = {peer: sender.last for peer, sender in flow.by_peer.items()}
+        lasts = {peer: last for peer in flow.by_peer if (last := self.last(source, peer)) is not None}
         self.disconnect(source)  # first: what follows may connect the source anew
         self._exports.lost(source, reason[: limits.CONTROL_TEXT_MAX], lasts)
         self._on_over(source)

@@ -30,7 +30,6 @@ from rmpa.bridge.topics.local import (
 )
 from rmpa.bridge.topics.peer_topics import LossReports, PeerTopic, PeerTopics, TopicEvents
 from rmpa.core.contract import Priority
-from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import is_own
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
@@ -39,12 +38,14 @@ from rmpa.runtime.loop import yield_to_data
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
-    from rmpa.bridge.data.quality import QosEvent, QosWatch
+    from rmpa.bridge.data.quality import QosEvent
+    from rmpa.bridge.data.route import RouteBegin
     from rmpa.bridge.messages import Message
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import ExportRoute
     from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.bridge.topics.peer_topics import Pasts
     from rmpa.ros.node.publication import Publication, Receiver, SubscriberConnection
     from rmpa.ros.wire.xmlrpc import RosReply
 
@@ -80,7 +81,7 @@ class Topics(GraphPart, TopicEvents):
     def __init__(self, shared: Shared, find: Callable[[str, str, str], Publication | None]) -> None:
         super().__init__(shared, Exports, Imports)
         self.peers: dict[int, PeerTopics] = {}
-        self._pasts: OrderedDict[str, dict[Source, tuple[QosWatch, str]]] = OrderedDict()
+        self._pasts: OrderedDict[str, Pasts] = OrderedDict()
         self.losses = LossReports(shared, self.exports, self.peers, self)
         self.outbound = LocalSubscriptions(
             shared, self.exports, self.losses, self, find, lambda source: self.look((source.topic,))
@@ -124,11 +125,15 @@ class Topics(GraphPart, TopicEvents):
             _log.info("= %s is back: reliable topics go on", name)
             self.outbound.back(peer)
         else:
-            pasts = self._pasts[name] = self._pasts.pop(name, {})
-            if len(self._pasts) > mesh_limits.ABSENT_PEERS_MAX:
-                self._pasts.popitem(last=False)
-            self.peers[peer] = PeerTopics(self._shared, self, session, pasts)
+            self.peers[peer] = PeerTopics(self._shared, self, session, self._pasts_of)
         super().link_up(session)
+
+    def _pasts_of(self, name: str) -> Pasts:
+        """What is remembered of the reliable sources of a module."""
+        pasts = self._pasts[name] = self._pasts.pop(name, {})
+        if len(self._pasts) > mesh_limits.ABSENT_PEERS_MAX:
+            self._pasts.popitem(last=False)
+        return pasts
 
     def link_down(self, session: PeerSession) -> None:
         """Suspend the peer's routes; after silence its sources stay in the local graph for ``SILENT_GRACE``."""
@@ -167,11 +172,11 @@ class Topics(GraphPart, TopicEvents):
         peer = session.peer
         super().gone(session)
         self.outbound.gone(peer)
+        self._freeing.append(self.imports.link_down(peer))
         topics = self.peers.pop(peer)
         self._mismatches.peer_gone(session.link.name)
         self.run(self.exports.link_down(peer))
         self._shared.relay.peer_gone(peer)
-        self._freeing.append(self.imports.link_down(peer))
         self.schedule()
         topics.close()
 
@@ -280,18 +285,13 @@ class Topics(GraphPart, TopicEvents):
 
     # --- effects of the exports --------------------------------------------------------------------------------
 
-    def add_route(self, source: Source, peer: int, route: ExportRoute) -> None:
+    def add_route(self, source: Source, peer: int, route: ExportRoute, begin: RouteBegin) -> None:
         """Begin to send a source's messages to a peer; first those that its contract or publisher keeps."""
         session = self._shared.sessions.get(peer)
         if session is None:
             return
-        try:
-            self.outbound.add_route(source, peer, route, session.link)
-            self.losses.tell_oversized(source, self.outbound.flows[source], peer)
-        except RemoteProtocolError as error:
-            # Caught here: the caller may be handling another peer's event. The next link gets a new numbering.
-            self.refuse(session, error)
-            asyncio.get_running_loop().call_soon(self.exports.end_route, source, peer)
+        self.outbound.add_route(source, peer, route, begin, session.link)
+        self.losses.tell_oversized(source, self.outbound.flows[source], peer)
 
     def suspend_route(self, source: Source, peer: int, outage: float) -> None:
         """Keep the unacknowledged and all further messages of a route for an absent peer, for a time in seconds."""
@@ -309,19 +309,45 @@ class Topics(GraphPart, TopicEvents):
     # --- effects of the imports --------------------------------------------------------------------------------
 
     def position(self, entry: RemoteTopic) -> tuple[int, int] | None:
-        """Epoch and last message of a reliable route that outlived its link, or ``None``."""
-        return topics.position(entry.wire) if (topics := self.peers.get(entry.peer)) is not None else None
+        """Epoch and last message of a source, behind which a route goes on, by this way or another; or ``None``."""
+        carrier = self.imports.carrier(entry)
+        topics = self.peers.get(carrier.peer) if carrier is not None else None
+        if carrier is None or topics is None or (topic := topics.topics.get(carrier.wire)) is None:
+            return None
+        if topic.flow is not None:
+            return topic.flow.position
+        return self.exports.position(Source(topic.topic, topic.node.name))  # a relay has what its peer has
 
     def publish(self, entry: RemoteTopic) -> None:
         """Publish a peer's source at its proxy, in a later turn of the loop."""
-        session, topics, source = self._shared.sessions.get(entry.peer), self.peers.get(entry.peer), entry.wire
+        session, topics = self._shared.sessions.get(entry.peer), self.peers.get(entry.peer)
         if session is not None and topics is not None:
-            name = self._shared.sessions.proxy_name(session, source.node, entry.origin)
-            place = (entry.name, name)
-            self._shared.relay.pass_on(session.peer, session.link.identity, source, place, entry.origin)
-            topic = PeerTopic(topics, entry)
-            session.proxies.hold(source.node, source, topic.ready, topic.left)
+            proxies, node = self._shared.sessions.proxies(session, entry.node, entry.origin)
+            self._pass_on(entry, session)
+            topics.publish(entry, proxies, node)
             self.direct_imports.shown(entry)
+
+    def moved(self, old: RemoteTopic, new: RemoteTopic) -> None:
+        """Let another way carry a source, whose proxy and subscribers stay."""
+        session, before = self._shared.sessions.get(new.peer), self.peers[old.peer]
+        if session is not None and (topic := before.held.get(old.wire)) is not None:
+            topic.move(self.peers[new.peer], new.wire)
+            self._pass_on(new, session)
+            self._shared.relay.gone(old.peer, old.wire)
+            self.direct_imports.hidden(old)
+            self.direct_imports.shown(new)
+            self.look((new.name,))
+
+    def path_changed(self, entry: RemoteTopic) -> None:
+        """Offer what is relayed with the path that it has now."""
+        if entry.shown and (session := self._shared.sessions.get(entry.peer)) is not None:
+            self._pass_on(entry, session)
+            self.look((entry.name,))
+
+    def _pass_on(self, entry: RemoteTopic, session: PeerSession) -> None:
+        name = self._shared.sessions.proxy_name(session, entry.node, entry.origin)
+        place = (entry.name, name)
+        self._shared.relay.pass_on(session.peer, session.link.identity, entry.wire, place, entry.origin)
 
     def retract(self, entry: RemoteTopic) -> None:
         """Remove a peer's source from the local graph: unregister it and close its sockets."""

@@ -20,7 +20,7 @@ from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Needs
 from rmpa.core.contract import Durability, Reliability
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.identity import serial_add
+from rmpa.core.identity import OWN_NODE, serial_add
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.node.publication import Publication, PublicationEvents
@@ -28,12 +28,13 @@ from rmpa.ros.wire.tcpros import TopicDescription, printable
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Mapping
+    from collections.abc import Awaitable, Callable, Mapping
 
     from rmpa.bridge.data.export import ExportFlow
     from rmpa.bridge.data.quality import QosEvent, QosWatch
     from rmpa.bridge.messages import RouteOpened
     from rmpa.bridge.offers import Effects
+    from rmpa.bridge.proxies import PeerProxies
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports
@@ -43,6 +44,10 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import RosReply
 
 _log = logging.getLogger(__name__)
+
+
+# What is remembered of the reliable sources of a module, by topic here and node there; see ``PeerTopics``.
+Pasts = dict[Source, tuple["QosWatch", str]]
 
 
 class TopicEvents:
@@ -70,26 +75,54 @@ class TopicEvents:
 
 
 class PeerTopic(PublicationEvents):
-    """One source of a peer at its proxy: the publication, and the flow of its route.
+    """One source at its proxy: the publication, and the flow of its route, whichever peer carries it.
 
     Args:
-        peer: All topics of the peer.
+        peer: All topics of the peer that carries it.
         entry: The source.
 
     Attributes:
         topic: The name in the local graph.
         flow: The flow of its route: the open one, or the one that outlived its link.
+        on_open: Called when its route is open, where this module has to pass it on since before.
     """
 
-    __slots__ = ("_peer", "flow", "node", "publication", "source", "topic", "type")
+    __slots__ = (
+        "_key",
+        "_pasts",
+        "_peer",
+        "flow",
+        "node",
+        "on_open",
+        "publication",
+        "release",
+        "source",
+        "topic",
+        "type",
+    )
 
     def __init__(self, peer: PeerTopics, entry: RemoteTopic) -> None:
         self._peer = peer
         self.source, self.type = entry.wire, entry.type
         self.topic = entry.name
+        # Where its events are remembered, by its names in its module and here: another peer may carry it next.
+        self._pasts = peer.pasts(entry.module[1])
+        self._key = Source(entry.name, entry.node if entry.origin is None else entry.origin.node)
         self.node: SlaveNode
         self.publication: Publication
+        self.release: Callable[[], None]
         self.flow: ImportFlow | None = None
+        self.on_open: Callable[[], object] | None = None
+
+    def move(self, peer: PeerTopics, source: Source) -> None:
+        """Let another peer carry it, which calls it ``source``."""
+        before, was = self._peer, self.source
+        before.held.pop(was, None)
+        registered = before.topics.pop(was, None)
+        self._peer, self.source = peer, source
+        peer.held[source] = self
+        if registered is not None:
+            peer.topics[source] = self
 
     # --- at the proxy ------------------------------------------------------------------------------------------
 
@@ -149,6 +182,11 @@ class PeerTopic(PublicationEvents):
 
     # --- the flow ----------------------------------------------------------------------------------------------
 
+    @property
+    def watch(self) -> QosWatch | None:
+        """The watch of its flow, or of the last one of a reliable source."""
+        return self.flow.watch if self.flow is not None else self._pasts.get(self._key, (None, ""))[0]
+
     def occurred(self, event: QosEvent) -> None:
         """An event of the contract."""
         self._peer.part.occurred(self._peer.session.peer, self.source, event)
@@ -168,21 +206,34 @@ class PeerTopic(PublicationEvents):
         The count of a reliable source goes on in any case. Where it cannot know what was lost, that is an event.
         """
         contract, flow, session = opened.contract, self.flow, self._peer.session
-        past, missed_at = self._peer.pasts.pop(self.source, (None, ""))
+        past, missed_at = self._pasts.pop(self._key, (None, ""))
         known = flow is not None
         if flow is not None and flow.contract.reliability is Reliability.RELIABLE:
             past, missed_at = flow.watch, self.topic
         reliable = contract.reliability is Reliability.RELIABLE
-        cut = flow is not None and not reliable
+        cut, had = known and not reliable, flow.position if flow is not None else None
+        continues = had is not None and had[0] == opened.epoch
         # An older agent does not number best-effort routes: their epoch is 0, and each begins anew.
         if flow is None or not flow.contract.same_route(contract) or not opened.epoch:
             if flow is not None:
                 flow.close()
-            past = past if reliable else None
-            time, counters = session.time, self._peer.counters
-            flow = ImportFlow(self.publication, contract, time, counters, self.occurred, self.torn, past)
-        self.flow, flow.contract = flow, contract
+            flow = ImportFlow(
+                self.publication,
+                contract,
+                session.time,
+                self._peer.counters,
+                self.occurred,
+                self.torn,
+                past if reliable else None,
+                numbering=flow.numbering if flow is not None and continues else None,
+                relays=self._peer.relays,
+            )
+        is_other = flow is not self.flow
+        self.flow, flow.contract, flow.link_time = flow, contract, session.time
         goes_on = flow.bind(session.link, opened.route, opened.epoch, opened.first)
+        renumbered = (is_other or not goes_on) and self.publication.description is not None
+        if self._peer.relays and renumbered and self.on_open is None:
+            self.publication.hang_up(OWN_NODE)  # what is relayed has other numbers from now on
         self.publication.bound(contract.queue_depth)
         if contract.durability is Durability.TRANSIENT_LOCAL:
             self.publication.keep(contract.kept)
@@ -198,6 +249,9 @@ class PeerTopic(PublicationEvents):
             flow.expect_replay(self.publication.latched)
         if opened.shared is True and not known:
             self.publication.join()
+        on_open, self.on_open = self.on_open, None
+        if on_open is not None:
+            on_open()
         return flow
 
     def end(self, *, missed: bool, gone: bool = True) -> None:
@@ -208,13 +262,13 @@ class PeerTopic(PublicationEvents):
             gone: Whether the source leaves the graph or its route has ended: lost liveliness does not wait for its
                 lease.
         """
-        flow, self.flow, pasts = self.flow, None, self._peer.pasts
+        flow, self.flow, pasts, key = self.flow, None, self._pasts, self._key
         if flow is None:
-            if not missed and self.source in pasts:
-                pasts[self.source] = pasts[self.source][0], ""
+            if not missed and key in pasts:
+                pasts[key] = pasts[key][0], ""
             return
         if flow.contract.reliability is Reliability.RELIABLE and (missed or flow.watch.counts):
-            pasts[self.source] = flow.watch, self.topic if missed else ""
+            pasts[key] = flow.watch, self.topic if missed else ""
             if len(pasts) > mesh_limits.LOSSES_REMEMBERED:
                 del pasts[next(iter(pasts))]
         if gone:
@@ -230,21 +284,23 @@ class PeerTopics:
         shared: What the parts share.
         part: Is told of demand, of listeners and of events.
         session: The peer: its proxies, its link with the handlers of its routes, and its time.
-        pasts: Of each reliable source of the module that had a flow and has none now: its watch, for its next flow,
-            and its topic while a local node listens, so that messages are missed. It outlives the session.
+        pasts: Returns, by the name of a module, of each of its reliable sources that had a flow and has none now: its
+            watch, for its next flow, and its topic while a local node listens, so that messages are missed.
 
     Attributes:
-        topics: Those that are registered.
+        held: Those that the peer carries, with their proxies.
+        topics: Those of them that are registered.
         flows: The flow of each open route, by its id.
     """
 
     def __init__(
-        self, shared: Shared, part: TopicEvents, session: PeerSession, pasts: dict[Source, tuple[QosWatch, str]]
+        self, shared: Shared, part: TopicEvents, session: PeerSession, pasts: Callable[[str], Pasts]
     ) -> None:
-        self.core, self.counters = shared.core, shared.counters
+        self.core, self.counters, self.relays = shared.core, shared.counters, shared.relay.enabled
         self.part = part
         self.session = session
         self.pasts = pasts
+        self.held: dict[Source, PeerTopic] = {}
         self.topics: dict[Source, PeerTopic] = {}
         self.flows: dict[int, ImportFlow] = {}
 
@@ -260,8 +316,15 @@ class PeerTopics:
 
     def watch(self, source: Source) -> QosWatch | None:
         """The watch of a source's flow, or of the last one of a reliable source."""
-        flow = self.flow(source)
-        return flow.watch if flow is not None else self.pasts.get(source, (None, ""))[0]
+        if (held := self.held.get(source)) is not None:
+            return held.watch
+        return self.pasts(self.session.link.name).get(source, (None, ""))[0]
+
+    def publish(self, entry: RemoteTopic, proxies: PeerProxies, node: str) -> None:
+        """Publish a source at the proxy of its node, in a later turn of the loop."""
+        topic = self.held[entry.wire] = PeerTopic(self, entry)
+        topic.release = lambda: proxies.release(node, topic.topic)
+        proxies.hold(node, topic.topic, topic.ready, topic.left)
 
     def position(self, source: Source) -> tuple[int, int] | None:
         """Epoch and last sequence from which a reliable source's next route continues; ``None``: it begins anew."""
@@ -272,7 +335,8 @@ class PeerTopics:
         """Retract a source: its data stops at once, its registration in a later turn of the loop."""
         if (topic := self.topics.get(source)) is not None:
             topic.end(missed=True)
-        self.session.proxies.release(source.node, source)
+        if (held := self.held.pop(source, None)) is not None:
+            held.release()
 
     def describe(self, source: Source, opened: RouteOpened) -> None:
         """Prepare for data on a newly opened route, and answer the waiting subscribers with its description."""
@@ -290,6 +354,7 @@ class PeerTopics:
             return
         if flow is not None and last is not None:
             flow.skip(serial_add(last, 1))
+            flow.numbering.complete = True
         topic.end(missed=missed and last is None)
         topic.publication.forget_latched()
 
@@ -310,9 +375,12 @@ class PeerTopics:
                 topic.register()
 
     def close(self) -> None:
-        """End all flows, and remember the events of the reliable ones; the publications go with the proxies."""
+        """Retract all topics, and remember the events of the reliable ones."""
         for topic in self.topics.values():
             topic.end(missed=True, gone=False)
+        for topic in self.held.values():
+            topic.release()
+        self.held.clear()
         for route in self.flows:
             self.session.link.routes.pop(route, None)
         self.flows.clear()

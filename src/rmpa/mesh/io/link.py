@@ -220,9 +220,9 @@ class Connection(ConnectionProtocol):
         finally:
             self._pings.pop(stamp, None)
 
-    def end(self, reason: str) -> None:
-        """Send a bye, wait at most ``limits.DRAIN_TIMEOUT`` for the last bytes to be sent, and close."""
-        self.close(reason, self.mesh.clock.now())
+    def end(self, reason: str, *, moves: bool = False) -> None:
+        """Send a bye, wait at most ``limits.DRAIN_TIMEOUT`` for the last bytes, and close; see ``close``."""
+        self.close(reason, self.mesh.clock.now(), moves=moves)
         self.flush()
 
     # --- what the machine reports -------------------------------------------------------------------------------

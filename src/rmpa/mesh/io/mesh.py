@@ -42,6 +42,9 @@ _ORDINARY: Final = frozenset({Refusal.ALREADY_LINKED, Refusal.MYSELF, Refusal.NO
 
 _TRUST: Final = frozenset(TrustReason)
 
+# Seconds that the byes of an agent with a new address are waited for; its links are made anew at once.
+MOVE_TIMEOUT: Final = 0.1
+
 
 def _log_refusal(peer: object, refuse: Refuse) -> None:
     """One line of a peer that refuses a link, with the code of the reason."""
@@ -111,8 +114,13 @@ class Mesh(LinkOwner):
         self._acceptor.start()
         self._act()
 
-    async def close(self) -> None:
-        """Send a bye on every connection, wait at most ``limits.DRAIN_TIMEOUT``, and close all sockets."""
+    async def close(self, *, moves: bool = False) -> None:
+        """Send a bye on every connection, wait at most ``limits.DRAIN_TIMEOUT``, and close all sockets.
+
+        Args:
+            moves: Whether this agent is back at once, at another address: the address of some connections may be gone
+                already, so that their byes have no answer, and are not waited for.
+        """
         self._acceptor.close()
         if not self._running:
             return
@@ -124,9 +132,9 @@ class Mesh(LinkOwner):
             await self._securing.close()
         await self._tasks.close()
         for connection in self.connections():
-            connection.end(f"{self.identity.name} ends")
+            connection.end(f"{self.identity.name} {'has another address' if moves else 'ends'}", moves=moves)
         if ends := [connection.over for connection in self.connections()]:
-            await asyncio.wait(ends, timeout=runtime_limits.DRAIN_TIMEOUT)
+            await asyncio.wait(ends, timeout=MOVE_TIMEOUT if moves else runtime_limits.DRAIN_TIMEOUT)
             for connection in self.connections():
                 connection.lost("the bye was not answered in time")
             await asyncio.wait(ends)
@@ -206,7 +214,8 @@ class Mesh(LinkOwner):
             self._peering.link_up(link.id, link.identity, now, dialled=link.dialled, endpoint=endpoint)
             self._act()
             return
-        of = next((link for link in self.links() if link.identity.is_same_run(connection.identity)), None)
+        there = (link for link in self.links() if link.guid.place == connection.identity.guid.place)
+        of = next((link for link in there if link.identity.is_same_run(connection.identity)), None)
         if of is None:
             connection.end("its express lane is gone")
             return
@@ -264,6 +273,7 @@ class Mesh(LinkOwner):
                 self.counters.add("link.discarded", discarded)
             needed = connection.keepalive.remote_lease <= limits.EXPRESS_LEASE  # that of a link at rest is longer
             self._peering.link_down(link.id, reason, now, silent=link.silent, needed=needed)
+            link.silent |= connection.moves
         self._act()
         self._links.pop(connection.id, None)
 

@@ -143,6 +143,10 @@ def peer_stages(snapshot: Snapshot, name: str) -> tuple[Check, ...]:
     peer, agent = find_peer(snapshot, name), snapshot.agent
     if peer is None and (strangers := _fitting(snapshot.strangers, name)):
         return (Check.from_message("peer", FAIL, f"{name} is {strangers[0].last_error}"),)
+    if peer is None and (relay := snapshot.lost.get(name)):
+        text = f"{name} was reached by way of {relay}, which does not pass on what it publishes any more"
+        remedy = f"start {relay} again or see `rmpa peer info {relay}`; or give {name} a link of its own"
+        return (Check("peer", FAIL, text, remedy),)
     if peer is None:
         known = [p.name for p in snapshot.peers]
         text = f"{agent.name} knows no peer {name!r} (domain {agent.domain}, looking on "
@@ -159,11 +163,19 @@ def peer_stages(snapshot: Snapshot, name: str) -> tuple[Check, ...]:
         return (_conflict(peer, FAIL),)
     if peer.state == "relayed":
         text = "another site" if peer.guid == OUTSIDE_GUID else f"known ({peer.guid})"
-        link = Check("link", OK, f"no link of its own; {peer.via} passes on what it publishes")
-        return (Check("peer", OK, f"{peer.name} is {text}"), link)
+        return (Check("peer", OK, f"{peer.name} is {text}"), _relay(peer, find_peer(snapshot, peer.via)))
     found = Check("peer", OK, f"{peer.name} is known, by {peer.source or 'its link'} ({peer.guid})")
     # Two peers of one name, say: both are linked.
     return (_conflict(peer, WARN) if peer.conflicts else found, _link(peer))
+
+
+def _relay(peer: PeerInfo, relay: PeerInfo | None) -> Check:
+    """Whether the relay by which a peer is reached is linked, as far as it is known."""
+    if relay is None or relay.state == "linked":
+        return Check("link", OK, f"no link of its own; {peer.via} passes on what it publishes")
+    text = f"no link of its own, and {peer.via}, which passes on what it publishes, is away"
+    remedy = f"see that {peer.via} runs and is reached, or give {peer.name} a link of its own"
+    return Check("link", FAIL, text, remedy)
 
 
 def _conflict(peer: PeerInfo, level: CheckLevel) -> Check:

@@ -259,21 +259,22 @@ class WhyService:
         if (session := self._session(peer)) is None:
             return
         topics, facts = self._bridge.topics, self._snapshots.topics
-        publishers, standing = self._core.publishers(topic), dict(session.proxies)
+        publishers = self._core.publishers(topic)
         facts.follow_clocks()
         for number, source in list(topics.imports.at(topic)):
             entry = topics.imports.get(number, source)
             if number != session.peer or entry is None or _instance(session, entry.origin) != peer.instance:
                 continue
             node, publication = source.node, topics.peers[session.peer].publication(source)
-            name = session.proxies.name(node)
+            proxies, owner = self._bridge.sessions.proxies(session, node, entry.origin)
+            name, proxy = proxies.name(owner), proxies.get(owner)
             links = publication.connections() if publication is not None else ()
             yield (
                 node,
                 Arrival(
                     route=facts.incoming(session, source, entry),
                     proxy=name,
-                    registered=node in standing and publishers.get(name) == standing[node].uri,
+                    registered=proxy is not None and publishers.get(name) == proxy.uri,
                     cause=entry.cause,
                     permission=self._permission(session.link.name, entry),
                     readers={at.number: (printable(at.other), at.waiting, at.dropped) for at in links},

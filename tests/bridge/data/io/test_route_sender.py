@@ -13,7 +13,6 @@ from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender, RouteSender
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, History, Reliability
-from rmpa.core.errors import RemoteProtocolError
 from rmpa.mesh import limits as mesh_limits
 from tests.bridge.io.doubles import Clock, Link, running
 
@@ -179,7 +178,7 @@ DEFAULT = (core_limits.ROUTE_QUEUE_MESSAGES, mesh_limits.ROUTE_QUEUE_AGE, mesh_l
 )
 def test_both_lanes_get_the_bounds(contract: Contract, terms: tuple[object, ...]) -> None:
     link = Link()
-    ExportFlow().add(1, link, 7, contract, 1)
+    ExportFlow().add(1, link, 7, contract)
     assert link.express.terms == link.bulk.terms == {7: terms}
 
 
@@ -262,7 +261,7 @@ def test_parts_go_as_they_come_once_the_lane_is_right() -> None:
 def test_aborted_message_uses_its_number() -> None:
     link, flow = Link(), ExportFlow()
     flow.large = True
-    sender = flow.add(1, link, 7, Contract(), 0)
+    sender = flow.add(1, link, 7, Contract())
     answer(link, sender)
     flow.begin(BIG)
     flow.part(memoryview(bytes(10)))
@@ -370,13 +369,6 @@ def test_bulk_lost_on_the_way_back_uses_the_express_lane(clock: Clock) -> None:
     assert link.log == [("bulk", "discard", 7)] + [
         ("express", "message", 7, number) for number in range(101, ROW + 2)
     ]
-
-
-def test_acknowledgement_of_unsent_messages_is_an_error() -> None:
-    _, sender = fresh(reliable)
-    sender.message(0, SMALL)
-    with pytest.raises(RemoteProtocolError):
-        sender.acknowledged(2)
 
 
 def test_later_acknowledgement_outweighs_the_position() -> None:

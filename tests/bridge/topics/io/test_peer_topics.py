@@ -15,7 +15,7 @@ from rmpa.bridge.messages import Description, RouteOpened, Source
 from rmpa.bridge.proxies import PeerProxies, ProxyNodes
 from rmpa.bridge.sessions import AWAY_GRACE, PeerSession
 from rmpa.bridge.topics.imports import RemoteTopic
-from rmpa.bridge.topics.peer_topics import PeerTopic, PeerTopics
+from rmpa.bridge.topics.peer_topics import Pasts, PeerTopics
 from rmpa.core.contract import Contract, Durability, Reliability, Transport
 from rmpa.core.counters import Counters
 from rmpa.core.outbox import FIRST
@@ -91,13 +91,14 @@ class Proxied:
             join=lambda _topic, _connection: None,
             request=lambda *_: None,
         )
-        shared = SimpleNamespace(core=core, counters=Counters())
+        shared = SimpleNamespace(core=core, counters=Counters(), relay=SimpleNamespace(enabled=False))
         session = PeerSession(1, cast("Any", link), self.proxies)
-        self.topics = PeerTopics(cast("Any", shared), cast("Any", part), session, {})
+        pasts: Pasts = {}
+        self.topics = PeerTopics(cast("Any", shared), cast("Any", part), session, lambda _: pasts)
 
     async def publish(self) -> Publication:
-        topic = PeerTopic(self.topics, RemoteTopic(peer=1, wire=CMD, name=CMD.topic, node=CMD.node, type="a/B"))
-        self.proxies.hold(CMD.node, CMD, topic.ready, topic.left)
+        entry = RemoteTopic(peer=1, wire=CMD, name=CMD.topic, node=CMD.node, type="a/B", module=("", "b"))
+        self.topics.publish(entry, self.proxies, CMD.node)
         await asyncio.sleep(0.01)
         publication = self.topics.publication(CMD)
         assert publication is not None

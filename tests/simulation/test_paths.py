@@ -1,0 +1,30 @@
+"""Triangles and squares of modules and relays, with cables plugged and pulled at random.
+
+``make test-long`` plays eight times as many runs, and ten minutes of each.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.simulation.paths_scenario import play
+from tests.simulation.scenario import FACTOR
+
+BLOCK = 10
+
+
+@pytest.mark.parametrize("relays", [1, 2])
+@pytest.mark.parametrize("block", range(2 * FACTOR))
+def test_what_is_lost_is_told_and_nothing_comes_twice(block: int, relays: int) -> None:
+    for seed in range(block * BLOCK, (block + 1) * BLOCK):
+        play(seed, relays=relays)
+
+
+@pytest.mark.parametrize("seed", range(FACTOR))
+def test_ten_minutes_of_three_relays(seed: int) -> None:
+    play(1000 + seed, relays=3, seconds=600.0)
+
+
+def test_one_seed_gives_one_run() -> None:
+    first, second = (play(3, relays=2) for _ in range(2))
+    assert first == second
