@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-from rmpa.bridge.data.export import ReliableRouteSender, RouteSender
+from rmpa.bridge.data.route_sender import ReliableRouteSender, RouteSender
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import QueuedMessage

@@ -9,9 +9,10 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender
+from rmpa.bridge.data.export import ExportFlow
 from rmpa.bridge.data.reception import ImportFlow, LinkTime
 from rmpa.bridge.data.route import RouteBegin
+from rmpa.bridge.data.route_sender import ReliableRouteSender
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.counters import Counters
 from rmpa.core.identity import serial_add
@@ -22,7 +23,7 @@ from tests.simulation.mesh_peer import MeshPeer
 if TYPE_CHECKING:
     import random
 
-    from rmpa.bridge.data.export import RouteSender
+    from rmpa.bridge.data.route_sender import RouteSender
     from rmpa.mesh.io.link import PeerLink
 
 _RING: Final = bytes(range(256))

@@ -9,8 +9,8 @@ import math
 from itertools import chain
 from typing import TYPE_CHECKING, Any, cast
 
-from rmpa.bridge.data.export import ReliableRouteSender
 from rmpa.bridge.data.quality import PeerClockHistory, QosEventKind, shown_seconds
+from rmpa.bridge.data.route_sender import ReliableRouteSender
 from rmpa.bridge.direct.conditions import Condition, Want, unmet_by_contract
 from rmpa.bridge.direct.paths import AGENTS
 from rmpa.bridge.peer_offers import CONFLICT, CROWDED

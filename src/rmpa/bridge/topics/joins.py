@@ -24,7 +24,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits, messages
-from rmpa.bridge.data.export import RouteSender
+from rmpa.bridge.data.route_sender import RouteSender
 from rmpa.bridge.policy import Needs
 from rmpa.core.contract import Contract, History
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError

@@ -17,7 +17,8 @@ import logging
 from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge import limits
-from rmpa.bridge.data.export import ExportFlow, RelayedFlow, ReliableRouteSender
+from rmpa.bridge.data.export import ExportFlow, RelayedFlow
+from rmpa.bridge.data.route_sender import ReliableRouteSender
 from rmpa.bridge.messages import Audience, Description, Mismatch, Source, encode, is_crossing_name
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.bridge.topics.peer_topics import PeerTopic
@@ -36,8 +37,8 @@ from rmpa.runtime.loop import MachineTimer
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from rmpa.bridge.data.export import RouteSender
     from rmpa.bridge.data.route import RouteBegin
+    from rmpa.bridge.data.route_sender import RouteSender
     from rmpa.bridge.messages import Message
     from rmpa.bridge.offers import Effects
     from rmpa.bridge.policy import Relay

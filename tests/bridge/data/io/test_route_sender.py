@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
-from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender, RouteSender
+from rmpa.bridge.data.export import ExportFlow
+from rmpa.bridge.data.route_sender import ReliableRouteSender, RouteSender
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, History, Reliability
 from rmpa.mesh import limits as mesh_limits
