@@ -169,10 +169,11 @@ def state_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture(autouse=True)
-def clean_environment(monkeypatch: pytest.MonkeyPatch, state_home: Path) -> None:
+def clean_environment(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, state_home: Path) -> None:
     """Take the user's ROS and rmpa settings away, so that no test depends on them; nothing is kept in his home."""
     monkeypatch.setenv("XDG_STATE_HOME", str(state_home / str(next(_numbers))))
     for name in list(os.environ):
         if name.startswith(("ROS_", "RMPA_")) or name in _TAKEN:
             monkeypatch.delenv(name)
-    monkeypatch.setenv("PYTHONPATH", USER)
+    if _room(request.path) not in _ROOMS:  # those start no programs, and messages' types are searched there
+        monkeypatch.setenv("PYTHONPATH", USER)

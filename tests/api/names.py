@@ -20,7 +20,7 @@ MODULES: Final = ("rmpa", "rmpa.client", "rmpa.resource")
 _SPECIAL: Final = {"__aenter__", "__aiter__", "__enter__"}
 # What a node and its publishers, subscribers and services call of each other.
 _INSIDE: Final = {
-    *("ended", "first_subscriber", "key", "last_subscriber", "listeners_changed", "mismatch"),
+    *("ended", "first_subscriber", "join", "key", "last_subscriber", "listeners_changed", "mismatch"),
     *("register", "remove", "request", "serve", "withdraw"),
 }
 # Classes whose objects others make.

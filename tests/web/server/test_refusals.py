@@ -102,10 +102,10 @@ FOXGLOVE: Final[dict[str, tuple[str, dict[str, Any], bool]]] = {
     "subscribeConnectionGraph": ("", NOTHING, False),
     "unsubscribeConnectionGraph": ("", NOTHING, False),
 }
-# The ops of the pages; what "ask" asks says itself what it needs.
+# The ops of the pages; what "ask" asks says itself what it needs, and every page may stop what "stick" drives.
 MONITOR: Final = {
     "ack": "", "look": "", "watch": "subscribe", "unwatch": "", "ask": "", "log": "subscribe",
-    "drive": "drive", "release": "",
+    "drive": "drive", "release": "", "stick": "drive",
 }  # fmt: skip
 
 
