@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rmpa.core.identity import Guid, Identity
-from rmpa.discovery.discovery import Stranger
+from rmpa.discovery.packet_filter import Stranger
 from rmpa.observe.peer_info import judge_refusal, judge_stranger
 from rmpa.observe.snapshot_builder import judge_strangers
 from rmpa.trust.permissions import MemberInfo, TrustReason, TrustStatus

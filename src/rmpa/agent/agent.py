@@ -283,9 +283,6 @@ def is_displaced(ours: IPv4Address, everything: tuple[Interface, ...], wanted: t
     return ours.is_loopback or ours not in kept
 
 
-# --- What the user is told at the start about settings of permissions that do not do what they seem to --------------
-
-
 def permission_notes(settings: Settings, *, secured: bool) -> Iterator[str]:
     """The warnings, each ready to read.
 
@@ -315,8 +312,6 @@ def _asking_for_direct(settings: Settings) -> list[str]:
         asked.append("[services]")
     return asked
 
-
-# --- the ROS core of an agent: an embedded one, or a roscore that runs already ---
 
 # Seconds in which a program that has the core's port says whether it is a ROS master.
 _ASKED: Final = 1.0

@@ -49,8 +49,9 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.core.counters import Counters, Yielder
     from rmpa.core.identity import Identity
-    from rmpa.discovery.discovery import Discovery, Stranger
+    from rmpa.discovery.discovery import Discovery
     from rmpa.discovery.endpoints import PeerView
+    from rmpa.discovery.packet_filter import Stranger
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.mesh import Mesh

@@ -9,7 +9,8 @@ from rmpa.core.counters import Counters
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.discovery.discovery import BEACONS_UNPROVED_PAUSE, STRANGER_KEPT, PacketFilter
+from rmpa.discovery.discovery import BEACONS_UNPROVED_PAUSE
+from rmpa.discovery.packet_filter import STRANGER_KEPT, PacketFilter
 from rmpa.trust import limits as trust_limits
 from rmpa.trust.packets import GroupKey, KeyRing, PacketTrust
 from rmpa.trust.permissions import TrustReason

@@ -284,8 +284,6 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         if not topics[entry.name]:
             del topics[entry.name]
 
-    # --- what is shown -------------------------------------------------------------------------------------------
-
     def local_type(self, topic: str, type_name: str | None) -> None:
         """Set the type with which local nodes publish a topic; ``None`` if none publishes it.
 
@@ -485,8 +483,6 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             self._judge_at(peer, source)
         for waiting in known.admitted(self._out.context.settings.limits.nodes):
             self._judge(waiting)
-
-    # --- routes --------------------------------------------------------------------------------------------------
 
     def follow(self, entry: RemoteTopic, now: float) -> None:
         """Open, keep or close a source's route, by the facts of now; call it again whenever one has changed."""
