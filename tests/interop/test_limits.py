@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from lab.bed.processes import eventually
+from lab.bed.processes import DEADLINE
 from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from lab.bed.agents import Agent
@@ -40,10 +40,10 @@ def beyond(agent: Agent, peer: str) -> list[dict[str, Any]]:
 
 
 @pytest.fixture
-def dribblers() -> Iterator[list[int]]:
-    """Seven hundred connections to the port that is put into the list, each with a byte now and then."""
+def dribble() -> Iterator[Callable[[int], None]]:
+    """Makes seven hundred connections to a port, each with a byte now and then; returns when all have begun."""
     ports: list[int] = []
-    stop = threading.Event()
+    stop, all_begun = threading.Event(), threading.Event()
 
     def dial() -> socket.socket:
         made = socket.socket()
@@ -51,7 +51,7 @@ def dribblers() -> Iterator[list[int]]:
         made.connect_ex(("127.0.0.1", ports[0]))
         return made
 
-    def dribble() -> None:
+    def feed() -> None:
         while not ports and not stop.wait(0.01):
             pass
         begun: dict[socket.socket, bool] = {dial(): False for _ in range(700)} if ports else {}
@@ -66,18 +66,24 @@ def dribblers() -> Iterator[list[int]]:
                     one.close()
                     del begun[one]
                     begun[dial()] = False
+            if all(begun.values()):
+                all_begun.set()
         for one in begun:
             one.close()
 
-    thread = threading.Thread(target=dribble)
+    def begin(port: int) -> None:
+        ports.append(port)
+        assert all_begun.wait(DEADLINE)
+
+    thread = threading.Thread(target=feed)
     thread.start()
-    yield ports
+    yield begin
     stop.set()
     thread.join()
 
 
 def test_slow_connections_and_large_parameters(
-    agent: AgentFactory, shell: ShellFactory, dribblers: list[int], tmp_path: Path
+    agent: AgentFactory, shell: ShellFactory, dribble: Callable[[int], None], tmp_path: Path
 ) -> None:
     made = agent(name="core")
     ros = shell(port=made.core_port)
@@ -88,11 +94,11 @@ def test_slow_connections_and_large_parameters(
     assert "setParam /huge: 80000" in text, text[:500]
     assert "64 MiB" in text
 
-    dribblers.append(made.core_port)
-    eventually(lambda: "gave way to others" in made.process.output, 60.0, what="all places are taken")
+    dribble(made.core_port)
     slowest = 0.0
     for _ in range(5):
         begin = time.monotonic()
         assert "/rosout" in ros.tool("rostopic", "list")
         slowest = max(slowest, time.monotonic() - begin)
     assert slowest < 10.0, "it was refused, or waited for 10 s"
+    assert "gave way to others" not in made.process.output

@@ -90,33 +90,42 @@ def pip_environ(environ: dict[str, str], tmp_path: Path) -> dict[str, str]:
 
 
 @pytest.fixture(params=["bundle", "pip"])
-def program(request: pytest.FixtureRequest) -> tuple[Path, dict[str, str]]:
-    """The program as the bundle and as pip have it, and its environment."""
+def program(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[list[Path | str], dict[str, str]]:
+    """The program as the bundle and as pip have it, at home in a directory of the test, and its environment.
+
+    No variable leads it away from the home that the password database names, so it has one of its own.
+    """
+    script, environ = Path(sys.executable).with_name("rmpa"), "pip_environ"
     if request.param == "bundle":
-        return request.getfixturevalue("bundle") / "rmpa", request.getfixturevalue("environ")
-    script = Path(sys.executable).with_name("rmpa")
-    if not script.exists():
+        script, environ = request.getfixturevalue("bundle") / "rmpa", "environ"
+    elif not script.exists():
         pytest.skip("rmpa is not installed beside this Python")
-    return script, request.getfixturevalue("pip_environ")
+    users = tmp_path / "passwd"
+    users.write_text(f"root:x:0:0:root:{tmp_path / 'home'}:/bin/sh\n")
+    as_root = ["--map-root-user"] if os.geteuid() else []
+    bind = 'mount --bind "$0" /etc/passwd && exec "$@"'
+    return ["unshare", "--mount", *as_root, "sh", "-c", bind, users, script], request.getfixturevalue(environ)
 
 
 def test_agent_page_gateway_and_trust_are_deaf_and_hand_the_variables_on(
-    program: tuple[Path, dict[str, str]], tmp_path: Path
+    program: tuple[list[Path | str], dict[str, str]], tmp_path: Path
 ) -> None:
-    script, environ = program
+    command, environ = program
     local = ["--interface", "lo"]
     site = ["--site", "hall", "--listen", f"tcp/127.0.0.1:{free_port()}", "--insecure", *local]
     words = ["up", "--name", "a", "--core-port", str(free_port()), "--web", *local]
-    with Process([script, *words], env=environ, name="agent") as agent:
+    with Process([*command, *words], env=environ, name="agent") as agent:
         core = agent.wait_for("ROS_MASTER_URI=(\\S+)")[1]
-        _page_and_definitions(script, environ, agent, core, tmp_path)
-        with Process([script, "gateway", *site], env=environ, name="gateway") as gateway:
+        _page_and_definitions(command, environ, agent, core, tmp_path)
+        with Process([*command, "gateway", *site], env=environ, name="gateway") as gateway:
             gateway.wait_for("leads site hall")
             assert "poison" not in gateway.output + agent.output
-    run([script, "trust", "init", "--name", "a"], env=environ)
+    run([*command, "trust", "init", "--name", "a"], env=environ)
 
 
-def _page_and_definitions(script: Path, environ: dict[str, str], agent: Process, core: str, tmp_path: Path) -> None:
+def _page_and_definitions(
+    command: list[Path | str], environ: dict[str, str], agent: Process, core: str, tmp_path: Path
+) -> None:
     address = f"http://127.0.0.1:{environ['RMPA_WEB_PORT']}/metrics"
     page = eventually(lambda: _get(address), what="an answer of the page")
     assert "rmpa_" in page
@@ -126,19 +135,21 @@ def _page_and_definitions(script: Path, environ: dict[str, str], agent: Process,
     )
     for name in ("PYTHONPATH", "LD_LIBRARY_PATH", "PYTHONSTARTUP"):
         assert theirs[name] == environ[name]
-    assert "/rosout" in run([script, "topic", "list"], env=environ)
+    assert "/rosout" in run([*command, "topic", "list"], env=environ)
     module = tmp_path / "poison/my_msgs/msg/_Thing.py"
     module.parent.mkdir(parents=True)
     module.write_text('class Thing(object):\n  _type = "my_msgs/Thing"\n  _full_text = """int8 x"""\n')
     words = ["topic", "pub", "--master", core, "-1", "/thing", "my_msgs/Thing", "{x: 1}"]
-    run([script, *words], env=environ)
+    run([*command, *words], env=environ)
 
 
-def test_a_file_of_the_user_runs_and_has_the_variables(program: tuple[Path, dict[str, str]], tmp_path: Path) -> None:
-    script, environ = program
+def test_a_file_of_the_user_runs_and_has_the_variables(
+    program: tuple[list[Path | str], dict[str, str]], tmp_path: Path
+) -> None:
+    command, environ = program
     (tmp_path / "camera.py").write_text(NODE)
     options = ["--", "--interface", "lo", "--core-port", str(free_port())]
-    with Process([script, "run", tmp_path / "camera.py", "--no-state", *options], env=environ, name="run") as node:
+    with Process([*command, "run", tmp_path / "camera.py", "--no-state", *options], env=environ, name="run") as node:
         node.wait_for(f"the file has {re.escape(environ['PYTHONPATH'])}")
         node.wait_for("camera: active")
 

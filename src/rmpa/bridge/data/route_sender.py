@@ -6,6 +6,7 @@ It is called for each message from the publisher's read callback, by its flow (`
 from __future__ import annotations
 
 import asyncio
+import time
 from collections import deque
 from itertools import chain
 from typing import TYPE_CHECKING, Final
@@ -28,8 +29,9 @@ if TYPE_CHECKING:
 
     Keep = Callable[[bytes, int], object]
 
-# Nanoseconds: a link is silent for a second before it counts as lost; a connection that replaces it comes sooner.
-_RESENT_NS: Final = round(1.5 * mesh_limits.EXPRESS_LEASE * 1e9)
+# Nanoseconds: after a lease of silence the peer ends a link on which nothing comes, and after another one this side,
+# which may have heard the peer until then. Half as much again is for a busy machine.
+_RESENT_NS: Final = round(3 * mesh_limits.EXPRESS_LEASE * 1e9)
 _SMALL: Final = mesh_limits.EXPRESS_MESSAGE_MAX
 
 
@@ -52,7 +54,7 @@ class RouteSender:
 
     Attributes:
         _held: Sequence, stamp and bytes of messages that wait until the lane has changed, or for the next link.
-        _sent: Likewise, of the last messages that were sent.
+        _sent: When each of the last messages was sent, ns, and the same of it.
         _newest: Stamp and bytes of the message that down-sampling sends next.
         _direct: Whether ``message`` may take its short path for small messages.
         lapse: When a suspended route of best effort ends.
@@ -81,7 +83,7 @@ class RouteSender:
         self._switch = LaneSwitch(contract, large=large)
         self._held: deque[tuple[int, int, bytes]] = deque()
         self._held_bytes = 0
-        self._sent: deque[tuple[int, int, bytes]] = deque()
+        self._sent: deque[tuple[int, tuple[int, int, bytes]]] = deque()
         self._sent_bytes = 0
         self._downsampler = Downsampler(contract.max_rate) if contract.max_rate is not None else None
         self._newest: tuple[int, bytes] | None = None
@@ -161,7 +163,10 @@ class RouteSender:
     def suspend(self, keep: Keep | None = None) -> None:  # noqa: ARG002 - for reliable routes
         """Keep messages while the link is gone, within the bounds of the queue, until ``resume`` or ``close``."""
         self.link, self._direct = None, False
-        waiting, self._sent, self._held = chain(self._sent, self._held), deque(), deque()
+        if self.lapse is not None:
+            self.lapse.cancel()  # its link has ended before the peer opened the route
+        waiting = chain((message for _, message in self._sent), self._held)
+        self._sent, self._held = deque(), deque()
         self._sent_bytes = self._held_bytes = 0
         for message in waiting:
             self._hold(*message)
@@ -199,17 +204,17 @@ class RouteSender:
             return self._transmit(sequence, stamp_ns, framed)
         return self._hold(sequence, stamp_ns, bytes(framed))
 
-    def _transmit(self, sequence: int, stamp_ns: int, framed: Buffer) -> int:
-        """Sends a message, and keeps it for as long as the link may turn out to have been silent."""
-        sent = self._sent
-        sent.append((sequence, stamp_ns, bytes(framed)))
+    def _transmit(self, sequence: int, stamp_ns: int, framed: Buffer, now_ns: int | None = None) -> int:
+        """Sends a message, at its stamp or now, and keeps it while the link may prove to have been silent."""
+        sent, now_ns = self._sent, stamp_ns if now_ns is None else now_ns
+        sent.append((now_ns, (sequence, stamp_ns, bytes(framed))))
         self._sent_bytes += len(framed)
         while (
-            sent[0][1] < stamp_ns - _RESENT_NS
+            sent[0][0] < now_ns - _RESENT_NS
             or len(sent) > self._depth
             or (self._sent_bytes > self._max_bytes and len(sent) > 1)
         ):
-            self._sent_bytes -= len(sent.popleft()[2])
+            self._sent_bytes -= len(sent.popleft()[1][2])
         return self._lane.send(self.route, sequence, stamp_ns, framed)
 
     def _send_newest(self, downsampler: Downsampler) -> None:
@@ -233,10 +238,11 @@ class RouteSender:
     def _go_on(self) -> None:
         """Sends what has waited for the lane."""
         held, self._held, self._held_bytes = self._held, deque(), 0
+        now_ns = time.time_ns()
         for sequence, stamp_ns, payload in held:
             # A large message may have come during the change back to the express lane.
             if self._lane_for(len(payload)):
-                self._transmit(sequence, stamp_ns, payload)
+                self._transmit(sequence, stamp_ns, payload, now_ns)
             else:
                 self._hold(sequence, stamp_ns, payload)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from typing import TYPE_CHECKING, TypeVar
 
@@ -220,6 +221,26 @@ def test_what_was_sent_long_ago_is_not_kept() -> None:
     sender.message(10**10, b"")
     sender.suspend()
     assert sender.following == 2
+
+
+def test_what_was_sent_within_both_leases_is_kept() -> None:
+    sender = RouteSender(Link(), 7, Contract())
+    sender.message(0, b"")
+    sender.message(round(2.5 * mesh_limits.EXPRESS_LEASE * 1e9), b"")
+    sender.suspend()
+    assert sender.following == 1
+
+
+def test_what_was_sent_again_counts_from_then_on_for_a_further_cut() -> None:
+    sender = RouteSender(Link(), 7, Contract())
+    long_ago = time.time_ns() - 10**10
+    for _ in range(2):
+        sender.message(long_ago, b"")
+        sender.suspend()
+        sender.resume(Link(), 8, 0)
+    sender.message(time.time_ns(), b"")
+    sender.suspend()
+    assert sender.following == 1
 
 
 def test_sequences_wrap() -> None:
