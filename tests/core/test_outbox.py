@@ -49,10 +49,10 @@ def test_dropping_stays_cheap_with_many_keys() -> None:
         for key in range(keys):
             box.push(b"x", key)
             box.push(b"x", key)
-        started = time.perf_counter()
+        started = time.process_time()
         for _ in range(2000):
             box.push(b"x", 0)
-        return time.perf_counter() - started
+        return time.process_time() - started
 
     assert min(cost(4000) for _ in range(3)) < 20 * min(cost(10) for _ in range(3)) + 0.01
 
