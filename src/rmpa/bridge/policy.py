@@ -228,9 +228,9 @@ class PermissionGate:
                 return own
         return decision
 
-    def judge_all(self, access: Access, whom: str, name: str) -> PermissionDecision | None:
+    def judge_all(self, access: Access, askers: str, name: str) -> PermissionDecision | None:
         """The decision that holds for all modules and sites alike, as ``Permissions.judge_all`` says."""
-        return _WITHOUT_TRUST if self.permissions is None else self.permissions.judge_all(access, whom, name)
+        return _WITHOUT_TRUST if self.permissions is None else self.permissions.judge_all(access, askers, name)
 
     def may_relay(self, relay: str) -> bool:
         """Whether a peer may pass on what others offer."""

@@ -100,15 +100,15 @@ class Permissions:
             return PermissionDecision(True, 'no [[permission]] fits, and trust.default = "allow"')
         return PermissionDecision(False, f"no [[permission]] lets {asker_name(module)} {_DONE[access]} {name}")
 
-    def judge_all(self, access: Access, whom: str, name: str) -> PermissionDecision | None:
+    def judge_all(self, access: Access, askers: str, name: str) -> PermissionDecision | None:
         """The decision about a name that holds for all modules alike, however they are called; ``None``: it differs.
 
         Args:
             access: What they would do.
-            whom: What the text calls them, which is no name of a module: ``any other site``.
+            askers: What the text calls them, which is no name of a module: ``any other site``.
             name: As for ``judge``.
         """
-        common = self.judge(access, whom, name)
+        common = self.judge(access, askers, name)
         if not common.allowed and common.number is not None:
             return common  # a denial to all
         other = Effect.DENY if common.allowed else Effect.ALLOW
@@ -148,12 +148,12 @@ class Permissions:
 
     def _globs(self, number: int, rule: PermissionRule, module: str) -> Iterator[tuple[Access, str, str]]:
         """The globs of one rule, if it is about a module: the access, the glob, and the rule as text."""
-        whom = self._fit(rule, module)
-        if whom is None:
+        askers = self._fit(rule, module)
+        if askers is None:
             return
         verb = "allows" if rule.effect is Effect.ALLOW else "denies"
         for key, written in _globs(rule):
-            text = f"[[permission]] {number} {verb} {key} of {written!r} to {whom}"
+            text = f"[[permission]] {number} {verb} {key} of {written!r} to {askers}"
             for access, glob in _accesses(key, written.replace(PEER, module)):
                 yield access, glob, text
 
