@@ -139,11 +139,26 @@ def test_a_spared_key_loses_nothing_to_the_bound_of_all_keys() -> None:
 
 def test_age_counts_only_above_so_many_bytes() -> None:
     box = Outbox(10, 1000)
-    box.set_terms(1, 10, 0.5, above=20)
+    box.set_terms(1, 10, 0.1, above=20)
+    box.head(now=1.0)
     for _ in range(4):
         box.push(bytes(10), 1, 1.0)
-    assert sum(map(len, box.head(now=9.0))) == 20
+    assert sum(map(len, box.head(now=1.2))) == 20
     assert box.expired == {1: 2}
+
+
+def test_what_a_standstill_has_delayed_is_not_old_but_what_a_slow_socket_delays_is() -> None:
+    box = Outbox(1000, 1000)
+    box.set_terms(1, 1000, 0.5)
+    for _ in range(64 * 3):
+        box.push(bytes(1), 1, 1.0)
+    assert len(box.head(now=1.1)) == 64
+    box.consumed(64)
+    assert len(box.head(now=9.0)) == 64, "nothing was taken for eight seconds"
+    box.consumed(64)
+    for tenth in range(1, 7):
+        box.consumed(sum(map(len, box.head(1, now=9.0 + tenth / 10))))
+    assert box.expired == {1: 64 - 6}
 
 
 def test_of_a_strict_key_all_that_is_too_old_goes() -> None:

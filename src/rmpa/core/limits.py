@@ -72,6 +72,9 @@ PEERS_MAX: Final = 4096
 FRAGMENT_BYTES: Final = 128 * KIB
 # Waiting bytes that are committed for one write: nothing overtakes them, and they are not dropped.
 COMMIT_BYTES: Final = 64 * KIB
+# Seconds without a byte that the socket takes, after which it has stood still: the age of what waits begins anew.
+# Shorter than the age at which messages are dropped; longer than the pauses of a socket at 2 Mbit/s.
+STANDSTILL: Final = 0.3
 # [Messages] Messages of one topic that wait for a slow link (`depth` of `[[contract]]`)
 # At it: the oldest is dropped
 # Told in: `topic info`, `why` (*sent*), diagnostics

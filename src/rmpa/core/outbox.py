@@ -127,6 +127,7 @@ class Outbox:
         self.urgent_bytes = 0
         self._data_bytes = 0
         self._begun_bytes = 0
+        self._moved = self._standstill_end = 0.0
         self.dropped: Counter[int] = Counter()
         self.expired: Counter[int] = Counter()
 
@@ -155,8 +156,9 @@ class Outbox:
             key: The key.
             max_entries: Entries that may wait.
             max_age: Seconds that an entry may wait; ``None``: no bound.
-            strict: Whether the newest entry is dropped too when it is too old (a lifespan); otherwise the newest
-                entry is always sent.
+            strict: Whether the newest entry is dropped too when it is too old (a lifespan). Otherwise the newest
+                entry is always sent, and age counts from the end of the socket's last standstill: what a cut has
+                delayed is not what a slow socket delays.
             above: Bytes of this key's entries up to which none is dropped for its age.
             spared: Whether ``max_bytes`` never drops an entry of this key, because its owner bounds the bytes.
         """
@@ -318,6 +320,10 @@ class Outbox:
             max_parts: The most parts to return.
             now: Monotonic seconds, against which ages are judged; 0: no entry is dropped for its age.
         """
+        if now:
+            if now - self._moved > limits.STANDSTILL:
+                self._standstill_end = now
+            self._moved = now
         while len(self._committed) < max_parts and self._committed_bytes < limits.COMMIT_BYTES:
             if not self._commit(now):
                 break
@@ -508,10 +514,10 @@ class Outbox:
         bounds = queue.bounds
         if bounds.max_age is None:
             return
-        kept = 0 if bounds.strict else 1
+        kept, since = (0, 0.0) if bounds.strict else (1, self._standstill_end)
         while len(queue.messages) > kept and queue.size > bounds.above:
             message = queue.messages[0]
-            if message.sent or message.pinned or now - message.born <= bounds.max_age:
+            if message.sent or message.pinned or now - max(message.born, since) <= bounds.max_age:
                 return
             queue.messages.popleft()
             self._release(queue, message)

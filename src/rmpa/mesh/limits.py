@@ -116,12 +116,14 @@ UNPROVEN_RATE: Final = 500.0
 # At it: the oldest message of the topic with the most bytes is dropped, reliable ones last
 # Told in: `topic info`, `why` (*sent*), diagnostics
 LANE_QUEUE_BYTES: Final = 64 * MIB
-# [Messages] Time for which a message of a topic without a `depth` waits for a slow link while more than 4 MiB do
+# [Messages] Time for which a message of a topic without a `depth` waits for a slow link while more than 256 KiB do
 # At it: it is dropped
 # Told in: `topic info`, `why` (*sent*), diagnostics
-# Why: A burst may take its time, and where the link is too slow for an image topic the images stay fresh.
+# Why: Where the link is too slow for an image topic the images stay fresh. What a cut has delayed is not counted.
 ROUTE_QUEUE_AGE: Final = 0.5
-# [Messages] Bytes of a topic without a `depth` that wait for longer, or for a silent peer
+# Bytes of a topic without a `depth` that may wait for longer than that: a second at 2 Mbit/s.
+ROUTE_BURST_BYTES: Final = 256 * KIB
+# [Messages] Bytes of a topic without a `depth` that wait for a silent peer
 # At it: the oldest is dropped
 # Told in: `topic info`, `why` (*sent*), diagnostics
 # Why: As many as a TCP connection of a ROS node holds in the kernel.

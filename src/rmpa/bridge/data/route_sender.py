@@ -296,7 +296,7 @@ class RouteSender:
     def _set_bounds(self, link: PeerLink) -> None:
         lifespan, above = self.contract.lifespan, 0
         if lifespan is None and self._max_bytes < mesh_limits.LANE_QUEUE_BYTES:
-            lifespan, above = mesh_limits.ROUTE_QUEUE_AGE, self._max_bytes
+            lifespan, above = mesh_limits.ROUTE_QUEUE_AGE, mesh_limits.ROUTE_BURST_BYTES
         for lane in (link.express, link.bulk):
             lane.set_terms(self.route, self._depth, lifespan, above=above)
 

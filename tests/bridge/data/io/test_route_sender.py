@@ -161,7 +161,7 @@ def test_bulk_lost_without_a_fence_keeps_what_waits() -> None:
     assert link.log == [("bulk", "message", 7, 2)]
 
 
-DEFAULT = (core_limits.ROUTE_QUEUE_MESSAGES, mesh_limits.ROUTE_QUEUE_AGE, mesh_limits.ROUTE_QUEUE_BYTES, False)
+DEFAULT = (core_limits.ROUTE_QUEUE_MESSAGES, mesh_limits.ROUTE_QUEUE_AGE, mesh_limits.ROUTE_BURST_BYTES, False)
 
 
 @pytest.mark.parametrize(
