@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from rmpa.core.counters import SampleSummary
+    from rmpa.core.statistics import SampleSummary
 
 WIDTH, HEIGHT = 32, 11
 """The trail's drawing, in characters."""

@@ -9,7 +9,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rmpa.core.counters import SampleSummary
+from rmpa.core.statistics import SampleSummary
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

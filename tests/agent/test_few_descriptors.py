@@ -20,8 +20,9 @@ import pytest
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge import proxies as proxy_nodes
-from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import StartError, UnreachableError
+from rmpa.core.log import RefusalLog
+from rmpa.core.statistics import Counters
 from rmpa.observe.control_client import ControlClient
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.core import liveness

@@ -22,8 +22,8 @@ from rmpa.bridge.rpc import PeerRpc
 from rmpa.config.peer_rules import Effect, PermissionRule
 from rmpa.config.rules import FollowRule
 from rmpa.config.settings import ParamSettings, Settings, TimeSettings, TrustSettings
-from rmpa.core.counters import Counters
 from rmpa.core.errors import LimitExceeded, PeerRefused, RmpaError, UnreachableError
+from rmpa.core.statistics import Counters
 from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.parameters import leaves
 from rmpa.trust.permissions import Permissions

@@ -31,8 +31,8 @@ from rmpa.config.peer_rules import Access, Effect, PeerRule, PermissionRule, Pol
 from rmpa.config.read import load_settings
 from rmpa.config.settings import ServiceSettings, TimeSettings, TrustSettings
 from rmpa.core.contract import Contract, Contracts
-from rmpa.core.counters import Counters
 from rmpa.core.identity import NEVER_CROSSING
+from rmpa.core.statistics import Counters
 from rmpa.ros.wire.tcpros import ServiceDescription
 from rmpa.trust.permissions import Permissions
 from tests.bridge.recorder import (

@@ -19,8 +19,8 @@ from rmpa.bridge.sessions import AWAY_GRACE, Part, PeerSession, PeerSessions, Pe
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
 from rmpa.config.settings import TrustSettings
-from rmpa.core.counters import Counters
 from rmpa.core.identity import Guid, Identity
+from rmpa.core.statistics import Counters
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node import listeners as shared_listener

@@ -15,8 +15,8 @@ from rmpa.cli.messages import fill_stamps, flatten, pick, read_values, shorten, 
 from rmpa.cli.output import Painted, Table, duration, print_error, print_text, printable, size, warn
 from rmpa.cli.topic import facts
 from rmpa.core import errors
-from rmpa.core.counters import _Formatter
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
+from rmpa.core.log import _Formatter
 from rmpa.observe.snapshot import RouteInfo
 from tests.observe.samples import DIRECT
 

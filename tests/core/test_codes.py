@@ -13,8 +13,9 @@ import pytest
 
 import rmpa
 from rmpa.core import codes
-from rmpa.core.counters import Counters, RefusalLog, configure_logging
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
+from rmpa.core.log import RefusalLog, configure_logging
+from rmpa.core.statistics import Counters
 
 SRC = Path(rmpa.__path__[0])
 CODES = codes.texts()

@@ -18,18 +18,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core import limits
-from rmpa.core.counters import (
-    LOG_INTERVAL,
-    Backoff,
-    Counters,
-    RefusalLog,
-    SampleSummary,
-    TimerQueue,
-    TokenBucket,
-    _room_of,
-    configure_logging,
-    percentile,
-)
+from rmpa.core.log import LOG_INTERVAL, RefusalLog, _room_of, configure_logging
+from rmpa.core.statistics import Counters, SampleSummary, percentile
+from rmpa.core.timers import Backoff, TimerQueue, TokenBucket
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -144,7 +135,7 @@ def test_a_line_to_escape_is_written_without_file_descriptors() -> None:
     """The codec's module was loaded at its first use: asyncio's line about too many open files never came."""
     script = (
         "import logging, resource, sys\n"
-        "from rmpa.core.counters import configure_logging\n"
+        "from rmpa.core.log import configure_logging\n"
         "configure_logging('info', sys.stderr, as_json=False)\n"
         "resource.setrlimit(resource.RLIMIT_NOFILE, (3, 3))\n"
         "logging.error('too many\\nopen files')\n"

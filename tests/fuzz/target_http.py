@@ -7,8 +7,8 @@ import contextlib
 import socket
 from typing import TYPE_CHECKING
 
-from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.statistics import Counters
 from rmpa.ros.http.server import HttpConnection, XmlRpcServer
 from rmpa.ros.wire.http import ResponseParser
 from rmpa.ros.wire.xmlrpc import serialize_call, serialize_response

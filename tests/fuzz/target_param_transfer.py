@@ -12,8 +12,8 @@ from rmpa.bridge.messages import Message, Request, Response
 from rmpa.bridge.params import rules as transfer
 from rmpa.bridge.params.rules import key_problem
 from rmpa.bridge.rpc import LinkRequests, PeerRpc
-from rmpa.core.counters import Counters
 from rmpa.core.errors import RmpaError
+from rmpa.core.statistics import Counters
 from rmpa.ros.master.parameters import leaves
 from tests.bridge.services.test_calls import Wire
 

@@ -6,10 +6,10 @@ from typing import Any
 
 from rmpa.bridge.data.reception import ImportFlow, LinkTime
 from rmpa.core.contract import Contract, Reliability
-from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.core.statistics import Counters
 from rmpa.mesh.frames import WHOLE, Frame, FrameKind, Hello
 from rmpa.ros import limits
 from tests.mesh.worlds import ACCEPTOR, AnyRoute, Side, Time

@@ -7,7 +7,7 @@ from rmpa.bridge.policy import PermissionGate
 from rmpa.config.peer_rules import Access, Effect, PermissionRule, PolicySettings
 from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.config.settings import ServiceSettings, Settings, TrustSettings
-from rmpa.core.counters import Counters
+from rmpa.core.statistics import Counters
 from rmpa.gateway.rules import CrossingDecision, CrossingRules, ForeignSource, MeshSource, SourceKind
 from rmpa.trust.permissions import Permissions
 

@@ -11,7 +11,7 @@ import pytest
 
 from lab.bed.agents import Agent
 from lab.bed.processes import DEADLINE, eventually, run
-from rmpa.core.counters import Counters
+from rmpa.core.statistics import Counters
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.listeners import SharedListener
 from rmpa.ros.node.publication import Publication

@@ -21,8 +21,8 @@ from rmpa.bridge.proxies import PeerProxies, ProxyNodes
 from rmpa.bridge.sessions import PeerSession
 from rmpa.bridge.topics.imports import RemoteTopic
 from rmpa.bridge.topics.peer_topics import Pasts, PeerTopics, TopicEvents
-from rmpa.core.counters import Counters
 from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.core.statistics import Counters
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.rpc import call_api

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core.counters import configure_logging
+from rmpa.core.log import configure_logging
 from rmpa.runtime import limits
-from rmpa.runtime.process import LogWriter
+from rmpa.runtime.log_writer import LogWriter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

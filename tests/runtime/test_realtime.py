@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.runtime import process as realtime
+from rmpa.runtime import realtime
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,7 +21,7 @@ NOBODY: Final = 65534
 
 CHILD: Final = """
 import json, os, resource, sys, threading
-from rmpa.runtime import process as realtime
+from rmpa.runtime import realtime
 
 def who(tid=0):
     return os.sched_getscheduler(tid) & ~os.SCHED_RESET_ON_FORK, os.sched_getparam(tid).sched_priority

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from rmpa.runtime.process import restart_text, watchdog_period
+from rmpa.runtime.systemd import restart_text, watchdog_period
 
 # An event loop that hangs at SIGUSR1.
 _PROGRAM = """
 import asyncio, signal, time
-from rmpa.runtime.process import feed_watchdog, notify_service_manager
+from rmpa.runtime.systemd import feed_watchdog, notify_service_manager
 
 async def main():
     loop = asyncio.get_running_loop()
@@ -35,7 +35,7 @@ asyncio.run(main())
 # It has no descriptor left after the first sign of life.
 _OUT_OF_DESCRIPTORS = """
 import asyncio, resource
-from rmpa.runtime.process import feed_watchdog
+from rmpa.runtime.systemd import feed_watchdog
 
 async def main():
     feed_watchdog(asyncio.get_running_loop())

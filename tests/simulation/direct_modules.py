@@ -18,8 +18,8 @@ from rmpa.bridge.policy import OPEN_GATE
 from rmpa.bridge.topics import direct as direct_importer
 from rmpa.bridge.topics.direct import TopicPaths
 from rmpa.core.contract import Contracts, Transport
-from rmpa.core.counters import Counters
 from rmpa.core.errors import UnreachableError
+from rmpa.core.statistics import Counters
 from rmpa.ros.master.parameters import RegistrationKind
 from tests.simulation.network import Trace
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from ipaddress import IPv4Address
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.counters import earliest
 from rmpa.core.identity import Guid, Identity
+from rmpa.core.timers import earliest
 from rmpa.discovery.membership import RESTARTED, MembershipProtocol
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import Hello

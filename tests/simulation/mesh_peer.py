@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, cast
 
 from rmpa.config.settings import LaneSettings
-from rmpa.core.counters import Counters
+from rmpa.core.statistics import Counters
 from rmpa.mesh.io.dial import Dialler
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh

@@ -14,8 +14,8 @@ from rmpa.bridge.data.reception import ImportFlow, LinkTime
 from rmpa.bridge.data.route import RouteBegin
 from rmpa.bridge.data.route_sender import ReliableRouteSender
 from rmpa.core.contract import Contract, Priority, Reliability
-from rmpa.core.counters import Counters
 from rmpa.core.identity import serial_add
+from rmpa.core.statistics import Counters
 from rmpa.mesh.frames import FrameKind
 from tests.bridge.io.doubles import Outlet
 from tests.simulation.mesh_peer import MeshPeer

@@ -13,7 +13,7 @@ import msgspec
 from rmpa.core.errors import RmpaError
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
-from rmpa.web.gateways.frame_writer import FairQueue, Opcode
+from rmpa.web.clients.frame_writer import FairQueue, Opcode
 from rmpa.web.hub.graph import GraphService, GraphTopic
 from rmpa.web.hub.hub import HubClient
 from rmpa.web.hub.node_link import EVERYTHING
@@ -22,8 +22,8 @@ from rmpa.web.hub.topics import ReceivedMessage
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.web.gateways.connection import ClientStream
-    from rmpa.web.gateways.frame_writer import OutFrame
+    from rmpa.web.clients.connection import ClientStream
+    from rmpa.web.clients.frame_writer import OutFrame
 
 NOW_NS = 1_700_000_000_000_000_123
 

@@ -25,9 +25,9 @@ from rmpa.bridge.services.part import Services
 from rmpa.config.module_name import core_file
 from rmpa.core import limits
 from rmpa.core.contract import Transport
-from rmpa.core.counters import Counters
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.core.identity import OWN_NODE, Guid, Identity, is_own
+from rmpa.core.statistics import Counters
 from rmpa.discovery.discovery import Discovery
 from rmpa.discovery.network import choose, further_addresses, list_interfaces, pick_address
 from rmpa.mesh.io.link import LinkHandlers
@@ -47,11 +47,11 @@ from rmpa.ros.http.rpc import call_api, is_own_name
 from rmpa.ros.http.server import listen
 from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.node.slave_node import LoggerServices
-from rmpa.runtime import process as garbage_collector
+from rmpa.runtime import realtime
 from rmpa.runtime.accept import Use, open_mesh_port
 from rmpa.runtime.kernel_tcp import may_end_connections
 from rmpa.runtime.loop import SystemClock
-from rmpa.runtime.process import unit_of
+from rmpa.runtime.systemd import unit_of
 from rmpa.runtime.tasks import start_task
 from rmpa.trust.permissions import Permissions
 
@@ -503,8 +503,8 @@ class Agent:
             await self.network.start()
             undo.push_async_callback(self.network.close)
             await self.control.start()
-            garbage_collector.take_over()
-            undo.callback(garbage_collector.give_back)
+            realtime.freeze_heap()
+            undo.callback(realtime.thaw_heap)
             self._undo = undo.pop_all()
         _log.info("= ROS_MASTER_URI=%s", shown_uri(self.core.uri))
         self.network.warn_if_open()

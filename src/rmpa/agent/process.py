@@ -23,16 +23,16 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
 
 from rmpa import __version__
 from rmpa.config.settings import SETTINGS
-from rmpa.core.counters import Backoff, remedy
 from rmpa.core.errors import ConfigError, RmpaError, StartError
+from rmpa.core.timers import Backoff
 from rmpa.observe.control import ReloadReply
 from rmpa.observe.control_client import runtime_dir
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime import process as realtime
-from rmpa.runtime.accept import is_shortage, raise_file_limit
+from rmpa.runtime import realtime
+from rmpa.runtime.accept import is_shortage, open_files_advice, raise_file_limit
 from rmpa.runtime.interpreter import own_command
 from rmpa.runtime.loop import AgentLoop
-from rmpa.runtime.process import SERVICE_VARIABLES, feed_watchdog, notify_service_manager
+from rmpa.runtime.systemd import SERVICE_VARIABLES, feed_watchdog, notify_service_manager
 from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 
 if TYPE_CHECKING:
@@ -458,7 +458,7 @@ def run_process(
     except OSError as error:
         if is_shortage(error):
             raise StartError(
-                f"agent {settings.name}", "no file descriptors left", remedy(), code="out-of-descriptors"
+                f"agent {settings.name}", "no file descriptors left", open_files_advice(), code="out-of-descriptors"
             ) from error
         raise
     return 0

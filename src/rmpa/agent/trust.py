@@ -21,7 +21,6 @@ from rmpa.bridge.messages import convert
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.sessions import Part
 from rmpa.config.module_name import state_dir
-from rmpa.core.counters import Backoff, RefusalLog, TokenBucket
 from rmpa.core.errors import (
     ConfigError,
     PeerRefused,
@@ -31,8 +30,10 @@ from rmpa.core.errors import (
     UnreachableError,
     missing_extra,
 )
+from rmpa.core.log import RefusalLog
+from rmpa.core.timers import Backoff, TokenBucket
 from rmpa.discovery.network import list_interfaces
-from rmpa.runtime.process import restart_text
+from rmpa.runtime.systemd import restart_text
 from rmpa.runtime.tasks import end_tasks, keep_task
 from rmpa.trust import limits
 from rmpa.trust.permissions import (

@@ -19,9 +19,10 @@ from rmpa.bridge.sessions import Part, PeerSessions, call_each, guarded
 from rmpa.bridge.shared import Shared
 from rmpa.bridge.topics.part import Topics
 from rmpa.config.peer_rules import Access
-from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import OWN_NODE, is_global_name, is_own, matches
+from rmpa.core.log import RefusalLog
+from rmpa.core.statistics import Counters
 from rmpa.mesh.frames import FrameKind
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.runtime.loop import SystemClock, call_at_tick, yield_to_data

@@ -13,8 +13,8 @@ from rmpa.bridge import limits
 from rmpa.bridge.messages import Advertise, AdvertiseServices, decode, encode
 from rmpa.bridge.offers import Effects
 from rmpa.bridge.sessions import Part
-from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.core.log import RefusalLog
 from rmpa.runtime.loop import MachineTimer, turn_end, until, yield_to_data
 
 if TYPE_CHECKING:

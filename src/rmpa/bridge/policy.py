@@ -17,8 +17,8 @@ from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.rules import CLOCK
 from rmpa.config.settings import TimeSettings
 from rmpa.config.values import PEER
-from rmpa.core.counters import Counters
 from rmpa.core.identity import NEVER_CROSSING, is_own, matches
+from rmpa.core.statistics import Counters
 from rmpa.mesh import limits as mesh_limits
 from rmpa.trust.permissions import PermissionDecision, prohibition, refusal
 

@@ -8,14 +8,13 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 from weakref import WeakValueDictionary
 
-from rmpa.core.counters import remedy
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.core.identity import Guid, Identity, proxy_name, proxy_prefix
 from rmpa.ros.environment import is_loopback
 from rmpa.ros.node.listeners import SharedListener
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.xmlrpc import RosReply
-from rmpa.runtime.accept import DESCRIPTORS, Use, is_shortage
+from rmpa.runtime.accept import DESCRIPTORS, Use, is_shortage, open_files_advice
 from rmpa.runtime.loop import yielding_to_data
 from rmpa.runtime.tasks import start_task
 
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Collection, Hashable, Iterable, Iterator
 
     from rmpa.bridge.messages import Origin
-    from rmpa.core.counters import Counters
+    from rmpa.core.statistics import Counters
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.publication import Publication
 
@@ -344,7 +343,9 @@ class PeerProxies:
             _log.error("! %s: %s failed; the others go on", self.prefix, node, exc_info=error)
             return
         text = (
-            f"no file descriptor is left for its proxy; {remedy(os.getpid())}" if is_shortage(error) else str(error)
+            f"no file descriptor is left for its proxy; {open_files_advice(os.getpid())}"
+            if is_shortage(error)
+            else str(error)
         )
         if self.problems.get(node) != text:
             self.problems[node] = text

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.messages import Message
     from rmpa.bridge.policy import Needs
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.core.counters import Counters
+    from rmpa.core.statistics import Counters
 
 _log = logging.getLogger(__name__)
 

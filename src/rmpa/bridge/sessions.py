@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.bridge.proxies import PeerProxies, ProxyNamespaces
-from rmpa.core.counters import logged_failure
+from rmpa.core.log import logged_failure
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.wire.xmlrpc import RosReply
 from rmpa.runtime.loop import MachineTimer, yield_to_data

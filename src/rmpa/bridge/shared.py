@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.policy import Relay
     from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.sessions import PeerSessions
-    from rmpa.core.counters import Counters
+    from rmpa.core.statistics import Counters
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.slave_node import SlaveNode
 

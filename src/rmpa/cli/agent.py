@@ -24,15 +24,16 @@ from rmpa.config.module_name import GATEWAY_SUFFIX, NameSource, choose_name, kee
 from rmpa.config.read import load_settings
 from rmpa.config.settings import SETTINGS, json_value, schema_text, toml_value
 from rmpa.core import codes
-from rmpa.core.counters import configure_logging
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import proxied_node, proxied_peer
+from rmpa.core.log import configure_logging
 from rmpa.observe import limits
 from rmpa.observe.control import ReloadReply
 from rmpa.observe.control_client import find_agents
 from rmpa.observe.peer_info import FAIL, OK, WARN, CheckLevel
 from rmpa.observe.why.diagnosis import Diagnosis
-from rmpa.runtime.process import LogWriter, in_journal
+from rmpa.runtime.log_writer import LogWriter
+from rmpa.runtime.systemd import in_journal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping

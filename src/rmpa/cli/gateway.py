@@ -23,11 +23,12 @@ from rmpa.config.module_name import GATEWAY_SUFFIX
 from rmpa.config.read import INSECURE, load_settings
 from rmpa.config.settings import WebSettings
 from rmpa.config.values import HOST, BadValue
-from rmpa.core.counters import configure_logging
 from rmpa.core.errors import ConfigError, StartError, UnreachableError, missing_extra
 from rmpa.core.identity import peer_name_from
+from rmpa.core.log import configure_logging
 from rmpa.observe.control_client import ControlClient, find_agents
-from rmpa.runtime.process import LogWriter, in_journal
+from rmpa.runtime.log_writer import LogWriter
+from rmpa.runtime.systemd import in_journal
 from rmpa.trust.permissions import Permissions, TrustStatus
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from rmpa.cli.graph import find_peer, suggestion
 from rmpa.cli.options import Options, Selection, agent_verb, argument, flag, limit_options, ping_options, summary
 from rmpa.cli.output import Table, duration, printable, size, warn
 from rmpa.cli.topic import shown_state
-from rmpa.core.counters import SampleSummary
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
+from rmpa.core.statistics import SampleSummary
 from rmpa.observe import limits
 from rmpa.observe.control import GATEWAY_REPORT
 from rmpa.observe.peer_info import PENDING, SitesReport

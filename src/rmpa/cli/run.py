@@ -113,7 +113,7 @@ def run(
       rmpa run sonar.py --set cone=0.2             with another value of a parameter
       rmpa run sonar.py --master http://127.0.0.1:11311    on any ROS core, without an agent
     """
-    from rmpa.core.counters import configure_logging
+    from rmpa.core.log import configure_logging
 
     gc.disable()  # imports leave no garbage; collection is on again when the resources are active
     configure_logging(log_level, sys.stderr, as_json=False)

@@ -24,9 +24,9 @@ from rmpa.cli.graph import (
 )
 from rmpa.cli.options import Options, Selection, argument, count_option, flag, graph_verb, selection_options, summary
 from rmpa.cli.output import Painted, duration, print_json, print_text, printable, size, warn
-from rmpa.core.counters import SampleSummary
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
+from rmpa.core.statistics import SampleSummary
 from rmpa.observe.why.diagnosis import UNMEASURED, route_texts, subscriber_text
 from rmpa.ros import limits
 

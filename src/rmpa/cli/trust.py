@@ -23,7 +23,7 @@ from rmpa.config.settings import Settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError, missing_extra
 from rmpa.core.identity import is_global_name, peer_name_problem
 from rmpa.observe.control_client import ControlClient, find_agents, running_agents
-from rmpa.runtime.process import restart_text
+from rmpa.runtime.systemd import restart_text
 from rmpa.trust.permissions import Permissions, TrustReply, TrustStatus, action_topics
 from rmpa.trust.store import TrustStore, keys_elsewhere, modules_with_keys
 

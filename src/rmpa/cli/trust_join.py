@@ -21,7 +21,7 @@ from rmpa.cli.output import print_json, warn
 from rmpa.cli.trust import check_library, confirm, date_of, grouped, keep_member_name, trust_verb
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
 from rmpa.core.identity import peer_name_problem
-from rmpa.runtime.process import restart_text
+from rmpa.runtime.systemd import restart_text
 from rmpa.trust import limits
 from rmpa.trust.permissions import InviteReply, JoinStep, TrustError, TrustReply
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from rmpa.core.counters import Backoff, TimerQueue, TokenBucket
 from rmpa.core.identity import serial_add
+from rmpa.core.timers import Backoff, TimerQueue, TokenBucket
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Sequence
 
-    from rmpa.core.counters import Counters
     from rmpa.core.identity import Guid, Identity
+    from rmpa.core.statistics import Counters
     from rmpa.discovery.beacon import Address
     from rmpa.discovery.endpoints import EndpointTable, PeerInstance
 

@@ -11,7 +11,8 @@ from functools import partial
 from ipaddress import AddressValueError, IPv4Address
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.counters import Counters, RefusalLog
+from rmpa.core.log import RefusalLog
+from rmpa.core.statistics import Counters
 from rmpa.discovery import limits, network
 from rmpa.discovery.membership import MembershipProtocol
 from rmpa.discovery.packet_filter import PacketFilter, Stranger
@@ -23,8 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.config.settings import Settings
-    from rmpa.core.counters import Yielder
     from rmpa.core.identity import Guid, Identity
+    from rmpa.core.timers import Yielder
     from rmpa.discovery.beacon import Address, Beacon
     from rmpa.discovery.endpoints import PeerView
     from rmpa.discovery.membership import PeerEvent

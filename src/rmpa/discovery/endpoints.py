@@ -13,14 +13,14 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from rmpa.core import limits as core_limits
-from rmpa.core.counters import TimerQueue, earliest
 from rmpa.core.identity import is_later
+from rmpa.core.timers import TimerQueue, earliest
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import BeaconKind
 
 if TYPE_CHECKING:
-    from rmpa.core.counters import Yielder
     from rmpa.core.identity import Identity
+    from rmpa.core.timers import Yielder
     from rmpa.discovery.beacon import Address, Beacon
 
 # Seconds after a goodbye in which beacons that were sent before it may still come, or be read from another socket. A

@@ -14,7 +14,8 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final, Literal
 
 from rmpa.core import limits as core_limits
-from rmpa.core.counters import Counters, earliest
+from rmpa.core.statistics import Counters
+from rmpa.core.timers import earliest
 from rmpa.discovery import limits
 from rmpa.discovery.announcing import BeaconSender, GossipCandidates
 from rmpa.discovery.beacon import BeaconKind
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from ipaddress import IPv4Address
 
-    from rmpa.core.counters import Yielder
     from rmpa.core.identity import Guid, Identity
+    from rmpa.core.timers import Yielder
     from rmpa.discovery.announcing import OutgoingBeacon
     from rmpa.discovery.beacon import Address, Beacon
     from rmpa.discovery.endpoints import PeerView

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
-from rmpa.core.counters import Backoff
 from rmpa.core.limits import KIB
+from rmpa.core.timers import Backoff
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import KIND_AT, BeaconKind
 from rmpa.runtime.accept import in_thread
@@ -26,7 +26,7 @@ from rmpa.runtime.accept import in_thread
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.core.counters import Counters
+    from rmpa.core.statistics import Counters
     from rmpa.discovery.beacon import Address
 
 _log = logging.getLogger(__name__)

@@ -7,8 +7,9 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.counters import Counters, RefusalLog, TokenBucket
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.log import RefusalLog
+from rmpa.core.timers import TokenBucket
 from rmpa.discovery import limits
 from rmpa.discovery.announcing import AddressLimit
 from rmpa.discovery.beacon import (
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.core.identity import Guid, Identity
+    from rmpa.core.statistics import Counters
     from rmpa.discovery.beacon import Address
     from rmpa.trust.packets import PacketTrust, Verification
 

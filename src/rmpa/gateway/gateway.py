@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.agent.agent import Agent
 from rmpa.agent.process import run_process, serve
-from rmpa.core.counters import Backoff
 from rmpa.core.errors import RmpaError, StartError
+from rmpa.core.timers import Backoff
 from rmpa.gateway import limits
 from rmpa.gateway.own_graph import AgentGraph
 from rmpa.gateway.zenoh.session import open_trusted_session

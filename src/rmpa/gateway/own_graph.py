@@ -19,9 +19,9 @@ from rmpa.bridge.policy import is_outside, service_place
 from rmpa.bridge.services.bodies import LocalService, ServicePool
 from rmpa.bridge.sessions import Part
 from rmpa.bridge.topics.local import LocalSources
-from rmpa.core.counters import logged_failure
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.core.identity import OWN_NODE, is_own
+from rmpa.core.log import logged_failure
 from rmpa.gateway.foreign import ForeignSite, ProxiedService, ProxiedTopic
 from rmpa.gateway.rules import MeshSource, SourceKind
 from rmpa.ros.master.parameters import RegistrationKind

@@ -7,8 +7,8 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Final, Protocol
 
-from rmpa.core.counters import TokenBucket
 from rmpa.core.errors import RmpaError
+from rmpa.core.timers import TokenBucket
 from rmpa.gateway import limits
 from rmpa.observe.peer_info import OK, WARN, Check
 from rmpa.runtime.tls import after_read

@@ -20,9 +20,9 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits as core_limits
-from rmpa.core.counters import Counters
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.core.outbox import FIRST, LAST
+from rmpa.core.statistics import Counters
 from rmpa.mesh import frames, limits
 from rmpa.mesh.frames import PACE_NEEDED, WHOLE, Frame, FrameKind, Hello, Lane, Refuse, judge_welcome
 from rmpa.mesh.keepalive import Keepalive, RemoteClock

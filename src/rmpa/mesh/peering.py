@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Literal
 
 from rmpa.core import limits as core_limits
-from rmpa.core.counters import Backoff, TimerQueue, TokenBucket, earliest
 from rmpa.core.identity import Guid, Identity
+from rmpa.core.timers import Backoff, TimerQueue, TokenBucket, earliest
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FULL, Hello, Lane, Refusal, Refuse, judge
 from rmpa.trust.permissions import NOT_OF_THIS_MESH, TrustReason

@@ -25,7 +25,7 @@ from rmpa.observe import limits
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rmpa.core.counters import Yielder
+    from rmpa.core.timers import Yielder
 
 
 # --- The value of the control socket's operation ``reload`` ---------------------------------------------------------

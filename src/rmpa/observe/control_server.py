@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.messages import with_text
 from rmpa.config.values import suggestion
-from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError, StartError
+from rmpa.core.log import RefusalLog
+from rmpa.core.statistics import Counters
 from rmpa.observe import limits
 from rmpa.observe.control import ControlReply, ControlRequest
 from rmpa.observe.control_client import NameLock

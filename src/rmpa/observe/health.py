@@ -10,12 +10,12 @@ from collections import Counter
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.counters import remedy
 from rmpa.observe import limits
 from rmpa.observe.peer_info import FAIL, OK, STALE, WARN, Check
 from rmpa.observe.why.diagnosis import BY_RULE, connected_directly, misplaced, subscriber_text
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array, known_description
+from rmpa.runtime.accept import open_files_advice
 from rmpa.runtime.loop import SystemClock, call_at_tick, yield_to_data
 
 if TYPE_CHECKING:
@@ -328,7 +328,9 @@ def _agent(snapshot: Snapshot) -> Check:
     linked = sum(info.state == _LINKED for info in snapshot.peers)
     notes, files = list(snapshot.notes), snapshot.agent.files
     if files is not None and files.near and not files.problem:
-        notes.append(f"{files.open} of {files.limit} file descriptors are open; {remedy(snapshot.agent.pid)}")
+        notes.append(
+            f"{files.open} of {files.limit} file descriptors are open; {open_files_advice(snapshot.agent.pid)}"
+        )
     level = FAIL if files is not None and files.problem else WARN if notes else OK
     text = "; ".join(notes) or f"{linked} of {len(snapshot.peers)} known peers linked"
     return Check(HERE, level, text, evidence=agent_values(snapshot, linked))

@@ -14,7 +14,7 @@ from rmpa.observe.peer_info import PeerInfo  # noqa: TC001 - msgspec needs it to
 from rmpa.trust.permissions import TrustStatus  # noqa: TC001 - msgspec needs it to decode
 
 if TYPE_CHECKING:
-    from rmpa.core.counters import SampleSummary
+    from rmpa.core.statistics import SampleSummary
 
 
 class FilesInfo(msgspec.Struct, kw_only=True, frozen=True):

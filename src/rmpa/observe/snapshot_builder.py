@@ -16,7 +16,7 @@ import msgspec
 import psutil
 
 import rmpa
-from rmpa.core.counters import SampleSummary
+from rmpa.core.statistics import SampleSummary
 from rmpa.discovery import limits as discovery_limits
 from rmpa.observe.peer_info import (
     FOREIGN,
@@ -47,8 +47,9 @@ if TYPE_CHECKING:
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
-    from rmpa.core.counters import Counters, Yielder
     from rmpa.core.identity import Identity
+    from rmpa.core.statistics import Counters
+    from rmpa.core.timers import Yielder
     from rmpa.discovery.discovery import Discovery
     from rmpa.discovery.endpoints import PeerView
     from rmpa.discovery.packet_filter import Stranger

@@ -22,8 +22,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from rmpa.core.counters import Counters, RefusalLog, remedy
 from rmpa.core.errors import OutOfDescriptors, StartError
+from rmpa.core.log import RefusalLog
+from rmpa.core.statistics import Counters
 from rmpa.runtime import limits
 
 if TYPE_CHECKING:
@@ -200,7 +201,7 @@ class Descriptors:
             why = f"the system has no room for another file ({error.strerror}); see /proc/sys/fs/file-nr and `free`"
         else:
             kept = f"the limit is {self.limit}, of which the last {self.reserve} are kept for the core and the links"
-            why = f"no file descriptors left ({kept}); {remedy(os.getpid())}"
+            why = f"no file descriptors left ({kept}); {open_files_advice(os.getpid())}"
         self._problem, self._refused_at = f"{what} is refused: {why}", time.monotonic()
         self._refusals.refuse(self._refused_at, f"descriptors.refused.{use.name.lower()}", "", self._problem)
 
@@ -414,3 +415,15 @@ class Acceptor:
             text = f"{self._name} cannot accept connections: {error.strerror}; next attempt in {pause:g} s"
             self._refusals.refuse(now, "accept.failed", self._name, text)
         self.pause(limits.ACCEPT_PAUSE)
+
+
+def open_files_advice(pid: int | None = None) -> str:
+    """How to raise the limit permanently; with a process id also how to raise it for that process at once."""
+    enough = 65_536  # for some ten thousand nodes
+    text = (
+        f"raise it: LimitNOFILE={enough} of a systemd unit, "
+        f"`ulimit -n {enough}` as root in the shell that starts the agent"
+    )
+    if pid is not None:
+        text += f", or at once, as root: prlimit --pid {pid} --nofile={enough}:{enough}"
+    return text

@@ -418,7 +418,7 @@ def yield_to_data() -> None:
 
 
 def yielding_to_data(items: Iterable[_T], /) -> Iterator[_T]:
-    """Yield the items unchanged; handle data before the first, then each 250 µs (a ``core.counters.Yielder``)."""
+    """Yield the items unchanged; handle data before the first, then each 250 µs (a ``core.timers.Yielder``)."""
     due = 0.0
     for item in items:
         if (now := time.monotonic()) >= due:

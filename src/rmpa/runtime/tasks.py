@@ -7,7 +7,7 @@ import logging
 import random
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from rmpa.core.counters import Backoff
+from rmpa.core.timers import Backoff
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine

@@ -12,8 +12,8 @@ import logging
 import ssl
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, StartError, UnreachableError
+from rmpa.core.log import RefusalLog
 from rmpa.trust import certificates, limits, tokens
 from rmpa.trust import store as files_of
 from rmpa.trust.certificates import DenyList, KeyList, read_document
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Callable, Collection
 
-    from rmpa.core.counters import Counters
+    from rmpa.core.statistics import Counters
     from rmpa.runtime.loop import SystemClock
     from rmpa.runtime.tls import TlsHandshake
     from rmpa.trust.membership import Membership, MeshAuthority

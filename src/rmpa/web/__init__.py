@@ -1,1 +1,1 @@
-"""The web room: monitor, REST, metrics, and the gateways for rosbridge and Foxglove clients (extra ``rmpa[web]``)."""
+"""The web room: monitor, REST, metrics, rosbridge and Foxglove clients (extra ``rmpa[web]``)."""

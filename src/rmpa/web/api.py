@@ -19,8 +19,8 @@ import msgspec
 from rmpa.config.values import did_you_mean
 from rmpa.core.identity import is_legal_name
 from rmpa.web import limits
-from rmpa.web.gateways.gateways import PROTOCOLS, GatewayFigures
-from rmpa.web.gateways.gateways import REASONS as GATEWAY_REASONS
+from rmpa.web.clients.clients import PROTOCOLS, ClientFigures
+from rmpa.web.clients.clients import REASONS as GATEWAY_REASONS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -388,7 +388,7 @@ def web_metrics(
     responses: Mapping[str, int],
     refused: Mapping[str, int],
     reads: tuple[int, float],
-    gateways: Mapping[str, GatewayFigures],
+    sockets: Mapping[str, ClientFigures],
 ) -> Iterator[Metric]:
     """All metrics of the web server itself.
 
@@ -397,7 +397,7 @@ def web_metrics(
         responses: Responses so far, by HTTP status.
         refused: Refusals so far, by the words of ``REFUSALS``.
         reads: Questions to the agent so far, and the seconds that they took.
-        gateways: What each gateway counts, by its protocol.
+        sockets: What is counted of WebSocket clients, by their protocol.
     """
     is_open, accepted = connections
     yield Metric("rmpa_web_connections", "Open connections of clients.", "gauge", [("", is_open)])
@@ -409,9 +409,9 @@ def web_metrics(
     yield Metric("rmpa_web_refused", help_, "counter", reasons)
     read = [*zip(("_count", "_sum"), reads, strict=True)]
     yield Metric("rmpa_web_agent_read_seconds", "Time to read the agent's snapshot.", "summary", read)
-    clients = [(labels(protocol=name), gateways.get(name, GatewayFigures())) for name in PROTOCOLS]
-    counts: tuple[_Row[GatewayFigures], ...] = (
-        ("clients", "WebSocket clients of the gateways.", "gauge", lambda x: x.clients),
+    clients = [(labels(protocol=name), sockets.get(name, ClientFigures())) for name in PROTOCOLS]
+    counts: tuple[_Row[ClientFigures], ...] = (
+        ("clients", "WebSocket clients.", "gauge", lambda x: x.clients),
         ("client_queue_bytes", "Bytes that wait for these.", "gauge", lambda x: x.queued),
         ("client_frames", "Messages and answers sent to these.", "counter", lambda x: x.sent),
         (

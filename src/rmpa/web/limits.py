@@ -90,7 +90,7 @@ SEEN_PUBLISHERS_MAX: Final = 256
 # dropped, if it is not latched.
 EARLY_AGE: Final = 3.0
 
-# --- gateways -----------------------------------------------------------------------------------------------------
+# --- clients ------------------------------------------------------------------------------------------------------
 # Time that the first client waits for the graph and the parameters, before it is told that there are none.
 SETTLE: Final = 2.0
 # Time for a client to confirm the end of its WebSocket.

@@ -13,7 +13,7 @@ from rmpa.bridge.data.quality import PeerClockHistory, QosEvent, QosEventKind, Q
 from rmpa.bridge.data.route import Downsampler
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, Liveliness
-from rmpa.core.counters import SampleSummary
+from rmpa.core.statistics import SampleSummary
 from rmpa.mesh import limits as mesh_limits
 
 # Periods, latencies and rates of one remote source.

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
-from rmpa.core.counters import Counters
 from rmpa.core.identity import Guid, Identity
+from rmpa.core.statistics import Counters
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.discovery import BEACONS_UNPROVED_PAUSE

@@ -13,7 +13,7 @@ from rmpa.bridge.policy import OPEN_GATE
 from rmpa.config.peer_rules import ServiceRule
 from rmpa.config.settings import ServiceSettings, Settings
 from rmpa.core.contract import Contracts
-from rmpa.core.counters import Counters
+from rmpa.core.statistics import Counters
 from rmpa.gateway import limits
 from rmpa.gateway.rules import CrossingRules
 from rmpa.gateway.sites import topics

@@ -16,9 +16,9 @@ from typing import Any, Final
 import pytest
 
 from rmpa.config.settings import LaneSettings
-from rmpa.core.counters import Counters
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.limits import KIB, MIB
+from rmpa.core.statistics import Counters
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, Lane, Refusal, Refuse
 from rmpa.mesh.io.dial import (

@@ -15,9 +15,10 @@ import pytest
 
 pytest.importorskip("cryptography")
 
-from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.limits import MIB
+from rmpa.core.log import RefusalLog
+from rmpa.core.statistics import Counters
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, Lane, Refusal, Refuse
 from rmpa.mesh.io.link import PeerLink

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError, UnreachableError
+from rmpa.core.statistics import Counters
 from rmpa.ros import limits
 from rmpa.ros.core.liveness import name_at
 from rmpa.ros.http.rpc import call_api

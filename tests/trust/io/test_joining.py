@@ -14,7 +14,6 @@ import pytest
 
 pytest.importorskip("cryptography")
 
-from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import (
     ConfigError,
     PeerRefused,
@@ -22,6 +21,8 @@ from rmpa.core.errors import (
     StartError,
     UnreachableError,
 )
+from rmpa.core.log import RefusalLog
+from rmpa.core.statistics import Counters
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.io.securing import Securing
 from rmpa.runtime.accept import Acceptor, Use

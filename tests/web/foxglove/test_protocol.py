@@ -13,13 +13,13 @@ import pytest
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.web import limits
+from rmpa.web.clients.frame_writer import Opcode
 from rmpa.web.foxglove import protocol
 from rmpa.web.foxglove.channels import Channel, FoxgloveService, graph_update
 from rmpa.web.foxglove.session import DECODER, OPS
-from rmpa.web.gateways.frame_writer import Opcode
 
 if TYPE_CHECKING:
-    from rmpa.web.gateways.frame_writer import OutFrame
+    from rmpa.web.clients.frame_writer import OutFrame
     from rmpa.web.hub.node_link import ParamValue
 
 CHATTER = Channel(1, "/chatter", "std_msgs/String", "", "string data")

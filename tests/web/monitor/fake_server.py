@@ -32,7 +32,7 @@ from rmpa.observe.peer_info import LaneInfo, PeerAgent, PeerInfo, judge_stranger
 from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo
 from rmpa.observe.why.services import diagnose_module
 from rmpa.trust.permissions import TrustReason, TrustStatus
-from rmpa.web.gateways.frame_writer import Opcode
+from rmpa.web.clients.frame_writer import Opcode
 from rmpa.web.hub.node_link import FULL
 from rmpa.web.hub.topics import ReceivedMessage
 from rmpa.web.monitor.messages import SUBPROTOCOL

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import LimitExceeded
 from rmpa.web import limits
-from rmpa.web.gateways.frame_writer import Opcode
+from rmpa.web.clients.frame_writer import Opcode
 from rmpa.web.rosbridge.protocol import Assembler, OpError, split
 
 if TYPE_CHECKING:
     import random
 
-    from rmpa.web.gateways.frame_writer import OutFrame
+    from rmpa.web.clients.frame_writer import OutFrame
 
 
 def _text(*parts: bytes) -> OutFrame:

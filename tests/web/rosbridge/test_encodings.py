@@ -17,7 +17,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.messages import MessageType
 from rmpa.web import limits
-from rmpa.web.gateways.frame_writer import Opcode
+from rmpa.web.clients.frame_writer import Opcode
 from rmpa.web.rosbridge import protocol as encodings
 from rmpa.web.rosbridge.protocol import (
     Compression,

@@ -27,7 +27,7 @@ from rmpa.web.rosbridge import session as rosbridge
 from rmpa.web.rosbridge.rosapi import SERVICES
 from tests.ros.node.peers import DEADLINE
 from tests.web.hub.client import node
-from tests.web.server.test_gateways import running
+from tests.web.server.test_upgrades import running
 
 if TYPE_CHECKING:
     from collections.abc import Callable

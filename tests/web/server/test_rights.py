@@ -31,7 +31,7 @@ from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup
 from tests.ros.node.peers import DEADLINE, until
 from tests.web import snapshots
 from tests.web.hub.client import FakeClient, running_hub
-from tests.web.server.test_gateways import running
+from tests.web.server.test_upgrades import running
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from rmpa.bridge import limits
 from rmpa.core.contract import Liveliness
-from rmpa.core.counters import SampleSummary
+from rmpa.core.statistics import SampleSummary
 from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:

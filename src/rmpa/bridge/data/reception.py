@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from rmpa.bridge.data.quality import QosEvent
-    from rmpa.core.counters import Counters
+    from rmpa.core.statistics import Counters
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.node.publication import Publication
 

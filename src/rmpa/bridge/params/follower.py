@@ -18,8 +18,8 @@ from rmpa.bridge.params.rules import follow_rules
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.sessions import Part
 from rmpa.config.rules import SIM_TIME, overlap
-from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.core.log import RefusalLog
 from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:

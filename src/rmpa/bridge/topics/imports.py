@@ -42,7 +42,7 @@ from rmpa.bridge.peer_offers import CONFLICT, CROWDED, DENIED, ImportBook, Remot
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
 from rmpa.core.contract import Contract, Reliability
-from rmpa.core.counters import Backoff
+from rmpa.core.timers import Backoff
 from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:

@@ -16,8 +16,9 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.counters import Counters, TimerQueue
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.statistics import Counters
+from rmpa.core.timers import TimerQueue
 from rmpa.gateway import limits
 from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource, parse_token
 

@@ -7,7 +7,8 @@ import time
 from typing import TYPE_CHECKING
 
 import rmpa
-from rmpa.core.counters import RefusalLog, earliest, logged_failure
+from rmpa.core.log import RefusalLog, logged_failure
+from rmpa.core.timers import earliest
 from rmpa.gateway import limits
 from rmpa.gateway.rules import SourceKind
 from rmpa.gateway.sites.catalogue import CatalogueChange, Leader, SiteCatalogue, SiteHistory

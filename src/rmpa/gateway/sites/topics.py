@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.context import BridgeContext
     from rmpa.core.contract import Contract, Contracts
-    from rmpa.core.counters import Counters
+    from rmpa.core.statistics import Counters
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.rules import CrossingRules
     from rmpa.gateway.sites.plans import SiteExport, SiteImport

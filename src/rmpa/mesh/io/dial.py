@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rmpa.config.settings import LaneSettings
-    from rmpa.core.counters import Counters
+    from rmpa.core.statistics import Counters
     from rmpa.mesh.peering import SocketAddress
 
 # Time-outs of the successive TCP connects of one dial.

@@ -9,10 +9,10 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, cast
 
-from rmpa.core.counters import Backoff
 from rmpa.core.identity import SERIAL_MASK
 from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import URGENT, Outbox
+from rmpa.core.timers import Backoff
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionProtocol, ConnectionState
 from rmpa.mesh.frames import Frame, FrameKind, Lane
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
 
-    from rmpa.core.counters import Counters
     from rmpa.core.identity import Guid, Identity
+    from rmpa.core.statistics import Counters
     from rmpa.mesh.connection import DataHandler
     from rmpa.mesh.frames import Hello, Refuse
     from rmpa.mesh.io.securing import SecuredSocket

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.config.settings import LaneSettings
 from rmpa.core import codes
-from rmpa.core.counters import Counters, RefusalLog
+from rmpa.core.log import RefusalLog
+from rmpa.core.statistics import Counters
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FULL, Lane, Refusal, Refuse
 from rmpa.mesh.io.dial import Dialler, unacknowledged

@@ -17,8 +17,8 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.core.counters import TokenBucket
 from rmpa.core.errors import RemoteProtocolError, RmpaError
+from rmpa.core.timers import TokenBucket
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, Refusal, Refuse
 from rmpa.runtime.tasks import end_tasks, start_task
@@ -27,8 +27,8 @@ from rmpa.trust.permissions import TrustError, TrustReason
 from rmpa.trust.store import ALPN_JOIN, ALPN_LINK
 
 if TYPE_CHECKING:
-    from rmpa.core.counters import RefusalLog
     from rmpa.core.identity import Identity
+    from rmpa.core.log import RefusalLog
     from rmpa.mesh.frames import Hello
     from rmpa.mesh.peering import SocketAddress
     from rmpa.runtime.loop import SystemClock

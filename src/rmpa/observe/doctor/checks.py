@@ -16,7 +16,6 @@ from urllib.parse import urlsplit
 import psutil
 
 import rmpa
-from rmpa.core.counters import remedy as file_limit_advice
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
 from rmpa.observe import limits
@@ -24,6 +23,7 @@ from rmpa.observe.doctor import machine, network, repairs
 from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.why.diagnosis import misplaced, remedy_for, subscriber_text
 from rmpa.ros.http.rpc import call_api
+from rmpa.runtime.accept import open_files_advice
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -129,7 +129,7 @@ def _files(agent: AgentInfo) -> Iterator[Check]:
         problem, _, remedy = files.problem.partition("; ")
         text, level = f"{problem}; {files.open} are open", FAIL
     elif files.near:
-        level, remedy = WARN, file_limit_advice(agent.pid)
+        level, remedy = WARN, open_files_advice(agent.pid)
     yield Check("files", level, text, remedy, where=agent.name)
 
 

@@ -34,7 +34,7 @@ from rmpa.observe.snapshot import Snapshot
 from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback, shown_uri
 from rmpa.ros.http.rpc import call_api
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.process import REMEDY
+from rmpa.runtime.realtime import REMEDY
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -12,8 +12,8 @@ import os
 import uuid
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.counters import Counters
 from rmpa.core.errors import RmpaError
+from rmpa.core.statistics import Counters
 from rmpa.ros import limits
 from rmpa.ros.core.external import LOOPBACK, Core, GraphLog
 from rmpa.ros.core.liveness import Liveness, Notifier

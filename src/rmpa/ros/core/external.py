@@ -13,8 +13,9 @@ import logging
 from collections import deque
 from typing import TYPE_CHECKING, Final, Protocol
 
-from rmpa.core.counters import Counters, logged_failure
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.core.log import logged_failure
+from rmpa.core.statistics import Counters
 from rmpa.ros import limits
 from rmpa.ros.core.liveness import Liveness, refuses
 from rmpa.ros.http.rpc import call, call_api, exchange, read_response

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Final, TypeAlias, cast
 
-from rmpa.core.counters import Backoff
 from rmpa.core.errors import (
     LocalProtocolError,
     OutOfDescriptors,
@@ -21,6 +20,7 @@ from rmpa.core.errors import (
     RmpaError,
     UnreachableError,
 )
+from rmpa.core.timers import Backoff
 from rmpa.ros import limits
 from rmpa.ros.environment import NodeConnection, NodePing
 from rmpa.ros.http.rpc import call, call_api, connect, is_own_name, split_uri
@@ -36,7 +36,7 @@ from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from rmpa.core.counters import Counters
+    from rmpa.core.statistics import Counters
     from rmpa.ros.master.parameters import SlaveCall
     from rmpa.ros.master.registrations import Registrations
 

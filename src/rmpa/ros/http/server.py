@@ -23,15 +23,16 @@ from collections.abc import Awaitable, Callable, Iterator
 from itertools import islice
 from typing import Final
 
-from rmpa.core.counters import Counters, RefusalLog, remedy
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, StartError
 from rmpa.core.limits import KIB
+from rmpa.core.log import RefusalLog
+from rmpa.core.statistics import Counters
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import read_large, slices
 from rmpa.ros.wire.http import CONTINUE, HttpRefusal, HttpRequest, RequestParser, response_head
 from rmpa.ros.wire.xmlrpc import DocumentReader, RosFault, XmlRpcValue, brief, response_pieces, serialize_fault
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.accept import DESCRIPTORS, Acceptor, Use
+from rmpa.runtime.accept import DESCRIPTORS, Acceptor, Use, open_files_advice
 from rmpa.runtime.kernel_tcp import program_at
 from rmpa.runtime.loop import yield_to_data
 from rmpa.runtime.tasks import OwnedTasks, start_task
@@ -558,7 +559,7 @@ async def listen(name: str, host: str, port: int, use: Use) -> socket.socket:
             errno.EACCES: ("this user may not use that port", "choose a port above 1023"),
             errno.EPERM: ("this user may not use that port", "choose a port above 1023"),
             errno.EADDRNOTAVAIL: ("this machine does not have that address", "choose one that `ip addr` shows"),
-            errno.EMFILE: ("no file descriptors left", remedy()),
+            errno.EMFILE: ("no file descriptors left", open_files_advice()),
         }
         problem = problems.get(error.errno or 0, (error.strerror or str(error), ""))
         raise StartError(f"{name} at {host}:{port}", *problem, code="port-in-use") from error

@@ -19,7 +19,7 @@ from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rmpa.core.counters import Yielder
+    from rmpa.core.timers import Yielder
 
 _log = logging.getLogger(__name__)
 

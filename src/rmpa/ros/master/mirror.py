@@ -24,7 +24,7 @@ from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue, brief
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from rmpa.core.counters import Yielder
+    from rmpa.core.timers import Yielder
 
 # The kinds of the three lists of ``getSystemState``, in order.
 _KINDS: Final = (RegistrationKind.PUBLISHER, RegistrationKind.SUBSCRIBER, RegistrationKind.SERVICE)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.core.counters import Yielder
+    from rmpa.core.timers import Yielder
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config import limits as config_limits
 from rmpa.core import limits as core_limits
-from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError, UnreachableError
+from rmpa.core.log import RefusalLog
+from rmpa.core.statistics import Counters
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.service_client import ServiceConnection

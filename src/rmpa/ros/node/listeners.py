@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
-from rmpa.core.counters import Counters, RefusalLog, remedy
 from rmpa.core.errors import StartError
+from rmpa.core.log import RefusalLog
+from rmpa.core.statistics import Counters
 from rmpa.ros import limits
 from rmpa.ros.http.server import RESET, ResetConnection, XmlRpcServer
 from rmpa.ros.node.publication import AcceptedConnection
 from rmpa.ros.wire.tcpros import check_request, printable
-from rmpa.runtime.accept import DESCRIPTORS, Acceptor, Use, is_shortage
+from rmpa.runtime.accept import DESCRIPTORS, Acceptor, Use, is_shortage, open_files_advice
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -191,7 +192,7 @@ class TcprosServer:
                 sock.listen(_TCPROS_BACKLOG)
                 on_error.pop_all()
         except OSError as error:
-            problem = ("no file descriptors left", remedy()) if is_shortage(error) else (str(error),)
+            problem = ("no file descriptors left", open_files_advice()) if is_shortage(error) else (str(error),)
             raise StartError(f"{name} at {host}:{port}", *problem, code="port-in-use") from error
         self.address = sock.getsockname()[:2]
         self._acceptor = Acceptor(sock, self.adopt, name=name)

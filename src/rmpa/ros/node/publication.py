@@ -12,7 +12,7 @@ import socket
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
 
-from rmpa.core.counters import logged_failure
+from rmpa.core.log import logged_failure
 from rmpa.core.outbox import URGENT, Outbox
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import keep_alive, tcpros_info

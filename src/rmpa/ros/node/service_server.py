@@ -8,9 +8,9 @@ from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits as config_limits
-from rmpa.core.counters import logged_failure
 from rmpa.core.errors import LimitExceeded, RmpaError
 from rmpa.core.limits import KIB
+from rmpa.core.log import logged_failure
 from rmpa.ros import limits
 from rmpa.ros.wire import tcpros
 from rmpa.runtime import limits as runtime_limits

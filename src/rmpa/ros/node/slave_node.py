@@ -15,8 +15,8 @@ import logging
 import os
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.statistics import Counters
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.node.listeners import TcprosServer
 from rmpa.ros.node.service_server import ServiceEndpoint

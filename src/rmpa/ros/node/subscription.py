@@ -9,9 +9,9 @@ from functools import partial
 from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core import limits as core_limits
-from rmpa.core.counters import Backoff
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.outbox import URGENT, Outbox, QueuedMessage
+from rmpa.core.timers import Backoff
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api, connect, keep_alive, tcpros_info
 from rmpa.ros.wire.slave_api import INBOUND, TCPROS, BusConnection

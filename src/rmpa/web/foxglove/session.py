@@ -13,20 +13,20 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
 
-from rmpa.core.counters import TokenBucket
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name, is_type_name
+from rmpa.core.timers import TokenBucket
 from rmpa.web import limits
+from rmpa.web.clients.connection import ClientStream, Session, struct_of
 from rmpa.web.foxglove import protocol
 from rmpa.web.foxglove.protocol import ENCODING, ERROR, WARNING, message, status
-from rmpa.web.gateways.connection import ClientStream, Session, struct_of
 from rmpa.web.hub.params import CLOCK, CLOCK_TYPE, clock_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable, Mapping
 
+    from rmpa.web.clients.frame_writer import OutFrame
     from rmpa.web.foxglove.channels import Channel, ChannelTable
-    from rmpa.web.gateways.frame_writer import OutFrame
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Follower, ParamValue, Payload, Rights
     from rmpa.web.hub.topics import ClientPublication, ClientSubscription, ReceivedMessage

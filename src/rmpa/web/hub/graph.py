@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
 
-from rmpa.core.counters import TokenBucket, logged_failure
 from rmpa.core.errors import RmpaError
+from rmpa.core.log import logged_failure
+from rmpa.core.timers import TokenBucket
 from rmpa.observe.control import GraphRows, ServiceRow, TopicRow
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.http.rpc import exchange, read_response

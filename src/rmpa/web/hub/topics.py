@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from rmpa.config.peer_rules import Access
-from rmpa.core.counters import logged_failure
 from rmpa.core.errors import PeerRefused
 from rmpa.core.limits import MIB
+from rmpa.core.log import logged_failure
 from rmpa.ros.types.messages import HeaderNumbers
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.web import limits

@@ -15,12 +15,12 @@ import msgspec
 from aiohttp import WSCloseCode
 from msgspec import Meta
 
-from rmpa.core.counters import TokenBucket
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name
+from rmpa.core.timers import TokenBucket
 from rmpa.web import limits
-from rmpa.web.gateways.connection import Session, struct_of
-from rmpa.web.gateways.frame_writer import Opcode
+from rmpa.web.clients.connection import Session, struct_of
+from rmpa.web.clients.frame_writer import Opcode
 from rmpa.web.monitor.messages import VERSION, Tree, WatchState, difference
 from rmpa.web.monitor.questions import QUESTIONS
 

@@ -24,13 +24,13 @@ import msgspec
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import is_type_name, resolve_name
 from rmpa.web import limits
-from rmpa.web.gateways.frame_writer import Opcode
+from rmpa.web.clients.frame_writer import Opcode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from rmpa.ros.types.codec import MessageCodec
-    from rmpa.web.gateways.frame_writer import OutFrame
+    from rmpa.web.clients.frame_writer import OutFrame
 
 
 Id: TypeAlias = str | int | None

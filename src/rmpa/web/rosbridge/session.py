@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 from rmpa.core.errors import RmpaError
 from rmpa.ros.types.codec import MessageCodec, codec_for
 from rmpa.web import limits
-from rmpa.web.gateways.connection import ClientStream, Session, struct_of
+from rmpa.web.clients.connection import ClientStream, Session, struct_of
 from rmpa.web.rosbridge.protocol import (
     Assembler,
     Compression,
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Coroutine, Mapping
 
-    from rmpa.web.gateways.frame_writer import OutFrame
+    from rmpa.web.clients.frame_writer import OutFrame
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Payload, Rights
     from rmpa.web.hub.services import ServedService

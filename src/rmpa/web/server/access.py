@@ -26,16 +26,16 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias, cast
 
-from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import StartError
+from rmpa.core.log import RefusalLog
 from rmpa.web import limits
-from rmpa.web.gateways.frame_writer import MaskCheck
+from rmpa.web.clients.frame_writer import MaskCheck
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from pathlib import Path
 
-    from rmpa.core.counters import Counters
+    from rmpa.core.statistics import Counters
 
 TOKEN_PARAMETER: Final = "token"  # noqa: S105 - its name, not its value
 _HOST: Final = re.compile(r"(?:\[(?P<six>[0-9A-Fa-f:.]+)\]|(?P<name>[A-Za-z0-9_.-]+))(?::[0-9]{1,5})?")

@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Final
 from aiohttp import web
 from aiohttp.abc import AbstractAccessLogger
 
-from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import StartError
+from rmpa.core.log import RefusalLog
+from rmpa.core.statistics import Counters
 from rmpa.web import api, limits
-from rmpa.web.gateways.gateways import MONITOR_PATH, is_upgrade
+from rmpa.web.clients.clients import MONITOR_PATH, is_upgrade
 from rmpa.web.server.access import (
     TOKEN_PARAMETER,
     AccessPolicy,
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 
     from aiohttp.typedefs import Handler, Middleware
 
-    from rmpa.web.gateways.gateways import Gateways
+    from rmpa.web.clients.clients import WebSocketClients
     from rmpa.web.server.agent_watch import AgentWatch
 
 _TYPES: Final = {
@@ -117,7 +118,7 @@ class WebServer:
         watch: Gives the agent's snapshot; closed with the server.
         policy: Which requests are served.
         host: The address to listen at.
-        gateways: Serve WebSocket upgrades of ``WEBSOCKET_PATHS``.
+        sockets: Serve WebSocket upgrades of ``WEBSOCKET_PATHS``.
         ports: Further ports to listen at.
         tls: Serves HTTPS with its certificate; ``None``: HTTP.
     """
@@ -128,14 +129,14 @@ class WebServer:
         watch: AgentWatch,
         policy: AccessPolicy,
         host: str,
-        gateways: Gateways | None = None,
+        sockets: WebSocketClients | None = None,
         ports: Sequence[int] = (),
         tls: ssl.SSLContext | None = None,
     ) -> None:
         self._watch = watch
         self._policy = policy
         self._addresses = [(host, port) for port in dict.fromkeys((policy.port, *ports))]
-        self._gateways = gateways
+        self._clients = sockets
         self._tls = tls
         # Refusals, by reason; those of connections too.
         self.counters = Counters()
@@ -149,8 +150,8 @@ class WebServer:
         self._runner: web.AppRunner | None = None
         self._table: ConnectionTable | None = None
         self._servers: list[asyncio.Server] = []
-        if gateways is not None:
-            gateways.upgraded = _upgraded
+        if sockets is not None:
+            sockets.upgraded = _upgraded
 
     async def start(self) -> None:
         """Listen.
@@ -208,8 +209,8 @@ class WebServer:
         """End: responses under way have 2 s, then every connection is closed."""
         for server in self._servers:
             server.close()
-        if self._gateways is not None:
-            await self._gateways.close()
+        if self._clients is not None:
+            await self._clients.close()
         if self._runner is not None:
             await self._runner.cleanup()
         if self._table is not None:
@@ -252,8 +253,8 @@ class WebServer:
             return web.Response(status=204, headers=PREFLIGHT)
         if verdict == "move token":
             return self._move_token(request)
-        if self._gateways is not None and is_upgrade(request) and request.path in WEBSOCKET_PATHS:
-            return await self._upgrade(request, self._gateways)
+        if self._clients is not None and is_upgrade(request) and request.path in WEBSOCKET_PATHS:
+            return await self._upgrade(request, self._clients)
         try:
             return await handler(request)
         except web.HTTPException:  # of aiohttp's router: no such path
@@ -262,13 +263,13 @@ class WebServer:
             _log.exception("! %s failed", request.path)
             return _response(api.problem(500, "the server failed; its log says why"))
 
-    async def _upgrade(self, request: web.Request, gateways: Gateways) -> web.StreamResponse:
+    async def _upgrade(self, request: web.Request, sockets: WebSocketClients) -> web.StreamResponse:
         """Serve a WebSocket until it has ended."""
         try:
-            return await gateways.handle(request)
+            return await sockets.handle(request)
         except web.HTTPBadRequest as error:  # of aiohttp's handshake
             text = (error.text or "").partition("\n")[0][:_SHOWN]
-            gateways.refuse(request.remote or "?", "handshake", text)
+            sockets.refuse(request.remote or "?", "handshake", text)
             return _response(api.problem(400, f"not the handshake of a WebSocket: {text}"))
         except Exception:  # noqa: BLE001 - as above
             _log.exception("! the WebSocket at %s failed", request.path)
@@ -349,10 +350,10 @@ class WebServer:
         return web.Response(body=made[1], headers={"Content-Type": form})
 
     def _own_metrics(self) -> Iterator[api.Metric]:
-        gateways, table = self._gateways, self._table
+        sockets, table = self._clients, self._table
         connections = (len(table.open), table.accepted) if table is not None else (0, 0)
-        refused = self.counters.as_dict() | (gateways.counters.as_dict() if gateways is not None else {})
-        reads, clients = (self._watch.reads, self._watch.seconds), gateways.figures() if gateways is not None else {}
+        refused = self.counters.as_dict() | (sockets.counters.as_dict() if sockets is not None else {})
+        reads, clients = (self._watch.reads, self._watch.seconds), sockets.figures() if sockets is not None else {}
         return api.web_metrics(connections, self._responses.as_dict(), refused, reads, clients)
 
     # --- what aiohttp answers by itself ---

@@ -16,12 +16,12 @@ from rmpa.config.module_name import module_dir, state_dir
 from rmpa.core.contract import Priority
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
 from rmpa.ros.node.node import Node
-from rmpa.runtime.process import feed_watchdog, notify_service_manager
+from rmpa.runtime.systemd import feed_watchdog, notify_service_manager
 from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 from rmpa.trust.permissions import Permissions, server_names
 from rmpa.trust.store import CERTIFICATE, KEY
 from rmpa.web import limits
-from rmpa.web.gateways.gateways import Gateways
+from rmpa.web.clients.clients import WebSocketClients
 from rmpa.web.hub.hub import Hub
 from rmpa.web.hub.node_link import EVERYTHING, READ_ONLY, NodeRules, Rights
 from rmpa.web.monitor.monitor import Monitor
@@ -347,7 +347,7 @@ async def serve(
     watch = AgentWatch(reader, read_whole=reader.read_whole)
     hub = make_hub(watch, web.port, setup.rules)
     monitor = Monitor(hub, watch, agent=agent)
-    gateways = Gateways(
+    sockets = WebSocketClients(
         hub,
         f"RMPA {setup.module or socket.gethostname()}",
         setup.rights,
@@ -355,7 +355,7 @@ async def serve(
         monitor,
     )
     certificate = ServerCertificate(setup.files)
-    server = WebServer(watch, setup.policy, web.listen, gateways, web.ports, certificate.context)
+    server = WebServer(watch, setup.policy, web.listen, sockets, web.ports, certificate.context)
     try:
         async with hub:
             await server.start()
@@ -367,7 +367,7 @@ async def serve(
             feed_watchdog(loop)
             await _first_of(stop.wait(), follower.misfit.wait(), _changed(setup, load, reload))
             _log.info("= ending" if stop.is_set() else "= starting again with other settings")
-            await gateways.close()
+            await sockets.close()
             await follower.close()
             await monitor.close()
     finally:

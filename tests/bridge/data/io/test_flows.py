@@ -14,9 +14,9 @@ from rmpa.bridge.data.export import ExportFlow
 from rmpa.bridge.data.quality import QosEventKind
 from rmpa.bridge.data.reception import ImportFlow, LinkTime
 from rmpa.core.contract import Contract, Durability, Priority, Reliability
-from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.core.statistics import Counters
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import FrameKind
 from rmpa.mesh.reliable import ACK_DELAY

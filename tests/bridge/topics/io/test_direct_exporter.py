@@ -17,8 +17,8 @@ from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import PermissionGate
 from rmpa.config.settings import TrustSettings
 from rmpa.core.contract import Contract, Contracts, Transport
-from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.statistics import Counters
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.trust.permissions import Permissions
 from tests.ros.node.peers import until

@@ -16,8 +16,8 @@ from rmpa.bridge.policy import OPEN_GATE
 from rmpa.bridge.topics import direct as direct_importer
 from rmpa.bridge.topics.direct import TopicPaths
 from rmpa.core.contract import Contracts, Transport
-from rmpa.core.counters import Counters
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.core.statistics import Counters
 from rmpa.ros.wire.xmlrpc import RosReply
 from tests.ros.node.peers import until
 

@@ -17,8 +17,8 @@ from rmpa.bridge.sessions import AWAY_GRACE, PeerSession
 from rmpa.bridge.topics.imports import RemoteTopic
 from rmpa.bridge.topics.peer_topics import Pasts, PeerTopics
 from rmpa.core.contract import Contract, Durability, Reliability, Transport
-from rmpa.core.counters import Counters
 from rmpa.core.outbox import FIRST
+from rmpa.core.statistics import Counters
 from tests.bridge.io.nodes import MD5, Core, Ear, stages
 from tests.bridge.io.two_bridges import made_up
 from tests.bridge.io.virtual import VirtualLoop, run

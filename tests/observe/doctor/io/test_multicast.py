@@ -9,8 +9,8 @@ import threading
 import pytest
 
 from rmpa.config import limits as config_limits
-from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError
+from rmpa.core.statistics import Counters
 from rmpa.discovery.network import Interface, list_interfaces, receive
 from rmpa.discovery.packet_filter import PacketFilter
 from rmpa.observe import limits

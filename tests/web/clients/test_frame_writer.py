@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.web.gateways.frame_writer import FairQueue, FrameWriter, MaskCheck, Opcode, frame_header
+from rmpa.web.clients.frame_writer import FairQueue, FrameWriter, MaskCheck, Opcode, frame_header
 from tests.ros.node.peers import DEADLINE, until
 
 if TYPE_CHECKING:

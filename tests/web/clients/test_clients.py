@@ -1,4 +1,4 @@
-"""WebSocket clients at both gateways, with nodes of a core."""
+"""WebSocket clients at both sockets, with nodes of a core."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rmpa.ros.types.messages import MessageType
 from rmpa.web.hub.node_link import FULL, READ_ONLY
 from rmpa.web.server.process import CertificateFiles, tls_context
 from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
-from tests.web.gateways.server import Client, running_server
+from tests.web.clients.server import Client, running_server
 from tests.web.hub.client import listen, subscribed
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ async def test_large_messages_arrive_whole_by_tls_at_a_client_that_reads_late(co
         await publisher.wait_for_subscriber()
         await subscribed(server.hub, len(server.hub.clients))
         client.socket._reader._protocol.pause_reading()
-        (connection,) = server.gateways.connections
+        (connection,) = server.sockets.connections
         before = connection.sent
         publisher.publish_raw(payload)
         await until(lambda: connection.sent > before)
@@ -140,15 +140,15 @@ async def test_a_client_that_stops_reading_costs_its_bound_and_no_other_a_messag
             for _ in range(45):
                 publisher.publish_raw(payload)
                 assert (await reader.next_bytes())[13:] == payload
-            queues = sorted((each.queue.bytes, each.queue.dropped_total) for each in server.gateways.connections)
+            queues = sorted((each.queue.bytes, each.queue.dropped_total) for each in server.sockets.connections)
             assert queues[0] == (0, 0)
             assert 0 < queues[1][0] <= 16 << 20
             assert queues[1][1] > 0
-            figures = server.gateways.figures()["foxglove"]
+            figures = server.sockets.figures()["foxglove"]
             assert (figures.clients, figures.queued, figures.dropped) == (2, *queues[1])
             stuck.socket._response.connection.transport.abort()  # type: ignore[union-attr]
-            await until(lambda: len(server.gateways.connections) == 1)
-            gone = server.gateways.figures()["foxglove"]
+            await until(lambda: len(server.sockets.connections) == 1)
+            gone = server.sockets.figures()["foxglove"]
             assert (gone.clients, gone.queued, gone.dropped) == (1, 0, figures.dropped)
 
 
@@ -164,12 +164,12 @@ async def test_a_close_frame_comes_behind_a_large_message_under_way(
         await publisher.wait_for_subscriber()
         client.socket._reader._protocol.pause_reading()
         publisher.publish_raw(payload)  # which the kernel does not take whole
-        (connection,) = server.gateways.connections
+        (connection,) = server.sockets.connections
         await until(lambda: connection.unsent - connection.queue.bytes > 1_000_000)
         if by_client:
             await client.socket._writer.close(4000)
-            await until(lambda: not server.gateways.connections)
-        closing = asyncio.ensure_future(server.gateways.close())
+            await until(lambda: not server.sockets.connections)
+        closing = asyncio.ensure_future(server.sockets.close())
         await asyncio.sleep(0)
         client.socket._reader._protocol.resume_reading()
         assert (await client.next_bytes())[13:] == payload
@@ -199,7 +199,7 @@ async def test_the_hub_has_nothing_left_of_a_client_that_went(
                 client.socket._response.connection.transport.abort()  # type: ignore[union-attr]
                 await until(lambda: not server.hub.clients)
             await until(lambda: publisher.subscribers == 0 and not core.publishers("/u"))
-        assert not server.gateways.connections
+        assert not server.sockets.connections
         assert not server.hub.topics.names
 
 
@@ -281,7 +281,7 @@ async def test_a_command_overtakes_the_images_that_wait(core: RosCore, talker: N
         await image.wait_for_subscriber()
         await command.wait_for_subscriber()
         client.socket._reader._protocol.pause_reading()
-        (connection,) = server.gateways.connections
+        (connection,) = server.sockets.connections
         images = 0
         while sum(connection.queue.waiting.values()) < 5:
             image.publish_raw(payload)

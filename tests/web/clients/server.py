@@ -1,4 +1,4 @@
-"""Both gateways at a port of this machine, and WebSocket clients of another library's making."""
+"""Both sockets at a port of this machine, and WebSocket clients of another library's making."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import aiohttp
 from aiohttp import web
 
-from rmpa.web.gateways.gateways import MONITOR_PATH, Gateways
+from rmpa.web.clients.clients import MONITOR_PATH, WebSocketClients
 from rmpa.web.hub.node_link import FULL, Rights
 from rmpa.web.monitor.monitor import Monitor
 from tests.ros.node.peers import DEADLINE
@@ -52,10 +52,10 @@ class Client:
 
 
 class Server:
-    """The gateways, and their port."""
+    """The sockets, and their port."""
 
-    def __init__(self, gateways: Gateways, hub: Any, port: int, session: aiohttp.ClientSession) -> None:
-        self.gateways = gateways
+    def __init__(self, sockets: WebSocketClients, hub: Any, port: int, session: aiohttp.ClientSession) -> None:
+        self.sockets = sockets
         self.hub = hub
         self.port = port
         self.session = session
@@ -79,7 +79,7 @@ async def running_server(
     watch: AgentWatch | None = None,
     tls: tuple[ssl.SSLContext, ssl.SSLContext] | None = None,
 ) -> AsyncIterator[Server]:
-    """The gateways; with ``watch``, which asks an agent, also the monitor; with ``tls`` by WSS.
+    """The sockets; with ``watch``, which asks an agent, also the monitor; with ``tls`` by WSS.
 
     Args:
         tls: The contexts of the server and of its clients.
@@ -88,10 +88,10 @@ async def running_server(
         monitor = Monitor(hub, watch, {}) if watch is not None else None
         if monitor is not None:
             monitor.start()
-        gateways = Gateways(hub, "test", rights, priority, monitor)
+        sockets = WebSocketClients(hub, "test", rights, priority, monitor)
         app = web.Application()
         for path in ("/", MONITOR_PATH):
-            app.router.add_get(path, gateways.handle)
+            app.router.add_get(path, sockets.handle)
         runner = web.AppRunner(app, shutdown_timeout=1)
         await runner.setup()
         site = web.TCPSite(runner, "127.0.0.1", port, ssl_context=tls[0] if tls else None)
@@ -100,11 +100,11 @@ async def running_server(
         try:
             connector = aiohttp.TCPConnector(ssl=tls[1]) if tls else None
             async with aiohttp.ClientSession(connector=connector) as session:
-                server = Server(gateways, hub, port, session)
+                server = Server(sockets, hub, port, session)
                 server.scheme = "wss" if tls else "ws"
                 yield server
         finally:
-            await gateways.close()
+            await sockets.close()
             await runner.cleanup()
             if monitor is not None:
                 await monitor.close()

@@ -1,4 +1,4 @@
-"""The gateways: the subprotocol that a client offers chooses, and the pages have a path of their own."""
+"""WebSocket clients: the subprotocol that a client offers chooses, and the pages have a path of their own."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from typing import TYPE_CHECKING, Final
 
 from aiohttp import WSCloseCode, web
 
-from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import PeerRefused
+from rmpa.core.log import RefusalLog
+from rmpa.core.statistics import Counters
 from rmpa.runtime.tasks import start_task
 from rmpa.web import limits
+from rmpa.web.clients.frame_writer import FrameSocket
 from rmpa.web.foxglove.channels import ChannelTable
 from rmpa.web.foxglove.protocol import SUBPROTOCOLS, choose_subprotocol
 from rmpa.web.foxglove.session import FoxgloveSession
-from rmpa.web.gateways.frame_writer import FrameSocket
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.monitor.session import MonitorSession
 from rmpa.web.rosbridge.protocol import PublishFrames
@@ -29,14 +30,14 @@ from rmpa.web.rosbridge.session import RosbridgeSession
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.web.gateways.connection import ClientConnection, Session
+    from rmpa.web.clients.connection import ClientConnection, Session
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Rights
     from rmpa.web.monitor.monitor import Monitor
 
 
 _log = logging.getLogger(__name__)
-# The gateways, as ``ClientConnection.kind`` names them.
+# The protocols, as ``ClientConnection.kind`` names them.
 PROTOCOLS: Final = ("foxglove", "monitor", "rosbridge")
 # Why WebSocket clients are refused or disconnected, as counted: a handshake that is malformed or asks for another
 # protocol; too many clients; a malformed frame or message, or one that does not end; one that is too long; too many
@@ -45,7 +46,7 @@ REASONS: Final = ("handshake", "clients", "message", "message_size", "message_ra
 
 
 @dataclass(frozen=True, slots=True)
-class GatewayFigures:
+class ClientFigures:
     """The clients of one gateway.
 
     Attributes:
@@ -69,7 +70,7 @@ def is_upgrade(request: web.BaseRequest) -> bool:
     return request.headers.get("Upgrade", "").lower() == "websocket"
 
 
-class Gateways:
+class WebSocketClients:
     """Serves WebSocket clients; its ``handle`` is the handler of one or more paths.
 
     Args:
@@ -110,12 +111,12 @@ class Gateways:
         """All clients, with their queues."""
         return tuple(session.connection for session in self._open)
 
-    def figures(self) -> dict[str, GatewayFigures]:
+    def figures(self) -> dict[str, ClientFigures]:
         """What each gateway counts."""
         found = {}
         for kind in PROTOCOLS:
             present = [each.connection for each in self._open if each.kind == kind]
-            found[kind] = GatewayFigures(
+            found[kind] = ClientFigures(
                 clients=len(present),
                 queued=sum(each.queue.bytes for each in present),
                 sent=self._sent[kind] + sum(each.sent for each in present),

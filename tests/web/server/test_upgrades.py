@@ -15,8 +15,8 @@ import pytest
 from rmpa.config.settings import Settings, WebSettings
 from rmpa.core.contract import ContractRule, Contracts, Priority
 from rmpa.web import limits
-from rmpa.web.gateways.frame_writer import Opcode, frame_header
-from rmpa.web.gateways.gateways import Gateways
+from rmpa.web.clients.clients import WebSocketClients
+from rmpa.web.clients.frame_writer import Opcode, frame_header
 from rmpa.web.hub.node_link import EVERYTHING, NodeRules
 from rmpa.web.server.access import AccessPolicy, own_names
 from rmpa.web.server.agent_watch import AgentWatch
@@ -40,14 +40,14 @@ async def running(token: str = "", rules: NodeRules = EVERYTHING) -> AsyncIterat
         watch = AgentWatch(lambda: msgspec.structs.replace(SNAPSHOT, agent=agent))
         hub = make_hub(watch, 8480, rules)
         settings = Settings(web=WebSettings(control=bool(token)))
-        gateways = Gateways(hub, "test", WebSetup(settings, TokenAccess(token), CertificateFiles()).rights)
+        sockets = WebSocketClients(hub, "test", WebSetup(settings, TokenAccess(token), CertificateFiles()).rights)
         access = AccessPolicy(0, own_names(("base",)), token)
-        server = WebServer(watch, access, "127.0.0.1", gateways, (0,))
+        server = WebServer(watch, access, "127.0.0.1", sockets, (0,))
         try:
             async with hub:
                 await server.start()
                 yield server, core
-                await gateways.close()
+                await sockets.close()
         finally:
             await server.close()
 
@@ -185,7 +185,7 @@ async def test_a_message_whose_fragments_never_end_disconnects_its_client_alone(
             message = await socket.receive()
         going_on.cancel()
         assert (message.type, message.data) == (aiohttp.WSMsgType.CLOSE, 1008)
-        assert server._gateways is not None
-        assert server._gateways.counters["message"] == 1
+        assert server._clients is not None
+        assert server._clients.counters["message"] == 1
         await other.send_json({"op": "call_service", "service": "/rosapi/get_time", "id": "1"})
         assert json.loads((await asyncio.wait_for(reading, DEADLINE)).data)["result"]

@@ -26,7 +26,7 @@ from rmpa.web.hub.node_link import FULL, READ_ONLY
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.server.agent_watch import AgentWatch
 from tests.ros.node.peers import DEADLINE, until
-from tests.web.gateways.server import running_server
+from tests.web.clients.server import running_server
 from tests.web.hub.client import listen, node
 from tests.web.monitor.patches import apply
 from tests.web.snapshots import FULL as SNAPSHOT
@@ -316,7 +316,7 @@ async def test_pages_share_what_is_asked_of_the_agent_and_nothing_is_asked_witho
         ):
             for page in (Page(one.socket, agent), Page(other.socket, agent)):
                 await page.sees(lambda page=page: page.state.get("modules"))
-        await until(lambda: not server.gateways.connections)
+        await until(lambda: not server.sockets.connections)
         await asyncio.sleep(2 * limits.STATE_PERIOD)  # what was under way
         reads = watch.reads
         await asyncio.sleep(4 * limits.STATE_PERIOD)

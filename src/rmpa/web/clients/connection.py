@@ -23,7 +23,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.core.limits import KIB
 from rmpa.runtime.tasks import end_tasks, start_task
 from rmpa.web import limits
-from rmpa.web.gateways.frame_writer import FairQueue, FrameWriter, Opcode, OutFrame
+from rmpa.web.clients.frame_writer import FairQueue, FrameWriter, Opcode, OutFrame
 from rmpa.web.hub.hub import HubClient
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from aiohttp import web
 
-    from rmpa.web.gateways.frame_writer import FrameSocket
+    from rmpa.web.clients.frame_writer import FrameSocket
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Payload, Rights
     from rmpa.web.hub.topics import ReceivedMessage
@@ -279,7 +279,7 @@ class ClientConnection:
         Args:
             code: Of RFC 6455, section 7.4.
             reason: For the client and the log.
-            refusal: Which of ``gateways.REASONS`` is counted, where the client is the cause.
+            refusal: Which of ``clients.REASONS`` is counted, where the client is the cause.
         """
         if self._close is not None:
             return
@@ -323,7 +323,7 @@ class ClientConnection:
             request: Asks for the WebSocket.
             socket_: Not prepared yet.
             upgraded: Called when the handshake is done; what it returns counts the bytes that the client has sent.
-            refused: ``(reason, text)``: called if the client is disconnected for one of ``gateways.REASONS``.
+            refused: ``(reason, text)``: called if the client is disconnected for one of ``clients.REASONS``.
 
         Raises:
             PeerRefused: There are too many clients.

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from rmpa.web import limits
-from rmpa.web.gateways.connection import CommandAge, MessageArrival, Session
-from rmpa.web.gateways.frame_writer import FrameWriter
+from rmpa.web.clients.connection import CommandAge, MessageArrival, Session
+from rmpa.web.clients.frame_writer import FrameWriter
 from rmpa.web.hub.node_link import READ_ONLY
 from tests.ros.node.peers import DEADLINE
 

@@ -1,0 +1,117 @@
+"""systemd: the journal, the unit that runs a process, and status notifications with the watchdog (sd_notify(3)).
+
+A notification is one datagram to NOTIFY_SOCKET, if it is set.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import logging
+import os
+import re
+import socket
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from asyncio import AbstractEventLoop
+    from collections.abc import Mapping
+
+_log = logging.getLogger(__name__)
+
+# What systemd sets for the process that it starts, and that means no child of it.
+SERVICE_VARIABLES: Final = ("NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC")
+# Seconds after which a sign of life that could not be sent is tried again.
+_WATCHDOG_RETRY: Final = 1.0
+_CANNOT_TELL: Final = "! the service manager at NOTIFY_SOCKET=%s cannot be told %s: %s [watchdog]"
+# The line of proc(5)'s cgroup of a process that a unit of the system runs.
+_OF_UNIT: Final = re.compile(r":/system\.slice/(rmpa[\w-]*)\.service", re.MULTILINE)
+
+
+def in_journal(environ: Mapping[str, str], fd: int) -> bool:
+    """Whether a descriptor leads to systemd's journal, by JOURNAL_STREAM (systemd.exec(5))."""
+    try:
+        status = os.fstat(fd)
+    except OSError:
+        return False
+    return environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
+
+
+def unit_of(pid: int | str = "self") -> str:
+    """The system's unit that an agent runs in, ``rmpa``; empty: it was started by hand."""
+    try:
+        found = _OF_UNIT.search(Path(f"/proc/{pid}/cgroup").read_text("utf-8", "replace"))
+    except OSError:
+        return ""
+    return found[1] if found else ""
+
+
+def restart_text(pid: int | str = "self", start: str = "rmpa up") -> str:
+    """How an agent is restarted, behind "restart …: "; ``start`` starts one that no unit runs."""
+    unit = unit_of(pid)
+    return f"sudo systemctl restart {unit}" if unit else f"end it (Ctrl-C), then {start}"
+
+
+def notify_service_manager(state: str) -> bool:
+    """Send ``READY=1``, ``STOPPING=1`` or ``STATUS=…``; a failure is logged and never fatal.
+
+    Returns:
+        Whether it was sent.
+    """
+    address = _notify_address()
+    if not address:
+        return False
+    try:
+        with _notify_socket() as sock:
+            sock.sendto(state.encode(), address)
+    except OSError as error:
+        _log.warning(_CANNOT_TELL, address, state, error)
+        return False
+    return True
+
+
+def _notify_address() -> str:
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    return "\0" + address[1:] if address.startswith("@") else address
+
+
+def _notify_socket() -> socket.socket:
+    return socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+
+
+def watchdog_period(environ: Mapping[str, str]) -> float | None:
+    """Half of the time in seconds in which systemd wants ``WATCHDOG=1``; ``None``: never (sd_watchdog_enabled(3))."""
+    usec, pid = environ.get("WATCHDOG_USEC", ""), environ.get("WATCHDOG_PID", "")
+    if not usec.isdecimal() or int(usec) == 0 or pid not in ("", str(os.getpid())):
+        return None
+    return int(usec) / 2e6
+
+
+def feed_watchdog(loop: AbstractEventLoop) -> None:
+    """Send ``WATCHDOG=1`` from the event loop for as long as it runs, if systemd wants it.
+
+    A loop that hangs sends none, and systemd ends the process by SIGABRT; where it hung is then in the log.
+    """
+    period, address = watchdog_period(os.environ), _notify_address()
+    if period is None or not address:
+        return
+    faulthandler.enable()
+    sock: socket.socket | None = None
+    failed = False
+
+    def feed() -> None:
+        nonlocal sock, failed
+        try:
+            # One socket for all: later there may be no descriptor left.
+            sock = sock or _notify_socket()
+            # A service manager that does not read must not stop the loop.
+            sock.sendto(b"WATCHDOG=1", socket.MSG_DONTWAIT, address)
+        except OSError as error:
+            if not failed:
+                _log.warning(_CANNOT_TELL, address, "WATCHDOG=1", error)
+            failed = True
+        else:
+            failed = False
+        loop.call_later(min(period, _WATCHDOG_RETRY) if failed else period, feed)
+
+    feed()

@@ -1,0 +1,1 @@
+"""WebSocket clients: rosbridge v2, the Foxglove WebSocket protocol and the pages, over the hub."""
