@@ -94,5 +94,5 @@ def test_the_documentation_lists_every_handler_with_the_permission_that_it_asks(
 
 def test_every_kind_of_handler_is_found() -> None:
     found = {name for _, name, _ in registrations()}
-    assert {"param.get", "site.param", "node.ping", "trust.renew", "direct.topic_release"} <= found
-    assert "rmpa/1/<site>/<module>/p/**" in found
+    assert {"param.get", "node.ping", "trust.renew", "direct.topic_release"} <= found
+    assert "rmpa/1/<site>/-gateway/why" in found

@@ -83,7 +83,7 @@ def test_a_peers(place: Place, peer: dict[str, Any]) -> None:
     assert peer["/new"] == "é" * 40_000
     said = place.transcript(
         "get --peer base /speed", "list --peer base", "list base:/", "get --peer arm base:/big",
-        "delete --peer base /new", "get --peer base /nothing",
+        "delete --peer base /new", "get --peer base /nothing", "get hall/arm:/speed",
         group="param",
     )  # fmt: skip
     compare("param_of_a_peer", said)

@@ -2,35 +2,22 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, Final
 
 import msgspec
 
-from rmpa.core.errors import RemoteProtocolError, RmpaError
+from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway.ros2 import format as ros2_tokens
 from rmpa.gateway.ros2.format import Ros2Attachment, Ros2Endpoint
 from rmpa.gateway.ros2.graph import Ros2Graph
 from rmpa.gateway.sites import keys as site_keys
 from rmpa.gateway.sites.answers import WhyQuestion, parse_ways
 from rmpa.gateway.sites.keys import AttachmentReader, MessageSource, TopicHeader
-from rmpa.gateway.sites.params import (
-    GATEWAYS,
-    ParamAnswer,
-    ParamQuestion,
-    from_json,
-    lost_with,
-    param_key,
-    parameters_in,
-    parse_param_key,
-    read_text_about,
-    to_json,
-)
 from rmpa.gateway.sites.services import asked_type, read_description
 from rmpa.observe.peer_info import OK, Check
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.wire.tcpros import ServiceDescription
-from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
+from rmpa.ros.wire.xmlrpc import serialize_response
 from tests.fuzz.readers import MD5, Reader, Row, printable, text
 
 _RUN: Final = "0123456789abcdef0123456789abcdef"
@@ -62,21 +49,6 @@ def _graph(key: str) -> None:
 def _safe_stages(ways: tuple[Diagnosis, ...]) -> None:
     for stage in (stage for way in ways for stage in way.stages):
         printable(f"{stage.name}{stage.text}{stage.remedy}")
-
-
-def _value(data: bytes) -> None:
-    """What a program sets: JSON that becomes the text of XML-RPC, is judged, and is told again."""
-    value = parse_response(serialize_response(from_json(data)))
-    names = parameters_in("/a", value)
-    assert all(name.startswith("/a") for name in names), f"{names} are not below /a"
-    assert lost_with(["/a"], names) == [name for name in names if name != "/a"], f"{names} are all lost with /a"
-    to_json(value)
-
-
-def _check_param(found: tuple[str, str]) -> None:
-    module, name = found
-    again = parse_param_key(param_key("hall", module, name))
-    assert again == found or name.strip("/") != name[1:], f"{found} names another parameter once it is written"
 
 
 def _row(readers: list[Reader], *seeds: bytes, error: type[Exception] = RemoteProtocolError) -> Row:
@@ -127,26 +99,5 @@ GATEWAY_READERS: Final[dict[str, Row]] = {
         msgspec.json.encode(
             [Diagnosis.of((Check("sent", OK, "3 messages"),), name="/scan", peer="arm", to="site hall", node="/n")]
         ),
-    ),
-    "site_params": _row(
-        [
-            Reader(ParamQuestion.parse, msgspec.json.encode),
-            Reader(partial(read_text_about, kind=ParamAnswer), msgspec.json.encode),
-            Reader(_value),
-            Reader(text(parse_param_key), check=_check_param),
-        ],
-        msgspec.json.encode(ParamQuestion(op="get", key="/gains")),
-        msgspec.json.encode(ParamQuestion(op="names", askers=("arm", "base"))),
-        msgspec.json.encode(ParamQuestion(op="set", key="/gains/p", text=_TEXT)),
-        msgspec.json.encode(ParamQuestion(op="delete", key="/gains")),
-        msgspec.json.encode(ParamAnswer(text=_TEXT, names=["/a", "/b"], count=2)),
-        b'{"p": 1, "i": [2, 3.5, "x", true], "deep": {"er": {}}}',
-        b"[" * 300 + b"]" * 300,
-        b"123456789012345678901234567890",
-        b'{"": "\\u0000", "a/b": -1e999}',
-        param_key("hall", "arm", "/gains/p").encode(),
-        param_key("hall", "arm", GATEWAYS).encode(),
-        b"rmpa/1/hall/arm/p/-/",
-        error=RmpaError,
     ),
 }

@@ -48,13 +48,11 @@ WAREHOUSE: Final = (
 modules = ["yard"]
 subscribe = ["/**"]
 call = ["/work"]
-param = ["/shown/**"]
 
 [[permission]]
 modules = ["yard"]
 effect = "deny"
 subscribe = ["/secret"]
-param = ["/shown/secret"]
 """
 )
 YARD: Final = (
@@ -161,31 +159,6 @@ def test_what_a_permission_of_the_site_denies_stays_there_and_why_says_so(joined
         assert (code, "it flows" in output) == (0, True), output
         counters = joined.warehouse.gateway.snapshot().counters
         assert counters.get("permission.subscribe", 0) > 0, counters
-
-
-def test_a_parameter_is_had_by_way_of_gateways_only_as_its_owner_permits(joined: JoinedModules) -> None:
-    arm, base = joined.arm.agent, joined.base.agent
-    for key, value in (("/shown/speed", "1"), ("/shown/secret", "42"), ("/other", "42")):
-        assert arm.rmpa("param", "set", key, value)[0] == 0
-    at_arm = ("--peer", "warehouse/arm")
-    code, output = base.rmpa("param", "get", "/shown/speed", *at_arm)
-    assert (code, output.strip()) == (0, "1"), output
-    for words in (
-        ("get", "/"),
-        ("get", "/shown/"),
-        ("get", "/other"),
-        ("set", "/shown/secret/", "5"),
-        ("delete", "/shown"),
-    ):
-        code, output = base.rmpa("param", *words, *at_arm)
-        assert (code, "42" in output, "do not let" in output) == (1, False, True), (words, output)
-    code, output = base.rmpa("param", "list", *at_arm)
-    assert [name in output for name in ("/shown/speed", "secret", "/other")] == [True, False, False]
-    code, output = base.rmpa("param", "set", "/shown/speed", "7", *at_arm)
-    assert code == 0, output
-    assert arm.rmpa("param", "get", "/shown")[1].split() == ["secret:", "42", "speed:", "7"]
-    code, output = arm.rmpa("param", "get", "/", "--peer", "warehouse/arm")
-    assert (code, "of this very site" in output) == (1, True), output
 
 
 def test_a_members_program_at_the_router_hears_nothing_that_no_site_may_have(joined: JoinedModules) -> None:

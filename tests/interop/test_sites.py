@@ -303,23 +303,6 @@ def test_why_and_site_tell_of_both_sites(joined: JoinedModules) -> None:
         assert other in json.dumps(json.loads(does(site.gateway, "site", "list", "--json")))
 
 
-def test_parameters_of_another_site_are_read_set_and_refused_by_rules(joined: JoinedModules) -> None:
-    arm, base = joined.arm.agent, joined.base.agent
-    does(arm, "param", "set", "/speed", "1.5")
-    does(arm, "param", "set", "/secret/key", "42")
-    assert does(base, "param", "get", *THERE, "/speed").strip() == "1.5"
-    does(base, "param", "set", *THERE, "/gains", "{p: 1, i: [2, 3]}")
-    assert does(arm, "param", "get", "/gains/i").split() == ["-", "2", "-", "3"]
-    names = does(base, "param", "list", *THERE).split()
-    assert ("/speed" in names, "/secret/key" in names) == (True, False)
-    assert "gateway.rule 1" in does(base, "param", "set", *THERE, "/secret/key", "0", status=1)
-    assert does(arm, "param", "get", "/secret/key").strip() == "42"
-    leg = does(base, "param", "get", "--peer", "warehouse/leg", "/x", status=1)
-    assert "no module answers at site warehouse as 'leg'" in leg
-    does(base, "param", "delete", *THERE, "/gains")
-    does(arm, "param", "get", "/gains", status=1)
-
-
 def test_smart_resources_of_another_site_are_listed_and_set(joined: JoinedModules) -> None:
     arm, base = joined.arm.agent, joined.base.agent
     arm.kill()

@@ -119,11 +119,6 @@ PARAM_TEXT_MAX: Final = 16 * MIB
 # Told in: the command's error
 # Why: Each takes the core some 0.25 ms, between data; a large robot has some thousand in all.
 PARAMS_SET_MAX: Final = 10_000
-# [Core] Modules of another site for which a gateway asks for parameters at once
-# At it: the question is refused
-# Told in: the command's error
-# Why: As many as one mesh has.
-PARAM_ASKERS_MAX: Final = 256
 # Seconds that a peer has to answer a request about a parameter: as data goes first, its core may need seconds for
 # megabytes of numbers. Less than CONTROL_HANDLER_TIMEOUT, so that the error names the agent that did not answer.
 PARAM_ASK_TIMEOUT: Final = 25.0

@@ -369,7 +369,6 @@ def site() -> None:
 
     ---
     Any module of a site can ask: the gateways that it is linked to answer.
-    Parameters of another site's module: `rmpa param get --peer SITE/MODULE /name`.
     Why something does not come from a site: `rmpa why /name`.
     """
 

@@ -51,7 +51,7 @@ peer_option: Final = click.option(
     "--peer",
     metavar="PEER",
     shell_complete=completes("peer"),
-    help="The parameters of this peer's module (or its GUID); SITE/MODULE: of another site's.",
+    help="The parameters of this peer's module (or its GUID).",
 )
 
 
@@ -136,12 +136,15 @@ def open_store(peer: str | None, options: Options) -> ParamStore:
 
     Raises:
         ConfigError: Both ``--peer`` and ``--master`` are given.
-        RmpaError: There is no such agent.
+        RmpaError: There is no such agent, or the peer is another site's, from which parameters do not cross.
     """
     if peer is None:
         return MasterParams(options.master())
     if options.master_uri is not None:
         raise ConfigError("--peer", "a peer is asked through this machine's agent, not at a master", "leave one out")
+    if "/" in peer:
+        remedy = "run `rmpa param` at that site, or have a service, a latched topic or dynamic_reconfigure bring it"
+        raise RmpaError(f"{peer}: parameters do not cross between sites; {remedy}", code="not-offered")
     client = options.client(observe_limits.CONTROL_HANDLER_TIMEOUT)
     if context := click.get_current_context(silent=True):
         context.with_resource(client)

@@ -37,14 +37,6 @@ SITE_REPORT_SOURCES_MAX: Final = 5000
 # [Gateway] Connections to action servers here for other sites' clients, two for each
 # At it: further clients are not seen by the server
 SITE_ACTIONS_MAX: Final = 1024
-# [Gateway] Bytes of one question or answer about parameters between gateways
-# At it: it fails
-# Told in: the command's error
-# Why: Some of the largest values.
-SITE_PARAM_BYTES_MAX: Final = 64 * MIB
-# Seconds for a question about a parameter to another site: less than the module that asks waits for this
-# gateway.
-SITE_PARAM_TIMEOUT: Final = 20.0
 # Characters of a site's name, as settings have it.
 SITE_NAME_MAX: Final = config_limits.SITE_NAME_MAX
 # [ROS 2] Characters of a name

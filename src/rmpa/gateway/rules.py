@@ -18,7 +18,7 @@ from rmpa.core.identity import is_global_name, matches
 from rmpa.trust.permissions import asker_name, refusal
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.policy import PermissionGate
@@ -195,21 +195,17 @@ class CrossingRules:
         module: str,
         name: str,
         access: Access = Access.SUBSCRIBE,
-        askers: Iterable[str] = (),
-        told: str | None = None,
     ) -> str:
-        """Why another site may not have a source or parameter of this one; empty if it may.
+        """Why another site may not have a source of this one; empty if it may.
 
         Args:
             site: The other site; empty for a program that names none.
             module: The module that has it.
             name: Its name in its module.
             access: What the other site would do with it.
-            askers: The modules of the other site that ask, as it says.
-            told: The name for the text, if ``name`` was found in what was asked for and may be a secret.
         """
         decision = self.outgoing_to(site, module, name)
-        return self.denial(site, name, access, askers, told) if decision.allowed else decision.why
+        return self.denial(site, name, access) if decision.allowed else decision.why
 
     @property
     def secured(self) -> bool:
@@ -226,15 +222,13 @@ class CrossingRules:
         """
         return not asker or self._gate.judge(ACCESS[kind], asker, name).allowed
 
-    def denial(
-        self, site: str, name: str, access: Access, askers: Iterable[str] = (), told: str | None = None
-    ) -> str:
+    def denial(self, site: str, name: str, access: Access) -> str:
         """Why permissions, without the rules, do not let another site, or a module, have a name; empty if they do."""
-        decision = self._gate.judge_site(access, site, askers, name)
+        decision = self._gate.judge(access, site, name)
         if decision.allowed:
             return ""
         self._gate.refused(access, site, name, decision)
-        return refusal(access, site, name if told is None else told)
+        return refusal(access, site, name)
 
     def incoming(self, source: ForeignSource) -> CrossingDecision:
         """Decide whether a source of another site or of ROS 2 is shown here, and under which name.

@@ -29,7 +29,7 @@ from rmpa.core.identity import OWN_NODE, is_global_name
 from rmpa.observe import limits
 from rmpa.observe.control import GraphRevision, GraphRows, ReloadReply, ServiceRow, TopicRow
 from rmpa.observe.peer_info import INFO as AGENT_INFO
-from rmpa.observe.peer_info import ContractTerm, PeerAgent, read_site_module
+from rmpa.observe.peer_info import ContractTerm, PeerAgent
 from rmpa.observe.snapshot import FollowedInfo, PingReply, Snapshot
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.environment import NodeLine, PeerNodes
@@ -58,22 +58,17 @@ Args = dict[str, Any]
 REPORT: Final = "site.report"
 # The request for a ``SitesReport`` of one site with its sources: ``{site}``.
 INFO: Final = "site.info"
-# A request about parameters (``bridge.params.rules``) to a module: ``{site, module, what, key, text}``.
-PARAM: Final = "site.param"
 # The request for the ways of a topic or a service through gateways: ``{name, site, module, service}``.
 WHY: Final = "site.why"
 _SOURCES: Final = Needs(
     (Access.SUBSCRIBE, Access.CALL),
     "each topic and service; of this site the asking module's own alone. Sites and modules are named to all",
 )
-_PARAM: Final = Needs(
-    (Access.PARAM,), "as `param.get` and its like, by this gateway, the other site's and the owner. None of this site"
-)
 _WAYS: Final = Needs(
     (Access.SUBSCRIBE, Access.CALL), "the topic or service, by its name here; what leaves is the asking module's own"
 )
 # The questions about other sites.
-QUESTIONS: Final = (REPORT, INFO, PARAM, WHY)
+QUESTIONS: Final = (REPORT, INFO, WHY)
 
 
 class SiteAnswerer(Protocol):
@@ -109,7 +104,6 @@ class SiteRequests:
         self.answerer, rpc = gateway, self._bridge.rpc
         rpc.on_request(REPORT, partial(self._answer_peer, gateway, REPORT), _SOURCES)
         rpc.on_request(INFO, partial(self._answer_peer, gateway, INFO), _SOURCES)
-        rpc.on_request(PARAM, partial(self._answer_peer, gateway, PARAM), _PARAM)
         rpc.on_request(WHY, partial(self._answer_peer, gateway, WHY), _WAYS)
 
     async def answer(self, args: Args) -> Any:
@@ -332,16 +326,10 @@ class ControlOperations:
         return PingReply(times=tuple(times), remote=f"{host}:{port}")
 
     async def param(self, args: Args) -> Any:
-        """Pass a request about parameters on to a peer: ``peer``, ``what``, and ``key`` and ``text`` of that request.
-
-        A peer ``site/module`` is a module of another site, which a gateway asks.
-        """
-        what, peer = _request(args, transfer.QUESTIONS), str(args.get("peer", ""))
+        """Pass a request about parameters on to a peer: ``peer``, ``what``, and its ``key`` and ``text``."""
+        what, session = _request(args, transfer.QUESTIONS), self._session(args.get("peer", ""))
         inner: Args = {name: args[name] for name in ("key", "text") if name in args}
-        if "/" in peer:
-            site, module = read_site_module(peer)
-            return await self.sites.one(PARAM, {"site": site, "module": module, "what": what, **inner})
-        return await self.bridge.rpc.request(self._session(peer), what, inner, bridge_limits.PARAM_ASK_TIMEOUT)
+        return await self.bridge.rpc.request(session, what, inner, bridge_limits.PARAM_ASK_TIMEOUT)
 
     def followed(self, _args: Args) -> tuple[FollowedInfo, ...]:
         """The parameters of other modules that this one follows."""

@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Final, Self
 import msgspec
 
 from rmpa.core import codes
-from rmpa.core.errors import ConfigError
-from rmpa.core.identity import peer_name_problem
 from rmpa.trust.permissions import TrustReason, not_of_this_mesh
 
 if TYPE_CHECKING:
@@ -358,18 +356,6 @@ class SitesReport(msgspec.Struct, frozen=True, kw_only=True):
     problem: str = ""
     endpoints: tuple[str, ...] = ()
     sites: tuple[SiteInfo, ...] = ()
-
-
-def read_site_module(text: str) -> tuple[str, str]:
-    """Split ``warehouse/arm`` into the site and the module.
-
-    Raises:
-        ConfigError: It is not the name of a site and of a module.
-    """
-    site, slash, module = text.partition("/")
-    if not slash or peer_name_problem(site) is not None or peer_name_problem(module) is not None:
-        raise ConfigError("SITE/MODULE", f"{text!r} is not a site and a module", "write one as warehouse/arm")
-    return site, module
 
 
 # The terms of a topic's contract by the settings of a module, which the topic has before any route is open.

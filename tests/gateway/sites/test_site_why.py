@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -13,13 +13,13 @@ from rmpa.bridge.policy import PermissionGate
 from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.config.settings import TrustSettings
-from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.gateway.sites.answers import SiteAnswers, WhyQuestion, here_stages, parse_ways, sent_stages
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
 from rmpa.gateway.sites.plans import SiteImport
-from rmpa.observe.operations import INFO, PARAM, REPORT, WHY
+from rmpa.observe.operations import INFO, REPORT, WHY
 from rmpa.observe.peer_info import FAIL, OK, WARN, Check
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.wire.tcpros import TopicDescription
@@ -46,13 +46,6 @@ class Asked:
 
     site: Site
     answers: SiteAnswers
-    params: list[tuple[str, str, str]] = field(default_factory=list)
-
-    async def ask(self, asker: str, at: str, module: str, args: dict[str, Any]) -> object:
-        """As ``SiteParams``."""
-        del asker
-        self.params.append((at, module, args["what"]))
-        return args
 
     async def why(self, name: str, site: str = "", module: str = "", asker: str = "") -> list[Diagnosis]:
         args = {"name": name, "site": site, "module": module}
@@ -75,9 +68,7 @@ class AskedBed:
     ) -> Asked:
         gate = PermissionGate(None if permissions is None else Permissions(TrustSettings(rules=permissions)))
         site = await self._bed.site(name, rules=rules, gate=gate)
-        params: Any = SimpleNamespace()
-        asked = Asked(site, SiteAnswers(site.neighbour, params))
-        params.ask = asked.ask
+        asked = Asked(site, SiteAnswers(site.neighbour))
         await until(lambda: site.neighbour.leads)
         return asked
 
@@ -178,25 +169,8 @@ async def test_a_site_that_left_is_unreachable_since_then_and_one_that_never_was
     assert await hall.why("/chatter", "joystick") == []  # a peer's name
     (moon,) = await hall.why("/chatter", "moon", "arm")
     assert "no gateway of a site moon" in failed(moon).text
-    with pytest.raises(RmpaError, match="site yard is unreachable since"):
-        await hall.answers.answer(PARAM, {"site": "yard", "module": "arm"})
-    with pytest.raises(UnreachableError, match="known are: none"):
-        await hall.answers.answer(PARAM, {"site": "moon", "module": "arm"})
-
-
-async def test_questions_are_checked_before_they_are_passed_on(bed: AskedBed) -> None:
-    hall = await bed.site("hall")
-    for what, args in (
-        ("site.shout", {"site": "hall", "module": "arm"}),
-        (PARAM, {"site": "ha ll", "module": "arm", "what": "param.get"}),
-        (PARAM, {"site": "hall", "module": "*", "what": "param.get"}),
-    ):
-        with pytest.raises(RmpaError):
-            await hall.answers.answer(what, args)
-    assert hall.params == []
-    question = {"site": "hall", "module": "arm", "what": "param.get", "key": "/x"}
-    assert await hall.answers.answer(PARAM, question) == question
-    assert hall.params == [("hall", "arm", "param.get")]
+    with pytest.raises(RmpaError, match=r"'site\.shout' is no question"):
+        await hall.answers.answer("site.shout", {"site": "hall", "module": "arm"})
 
 
 def test_losses_are_told_with_the_hop_where_they_happen() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from rmpa.bridge.policy import OPEN_GATE
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
-from rmpa.observe.operations import INFO, PARAM, REPORT, SiteRequests
+from rmpa.observe.operations import INFO, REPORT, SiteRequests
 
 
 def peer(name: str) -> Any:
@@ -74,14 +74,14 @@ async def test_the_peer_that_is_a_gateway_answers_and_is_asked_first_the_next_ti
 
 
 async def test_no_member_but_the_relays_is_believed_about_other_sites() -> None:
-    """It would answer for every site and module, and take what is set there."""
+    """It would answer for every site."""
     rpc = Rpc({"eve": {"x": 666}, "gate": {"x": 1}})
     asks = requests(rpc, "eve", "gate", gate=Gate())
-    assert await asks.one(PARAM, {"site": "hall"}) == {"x": 1}
+    assert await asks.one(INFO, {"site": "hall"}) == {"x": 1}
     assert await asks.all(REPORT, {}) == [{"x": 1}]
     assert rpc.asked == ["gate", "gate"]
     with pytest.raises(UnreachableError, match=r"`relays` of \[trust\]"):
-        await requests(rpc, "eve", gate=Gate()).one(PARAM, {"site": "hall"})
+        await requests(rpc, "eve", gate=Gate()).one(INFO, {"site": "hall"})
 
 
 async def test_the_error_of_a_gateway_goes_before_that_of_others() -> None:
@@ -104,5 +104,5 @@ async def test_a_gateway_answers_itself_and_is_told_which_module_asks() -> None:
     async def ask(who: str, what: str, args: dict[str, Any]) -> object:
         return await rpc.handlers[what](peer(who), args)
 
-    assert await ask("other", PARAM, {"asker": "desk"}) == "answer"
-    assert gateway.answered == [(REPORT, ""), (PARAM, "other")]
+    assert await ask("other", INFO, {"asker": "desk"}) == "answer"
+    assert gateway.answered == [(REPORT, ""), (INFO, "other")]

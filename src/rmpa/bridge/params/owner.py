@@ -25,13 +25,13 @@ from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import overlap
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RemoteProtocolError, RmpaError
-from rmpa.core.identity import OWN_NODE, peer_name_problem
+from rmpa.core.identity import OWN_NODE
 from rmpa.ros.http.rpc import read_large, slices
 from rmpa.ros.master.parameters import holds_nil, leaves
 from rmpa.ros.wire.xmlrpc import response_pieces
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
 from rmpa.runtime.tasks import start_task
-from rmpa.trust.permissions import asker_name, refusal
+from rmpa.trust.permissions import refusal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
-    from rmpa.trust.permissions import PermissionDecision
 
 # The caller's name when parameters are set for peers. A core does not notify a node of its own changes, and the
 # agent's node has to be notified of these.
@@ -155,54 +154,18 @@ _log = logging.getLogger(__name__)
 _EACH: Final = Needs((Access.PARAM,), "each parameter, all within a namespace and all that would be lost")
 
 
-@dataclass(frozen=True, slots=True)
-class _Asker:
-    """What asks: a peer, or by way of a peer that is a gateway another site.
-
-    Args:
-        peer: The peer's name, as its certificate proves it.
-        site: The other site; ``None``: the peer asks for itself.
-        modules: Its modules that ask, as the gateways say.
-    """
-
-    peer: str
-    site: str | None
-    modules: tuple[str, ...]
-
-    @classmethod
-    def read(cls, session: PeerSession, args: dict[str, Any]) -> _Asker:
-        """Read ``site`` and ``askers`` of a request.
-
-        Raises:
-            RmpaError: They are none.
-        """
-        site, modules = args.get("site"), args.get("askers", [])
-        if not isinstance(modules, list) or len(modules) > limits.PARAM_ASKERS_MAX:
-            raise RmpaError(f"askers is not a list of at most {limits.PARAM_ASKERS_MAX} modules")
-        for name in [*(() if site is None or site == "" else (site,)), *modules]:
-            # Globs of permissions have the name put in for {peer}: it must be a name, and no glob.
-            if not isinstance(name, str) or peer_name_problem(name) is not None:
-                raise RmpaError(f"{str(name)[:80]!r} is not the name of a site or a module")
-        return cls(session.link.name, site, tuple(dict.fromkeys(modules)))
-
-    def __str__(self) -> str:
-        return self.peer if self.site is None else asker_name(self.site)
-
-
 @dataclass(slots=True, eq=False)
 class _Follower:
     """A peer that follows parameters of this module.
 
     Args:
         session: The peer.
-        asker: The same, for its permissions.
         keys: What it follows.
         told: The mark (``_mark``) of the value that it was told last of each key; it is told of keys without one.
         task: Tells it.
     """
 
     session: PeerSession
-    asker: _Asker
     keys: set[str] = field(default_factory=set)
     told: dict[str, int] = field(default_factory=dict)
     task: asyncio.Task[None] | None = None
@@ -283,7 +246,7 @@ class ParamOwner:
     def judge_again(self) -> None:
         """Tell the peers of parameters that the new rules no longer let them follow."""
         for one in self._followers.values():
-            self._tell_soon(one, {key for key in one.keys if self._why_not_follow(one.asker, key)})
+            self._tell_soon(one, {key for key in one.keys if self._why_not_follow(one.session.link.name, key)})
 
     def tasks(self) -> Iterable[asyncio.Task[None] | None]:
         """Those that tell peers."""
@@ -292,26 +255,26 @@ class ParamOwner:
     # --- requests -----------------------------------------------------------------------------------------------
 
     async def _get(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
-        key, asker = self._key(args.get("key")), _Asker.read(session, args)
+        key, peer = self._key(args.get("key")), session.link.name
         found, value = await self._core.get(key)
         # The permissions come first: the error of ``[params]`` may name a parameter that they hide.
-        self._refuse(self._why_denied(asker, key, value) or self._why_not_get(key, value))
+        self._refuse(self._why_denied(peer, key, value) or self._why_not_get(key, value))
         if not found:
             raise RmpaError(f"there is no parameter {key}", code="unknown-name")
         return {"text": await write_text(key, value)}
 
-    async def _names(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
-        asker = _Asker.read(session, args)
+    async def _names(self, session: PeerSession, _args: dict[str, Any]) -> dict[str, object]:
         known = (await self._core.ask("getParamNames", OWN_NODE)).value
         names = [
             name
             for name in yielding_to_data(map(str, known) if isinstance(known, list) else ())
-            if not why_not_get(self._settings, name) and self._judge(asker, name)[0].allowed
+            if not why_not_get(self._settings, name)
+            and self._gate.judge(Access.PARAM, session.link.name, name).allowed
         ]
         return {"text": await write_text("the list of parameters", names)}
 
     async def _set(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
-        key, asker = self._key(args.get("key")), _Asker.read(session, args)
+        key, peer = self._key(args.get("key")), session.link.name
         value = await read_text(transfer.text_of(args))
         parameters: list[tuple[str, XmlRpcValue]] = []
         for given, one in yielding_to_data(leaves(key, value)):
@@ -324,32 +287,32 @@ class ParamOwner:
                 await asyncio.sleep(0)
             # A member may be named "" or "a/": the core drops the slash at the end, so the name is judged without it.
             name = given.rstrip("/") or "/"
-            self._refuse(key_problem(given) or why_not_set(self._settings, name) or self._why_denied(asker, name))
+            self._refuse(key_problem(given) or why_not_set(self._settings, name) or self._why_denied(peer, name))
             parameters.append((name, one))
         if self._gate.on:  # parameters that the peer may not set must not be lost by it
             around = "/".join(key.split("/")[:2])
             _, present = await self._core.get(around)
             lost = list(replaced((name for name, _ in parameters), around, present))
-            if any(self._why_denied(asker, name) for name in yielding_to_data(lost)):
-                raise RmpaError(refusal(Access.PARAM, str(asker), key), code="not-permitted")
+            if any(self._why_denied(peer, name) for name in yielding_to_data(lost)):
+                raise RmpaError(refusal(Access.PARAM, peer, key), code="not-permitted")
         for number, (name, one) in enumerate(parameters):
             await self._core.set(name, one, PEERS)
             yield_to_data()
             if number % limits.APPLIED_AT_ONCE == 0:
                 await asyncio.sleep(0)
-        _log.info("< %s sets %d parameters at %s", asker, len(parameters), key)
+        _log.info("< %s sets %d parameters at %s", peer, len(parameters), key)
         return {"count": len(parameters)}
 
     async def _delete(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
-        key, asker = self._key(args.get("key")), _Asker.read(session, args)
+        key, peer = self._key(args.get("key")), session.link.name
         self._refuse(why_not_set(self._settings, key))
         if self._gate.on:
             # All of a namespace, and the namespace itself: a rule may name either.
             _, value = await self._core.get(key)
-            self._refuse(self._why_denied(asker, key) or self._why_denied(asker, key, value))
+            self._refuse(self._why_denied(peer, key) or self._why_denied(peer, key, value))
         if not await self._core.delete(key, PEERS):
             raise RmpaError(f"there is no parameter {key}", code="unknown-name")
-        _log.info("< %s deletes parameter %s", asker, key)
+        _log.info("< %s deletes parameter %s", peer, key)
         return {}
 
     async def _follow(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
@@ -357,19 +320,19 @@ class ParamOwner:
         keys = args.get("keys")
         if not isinstance(keys, list) or len(keys) > config_limits.FOLLOW_RULES_MAX:
             raise RmpaError(f"keys is not a list of at most {config_limits.FOLLOW_RULES_MAX} parameters")
-        asker, most = _Asker.read(session, args), self._settings.limits.params
+        peer, most = session.link.name, self._settings.limits.params
         refused: dict[str, str] = {}
         wanted: set[str] = set()
         for given in keys:
             key = str(given).rstrip("/") or "/"
-            why = key_problem(given) or self._why_not_follow(asker, key)
+            why = key_problem(given) or self._why_not_follow(peer, key)
             if not why and key not in wanted and len(wanted) >= most:
                 why = f"more parameters than limits.params = {most} there; raise it, or follow a namespace"
             if why:
                 refused[str(given)[: config_limits.CROSSING_NAME_MAX]] = why
             else:
                 wanted.add(key)
-        follower = self._followers.setdefault(session.peer, _Follower(session, _Asker.read(session, {})))
+        follower = self._followers.setdefault(session.peer, _Follower(session))
         follower.keys = wanted
         for key in wanted:
             await self._core.follow(key)
@@ -383,29 +346,18 @@ class ParamOwner:
         names = yielding_to_data(leaves(key, value or None))  # an empty namespace is judged by its own name
         return next((why for name, _ in names if (why := why_not_get(self._settings, name))), "")
 
-    def _why_not_follow(self, asker: _Asker, key: str) -> str:
-        return why_not_follow(self._settings, key) or self._why_denied(asker, key)
+    def _why_not_follow(self, peer: str, key: str) -> str:
+        return why_not_follow(self._settings, key) or self._why_denied(peer, key)
 
-    def _judge(self, asker: _Asker, name: str) -> tuple[PermissionDecision, str]:
-        """Decide whether a parameter may be had by the peer and by the site for which it asks, and name those judged.
-
-        A peer that may not have it is judged by its own name alone: the site that it names may be invented.
-        """
-        decision = self._gate.judge(Access.PARAM, asker.peer, name)
-        if asker.site is None or not decision.allowed:
-            return decision, asker.peer
-        by_site = self._gate.judge_site(Access.PARAM, asker.site, asker.modules, name)
-        return by_site, f"{asker} by way of {asker.peer}"
-
-    def _why_denied(self, asker: _Asker, key: str, value: XmlRpcValue = None) -> str:
+    def _why_denied(self, peer: str, key: str, value: XmlRpcValue = None) -> str:
         """Why the permissions do not let a peer have a parameter, or all of a namespace; empty if they do."""
         if not self._gate.on:
             return ""
         for name, _ in yielding_to_data(leaves(key, value or None)):
-            decision, whose = self._judge(asker, name)
+            decision = self._gate.judge(Access.PARAM, peer, name)
             if not decision.allowed:
-                self._gate.refused(Access.PARAM, whose, name, decision)
-                return refusal(Access.PARAM, str(asker), key)  # not the name: it may be a secret
+                self._gate.refused(Access.PARAM, peer, name, decision)
+                return refusal(Access.PARAM, peer, key)  # not the name: it may be a secret
         return ""
 
     def _key(self, given: object) -> str:
@@ -441,7 +393,7 @@ class ParamOwner:
     async def _tell_one(self, follower: _Follower, key: str) -> bool:
         """Tell a peer a parameter's present value, or why it may not follow it; return whether that has arrived."""
         text = None
-        if why := self._why_not_follow(follower.asker, key):
+        if why := self._why_not_follow(follower.session.link.name, key):
             follower.keys.discard(key)
         else:
             try:
@@ -449,7 +401,7 @@ class ParamOwner:
                 if found:
                     # What is followed by itself was judged above: the time is shared whatever may be read.
                     hidden = self._why_not_get(key, value) if isinstance(value, dict) else ""
-                    why = self._why_denied(follower.asker, key, value) or hidden
+                    why = self._why_denied(follower.session.link.name, key, value) or hidden
                     text = None if why else await write_text(key, value)
             except RmpaError as error:  # the core does not answer, or the value is too large to cross
                 _log.warning("! peers do not get the parameter %s: %s [param-trouble]", key, error)

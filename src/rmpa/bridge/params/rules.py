@@ -110,9 +110,6 @@ def follow_rules(settings: Settings) -> tuple[FollowRule, ...]:
 #     param.follow {keys}            → {refused}    from now on the owner asks:
 #     param.value {key, text}        → null         the value now; text null: there is none
 #     param.value {key, refused}     → null         it may not be followed any more
-#
-# A gateway that asks for another site adds ``site`` (empty for a program that names none) and ``askers``, modules
-# of that site. Then the owner asks the permissions of the gateway, of the site, and denials of those modules.
 
 
 GET: Final = "param.get"

@@ -1,4 +1,4 @@
-"""The neighbour "other sites" with all that answers for it: ``rmpa site``, ``rmpa param`` and ``rmpa why``.
+"""The neighbour "other sites" with what answers for it: ``rmpa site`` and ``rmpa why``.
 
 What the gateways of two sites tell each other for ``rmpa why``, and the stages at one of them.
 
@@ -19,18 +19,17 @@ import msgspec
 from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.policy import Needs
 from rmpa.config.peer_rules import Access
-from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
-from rmpa.core.identity import is_global_name, peer_name_problem
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.identity import is_global_name
 from rmpa.gateway import limits
 from rmpa.gateway.rules import ACCESS, CrossingRules, SourceKind
 from rmpa.gateway.sites.keys import GATEWAY, ROOT, SiteGateway, read_json
-from rmpa.gateway.sites.params import SiteParams
 from rmpa.gateway.sites.services import ImportedService
 from rmpa.gateway.sites.site import SiteNeighbour
 from rmpa.gateway.sites.topics import SiteContext
 from rmpa.gateway.topics import flow
 from rmpa.gateway.zenoh.threads import first_answer
-from rmpa.observe.operations import INFO, PARAM, REPORT, WHY
+from rmpa.observe.operations import INFO, REPORT, WHY
 from rmpa.observe.peer_info import (
     FAIL,
     OK,
@@ -204,13 +203,11 @@ class SiteAnswers:
 
     Args:
         sites: The neighbour "other sites".
-        params: Asks modules of other sites about parameters.
     """
 
-    def __init__(self, sites: SiteNeighbour, params: SiteParams) -> None:
+    def __init__(self, sites: SiteNeighbour) -> None:
         self._sites = sites
         self._rules = sites.context.rules
-        self._params = params
         self._site = sites.own.site
         session = sites.context.session
         sites.questions.append(lambda: session.queryable(_why_key(self._site), self._take, _NEEDS))
@@ -227,29 +224,11 @@ class SiteAnswers:
         if what == INFO:
             # Of a site that is not known the names of all are the answer.
             return self._report([site] if site in known else known, asker, sources=site in known)
-        for each in (site, module):
-            if peer_name_problem(each) is not None:
-                raise RemoteProtocolError(f"{each[:80]!r} is not the name of a site or a module")
-        self._require(site)
-        if what == PARAM:
-            return await self._params.ask(asker, site, module, args)
         raise RemoteProtocolError(f"{what[:80]!r} is no question about sites")
 
     def _owns(self, asker: str, module: str) -> bool:
         """Whether what a module of this site has is told by this gateway: the others it asks itself."""
         return not self._rules.secured or asker in ("", module)
-
-    def _require(self, site: str) -> None:
-        sites = self._sites.catalogue.sites
-        if site == self._site or site in sites:
-            return
-        ago = self._sites.history.since_ago(site)
-        if ago is not None:
-            raise RmpaError(
-                f"site {site} is unreachable since {ago:.0f} s; `rmpa site list` shows all", code="site-unreachable"
-            )
-        known = f"known are: {', '.join(sites) or 'none'}"
-        raise UnreachableError(f"site {site!r}", "any Zenoh router that this gateway reaches", known)
 
     # --- what is there ----------------------------------------------------------------------------------------------
 
@@ -539,16 +518,5 @@ def make_site_neighbour(graph: AgentGraph, session: OpenSession, settings: Setti
         gateway.site, graph, session, rules, bridge, settings.make_contracts(), agent.bridge.counters
     )
     neighbour = SiteNeighbour(context, SiteGateway(gateway.site, gateway.rank, secrets.token_hex(16)))
-
-    async def ask_module(module: str, what: str, args: dict[str, Any]) -> object:
-        for peer in agent.bridge.sessions.linked():
-            if peer.link.name == module:
-                return await agent.bridge.rpc.request(peer, what, args, limits.SITE_PARAM_TIMEOUT)
-        where = f"site {gateway.site} as {module!r}"
-        raise UnreachableError("module", where, "`rmpa peer list` there shows which are linked to its gateway")
-
-    params = SiteParams(context, ask_module)
-    neighbour.questions.append(params.answer)
-    neighbour.closing.append(params.close)
-    agent.sites.serve(SiteAnswers(neighbour, params))
+    agent.sites.serve(SiteAnswers(neighbour))
     return neighbour

@@ -19,7 +19,7 @@ from rmpa.gateway.sites.topics import SiteTopics
 from rmpa.runtime.loop import MachineTimer
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Callable
 
     from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.sites.keys import SiteSource
@@ -46,7 +46,6 @@ class SiteNeighbour:
         imports: What is shown of the other sites.
         leads: Whether this gateway is the one of its site that exports and imports.
         questions: Declare what it answers while it leads.
-        closing: Called when it closes.
     """
 
     # More than twelve fields: it is the one place that knows the machines and the parts.
@@ -62,7 +61,6 @@ class SiteNeighbour:
         self.services = SiteServices(context)
         self.leads = False
         self.questions: list[Callable[[], Declaration]] = list(self.topics.questions)
-        self.closing: list[Callable[[], Awaitable[None]]] = [self.topics.close, self.services.close]
         self._actions = SiteActions(context.graph)
         self._leader = Leader(own, limits.LEADER_PATIENCE, time.monotonic())
         self._sites: tuple[str, ...] = ()
@@ -89,8 +87,8 @@ class SiteNeighbour:
         self._closed = True
         self._timer.close()
         self._rest()
-        for close in self.closing:
-            await close()
+        await self.topics.close()
+        await self.services.close()
         for declared in self._declared:
             declared.close()
 

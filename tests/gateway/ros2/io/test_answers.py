@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import UnreachableError
-from rmpa.observe.operations import INFO, PARAM, REPORT, WHY
+from rmpa.observe.operations import INFO, REPORT, WHY
 from rmpa.observe.peer_info import SiteInfo, SitesReport
 from tests.gateway.memory_zenoh import eventually
 from tests.gateway.ros2.io.ros2_bed import NO_TYPE, STRING, Ros2Bed
@@ -36,12 +36,12 @@ async def test_ros2_is_listed_with_its_topics_and_what_is_wrong_with_them(bed: R
     ways = await answer(WHY, {"name": "/chatter", "site": "ros2"})
     assert [(way.peer, way.node) for way in ways] == [("ros2", "/bot")]
     with pytest.raises(UnreachableError):
-        await answer(PARAM, {"site": "hall"})
+        await answer(INFO, {"site": "hall"})
 
 
 async def test_questions_about_sites_go_to_what_answers_for_them(bed: Ros2Bed) -> None:
     bed.neighbour.sites = OtherSites()
     report: SitesReport = await bed.neighbour.answer(REPORT, {})
     assert [site.name for site in report.sites] == ["hall", "ros2"]
-    for what, args in ((PARAM, {"site": "hall"}), (WHY, {"name": "/nothing"})):
+    for what, args in ((INFO, {"site": "hall"}), (WHY, {"name": "/nothing"})):
         assert await bed.neighbour.answer(what, args) == ["of a site"]
