@@ -27,7 +27,6 @@ from rmpa.core.schedule import positive
 from rmpa.observe import limits
 from rmpa.observe.control import GraphRevision
 from rmpa.observe.control_client import ControlClient, choose_agent
-from rmpa.observe.control_stream import ControlStream
 from rmpa.observe.peer_info import LinkInfo, PeerInfo
 from rmpa.observe.snapshot import AgentInfo, RouteInfo, ServiceInfo, Snapshot, TopicInfo
 
@@ -247,8 +246,8 @@ class AgentClient:
         Raises:
             UnreachableError: The agent does not answer.
         """
-        with await ControlStream.open(self._where) as stream:
-            return await stream.call("snapshot", Snapshot)
+        with await asyncio.to_thread(ControlClient, self._where) as client:
+            return await client.ask("snapshot", Snapshot)
 
     async def events(self, *, since: Snapshot | None = None, period: float = 1.0) -> AsyncGenerator[AgentEvent, None]:
         """The changes from a snapshot on, without end.
@@ -267,8 +266,8 @@ class AgentClient:
         last, problem = since, ""
         while True:
             try:
-                with await ControlStream.open(self._where) as stream:
-                    async with aclosing(_snapshots(stream, period)) as snapshots:
+                with await asyncio.to_thread(ControlClient, self._where) as client:
+                    async with aclosing(_snapshots(client, period)) as snapshots:
                         async for now in snapshots:
                             if problem:
                                 yield AgentReturned(now.agent)
@@ -292,19 +291,19 @@ class AgentClient:
         self._path = (await asyncio.to_thread(choose_agent, os.environ, self._name)).path
 
 
-async def _snapshots(stream: ControlStream, period: float) -> AsyncGenerator[Snapshot, None]:
+async def _snapshots(client: ControlClient, period: float) -> AsyncGenerator[Snapshot, None]:
     """A snapshot after each change of the graph, and after a period without one."""
     loop = asyncio.get_running_loop()
     known: int | None = None
     while True:
         began = loop.time()
         try:
-            known = (await stream.call("graph", GraphRevision)).revision
-            yield await stream.call("snapshot", Snapshot)
+            known = (await client.ask("graph", GraphRevision)).revision
+            yield await client.ask("snapshot", Snapshot)
             wait = min(period, limits.CONTROL_WAIT_MAX)
-            await stream.call("graph", GraphRevision, after=known, wait=wait)
+            await client.ask("graph", GraphRevision, after=known, wait=wait)
         except PeerRefused:  # an agent without a graph, such as a gateway's
-            yield await stream.call("snapshot", Snapshot)
+            yield await client.ask("snapshot", Snapshot)
             await asyncio.sleep(period)
         await asyncio.sleep(max(0.0, began + min(_LEAST, period) - loop.time()))
 

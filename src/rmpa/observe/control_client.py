@@ -1,10 +1,8 @@
-"""The blocking client of the control socket, and the search for this machine's agents.
-
-The blocking client of the control socket, and the search for this machine's agents; for the command line.
-"""
+"""The client of the control socket, the search for this machine's agents, and the lock of an agent's name."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import fcntl
 import grp
@@ -199,37 +197,8 @@ class _Result(msgspec.Struct, Generic[_T], frozen=True):
     follows: int = 0
 
 
-def read_reply(path: Path, op: str, line: bytes, type: type[_T]) -> _Result[_T]:  # noqa: A002 - as msgspec calls it
-    """Read the agent's reply to a request.
-
-    Args:
-        path: Its socket.
-        op: The operation.
-        line: What it sent, with its end.
-        type: The type of the value.
-
-    Raises:
-        PeerRefused: The agent refused, and said why.
-        UnreachableError: It closed the connection.
-        RemoteProtocolError: Its value has another type.
-    """
-    agent = f"agent {path.stem}"
-    if len(line) > limits.CONTROL_REPLY_MAX:
-        raise RemoteProtocolError(f"{agent} sends more than {limits.CONTROL_REPLY_MAX} bytes")
-    if not line.endswith(b"\n"):
-        raise UnreachableError("agent", f"{path}: it closed the connection", "its log says why")
-    try:
-        reply: _Result[_T] = msgspec.json.decode(line, type=_Result[type])  # type: ignore[valid-type]
-    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
-        refused = ControlReply.parse(line)
-        if not refused.ok:
-            raise PeerRefused(agent, refused.error, refused.remedy, code=refused.code or "refused") from None
-        raise RemoteProtocolError(f"{agent} answers {op} in another way: {error}; is it older?") from None
-    return reply
-
-
 class ControlClient:
-    """One connection to an agent; a context manager.
+    """One connection to an agent; a context manager; one call at a time.
 
     Args:
         path: Its socket.
@@ -296,10 +265,19 @@ class ControlClient:
             self._sock.sendall(ControlRequest(op, args).serialize())
             return self._file.readline(limits.CONTROL_REPLY_MAX + 1)
 
-        reply = read_reply(self.path, op, self._received(exchange), type)
+        reply = self._read(op, self._received(exchange), type)
         if reply.follows:
             with_text(reply.value, self._received(lambda: self._file.read(reply.follows)))
         return reply.value
+
+    async def ask(self, op: str, type: type[_T], **args: object) -> _T:  # noqa: A002 - as msgspec calls it
+        """As ``call``, in a thread; if it is cancelled, the connection ends."""
+        try:
+            return await asyncio.to_thread(lambda: self.call(op, type, **args))
+        except asyncio.CancelledError:
+            with contextlib.suppress(OSError):  # it has ended already
+                self._sock.shutdown(socket.SHUT_RDWR)
+            raise
 
     def snapshot(self, **args: object) -> Snapshot:
         """Everything that the agent shows; ``args`` are those of the operation. Raises as ``call``."""
@@ -308,6 +286,21 @@ class ControlClient:
     def agent(self) -> AgentInfo:
         """What the agent tells of itself, without its peers, topics and services; raises as ``call``."""
         return self.snapshot(topics=(), peers=False).agent
+
+    def _read(self, op: str, line: bytes, type: type[_T]) -> _Result[_T]:  # noqa: A002 - as msgspec calls it
+        agent = f"agent {self.name}"
+        if len(line) > limits.CONTROL_REPLY_MAX:
+            raise RemoteProtocolError(f"{agent} sends more than {limits.CONTROL_REPLY_MAX} bytes")
+        if not line.endswith(b"\n"):
+            raise UnreachableError("agent", f"{self.path}: it closed the connection", "its log says why")
+        try:
+            reply: _Result[_T] = msgspec.json.decode(line, type=_Result[type])  # type: ignore[valid-type]
+        except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+            refused = ControlReply.parse(line)
+            if not refused.ok:
+                raise PeerRefused(agent, refused.error, refused.remedy, code=refused.code or "refused") from None
+            raise RemoteProtocolError(f"{agent} answers {op} in another way: {error}; is it older?") from None
+        return reply
 
     def _received(self, receive: Callable[[], bytes]) -> bytes:
         try:

@@ -14,7 +14,6 @@ from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, Unreac
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.control import GraphRevision
 from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
-from rmpa.observe.control_stream import ControlStream
 from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 from rmpa.trust.permissions import TrustStatus
 from rmpa.web import limits
@@ -230,9 +229,11 @@ class AgentFollower:
         while not self.misfit.is_set():
             try:
                 agent = await asyncio.to_thread(self._find)
-                with await ControlStream.open(agent.path) as stream:
+                with await asyncio.to_thread(
+                    ControlClient, agent.path, limits.GRAPH_WAIT + limits.WEB_AGENT_TIMEOUT
+                ) as client:
                     pause = limits.TRUST_RETRY
-                    await self._follow(agent.name, graph, stream)
+                    await self._follow(agent.name, graph, client)
             except (RmpaError, OSError) as error:  # TimeoutError is an OSError
                 _log.debug("! the agent is not followed: %s", error)
                 if isinstance(error, PeerRefused | RemoteProtocolError):  # it will not tell more in a moment
@@ -242,10 +243,11 @@ class AgentFollower:
             await asyncio.sleep(pause)
             pause = min(2 * pause, limits.NODE_RETRY)
 
-    async def _follow(self, name: str, graph: GraphWatch, stream: ControlStream) -> None:
+    async def _follow(self, name: str, graph: GraphWatch, client: ControlClient) -> None:
         """Ask one run of an agent until it ends."""
         within = limits.WEB_AGENT_TIMEOUT
-        status = await stream.call("trust", TrustStatus, timeout=within, what="status")
+        async with asyncio.timeout(within):
+            status = await client.ask("trust", TrustStatus, what="status")
         if not self._fits(status if status.on else None):
             self.misfit.set()
             return
@@ -256,7 +258,7 @@ class AgentFollower:
         known: int | None = None
         while True:
             args: dict[str, Any] = {"after": known, "wait": limits.GRAPH_WAIT, "rows": True}
-            told = await stream.call("graph", GraphRevision, timeout=limits.GRAPH_WAIT + within, **args)
+            told = await client.ask("graph", GraphRevision, **args)
             if told.rows is None:
                 if told.revision != known:
                     graph.look()
