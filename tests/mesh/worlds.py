@@ -22,7 +22,7 @@ DIALLER, ACCEPTOR = "dialler", "acceptor"
 WALL = 1_700_000_000_000_000_000
 
 
-class _Route(DataHandler):
+class _Route:
     """One route of ``AnyRoute``."""
 
     def __init__(self, route: int, owner: AnyRoute) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -316,7 +317,7 @@ def topic_find(kind: str, options: Options) -> None:
     options.show(found, marked(found, graph.publishers))
 
 
-class _Figures:
+class _Figures(ABC):
     """Figures over a sliding window of messages, measured by this command's own subscriber.
 
     For each remote source the agent's figures follow, which are more exact: the agent takes the time of each message
@@ -374,17 +375,17 @@ class _Figures:
         """For JSON, in base units; ``source`` is what measured them."""
         return {"source": self.source, **self.own()}
 
+    @abstractmethod
     def own(self) -> dict[str, float]:
         """The figures of this command's subscriber, in base units."""
-        raise NotImplementedError
 
+    @abstractmethod
     def text(self) -> str:
         """The subscriber's figures as text."""
-        raise NotImplementedError
 
+    @abstractmethod
     def remote(self, route: RouteInfo) -> str:
         """The agent's figures of a remote source as text."""
-        raise NotImplementedError
 
 
 class _Rate(_Figures):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import logging
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits as bridge_limits
@@ -171,7 +172,7 @@ def _name_problem(source: ForeignSource) -> str:
     return ""
 
 
-class ProxiedSource:
+class ProxiedSource(ABC):
     """A foreign source in the gateway's graph: what topics and services share.
 
     Args:
@@ -245,18 +246,18 @@ class ProxiedSource:
         if self.refused:
             _log.error("! %s of %s: %s [core-refuses]", self.source.name, node.name, self.refused)
 
+    @abstractmethod
     def _withdraw(self) -> None:
         """End what subscribers or clients have of it."""
-        raise NotImplementedError
 
-    def _attach(self, node: SlaveNode) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def _attach(self, node: SlaveNode) -> None: ...
 
-    def _register(self) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def _register(self) -> None: ...
 
-    def _detach(self, node: SlaveNode) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def _detach(self, node: SlaveNode) -> None: ...
 
 
 class ProxiedTopic(ProxiedSource, PublicationEvents):

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import logging
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
@@ -56,10 +56,8 @@ class ConnectionState(IntEnum):
     CLOSED = 4
 
 
-class DataHandler:
-    """Takes the data that arrives on one route; for subclasses."""
-
-    __slots__ = ()
+class DataHandler(Protocol):
+    """Takes the data that arrives on one route."""
 
     def message(self, sequence: int, stamp_ns: int, framed: memoryview) -> None:
         """Take a whole message, its 4-byte length in front; ``framed`` is valid during the call only.
@@ -67,7 +65,6 @@ class DataHandler:
         Raises:
             RemoteProtocolError: It is no message; the connection is closed.
         """
-        raise NotImplementedError
 
     def part(self, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
         """Take a part of a large message (``core.outbox`` FIRST, LAST, ABORT); valid during the call only.
@@ -77,7 +74,6 @@ class DataHandler:
         Raises:
             RemoteProtocolError: The parts are no message; the connection is closed.
         """
-        raise NotImplementedError
 
 
 class ConnectionProtocol:

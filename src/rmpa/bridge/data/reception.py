@@ -20,7 +20,6 @@ from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import SERIAL_MASK, is_earlier, is_later, serial_add, serial_distance
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits as mesh_limits
-from rmpa.mesh.connection import DataHandler
 from rmpa.mesh.frames import FrameKind
 from rmpa.mesh.reliable import HistoryCache, ReliableReceiver
 from rmpa.ros import limits as ros_limits
@@ -63,7 +62,7 @@ class LinkTime:
 _PREFIX_SIZE: Final = LENGTH.size
 
 
-class ImportFlow(DataHandler):
+class ImportFlow:
     """From one peer's route to the local subscribers of its proxy.
 
     Most messages need a look at their number and their age alone (``_plain``). The numbering takes a message when it

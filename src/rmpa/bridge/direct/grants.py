@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
@@ -59,7 +60,7 @@ _Entry = tuple["PeerSession", DirectAsk, Grant | Unmet | None]
 _RELEASED: Final = Needs((), "what was granted to the peer itself")
 
 
-class Grants:
+class Grants(ABC):
     """What peers asked for, and what they were answered. Subclasses know the conditions, and where nodes listen.
 
     Args:
@@ -102,18 +103,18 @@ class Grants:
 
     # --- what subclasses know ---------------------------------------------------------------------------------------
 
+    @abstractmethod
     def _unmet(self, session: PeerSession, asked: DirectAsk) -> Unmet | None:
         """The condition that does not hold for a peer by the rules and the graph."""
-        raise NotImplementedError
 
+    @abstractmethod
     async def _find(self, session: PeerSession, want: Want) -> Grant | Unmet:
         """Where the node listens, if the peer may reach it."""
-        raise NotImplementedError
 
-    def _changed(self, session: PeerSession, want: Want, *, granted: bool) -> None:
+    def _changed(self, session: PeerSession, want: Want, *, granted: bool) -> None:  # noqa: B027 - of topics alone
         """A user has got a grant, or has none any more."""
 
-    def _broke(self, want: Want) -> None:
+    def _broke(self, want: Want) -> None:  # noqa: B027 - likewise
         """A peer's user says that its connection ended by itself."""
 
     # --- requests ---------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Generic
@@ -105,7 +106,7 @@ class Path(Generic[EntryT]):
         return "direct" if isinstance(self.found, Grant) else "relayed"
 
 
-class Paths(Generic[EntryT]):
+class Paths(ABC, Generic[EntryT]):
     """The decisions of this module. Subclasses probe nodes, and carry the decisions out.
 
     Args:
@@ -146,17 +147,17 @@ class Paths(Generic[EntryT]):
 
     # --- what subclasses do -----------------------------------------------------------------------------------------
 
+    @abstractmethod
     async def _probe(self, path: Path[EntryT], grant: Grant) -> str:
         """Why a node cannot be reached from here; empty: it can."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _decided(self, path: Path[EntryT]) -> None:
         """Carry out a decision."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _subject(self, path: Path[EntryT]) -> str:
         """A path in a warning."""
-        raise NotImplementedError
 
     # --- facts ------------------------------------------------------------------------------------------------------
 

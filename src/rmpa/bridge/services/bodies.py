@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,7 +26,6 @@ from rmpa.core.identity import OWN_NODE
 from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits as mesh_limits
-from rmpa.mesh.connection import DataHandler
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 from rmpa.runtime.loop import yield_to_data
@@ -161,7 +161,7 @@ def _framed(head: bytes, body: Buffer, size: int | None = None) -> bytes:
     return b"".join((length.to_bytes(_LENGTH, "little"), head, body))
 
 
-class BodyReceiver(DataHandler):
+class BodyReceiver(ABC):
     """Reassembles the bodies that arrive on one route; for subclasses.
 
     Args:
@@ -180,13 +180,13 @@ class BodyReceiver(DataHandler):
         self._size = 0
         self._stamp_ns = 0
 
+    @abstractmethod
     def body(self, sequence: int, body: bytes | bytearray) -> None:
         """Handle a complete body, which belongs to the callee; it no longer counts in the budget."""
-        raise NotImplementedError
 
+    @abstractmethod
     def failed(self, sequence: int, reason: str) -> None:
         """Handle the loss of a body whose first part had arrived."""
-        raise NotImplementedError
 
     def message(self, sequence: int, stamp_ns: int, framed: memoryview) -> None:
         """Handle a body that arrived in one frame.

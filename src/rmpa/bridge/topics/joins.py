@@ -31,7 +31,6 @@ from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_later, serial_add
 from rmpa.core.limits import UINT32_MAX
 from rmpa.core.outbox import ABORT, FIRST, LAST, QueuedMessage
-from rmpa.mesh.connection import DataHandler
 from rmpa.ros import limits as ros_limits
 from rmpa.runtime.tasks import OwnedTasks
 
@@ -224,7 +223,7 @@ class ServedJoin:
 # --- At the subscriber's agent --------------------------------------------------------------------------------------
 
 
-class JoiningSubscriber(DataHandler):
+class JoiningSubscriber:
     """A subscriber that gets the messages of its own connection to the publisher, until it gets what all get.
 
     Its publication gives it what all get in place of the connection; that is held until its number is named.

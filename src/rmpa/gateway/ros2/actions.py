@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from abc import abstractmethod
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -112,9 +113,9 @@ class JoinedAction(Goals):
         if topic in self._topics:
             self._topics[topic].publish(message)
 
+    @abstractmethod
     async def _join(self) -> None:
         """Find the types, and join the action if they are a pair."""
-        raise NotImplementedError
 
     def _show(self, part: str, header: TopicDescription, on_demand: Callable[[bool], None]) -> None:
         source = ForeignSource(SourceKind.TOPIC, SITE, "", self._shown, f"{self.here}/{part}", header.type)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import struct
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -257,7 +258,7 @@ def _unpack(form: str, raw: Buffer, what: str) -> tuple[Any, ...]:
         raise RemoteProtocolError(f"{len(raw)} bytes are no {what}") from error
 
 
-class Goals:
+class Goals(ABC):
     """The goals of one action, in one direction, without I/O: what a goal causes, the join of the action carries out.
 
     Args:
@@ -272,21 +273,21 @@ class Goals:
     def __init__(self, clock: SystemClock) -> None:
         self._clock = clock
 
+    @abstractmethod
     def tell_ros1(self, topic: str, message: bytes) -> None:
         """Publish a message for ROS 1."""
-        raise NotImplementedError
 
+    @abstractmethod
     def server_gone(self) -> None:
         """The server is gone: all goals end as aborted."""
-        raise NotImplementedError
 
+    @abstractmethod
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is to be called; ``None``: not."""
-        raise NotImplementedError
 
+    @abstractmethod
     def handle_timer(self, now: float) -> None:
         """Do what is due."""
-        raise NotImplementedError
 
 
 @dataclass(slots=True)
@@ -315,13 +316,13 @@ class GoalsToRos1(Goals):
         # By the id in ROS 1, which is the text of the UUID.
         self._goals: dict[str, _SentToRos1] = {}
 
+    @abstractmethod
     def tell_ros2(self, topic: str, message: bytes) -> None:
         """Publish a message for ROS 2."""
-        raise NotImplementedError
 
+    @abstractmethod
     def answer(self, query: ArrivedQuery, response: bytes) -> None:
         """Answer a request of a client."""
-        raise NotImplementedError
 
     def send_goal(self, query: ArrivedQuery) -> None:
         """A client calls ``send_goal``."""
@@ -473,9 +474,9 @@ class GoalsToRos2(Goals):
         self._goals: dict[bytes, _SentToRos2] = {}
         self._next_status: float | None = None
 
+    @abstractmethod
     def ask(self, service: str, uuid: bytes, request: bytes) -> None:
         """Call a service of the server; ``answered`` or ``failed`` follows."""
-        raise NotImplementedError
 
     def goal(self, raw: Buffer) -> None:
         """A client publishes an ``ActionGoal``."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
+from abc import ABC, abstractmethod
 from functools import partial
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -66,7 +67,7 @@ class PartsTaker(Protocol):
 OUT_OF_FILES: Final = "the subscribing side has no file descriptor left for it; `rmpa doctor` there says what to do"
 
 
-class TopicConnection:
+class TopicConnection(ABC):
     """A subscriber's connection to one publisher of one topic.
 
     It connects again until it is closed or the publisher refuses it. The owner closes it when the publisher is no
@@ -150,13 +151,13 @@ class TopicConnection:
         """Whether the headers have been exchanged."""
         return bool(self.fields)
 
+    @abstractmethod
     def start(self) -> None:
         """Connect, in a later turn of the loop."""
-        raise NotImplementedError
 
+    @abstractmethod
     def close(self) -> None:
         """Disconnect at once; no callback is called any more."""
-        raise NotImplementedError
 
     def connection(self) -> BusConnection:
         """The connection's row in ``getBusInfo`` and ``getBusStats``."""
