@@ -39,8 +39,9 @@ if TYPE_CHECKING:
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
-_T = TypeVar("_T")
 _log = logging.getLogger(__name__)
+
+_T = TypeVar("_T")
 
 # Messages that wait for a callback; above it the oldest is dropped.
 _QUEUE: Final = 100
@@ -206,8 +207,6 @@ class SyncNode:
 
         return self._wait_for(logger())
 
-    # --- topics -----------------------------------------------------------------------------------------------
-
     def advertise(
         self,
         topic: str,
@@ -261,8 +260,6 @@ class SyncNode:
         """Topics that have a publisher, with their types."""
         return self._wait_for(self._open_node.get_published_topics())
 
-    # --- services ---------------------------------------------------------------------------------------------
-
     def advertise_service(
         self, name: str, kind: str, handler: Callable[[Any], Any], *, timeout: float = SERVICE_TIMEOUT
     ) -> Callable[[], None]:
@@ -307,8 +304,6 @@ class SyncNode:
         """Call a service, and return its response; see ``rmpa.Node.call_service``."""
         return self._wait_for(self._open_node.call_service(name, kind, request, timeout))
 
-    # --- parameters -------------------------------------------------------------------------------------------
-
     def get_param(self, key: str, default: Any = _NO_DEFAULT) -> Any:
         """A parameter's value, or ``default`` where one is given and the parameter does not exist."""
         given = {} if default is _NO_DEFAULT else {"default": default}
@@ -347,8 +342,6 @@ class SyncNode:
         value = self._wait_for(node.follow_param(key, change))
         self._for_each(each(), lambda change: callback(*change), f"callback for parameter {key}")
         return value
-
-    # --- time -------------------------------------------------------------------------------------------------
 
     def rate(self, hz: float) -> Iterator[int]:
         """The numbers 0, 1, 2 … at a rate, until the node is closed; see ``rmpa.Node.rate``."""
@@ -395,8 +388,6 @@ class SyncNode:
     def stopped(self) -> bool:
         """Whether the node is closed."""
         return self._stopped.is_set()
-
-    # --- inside -----------------------------------------------------------------------------------------------
 
     @property
     def _open_node(self) -> Node:

@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from rmpa.config.read import Loaded
     from rmpa.config.settings import Settings
 
+_log = logging.getLogger(__name__)
+
 # Until rmpa web is started again after it ended; each further time it is twice as long.
 WEB_RESTART_FIRST: Final = 0.5
 # The longest such time.
@@ -54,8 +56,6 @@ WEB_END_TIMEOUT: Final = 5.0
 
 # Reads the settings again while the agent runs, and applies those that it can (SIGHUP, ``rmpa reload``).
 
-
-_log = logging.getLogger(__name__)
 
 # The fields of ``Settings`` that a running agent takes; all others need a restart.
 LIVE: Final = frozenset(setting.path[0] for setting in SETTINGS if setting.live)
@@ -189,11 +189,9 @@ def _shown(value: object) -> str:
     return text if len(text) <= _VALUE_SHOWN else text[: _VALUE_SHOWN - 3] + "..."
 
 
-# --- Runs ``rmpa web`` as a child process of the agent, which does not depend on it ---------------------------------
-#
-# It ends with an agent that ends in order. An agent that is killed leaves it, with its clients, to the next one: the
-# file ``<name>.web`` beside the control socket notes the process, and is locked as long as that runs, which has
-# inherited the descriptor.
+# Runs ``rmpa web`` as a child process of the agent, which does not depend on it. It ends with an agent that ends in
+# order. An agent that is killed leaves it, with its clients, to the next one: the file ``<name>.web`` beside the
+# control socket notes the process, and is locked as long as that runs, which has inherited the descriptor.
 
 
 # The exit code of a command that cannot run as it is written: another start would end alike.
@@ -389,9 +387,7 @@ async def _ended(pid: int) -> None:
         os.close(descriptor)
 
 
-# --- The process of an agent ----------------------------------------------------------------------------------------
-#
-# Its signals, its readiness, and the limits that it sets for itself.
+# The process of an agent. Its signals, its readiness, and the limits that it sets for itself.
 
 
 async def serve(

@@ -156,8 +156,6 @@ class AgentTrust(Part):
         own = Needs((), "the certificate for the peer's own certified name, unless that is revoked")
         bridge.rpc.on_request(RENEW, self._renew_other, own)
 
-    # --- life -------------------------------------------------------------------------------------------------
-
     def start(self) -> None:
         """Look after the certificate from now on."""
         self._renewing = keep_task(self._look_after, "renew the certificate")
@@ -184,8 +182,6 @@ class AgentTrust(Part):
     def linked(self) -> set[str]:
         """The names of the linked modules."""
         return {session.link.name for session in self._bridge.sessions.linked()}
-
-    # --- documents --------------------------------------------------------------------------------------------
 
     def link_up(self, session: PeerSession) -> None:
         """Tell a new link what this module has."""
@@ -238,8 +234,6 @@ class AgentTrust(Part):
             if peer in sessions:
                 document = self.membership.document(kind).decode()
                 self._bridge.rpc.notify(sessions[peer], kind.notice, {"document": document})
-
-    # --- renewal ----------------------------------------------------------------------------------------------
 
     def _authority_found(self, session: PeerSession) -> None:
         self._authority_peer = session
@@ -358,9 +352,6 @@ class AgentTrust(Part):
     def is_linked(self, name: str) -> bool:
         """Whether a module of a name is linked, or is this one; upper and lower case are the same."""
         return name.casefold() in {each.casefold() for each in (self.membership.name, *self.linked())}
-
-
-# --- Answers ``rmpa trust …`` on the control socket of a secured agent ----------------------------------------------
 
 
 Args = dict[str, object]

@@ -9,7 +9,6 @@ from typing import Final
 
 from rmpa.core.limits import KIB
 
-# --- settings ---------------------------------------------------------------------------------------------------
 # [Agent] Bytes of a settings file
 # At it: it is refused
 # Told in: error at start
@@ -57,20 +56,17 @@ GATEWAY_BYTES_MAX: Final = 100_000_000_000
 # Highest value of a setting in ``[limits]``: such a graph takes some gigabytes.
 BOUND_MAX: Final = 1_000_000
 
-# --- discovery --------------------------------------------------------------------------------------------------
 # Administratively scoped (RFC 2365), so routers keep it on site; 82.77 is "RM".
 MULTICAST_GROUP: Final = "239.255.82.77"
 # The discovery port of domain 0; domain n uses this port plus n.
 MULTICAST_PORT: Final = 11411
 
-# --- ROS --------------------------------------------------------------------------------------------------------
 # [Services] Time for a call (`services.timeout`, `[[service]]`)
 # At it: the call fails
 # Told in: the caller's error, `service info`
 # Why: Planners take tens of seconds; rospy and roscpp wait for ever.
 SERVICE_TIMEOUT: Final = 60.0
 
-# --- bridge -----------------------------------------------------------------------------------------------------
 # [Graph] Nodes of one peer in the local graph (`limits.nodes`)
 # At it: further ones stay hidden, with their topics and services
 # Told in: `peer info`, `peer list`, `why` (*limit*), diagnostics, log

@@ -160,8 +160,6 @@ def core_file(environ: Mapping[str, str], port: int, module: str = "", setting: 
     return (module_dir(directory, module) if module else directory) / f"core-{port}.state"
 
 
-# --- the module's name ----------------------------------------------------------------------------------------------
-
 # In the state directory: the name of this machine's module. No folder of a module is named so: it has a dash.
 NAME_FILE: Final = "module-name"
 # In the state directory of the user's home: others in which modules have joined a secured mesh, one a line.

@@ -71,8 +71,6 @@ def _make_service(given: dict[str, Any]) -> ServiceRule:
 
 SERVICE_RULES: Final = rules_of(keys_of(ServiceRule), _make_service, _SERVICE_EXAMPLE)
 
-# --- [[peer]] -------------------------------------------------------------------------------------------------------
-
 # Names before and after, or namespaces ``/namespace/**``; ``{peer}`` in them is the peer's name.
 Renames = tuple[tuple[str, str], ...]
 
@@ -179,9 +177,6 @@ def peer_warnings(rules: Sequence[PeerRule]) -> Iterator[tuple[values.Place, str
         if rule.prefix and values.PEER not in rule.prefix and re.search(r"[*?]", rule.name):
             text = f"{rule.prefix} is one place for every peer that {rule.name} fits"
             yield (index, "prefix"), f"{text}; /{values.PEER} would keep them apart"
-
-
-# --- [[permission]] and [trust.groups] ------------------------------------------------------------------------------
 
 
 class Effect(StrEnum):

@@ -30,11 +30,6 @@ if TYPE_CHECKING:
     from rmpa.config.schema import Key, Setting
 
 
-# --- Where in a TOML text a key or an element stands ----------------------------------------------------------------
-#
-# ``tomllib`` does not say.
-
-
 def value_at(table: object, place: Place) -> object:
     """The value at a place of a parsed file; ``None`` if there is none."""
     for part in place:
@@ -217,9 +212,7 @@ def _keys(schema: JsonSchema, table: Key = ()) -> Iterator[Key]:
             yield (*table, name)
 
 
-# --- Where settings come from, each source stronger than the one before it ------------------------------------------
-#
-# ::
+# Where settings come from, each source stronger than the one before it::
 #
 #     defaults < ROS environment < rmpa.toml < RMPA_* < options
 #

@@ -132,9 +132,7 @@ def contract_warnings(rules: Sequence[ContractRule]) -> Iterator[tuple[Place, st
             yield (index, "max_rate"), text
 
 
-# --- The tables ``[[param]]`` of ``rmpa.toml`` ----------------------------------------------------------------------
-#
-# Which parameters of which peers are followed, and under which name.
+# The tables ``[[param]]`` of ``rmpa.toml``. Which parameters of which peers are followed, and under which name.
 
 
 SIM_TIME: Final = "/use_sim_time"
@@ -237,9 +235,7 @@ def _read_params(raw: object) -> tuple[FollowRule, ...]:
 PARAM_RULES: Final = ValueType(_read_params, _FOLLOW.json_schema)
 
 
-# --- The table ``[gateway]`` of ``rmpa.toml`` -----------------------------------------------------------------------
-#
-# Which other sites and which ROS 2 a gateway joins, and what may cross.
+# The table ``[gateway]`` of ``rmpa.toml``. Which other sites and which ROS 2 a gateway joins, and what may cross.
 
 
 # Stands in the place of a site in names and rules, for a ROS 2 graph; no site may have it.

@@ -177,11 +177,6 @@ def settings_of(
             yield replace(it, path=where, key=key, env=variable, live=live or it.live, command=command)
 
 
-# --- Lists of tables such as [[contract]] ---------------------------------------------------------------------------
-#
-# Rules.
-
-
 def keys_of(kind: type) -> dict[str, Setting]:
     """The keys that a dataclass of a rule declares, by their names in the file."""
     return {it.key[-1]: it for it in settings_of(kind) if it.key}

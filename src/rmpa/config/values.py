@@ -97,9 +97,6 @@ def text_type(read: Callable[[Any], _T], *examples: str, metavar: str = "") -> V
     return ValueType(read, {"type": "string", "examples": list(examples)}, metavar)
 
 
-# --- texts, names and words -----------------------------------------------------------------------------------------
-
-
 def read_text(raw: object) -> str:
     """A string that is not empty."""
     if not isinstance(raw, str) or not raw.strip():
@@ -185,8 +182,6 @@ CORE_MODE: Final = word_of(
     "MODE",
 )
 
-# --- switches and numbers -------------------------------------------------------------------------------------------
-
 
 def _read_bool(raw: object) -> bool:
     """``true`` or ``false``, also as 1, 0, yes, no, on, off."""
@@ -221,8 +216,6 @@ DSCP: Final = whole_number(0, 63, "a DSCP (the TOS byte / 4; CS6 is 48)")
 PACKET_PRIORITY: Final = whole_number(0, 6, "SO_PRIORITY without CAP_NET_ADMIN")
 FIFO_PRIORITY: Final = whole_number(1, 99, "a priority of SCHED_FIFO")
 BOUND: Final = whole_number(1, limits.BOUND_MAX, "a limit")
-
-# --- durations and rates: numbers in seconds, messages or bytes a second, or texts with a unit ----------------------
 
 # By unit: so many of it are a second. Dividing by these rounds only once, so that ``"100 ms"`` is exactly 0.1.
 _SECONDS: Final = {"us": 1e6, "µs": 1e6, "ms": 1e3, "s": 1.0, "min": 1 / 60, "h": 1 / 3600}
@@ -354,8 +347,6 @@ BYTES_A_SECOND: Final = ValueType(
     read_bytes_a_second, _number_or_text(125_000, "100 KB/s", "1 Mbit/s", _UNLIMITED), "RATE"
 )
 
-# --- addresses ------------------------------------------------------------------------------------------------------
-
 
 @dataclass(frozen=True, slots=True)
 class HostPort:
@@ -451,8 +442,6 @@ HOST_PORT: Final = text_type(_read_host_port, "10.8.0.5:40001", metavar="HOST:PO
 MASTER_URI: Final = text_type(_read_master_uri, "http://localhost:11311/", metavar="URI")
 MULTICAST: Final = ValueType(_read_multicast, {"type": ["boolean", "string"]}, "GROUP:PORT")
 
-# --- globs ----------------------------------------------------------------------------------------------------------
-
 
 def glob_over(what: str, *examples: str) -> ValueType[str]:
     """A glob over ROS names (``core.identity.matches``) of one kind; ``{peer}`` is allowed if an example has it."""
@@ -496,8 +485,6 @@ PEER_GLOB: Final = text_like(
 SERVICE_GLOB: Final = glob_over("service", "/**")
 NODE_GLOB: Final = glob_over("node", "/**")
 PARAM_GLOB: Final = glob_over("parameter", "/**")
-
-# --- lists ----------------------------------------------------------------------------------------------------------
 
 
 def list_of(item: ValueType[_T], *, if_empty: str = "") -> ValueType[tuple[_T, ...]]:

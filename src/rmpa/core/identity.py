@@ -18,9 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
 
-# --- GUIDs ----------------------------------------------------------------------------------------------------------
-#
-# They identify a peer, and decide which of two peers dials (paper, section 4.2).
+# GUIDs. They identify a peer, and decide which of two peers dials (paper, section 4.2).
 
 
 _TEXT: Final = re.compile(r"(?P<ip>[0-9.]+):(?P<port>[0-9]+)(?:#(?P<incarnation>[0-9]+))?")
@@ -126,9 +124,6 @@ def _is_unicast(first: int) -> bool:
     return 0 < first < _MULTICAST
 
 
-# --- ROS graph names (wiki.ros.org/Names, REP 144) and the globs that rules are written in --------------------------
-
-
 _LEGAL: Final = re.compile(r"[~/A-Za-z][\w/]*", re.ASCII)
 # Topics that stay in their module under every policy, and why.
 NEVER_CROSSING: Final = {
@@ -209,10 +204,9 @@ def matches(pattern: str, name: str) -> bool:
     return _compile_glob(pattern).fullmatch(name) is not None
 
 
-# --- Serial numbers of 32 bits, which wrap around and are compared as in RFC 1982 -----------------------------------
-#
-# Of two numbers the later one is less than 2³¹ ahead of the other. Code that runs once for each message writes the
-# expressions out with ``SERIAL_MASK`` and ``SERIAL_HALF``, because a call takes longer than the arithmetic.
+# Serial numbers of 32 bits, which wrap around and are compared as in RFC 1982. Of two numbers the later one is less
+# than 2³¹ ahead of the other. Code that runs once for each message writes the expressions out with ``SERIAL_MASK``
+# and ``SERIAL_HALF``, because a call takes longer than the arithmetic.
 
 
 # ``number & SERIAL_MASK`` wraps a number.
@@ -325,8 +319,6 @@ class Identity:
         """``base (10.0.0.1:40001#7)``."""
         return f"{self.name} ({self.guid})"
 
-
-# --- Names of the agent and of its proxies in the local graph -------------------------------------------------------
 
 # The agent's own node; proxies have names below it: ``/rmpa/<peer>/<node>``.
 OWN_NODE: Final = "/rmpa"

@@ -8,9 +8,6 @@ from __future__ import annotations
 
 from typing import Final
 
-# --- Units of size, and the bounds of 32-bit integers ---------------------------------------------------------------
-
-
 KIB: Final = 1024
 MIB: Final = 1024 * KIB
 
@@ -18,7 +15,6 @@ INT32_MIN: Final = -(1 << 31)
 INT32_MAX: Final = (1 << 31) - 1
 UINT32_MAX: Final = (1 << 32) - 1
 
-# --- identity ---------------------------------------------------------------------------------------------------
 # Random id of one run of one agent: 128 bits, so that two runs never share one.
 INSTANCE_ID_BYTES: Final = 16
 # [Agent] Characters of a module's name
@@ -32,7 +28,6 @@ PEER_NAME_MAX: Final = 64
 # Why: ROS 2's own bound, so that the same ROS_DOMAIN_ID works for both.
 DOMAIN_MAX: Final = 232
 
-# --- settings ---------------------------------------------------------------------------------------------------
 # [Messages] Messages in `depth` of a `[[contract]]`
 # At it: the settings are refused
 # Told in: error at start, `reload`
@@ -57,7 +52,6 @@ OUTAGE_MIN: Final = 1.0
 # Why: As the other times of a contract.
 OUTAGE_MAX: Final = 86_400.0
 
-# --- discovery --------------------------------------------------------------------------------------------------
 # A peer without a link is gone when it was silent for three heartbeats and a second.
 PEER_LEASE: Final = 16.0
 # [Graph] Peers that are known
@@ -66,7 +60,6 @@ PEER_LEASE: Final = 16.0
 # Why: A hostile sender of forged GUIDs cannot fill the memory (2 KB each).
 PEERS_MAX: Final = 4096
 
-# --- mesh -------------------------------------------------------------------------------------------------------
 # Bytes of one message that are sent before another message of its lane: 10 ms of a 100 Mbit/s link. Longer messages
 # are sent in several data frames.
 FRAGMENT_BYTES: Final = 128 * KIB
@@ -90,7 +83,6 @@ CUT_THROUGH_BYTES: Final = 96 * KIB
 #   that fell silent stay as long.
 RESUME_WINDOW: Final = 30.0
 
-# --- logging ----------------------------------------------------------------------------------------------------
 # [Agent] Lines about one kind of refusal in 5 s
 # At it: further ones are counted in the next
 # Told in: log

@@ -181,8 +181,6 @@ class Outbox:
         queue = self._queues.get(key)
         return len(queue.messages) if queue is not None else 0
 
-    # --- input ----------------------------------------------------------------------------------------------
-
     def push_urgent(self, data: bytes) -> None:
         """Queue control bytes: before all data, but after the bytes that are already committed."""
         if data:
@@ -309,8 +307,6 @@ class Outbox:
         self._committed.clear()
         self._committed_bytes = self.urgent_bytes = self._data_bytes = self._begun_bytes = 0
 
-    # --- output ---------------------------------------------------------------------------------------------
-
     def head(self, max_parts: int = 64, now: float = 0.0) -> list[memoryview]:
         """The next bytes to send, in order, as parts for ``sendmsg``; they stay queued until ``consumed``.
 
@@ -349,8 +345,6 @@ class Outbox:
             count -= len(part)
             self._committed_bytes -= len(part)
             self._committed.popleft()
-
-    # --- inside ---------------------------------------------------------------------------------------------
 
     def _commit_bytes(self, data: memoryview) -> None:
         self._committed.append(data)

@@ -108,8 +108,6 @@ class Discovery:
         self._started = False
         self._flushing = False
 
-    # --- life -------------------------------------------------------------------------------------------------
-
     async def start(self) -> None:
         """Listen, and announce this agent. A socket that cannot be opened is logged; discovery works without it."""
         self._started = True
@@ -152,8 +150,6 @@ class Discovery:
         if self._heartbeats_tick is not None:
             self._heartbeats_tick.cancel()
 
-    # --- links and views --------------------------------------------------------------------------------------
-
     def link_up(self, identity: Identity, endpoint: Address | None = None) -> None:
         """A link to this peer is up; for as long as it is, the peer is a member.
 
@@ -189,8 +185,6 @@ class Discovery:
         ]
         full = self._filter.strangers_note(time.monotonic())
         return (*sorted(self._warned), *silent, *([full] if full else ()))
-
-    # --- sockets ----------------------------------------------------------------------------------------------
 
     def _open_group(self) -> None:
         """Receive multicasts: heartbeats by a socket of their own where the kernel can tell them from the others."""
@@ -279,8 +273,6 @@ class Discovery:
                 return False
         return True
 
-    # --- interfaces and seeds ---------------------------------------------------------------------------------
-
     def _look_again(self) -> bool:
         """Act on a change of the interfaces; return whether they could be listed."""
         try:
@@ -337,8 +329,6 @@ class Discovery:
         if text not in self._warned:
             self._warned.add(text)
             _log.warning("! %s [%s]", text, code)
-
-    # --- outputs and events -----------------------------------------------------------------------------------
 
     def _flush(self) -> None:
         """Send the outputs, deliver the events, set the timer. A handler of an event may call this again."""

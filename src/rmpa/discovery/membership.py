@@ -125,8 +125,6 @@ class MembershipProtocol:
         self._late_answers_at = NEVER
         self._events: list[PeerEvent] = []
 
-    # --- inputs -----------------------------------------------------------------------------------------------
-
     def start(self, now: float) -> None:
         """Announce this agent: a burst of beacons, then only heartbeats."""
         identity = self._sender.identity
@@ -307,8 +305,6 @@ class MembershipProtocol:
                 self._sender.send(BeaconKind.HEARTBEAT, address, gossip)
         self._announce(self._candidates.take_due(now))
 
-    # --- outputs and views ------------------------------------------------------------------------------------
-
     def outputs(self) -> list[OutgoingBeacon]:
         """The beacons to send, in order; each is returned once."""
         return self._sender.take()
@@ -340,8 +336,6 @@ class MembershipProtocol:
 
     def _members(self) -> Iterable[PeerInstance]:
         return self._endpoints.members.values()
-
-    # --- which peers are members ------------------------------------------------------------------------------
 
     def _settle(self, place: int, now: float, *, answer: bool = False) -> bool:
         """Decide anew about an endpoint, one of whose facts has changed, and report what is different.
@@ -470,8 +464,6 @@ class MembershipProtocol:
             return False
         self._remove(place, SILENCE)
         return True
-
-    # --- sending ----------------------------------------------------------------------------------------------
 
     def _announce(self, addresses: Iterable[Address]) -> None:
         for address in addresses:

@@ -165,9 +165,7 @@ async def watch_interfaces(look: Callable[[], bool]) -> None:
             netlink.close()
 
 
-# --- Seeds ----------------------------------------------------------------------------------------------------------
-#
-# Addresses of other agents in the settings. Host names are looked up in threads, again and again.
+# Seeds. Addresses of other agents in the settings. Host names are looked up in threads, again and again.
 
 
 def resolve_ipv4(host: str) -> list[str]:
@@ -211,9 +209,7 @@ async def follow_seed(
             await asyncio.sleep(_SEED_RESOLVE_INTERVAL)
 
 
-# --- The UDP sockets of discovery -----------------------------------------------------------------------------------
-#
-# The group is joined, and sent to, on each interface by its index.
+# The UDP sockets of discovery. The group is joined, and sent to, on each interface by its index.
 
 
 _MREQN: Final = struct.Struct("@4s4si")

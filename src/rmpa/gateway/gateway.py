@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     from rmpa.gateway.rules import Neighbour
     from rmpa.gateway.zenoh.session import OpenSession
 
+_log = logging.getLogger(__name__)
+
 # Seconds until a gateway without keys looks again whether an agent of a secured mesh runs beside it.
 _AGENTS_LOOK_PERIOD: Final = 5.0
 # The longest time in seconds between two attempts to open a session.
 _OPEN_RETRY_MAX: Final = 5.0
-
-_log = logging.getLogger(__name__)
 
 
 class Gateway:

@@ -95,8 +95,6 @@ ROS2_WORK_MAX: Final = 2_000_000
 ROS2_ARRAY_MAX: Final = 1_000_000
 
 
-# --- other sites ---------------------------------------------------------------------------------------------------
-
 # [Gateway] Other sites
 # At it: further ones are not shown
 # Told in: `site list`
@@ -188,9 +186,6 @@ ROS2_ACCEPT_TIMEOUT: Final = 10.0
 # At it: others are left out
 # Told in: `site info ros2`, log
 ROS2_ACTIONS_MAX: Final = 500
-
-
-# --- Every bound of the gateway's Zenoh session, with unit and reason -----------------------------------------------
 
 
 # Seconds without a sign of life after which a Zenoh transport counts as dead: with the other side's grace a

@@ -200,8 +200,6 @@ class AgentGraph(Part):
             taps=self._connections,
         )
 
-    # --- for neighbours ---------------------------------------------------------------------------------------
-
     def watch(self, on_change: Callable[[MeshSource, bool], None]) -> None:
         """Call ``on_change(source, there)`` for each source that is there now, and at each change."""
         self._sources.watchers.append(on_change)
@@ -306,8 +304,6 @@ class AgentGraph(Part):
         site.show(shown)
         return shown
 
-    # --- the bridge's part ------------------------------------------------------------------------------------
-
     async def begin(self) -> None:
         """Begin to follow the graph, once the agent has started and its place in the network is known."""
         self.node.master_uri = self._core.uri
@@ -365,8 +361,6 @@ class AgentGraph(Part):
             if pool.unused:
                 del self._pools[service]
         self._sources.look_at_all()
-
-    # --- inside -----------------------------------------------------------------------------------------------
 
     def _site(self, source: ForeignSource) -> ForeignSite:
         if source.site not in self._sites:

@@ -232,8 +232,6 @@ class Export:
         self._dialect.told("")
         self._dialect.close()
 
-    # --- demand ---------------------------------------------------------------------------------------------------
-
     def _announce(self) -> None:
         """Declare the publisher that the facts ask for."""
         try:
@@ -293,8 +291,6 @@ class Export:
         tap, self._tap = self._tap, None
         if tap is not None:
             tap.close()
-
-    # --- the publisher --------------------------------------------------------------------------------------------
 
     def _described(self, about: TopicDescription) -> None:
         self._flush()

@@ -152,8 +152,6 @@ class ConnectionProtocol:
             hello = Hello.of(ours, lease=lease, expected=expected, lane=lane)
             self._send(Frame(FrameKind.HELLO, hello.serialize()))
 
-    # --- for subclasses -------------------------------------------------------------------------------------------
-
     def judge(self, hello: Hello) -> Refuse | None:
         """Decide on the remote side's hello or welcome; ``None`` accepts the connection."""
         return judge_welcome(hello, self.ours, self.expected) if self.dialled else None
@@ -184,8 +182,6 @@ class ConnectionProtocol:
 
     def closed(self, reason: str) -> None:
         """The connection is over: the driver sends the remaining output and closes the socket."""
-
-    # --- for the driver -------------------------------------------------------------------------------------------
 
     @property
     def up(self) -> bool:
@@ -355,8 +351,6 @@ class ConnectionProtocol:
             self._send_pace(now)
         else:
             self.ping(now)
-
-    # --- inside ---------------------------------------------------------------------------------------------------
 
     def _admit(self, kind: int) -> bool:
         """Whether a frame of this kind is handled now; false while closing, when all frames are ignored.

@@ -206,10 +206,8 @@ def parse_text(payload: Buffer) -> str:
     return "".join(c if c.isprintable() else " " for c in text)[:512]
 
 
-# --- The handshake --------------------------------------------------------------------------------------------------
-#
-# Each side sends its identity, and accepts or refuses (docs/design/protocol.md, "Handshake"). ``judge`` decides on a
-# hello, ``judge_welcome`` on the answer.
+# The handshake. Each side sends its identity, and accepts or refuses (docs/design/protocol.md, "Handshake").
+# ``judge`` decides on a hello, ``judge_welcome`` on the answer.
 
 
 MAGIC: Final = b"RMPA"

@@ -9,7 +9,6 @@ from typing import Final
 
 from rmpa.core.limits import KIB, MIB, PEER_LEASE
 
-# --- mesh -------------------------------------------------------------------------------------------------------
 # [Graph] Modules of one mesh, this one included
 # At it: a further one is refused as *full*, and joins when a place is free; make more of them
 #   [sites](../guides/sites.md)

@@ -179,8 +179,6 @@ class Peering:
         self._queue_at: float | None = None
         self._dial_rate = TokenBucket(limits.DIAL_STRANGERS_RATE, limits.DIAL_STRANGERS_BURST)
 
-    # --- events of discovery --------------------------------------------------------------------------------
-
     def peer_found(self, identity: Identity, now: float, source: str | None = None) -> None:
         """Take in a peer that discovery found, or news of it (new addresses, a restart).
 
@@ -214,8 +212,6 @@ class Peering:
             return
         peer.announced, peer.gone = False, True
         self._forget_if_idle(peer)
-
-    # --- events of the driver -------------------------------------------------------------------------------
 
     def judge(self, hello: Hello, now: float) -> Refuse | None:
         """Decide on a received hello; ``None`` accepts it, and the driver then calls ``link_up``."""
@@ -381,8 +377,6 @@ class Peering:
         if len(there) == 1:
             self.link_refused(there[0].identity.guid, refuse)
 
-    # --- time and outputs -----------------------------------------------------------------------------------
-
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, in monotonic seconds."""
         return earliest(self._timers.next(), self._queue_at)
@@ -422,8 +416,6 @@ class Peering:
     def peers(self) -> list[Peer]:
         """All known peers, by GUID."""
         return sorted(self._peers.values(), key=lambda p: p.run.guid)
-
-    # --- inside ---------------------------------------------------------------------------------------------
 
     def _peer(self, identity: Identity) -> Peer:
         """What is known of the peer at this identity's place; a new record if there is none."""
@@ -500,8 +492,6 @@ class Peering:
             self._dial_at(peer, now + self._pause(peer, now))
         else:
             self._dial_at(peer, now)
-
-    # --- when to dial ---------------------------------------------------------------------------------------
 
     def _cap(self, peer: Peer) -> float:
         """The longest pause between dials, in seconds: unverified peers share the rate of all of them."""

@@ -372,9 +372,6 @@ class ReliableReceiver:
         return self._unacknowledged_since + ACK_DELAY
 
 
-# --- Reliable senders whose link is gone, kept in case their receivers come back ------------------------------------
-
-
 _Key = TypeVar("_Key", bound=Hashable)
 
 

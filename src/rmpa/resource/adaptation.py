@@ -120,8 +120,6 @@ class Adaptation:
         """The cool-downs that are not over, by profile."""
         return {name: one for name, one in self._cooling.items() if now < one.until}
 
-    # --- requirements -------------------------------------------------------------------------------------------
-
     def restore(
         self, requirements: Iterable[Requirement], profile: str, cool_downs: Mapping[str, CoolDown], now: float
     ) -> None:
@@ -180,8 +178,6 @@ class Adaptation:
         """Choose the best profile without hysteresis and dwell time: at the start, or in another context."""
         self._plan(now, why, at_once=True)
 
-    # --- measurements -------------------------------------------------------------------------------------------
-
     def window(self, measured: Mapping[str, Value], now: float) -> None:
         """Judge a window of measured quality that ends now.
 
@@ -226,8 +222,6 @@ class Adaptation:
             self.begin_cool_down(self.profile, why, now)
             self._apply(effort.profile, "none can serve: best effort", since)
 
-    # --- reports of the driver ----------------------------------------------------------------------------------
-
     def applied(self, profile: str, now: float) -> None:
         """Report that the profile has been applied; ignored unless it is the one that is being applied."""
         if not profile or profile != self.applying:
@@ -266,8 +260,6 @@ class Adaptation:
         if over:
             self._requirements_changed(now, f"what {', '.join(over)} asked for has expired")
         self._plan(now, "a profile's cool-down is over")
-
-    # --- planning -----------------------------------------------------------------------------------------------
 
     def _requirements_changed(self, now: float, why: str) -> None:
         before = self.bounds

@@ -52,9 +52,7 @@ _CONTEXT_PRIORITY: Final = 1 << 30
 _CONTEXT_CLIENT: Final = "context "
 
 
-# --- Calls of the user's functions ----------------------------------------------------------------------------------
-#
-# Those of profiles and contexts, and preconditions.
+# Calls of the user's functions. Those of profiles and contexts, and preconditions.
 
 
 class HungError(RmpaError):
@@ -143,9 +141,7 @@ class Preconditions:
         await end_tasks(*self._calls.values())
 
 
-# --- Texts and values of a resource's reports -----------------------------------------------------------------------
-#
-# Alarms, health, responses (``docs/guides/smart-resources.md#reference``).
+# Texts and values of a resource's reports. Alarms, health, responses (``docs/guides/smart-resources.md#reference``).
 
 
 def alarm_values(
@@ -264,8 +260,6 @@ class Adapter(RuntimePart):
         )
         self._closed = False
 
-    # --- start and end ------------------------------------------------------------------------------------------
-
     async def start(self) -> None:
         """Begin to measure, choose the first profile, and serve clients."""
         self._loop = asyncio.get_running_loop()
@@ -299,8 +293,6 @@ class Adapter(RuntimePart):
         self.publishers.clear()
         await end_tasks(self._checking, self._applying)
         await self._preconditions.close()
-
-    # --- measurements -------------------------------------------------------------------------------------------
 
     def published(self, output: Output, raw: bytes, now_ns: int) -> None:
         """Measure a message that an output has sent."""
@@ -339,8 +331,6 @@ class Adapter(RuntimePart):
         """Block the profiles whose preconditions do not hold, and those that the context excludes."""
         self.adaptation.block(self._blocked_by_needs | self._blocked_by_context, self._loop.time())
 
-    # --- clients ------------------------------------------------------------------------------------------------
-
     def _observation_received(self, message: Received) -> None:
         try:
             self.observed.report(message.caller_id, _pairs(message), self._loop.time())
@@ -378,8 +368,6 @@ class Adapter(RuntimePart):
             self.adaptation.release(client, now)
             self._tell()
 
-    # --- choices ------------------------------------------------------------------------------------------------
-
     def enter_context(self, context: Context) -> None:
         """Put a context's requirement in force, above those of clients, and block the profiles that it excludes.
 
@@ -412,8 +400,6 @@ class Adapter(RuntimePart):
         """Wait until no profile is being applied, or the resource ends."""
         while self.adaptation.applying and self._applying is not None and not self._closed and self.hung is None:
             await asyncio.wait([self._applying], timeout=_WAIT)
-
-    # --- what the loop has decided ------------------------------------------------------------------------------
 
     def apply(self, profile: str, why: str) -> None:
         """Begin to apply a profile; the loop decides on the next one only after the outcome of this one."""
@@ -477,8 +463,6 @@ class Adapter(RuntimePart):
     def _handle_timer(self, now: float) -> None:
         self.adaptation.handle_timer(now)
         self._tell()
-
-    # --- reports ------------------------------------------------------------------------------------------------
 
     def _tell(self) -> None:
         """Publish what may have changed: profile, decision and responses; and move the timers."""

@@ -263,8 +263,6 @@ class Demands(RuntimePart):
             if found and client.connected:
                 client.report(**found)
 
-    # --- inside -------------------------------------------------------------------------------------------------
-
     def _request(self, demand: Demand) -> None:
         client = self._clients.get(demand.resource)
         if client is not None:

@@ -134,8 +134,6 @@ class Contexts(RuntimePart):
                 raise
             self._publish()
 
-    # --- values of rules ----------------------------------------------------------------------------------------
-
     def received(self, item: Input, message: Received) -> None:
         """Keep the message of an input if a rule refers to its topic."""
         if item.name in self._taps:
@@ -187,8 +185,6 @@ class Contexts(RuntimePart):
                 topic, callback=lambda message: self._update(topic, message.kind, message.raw)
             )
 
-    # --- decision -----------------------------------------------------------------------------------------------
-
     def _wanted(self, now: float) -> str:
         """The context to be in: the one chosen by hand, or else the first whose rule holds; empty: none.
 
@@ -228,8 +224,6 @@ class Contexts(RuntimePart):
             await self.choose(name)
         except RmpaError as error:
             self._adapter.refuse(client, printable(str(error)))
-
-    # --- switch -------------------------------------------------------------------------------------------------
 
     async def _switch(self, name: str) -> None:
         """Switch to a context.

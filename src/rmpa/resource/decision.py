@@ -167,9 +167,6 @@ class Decider:
         return beyond / span if span > 0 else _MISSING
 
 
-# --- Shortfalls of measured quality, and alarms about them ----------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True)
 class Shortfall:
     """One attribute that violates the requirements.

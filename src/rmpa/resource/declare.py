@@ -160,9 +160,6 @@ class Parameter:
         return value
 
 
-# --- Interfaces of a resource ---------------------------------------------------------------------------------------
-
-
 class DeclaredTopic:
     """An output or input; its type is found on this machine, or learnt later from a publisher.
 
@@ -282,9 +279,6 @@ class Demand:
             self.on_change(self)
 
 
-# --- Behaviour of a resource ----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True)
 class Profile:
     """One System Profile: a configuration of the resource, with the quality that it offers (paper, section 3.1).
@@ -366,9 +360,6 @@ class Task:
     rate_parameter: Parameter | None = None
 
 
-# --- Checks of the arguments of a declaration -----------------------------------------------------------------------
-
-
 def check_arity(function: Callable[..., object], count: int, where: str) -> None:
     """Check that a function can be called with ``count`` arguments.
 
@@ -422,7 +413,7 @@ def _refuse_unknown(where: str, problem: str, text: str, known: Iterable[str], l
     raise ConfigError(where, problem, suggestion(text, names, f"{listed}{', '.join(names)}"))
 
 
-# --- Rules that select a context by fields of topics and by the resource's parameters -------------------------------
+# Rules that select a context by fields of topics and by the resource's parameters::
 #
 #     rule       = conjunction { "or" conjunction }
 #     conjunction= negation { "and" negation }

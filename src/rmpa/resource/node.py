@@ -175,8 +175,6 @@ class ResourceNode:
         await self.runtime.close()
         self.ended.set()
 
-    # --- inside -------------------------------------------------------------------------------------------------
-
     async def _configure(self) -> None:
         try:
             await self._change_state("configure")

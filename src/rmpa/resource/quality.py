@@ -22,9 +22,7 @@ if TYPE_CHECKING:
     from rmpa.ros.types.definitions import DiagnosticLevel
 
 
-# --- Units of quality attributes and their conversion ---------------------------------------------------------------
-#
-# ``20 Hz``, ``50 ms``, ``2 MB/s``.
+# Units of quality attributes and their conversion. ``20 Hz``, ``50 ms``, ``2 MB/s``.
 
 
 _DIMENSIONS: Final[dict[str, dict[str, float]]] = {
@@ -87,9 +85,7 @@ def quantity(text: str | float, to: str, where: str) -> float:
     return value * _DIMENSIONS[dimension][unit] / _DIMENSIONS[dimension][to]
 
 
-# --- Quality attributes ---------------------------------------------------------------------------------------------
-#
-# The unit and the scale of a quality, and which direction is better.
+# Quality attributes. The unit and the scale of a quality, and which direction is better.
 
 
 class Direction(StrEnum):
@@ -254,9 +250,7 @@ def find_attribute(attributes: Mapping[str, Attribute], name: str, resource: str
     return found
 
 
-# --- Requests for one attribute -------------------------------------------------------------------------------------
-#
-# As a user writes them (``at_least("20 Hz", hard=True)``), and as bounds.
+# Requests for one attribute. As a user writes them (``at_least("20 Hz", hard=True)``), and as bounds.
 
 
 @dataclass(frozen=True, slots=True)
@@ -392,9 +386,7 @@ def between(low: float | str, high: float | str, *, hard: bool = False, weight: 
     return QoSRequest(at_least=low, at_most=high, hard=hard, weight=weight)
 
 
-# --- Requests as texts, which any ROS tool can publish --------------------------------------------------------------
-#
-# ``rate: ">= 20 Hz hard"``, ``latency: "<= 50 ms weight=2"``.
+# Requests as texts, which any ROS tool can publish. ``rate: ">= 20 Hz hard"``, ``latency: "<= 50 ms weight=2"``.
 #
 # ::
 #
@@ -466,9 +458,7 @@ def parse_bound(text: str, name: str, attributes: Mapping[str, Attribute], resou
     return request.bound(attribute)
 
 
-# --- Requirements of clients ----------------------------------------------------------------------------------------
-#
-# The requests of each, and their merge.
+# Requirements of clients. The requests of each, and their merge.
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from rmpa.ros.node.endpoints import Publisher
     from rmpa.ros.types.messages import Plain
 
+_log = logging.getLogger(__name__)
+
 CONFIG_TYPE: Final = "dynamic_reconfigure/Config"
 DESCRIPTION_TYPE: Final = "dynamic_reconfigure/ConfigDescription"
 SERVICE_TYPE: Final = "dynamic_reconfigure/Reconfigure"
@@ -51,10 +53,6 @@ _GROUP: Final[dict[str, Plain]] = {"name": "Default", "id": 0, "parent": 0}
 _HOLDER: Final = "configuration"
 # Seconds that an ending resource waits for the parameter server.
 _MIRROR_TIMEOUT: Final = 1.0
-_log = logging.getLogger(__name__)
-
-
-# --- Pure functions between parameters and the plain values of dynamic_reconfigure's messages -----------------------
 
 
 @dataclass(eq=False)
@@ -312,8 +310,6 @@ class Reconfigure(RuntimePart):
         self._updates.publish(config(values, self._known))
         if self._mirror is None or self._mirror.done():
             self._mirror = start_task(self._to_server(), "mirror parameters")
-
-    # --- inside -------------------------------------------------------------------------------------------------
 
     async def _serve(self, request: Any) -> dict[str, object]:
         await self.set(read_config(request.config))

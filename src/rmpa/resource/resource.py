@@ -110,8 +110,6 @@ class Resource:
         # Parameters of the control loop.
         self.settings = AdaptationSettings()
 
-    # --- interfaces -------------------------------------------------------------------------------
-
     def output(self, name: str, kind: str, *, latch: bool = False, **contract: object) -> Output:
         """Declare a topic that the resource publishes.
 
@@ -261,8 +259,6 @@ class Resource:
                     found[key] = attribute
                 found[f"{label}.{key}"] = attribute
         return found | {name: declared.attribute for name, declared in self.declared_attributes.items()}
-
-    # --- behaviour -------------------------------------------------------------------------------------------
 
     def profile(
         self,

@@ -208,8 +208,6 @@ class Runtime:
         for part in self.parts:
             part.parameter_changed(parameter)
 
-    # --- inputs -------------------------------------------------------------------------------------------------
-
     async def _subscribe(self, item: Input) -> None:
         unknown = item.known is None
 
@@ -241,8 +239,6 @@ class Runtime:
             item.known = kind
             _log.info("= %s: %s is learnt from %s", self.node.name, item.type_name, caller)
         return True
-
-    # --- outputs ------------------------------------------------------------------------------------------------
 
     def hold(self, holder: str = "profile") -> None:
         """Queue messages from now on, so that no output mixes messages of two profiles or two contexts.

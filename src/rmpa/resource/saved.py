@@ -175,9 +175,7 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
         return found, lost
 
 
-# --- The clients of a resource --------------------------------------------------------------------------------------
-#
-# Their last messages, refusals and presence. ``quality.merge`` merges their requirements.
+# The clients of a resource. Their last messages, refusals and presence. ``quality.merge`` merges their requirements.
 
 
 @dataclass(slots=True)

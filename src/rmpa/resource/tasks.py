@@ -479,8 +479,6 @@ class Tasks(RuntimePart):
         if runner.task.on_failure is not OnFailure.RESTART:
             self._end(runner, problem.removeprefix(f"task {runner.task.name} failed: "))
 
-    # --- inside -------------------------------------------------------------------------------------------------
-
     def _start_task(self, task: Task, lost: int = 0, problem: str = "") -> None:
         kind = AsyncTaskRunner if asyncio.iscoroutinefunction(task.function) else ThreadTaskRunner
         runner = self._runners[task.name] = kind(self, task, lost, problem)

@@ -192,9 +192,6 @@ def _split(
     return special, remappings, parameters, tuple(rest)
 
 
-# --- Records about nodes, as ``rmpa node`` shows them and agents send them to each other ----------------------------
-
-
 class NodeLine(msgspec.Struct, frozen=True):
     """One node in a list.
 

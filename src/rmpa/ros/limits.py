@@ -12,7 +12,6 @@ from rmpa.core.limits import KIB, MIB
 # Why: The largest point clouds and images stay below this.
 MESSAGE_MAX: Final = 256 * MIB
 
-# --- TCPROS and services ------------------------------------------------------------------------------------------
 # [Messages] Bytes of a connection header (TCPROS)
 # At it: the connection is refused
 # Told in: log, counters
@@ -70,7 +69,6 @@ SUBSCRIBER_DRAIN: Final = 10.0
 # Why: For late subscribers (durability transient_local), whatever the contract's depth.
 LATCHED_MAX: Final = 100
 
-# --- message types ------------------------------------------------------------------------------------------------
 # [Messages] Characters of a message definition
 # At it: its type is not learnt; its bytes cross all the same
 # Told in: the command's error
@@ -109,11 +107,9 @@ TYPES_MISSING_MAX: Final = 64
 # Told in: the command's error
 # Why: One after the other.
 FETCH_TYPE_PUBLISHERS: Final = 8
-# --- values of messages (`ros.types.codec`) ---
 # Characters of a wrong value in an error.
 SHOWN: Final = 60
 
-# --- XML-RPC over HTTP --------------------------------------------------------------------------------------------
 # [Core] Bytes of one call to the core as XML: a parameter, or all those of a launch file
 # At it: a fault that names the call, its size and what to do
 # Told in: the caller's error (not roscpp's), log, counters
@@ -161,7 +157,6 @@ PARAM_DEPTH_MAX: Final = 64
 # Time-out of one XML-RPC call to a node; a stopped node must not hold the others up.
 SLAVE_CALL_TIMEOUT: Final = 3.0
 
-# --- cores --------------------------------------------------------------------------------------------------------
 # Period in which each registered node is checked: whether it still listens.
 NODE_CHECK_INTERVAL: Final = 5.0
 # [Core] Time for which a registered node may be unreachable

@@ -30,10 +30,10 @@ from rmpa.runtime import limits
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+_log = logging.getLogger(__name__)
 
-# --- The mesh port --------------------------------------------------------------------------------------------------
-#
-# TCP for links and UDP for unicast beacons under one number.
+
+# The mesh port. TCP for links and UDP for unicast beacons under one number.
 
 
 def open_mesh_port(port: int = 0) -> tuple[socket.socket, socket.socket]:
@@ -81,9 +81,7 @@ def _refused(port: int, error: OSError) -> StartError:
     return StartError(f"mesh port {port}", problem, remedy, code="port-in-use")
 
 
-# --- The file descriptors of this process ---------------------------------------------------------------------------
-#
-# Which uses may take the last ones, and what is said when they run out.
+# The file descriptors of this process. Which uses may take the last ones, and what is said when they run out.
 #
 # A process without a free descriptor can neither accept nor dial. Connections for data are refused early, so that
 # the ROS core, the control socket and the links to peers still work: a user must be able to ask what is wrong.
@@ -91,8 +89,6 @@ def _refused(port: int, error: OSError) -> StartError:
 # No count is kept. The kernel gives each new descriptor the lowest free number (POSIX, open(2)): a number near the
 # limit means that all lower ones are taken.
 
-
-_log = logging.getLogger(__name__)
 
 # Errors of accept(2) and socket(2) about a lack of descriptors or memory, which may pass.
 OUT_OF_DESCRIPTORS: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})

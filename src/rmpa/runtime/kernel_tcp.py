@@ -118,9 +118,6 @@ class TcpSocket:
         return cls(local, remote, _STATES.get(state, ""), family, uid, inode, name)
 
 
-# --- looking ----------------------------------------------------------------------------------------------------
-
-
 def ask_listening_ports() -> set[int] | None:
     """TCP ports in state LISTEN; ``None`` where the kernel does not report them. It takes some 0.1 ms."""
     found = _dump(_LISTEN)
@@ -207,9 +204,6 @@ def _packed(address: str) -> bytes:
         return socket.inet_pton(socket.AF_INET6 if ":" in address else socket.AF_INET, address)
     except OSError:
         raise ValueError(f"{address!r} is no IP address") from None
-
-
-# --- ending -----------------------------------------------------------------------------------------------------
 
 
 def end_connections(found: Iterable[TcpSocket]) -> int:
@@ -326,9 +320,6 @@ def try_to_end() -> str:
     if not ended or error != errno.ECONNABORTED:
         return "the kernel did not end a connection that it was told to end; use another kernel"
     return ""
-
-
-# --- netlink ----------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager

@@ -9,7 +9,6 @@ from typing import Final
 
 from rmpa.core.limits import KIB
 
-# --- process ----------------------------------------------------------------------------------------------------
 # [Agent] Open files that the agent asks for
 # At it: it gets as many as the hard limit allows (`LimitNOFILE=` of systemd, `ulimit -Hn`); if none is left, new
 #   connections wait
@@ -42,13 +41,11 @@ THREAD_SWITCH: Final = 1e-4
 # 500,000, if a quarter of them is new (20 ms at 5,000 topics).
 COLLECT_THRESHOLDS: Final = (1000, 5, 100)
 
-# --- the kernel's TCP sockets -----------------------------------------------------------------------------------
 # One part of a dump; the kernel makes parts of at most 32 KiB.
 SOCK_DIAG_BUFFER: Final = 64 * KIB
 # Dumps that are tried one after the other while each is interrupted by a change of the kernel's table.
 SOCK_DIAG_DUMPS: Final = 3
 
-# --- mesh -------------------------------------------------------------------------------------------------------
 # [Messages] Time for which an outage may delay a message of a topic with a `depth` of 1, as velocity commands have by
 #   default
 # At it: it is dropped if a newer one follows
@@ -63,7 +60,6 @@ MESH_BACKLOG: Final = 256
 # Attempts to find a port number that is free for both TCP and UDP; the first one nearly always succeeds.
 MESH_PORT_ATTEMPTS: Final = 32
 
-# --- logging ----------------------------------------------------------------------------------------------------
 # Log lines that wait while the reader of the log does not read: some 1 MB. Beyond it the newest lines are lost.
 LOG_WAITING: Final = 10_000
 # Log lines are gathered for this long before they are written, so that a burst costs one system call.

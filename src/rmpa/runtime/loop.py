@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
     from _typeshed import FileDescriptorLike
 
+_log = logging.getLogger(__name__)
+
 # Seconds over which the processes of a machine spread; a multiple of the usual periods.
 _ORIGIN_SPAN: Final = 60.0
 _origin: Final = random.uniform(0.0, _ORIGIN_SPAN)  # noqa: S311 - spreads load, protects nothing
@@ -62,9 +64,6 @@ async def sleep_to_tick(period: float) -> None:
     await asyncio.sleep(next_tick(period, now) - now)
 
 
-# --- The machine's own clocks ---------------------------------------------------------------------------------------
-
-
 class SystemClock:
     """The monotonic and the wall clock of this machine."""
 
@@ -77,9 +76,8 @@ class SystemClock:
         return time.time_ns()
 
 
-# --- Runs the timer of a protocol machine in the event loop ---------------------------------------------------------
-#
-# A machine has no clock: its ``next_timer()`` returns when it must be called next, and the call passes the time.
+# Runs the timer of a protocol machine in the event loop. A machine has no clock: its ``next_timer()`` returns when it
+# must be called next, and the call passes the time.
 
 
 class MachineTimer:
@@ -140,9 +138,7 @@ class MachineTimer:
         self.arm()
 
 
-# --- A timer as a file descriptor (timerfd_create(2)) ---------------------------------------------------------------
-#
-# Due at an absolute time, to the microsecond.
+# A timer as a file descriptor (timerfd_create(2)). Due at an absolute time, to the microsecond.
 #
 # The event loop's own timers are rounded to milliseconds, and a sleeping thread wakes up late by the timer slack of
 # 50 µs. A timerfd has neither fault. Python supports it since 3.13 only, so the C library is called.
@@ -219,9 +215,7 @@ def _check(result: int) -> int:
     return result
 
 
-# --- The event loop of an agent -------------------------------------------------------------------------------------
-#
-# Asyncio's, with direct callbacks for the sockets of the data path.
+# The event loop of an agent. Asyncio's, with direct callbacks for the sockets of the data path.
 #
 # asyncio takes an event from the selector, finds its handle, queues it, checks its timers, and runs the handle in
 # its context. For a message that is forwarded at once this is a fifth of the interpreter's work. Here the selector
@@ -233,8 +227,6 @@ def _check(result: int) -> int:
 # reader, and the code that it calls, may run in the middle of any code that yields, whose data must be consistent
 # at each yield. docs/design/isolation.md has the measurements.
 
-
-_log = logging.getLogger(__name__)
 
 _EPOLL_RESOLUTION: Final = 1e-3
 _MAX_EVENTS: Final = 64

@@ -225,8 +225,6 @@ class Stream:
         self._writing = True
         self._loop.add_writer(self._fd, self._writable)
 
-    # --- messages in parts ----------------------------------------------------------------------------------
-
     def open(self, key: int, size: int, sequence: int = 0, stamp_ns: int = 0) -> QueuedMessage:
         """Begin a message of ``size`` bytes, which ``extend`` adds before another message of its key begins."""
         return QueuedMessage(key, size, sequence, stamp_ns, self._loop.time())
@@ -303,8 +301,6 @@ class Stream:
             last = LAST if parcel.sent + start + len(part) == parcel.size else 0
             parts += (frame(parcel, len(part), first | last), part)
         return parts
-
-    # --- corking --------------------------------------------------------------------------------------------
 
     def _cork(self, parts: Sequence[Buffer], key: int, *, part: bool = False) -> None:
         """Keep a message until the present read is handled; all kept messages are then sent in one system call."""

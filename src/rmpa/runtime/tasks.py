@@ -12,8 +12,9 @@ from rmpa.core.timers import Backoff
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
-_T = TypeVar("_T")
 _log = logging.getLogger(__name__)
+
+_T = TypeVar("_T")
 # Seconds after which a kept task that failed runs again; they grow to the second value while it fails. What fails
 # is a fault of the program, so each attempt logs a traceback.
 _KEEP_FIRST: Final = 1.0

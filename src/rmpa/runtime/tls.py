@@ -29,9 +29,7 @@ def unsent(parts: Sequence[Buffer], sent: int) -> list[Buffer]:
     return left
 
 
-# --- Corking --------------------------------------------------------------------------------------------------------
-#
-# What is collected while one read is handled is passed on once, at its end, as TCP_CORK does.
+# Corking. What is collected while one read is handled is passed on once, at its end, as TCP_CORK does.
 #
 # One loop and one thread handle reads, one after the other; a read may be handled within another one.
 
@@ -72,9 +70,7 @@ def after_read(call: Callable[[], None]) -> None:
         call()
 
 
-# --- TLS below a ``Stream`` -----------------------------------------------------------------------------------------
-#
-# A socket whose ``sendmsg`` and ``recv_into`` encrypt and decrypt, by OpenSSL's memory BIOs.
+# TLS below a ``Stream``. A socket whose ``sendmsg`` and ``recv_into`` encrypt and decrypt, by OpenSSL's memory BIOs.
 #
 # asyncio's own TLS copies each message several times and takes 100 µs more a round trip, and ``ssl.SSLSocket`` has
 # no ``sendmsg``. Here a small message is one record, one ``send`` and one ``recv``, as without TLS.

@@ -34,9 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 
-# --- Signed, numbered documents of the authority --------------------------------------------------------------------
-#
-# The deny list and the list of group keys (docs/design/trust.md).
+# Signed, numbered documents of the authority. The deny list and the list of group keys (docs/design/trust.md).
 #
 # A document is the JSON object ``{"signed": TEXT, "signature": BASE64}``: TEXT is a JSON object too, and the
 # signature (ECDSA P-256, SHA-256, DER) is over the kind's label, a zero byte and TEXT. So it can be checked before
@@ -255,9 +253,6 @@ class ModuleCertificate:
         return f"{self.name} (certificate {self.serial:x})"
 
 
-# --- making ---------------------------------------------------------------------------------------------------------
-
-
 def make_ca(key: ec.EllipticCurvePrivateKey, label: str, serial: int, wall: float) -> bytes:
     """A CA's certificate (DER), signed by itself.
 
@@ -354,9 +349,6 @@ def issue(
         .sign(ca_key, hashes.SHA256())
     )
     return certificate.public_bytes(serialization.Encoding.DER)
-
-
-# --- checking -------------------------------------------------------------------------------------------------------
 
 
 def read_request(data: bytes) -> CertificateRequest:

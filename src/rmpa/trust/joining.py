@@ -153,8 +153,6 @@ class JoinServer:
             self._step(asked.token, "refused", name, refused)
         return self._refuse("join", host, refused)
 
-    # --- the user who invites ---------------------------------------------------------------------------------
-
     def step(self, token_id: bytes) -> JoinStep:
         """What came of a token so far, as ``rmpa trust invite`` shows it."""
         return self._steps.get(token_id, JoinStep(step=0, state="waiting"))
@@ -169,9 +167,7 @@ class JoinServer:
         changed.set()
 
 
-# --- A join, and a renewal with a certificate that has ended --------------------------------------------------------
-#
-# The side of the module that asks.
+# A join, and a renewal with a certificate that has ended. The side of the module that asks.
 
 
 _REMEDIES: Final = {
@@ -299,9 +295,6 @@ async def renew_at_authority(membership: Membership, address: str, port: int) ->
     context = member_context(*files, membership.files.ca, ALPN_JOIN, server_side=False)
     grant, _ = await _ask(address, port, context, question)
     membership.take_grant(grant)
-
-
-# --- Builds the state that ``rmpa trust status``, the snapshot and ``/diagnostics`` show ----------------------------
 
 
 def status_of(

@@ -9,11 +9,9 @@ from typing import Final
 
 from rmpa.core.limits import KIB, MIB
 
-# --- permissions ------------------------------------------------------------------------------------------------
 # Modules whose rules are cached: as many as a mesh can have (``PEERS_MAX``).
 MODULES_REMEMBERED: Final = 4096
 
-# --- packets ----------------------------------------------------------------------------------------------------
 # Bytes of an HMAC-SHA256 that are sent, half of it (RFC 2104, section 5): forging one takes 2¹²⁸ attempts.
 TAG_BYTES: Final = 16
 # A group key is as long as the hash (RFC 2104, section 3).
@@ -51,7 +49,6 @@ OLD_KEY_PACKETS_RATE: Final = 50.0
 # an answer. A module that starts announces itself four times; twenty on one machine have four heartbeats a second.
 OLD_KEY_PACKETS_PER_ADDRESS: Final = 5
 
-# --- joining ----------------------------------------------------------------------------------------------------
 # Random bytes of a token: 128 bits cannot be guessed.
 TOKEN_SECRET_BYTES: Final = 16
 # Bytes of the CA's fingerprint in a token: another certificate with this one takes 2¹²⁸ attempts.
@@ -77,7 +74,6 @@ JOIN_STEP_TIMEOUT: Final = 10.0
 # Modules whose last certificate the authority remembers, two for each member of a full roster.
 ISSUED_MAX: Final = 1024
 
-# --- certificates -----------------------------------------------------------------------------------------------
 # Validity of a module's certificate. It bounds how long a stolen key is of use where no deny list arrives.
 CERTIFICATE_LIFETIME: Final = 7 * 86_400
 # A certificate begins this long before it is issued: clocks of new modules are late.
@@ -111,7 +107,6 @@ PAGE_HOSTS_MAX: Final = 16
 # Bytes of a certificate (DER or PEM) that are parsed; one has some 600.
 CERTIFICATE_MAX: Final = 8 * KIB
 
-# --- documents --------------------------------------------------------------------------------------------------
 # [Agent] Names of revoked modules
 # At it: `rmpa trust revoke` fails; make a new mesh
 # Told in: its error

@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from rmpa.trust.certificates import CertificateRequest
     from rmpa.trust.store import TrustStore
 
-
-# --- Private keys of modules and of the CA, as PEM ------------------------------------------------------------------
+_log = logging.getLogger(__name__)
 
 
 def new_key() -> bytes:
@@ -64,7 +63,6 @@ def private_key(data: bytes, where: str) -> ec.EllipticCurvePrivateKey:
     return key
 
 
-_log = logging.getLogger(__name__)
 _REMEDY: Final = "join again: rmpa trust invite at the authority, rmpa trust join TOKEN here"
 
 
@@ -129,14 +127,10 @@ class Membership:
         """A document that holds, signed; empty: there is none yet."""
         return self.files.deny if kind is Document.DENY else self.files.keys
 
-    # --- clock ------------------------------------------------------------------------------------------------
-
     def wall(self) -> float | None:
         """Seconds since 1970; ``None`` while the machine's clock is not set."""
         wall = self._machine_wall()
         return wall if wall > self.certificate.issued - limits.CERTIFICATE_BACKDATE else None
-
-    # --- connections ------------------------------------------------------------------------------------------
 
     def judge_member(self, certificate: Mapping[str, Any] | bytes, claimed: str | None) -> None:
         """Check the other end's certificate behind a TLS handshake, which has checked the chain.
@@ -160,8 +154,6 @@ class Membership:
         """A request (DER) for a newer certificate of this module and its key, with these hosts of its page."""
         key = private_key(self.files.key, str(self.store.path(files_of.KEY)))
         return certificates.make_request(key, self.name, hosts)
-
-    # --- what is newer ----------------------------------------------------------------------------------------
 
     def accept_document(self, kind: Document, data: bytes) -> bool:
         """Take a signed document if it is newer than the one that holds; return whether it is.
@@ -315,8 +307,6 @@ class MeshAuthority:
         """The last certificate of each module, by name."""
         return tuple(sorted(self._issued.values(), key=lambda each: each.name))
 
-    # --- invitations ------------------------------------------------------------------------------------------
-
     def invite(self, address: IPv4Address, port: int, lifetime: float, name: str = "") -> Token:
         """A new token.
 
@@ -346,8 +336,6 @@ class MeshAuthority:
     def save_tokens(self) -> None:
         """Write the tokens, one of which was used."""
         self._store.save_tokens(self.book)
-
-    # --- certificates -----------------------------------------------------------------------------------------
 
     def wall(self) -> float:
         """Seconds since 1970.
@@ -462,8 +450,6 @@ class MeshAuthority:
             remedy = f"if it is that one, and away: --module {name}; else rmpa trust revoke {name}, or another name"
             raise ConfigError("the request", text, remedy)
         return asked, self.grant(request)
-
-    # --- documents --------------------------------------------------------------------------------------------
 
     def revoke_known(self, name: str, linked: Collection[str] = (), *, force: bool = False) -> DenyList:
         """Revoke a module that a user names; return the new list.

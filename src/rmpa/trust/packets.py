@@ -139,9 +139,6 @@ class KeyRing:
         return f"KeyRing({[key.number for key in self.keys]})"
 
 
-# --- Recognises packets that are sent again, by their numbers (RFC 4303, section 3.4.3) -----------------------------
-
-
 _WINDOW: Final = limits.REPLAY_WINDOW
 _MASK: Final = (1 << _WINDOW) - 1
 

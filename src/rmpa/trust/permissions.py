@@ -210,9 +210,7 @@ def _first(globs: tuple[str, ...], name: str) -> str | None:
     return next((glob for glob in globs if matches(glob, name)), None)
 
 
-# --- How signed documents reach every module ------------------------------------------------------------------------
-#
-# Which linked peer lacks which document (docs/design/trust.md).
+# How signed documents reach every module. Which linked peer lacks which document (docs/design/trust.md).
 #
 # Each module tells a new link the numbers of its documents (``trust.have``); the side with a higher number sends
 # that document, deny list first. A module that takes a newer one sends it on to all that are not known to have it. So
@@ -288,9 +286,7 @@ class DocumentSpreading:
         return found
 
 
-# --- The reasons for which a secured mesh refuses a connection ------------------------------------------------------
-#
-# One word each, for wire, counters, commands and logs.
+# The reasons for which a secured mesh refuses a connection. One word each, for wire, counters, commands and logs.
 
 
 class TrustReason(IntEnum):
@@ -370,9 +366,7 @@ class TrustError(RemoteProtocolError):
         self.reason = reason
 
 
-# --- What ``rmpa trust status`` and the other commands show ---------------------------------------------------------
-#
-# No part is a secret.
+# What ``rmpa trust status`` and the other commands show. No part is a secret.
 
 
 class MemberInfo(msgspec.Struct, kw_only=True, frozen=True):
@@ -505,9 +499,7 @@ class TrustReply(msgspec.Struct, kw_only=True, frozen=True):
     number: int = 0
 
 
-# --- The names and addresses by which a module's page is opened -----------------------------------------------------
-#
-# Which of them its certificate may have (RFC 9525).
+# The names and addresses by which a module's page is opened. Which of them its certificate may have (RFC 9525).
 #
 # Those that follow from the module's name are never another module's. Further ones are asked for. A browser that
 # trusts the mesh's CA is to believe it about no host of the Internet, so these are private addresses, and names of

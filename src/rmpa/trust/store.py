@@ -393,9 +393,7 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-# --- The ``ssl.SSLContext`` of members, and of modules that join ----------------------------------------------------
-#
-# TLS 1.3 alone, no resumption.
+# The ``ssl.SSLContext`` of members, and of modules that join. TLS 1.3 alone, no resumption.
 
 
 # Protocol of a link inside TLS (RFC 7301).
@@ -452,9 +450,7 @@ def _context(*, server_side: bool) -> ssl.SSLContext:
     return context
 
 
-# --- Whether a module may start without trust -----------------------------------------------------------------------
-#
-# Not beside keys of this user's other modules, unless that is said.
+# Whether a module may start without trust. Not beside keys of this user's other modules, unless that is said.
 #
 # A name or a state directory that was forgotten must not start a module of a secured mesh as an open one.
 

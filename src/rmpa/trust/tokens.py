@@ -263,9 +263,7 @@ class TokenBook:
         return True
 
 
-# --- The messages of joins and renewals -----------------------------------------------------------------------------
-#
-# One question and one answer, inside TLS with the ALPN ``rmpa-join/1``.
+# The messages of joins and renewals. One question and one answer, inside TLS with the ALPN ``rmpa-join/1``.
 #
 # ::
 #

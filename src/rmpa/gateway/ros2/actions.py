@@ -159,9 +159,6 @@ async def _parts_of(ros1: str) -> list[MessageType]:
     return await find_types(*(f"{ros1}{kind}" for kind in KINDS))
 
 
-# --- A server of ROS 1 for clients of ROS 2 -------------------------------------------------------------------------
-
-
 class OfferedAction(JoinedAction, GoalsToRos1):
     """Offers one actionlib server to ROS 2.
 
@@ -200,8 +197,6 @@ class OfferedAction(JoinedAction, GoalsToRos1):
         attachment = Ros2Attachment(asked.sequence, self._clock.wall_ns(), asked.gid)
         query.reply(query.key, response, attachment.serialize())
         query.finish()
-
-    # --- inside ---------------------------------------------------------------------------------------------------
 
     async def _join(self) -> None:
         context = self._context
@@ -323,8 +318,6 @@ class ShownAction(JoinedAction, GoalsToRos2):
         """Call a service of the server, and tell the goals what comes of it."""
         if self._open:
             self._context.start(self._ask(service, uuid, request), f"ask {service}")
-
-    # --- inside ----------------------------------------------------------------------------------------------------
 
     async def _join(self) -> None:
         context, server = self._context, self.server
@@ -460,8 +453,6 @@ class Ros2Actions:
             shown.finish()
         self._offered.clear()
         self._shown.clear()
-
-    # --- inside -----------------------------------------------------------------------------------------------------
 
     def _clients(self, name: str) -> set[MeshSource]:
         return {source for source, part in self._topics.get(name, {}).items() if part in _OF_CLIENTS}

@@ -180,8 +180,6 @@ class Conversion:
     def _codecs(self) -> tuple[MessageCodec, Ros2Codec]:
         return MessageCodec(self.ros1.name, self.ros1.specifications), Ros2Codec(self._types, self.ros2)
 
-    # --- whether two types are a pair, and what both have --------------------------------------------------------
-
     def _fields1(self, name: str) -> tuple[Field, ...]:
         known = self.ros1.specifications.get(name)
         return known.fields if known is not None else ()
@@ -259,8 +257,6 @@ class Conversion:
         other = _field_at(self.ros2, path2, self._types.fields)
         self._both(field, other, f"{self.ros1.name}.{path1} and {self.ros2}.{path2}")
         return path1.split("."), path2.split("."), field, other
-
-    # --- values of one side for the other ------------------------------------------------------------------------
 
     def _convert(self, values: dict[str, Any], *, to_ros1: bool) -> dict[str, Any]:
         if self._mapped is None:
@@ -360,9 +356,7 @@ def action_name(type_name: str, part: str) -> str:
     return type_name.removesuffix(part) if type_name.endswith(part) and not type_name.endswith(f"/{part}") else ""
 
 
-# --- An action type of ROS 1 and its counterpart in ROS 2 -----------------------------------------------------------
-#
-# The types that rosidl makes of it, and their conversions.
+# An action type of ROS 1 and its counterpart in ROS 2. The types that rosidl makes of it, and their conversions.
 
 
 # Stands between an action's name and those of its services and topics in ROS 2.

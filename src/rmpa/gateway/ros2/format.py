@@ -97,12 +97,10 @@ def _without_labels(raw: memoryview) -> memoryview:
     return memoryview(made + bytes(raw))
 
 
-# --- The QoS of a ROS 2 endpoint, and its text in a liveliness token ------------------------------------------------
-#
-# The text is ``reliability:durability:history,depth:deadline:lifespan:liveliness,lease``, where a duration is
+# The QoS of a ROS 2 endpoint, and its text in a liveliness token. The text is
+# ``reliability:durability:history,depth:deadline:lifespan:liveliness,lease``, where a duration is
 # ``seconds,nanoseconds``. A value that is rmw's default is left out, but for the depth of *keep last*: a publisher
-# with the default QoS has ``::,10:,:,:,,``, a latched one ``:1:,1:,:,:,,``. The numbers are those of
-# rmw/types.h.
+# with the default QoS has ``::,10:,:,:,,``, a latched one ``:1:,1:,:,:,,``. The numbers are those of rmw/types.h.
 
 
 # A duration that never ends, in nanoseconds: the default of all durations (RMW_DURATION_INFINITE).
@@ -220,9 +218,7 @@ def _kind(kind: type[_Kind], text: str, default: _Kind) -> _Kind:
         return default  # 0 is the system's default, and rmw has more kinds than these
 
 
-# --- The QoS of a topic that goes out to ROS 2 ----------------------------------------------------------------------
-#
-# Its contract in ROS 2's words, and in Zenoh's.
+# The QoS of a topic that goes out to ROS 2. Its contract in ROS 2's words, and in Zenoh's.
 
 
 def ros2_qos(contracts: Contracts, topic: str, type_name: str, *, latching: bool) -> Ros2Qos:
@@ -278,9 +274,7 @@ def _nanoseconds(seconds: float | None) -> int:
     return INFINITE if seconds is None else round(seconds * 1e9)
 
 
-# --- Liveliness tokens of ROS 2 over Zenoh --------------------------------------------------------------------------
-#
-# The graph of nodes and endpoints.
+# Liveliness tokens of ROS 2 over Zenoh. The graph of nodes and endpoints.
 #
 # Each node and each endpoint of ROS 2 declares a token; what declares none is not seen by ``ros2 topic list``::
 #

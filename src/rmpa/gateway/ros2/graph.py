@@ -29,9 +29,7 @@ if TYPE_CHECKING:
 SITE: Final = ROS2
 
 
-# --- Two endpoints of one name that do not hear each other, as their keys differ ------------------------------------
-#
-# ROS 2 itself says nothing.
+# Two endpoints of one name that do not hear each other, as their keys differ. ROS 2 itself says nothing.
 
 
 def mismatch(own: Ros2Endpoint, other: Ros2Endpoint, distribution: str) -> str:
@@ -63,9 +61,7 @@ def mismatch(own: Ros2Endpoint, other: Ros2Endpoint, distribution: str) -> str:
     )
 
 
-# --- The graph of a ROS 2 domain, read from liveliness tokens -------------------------------------------------------
-#
-# A machine without I/O.
+# The graph of a ROS 2 domain, read from liveliness tokens
 #
 # Tokens are declared by any program that reaches the router. What is malformed, has an impossible name or is more
 # than ``limits`` allow is ignored and counted; so are the tokens of gateways, this one's included.
@@ -213,10 +209,9 @@ def _valid(name: str) -> bool:
     return len(name) <= limits.ROS2_NAME_MAX and _NAME.fullmatch(name) is not None
 
 
-# --- The nodes and endpoints that the gateway declares in ROS 2's graph, for the nodes of its modules ---------------
-#
-# A module's node is ``/rmpa/<module>/<node>`` there, as its proxy is here. What the gateway itself subscribes to or
-# calls, for nodes and modules that want it, belongs to one node of its own, ``/rmpa/<name of the gateway>``.
+# The nodes and endpoints that the gateway declares in ROS 2's graph, for the nodes of its modules. A module's node is
+# ``/rmpa/<module>/<node>`` there, as its proxy is here. What the gateway itself subscribes to or calls, for nodes and
+# modules that want it, belongs to one node of its own, ``/rmpa/<name of the gateway>``.
 
 
 _NOT_IN_NAMES: Final = re.compile(r"[^A-Za-z0-9_]")

@@ -89,8 +89,6 @@ class TypeMapping:
             if problem := self._add(rule):
                 raise ConfigError("gateway.ros2.mapping", f"rule {number} {problem}", path=path)
 
-    # --- from ROS 1 to ROS 2 ---------------------------------------------------------------------------------------
-
     def message(self, name: str, known: Container[object]) -> TypePair | None:
         """The ROS 2 type of a message type.
 
@@ -122,8 +120,6 @@ class TypeMapping:
             packages.append(package.removesuffix("_msgs") + "_interfaces")
         return [f"{each}/{kind}/{base}" for each in packages]
 
-    # --- from ROS 2 to ROS 1 ---------------------------------------------------------------------------------------
-
     def ros1_type(self, name: str, known: Iterable[str] = ()) -> str:
         """The ROS 1 type of a message, service or action type of ROS 2; the same name without a rule.
 
@@ -138,8 +134,6 @@ class TypeMapping:
         packages = [f"{ros1}/{base}" for ros1, all_of in self._packages.items() if package in all_of]
         found = [*ruled, *([same] if same in known else []), *usual, *packages, same]
         return next((each for each in found if each in known), found[0])
-
-    # --- reading rules ---------------------------------------------------------------------------------------------
 
     def _add(self, rule: Any) -> str:
         """Take in one rule; return what is wrong with it, or an empty text."""
@@ -178,9 +172,7 @@ def _is_paths(fields: Any) -> bool:
     return isinstance(fields, dict) and all(isinstance(each, str) for pair in fields.items() for each in pair)
 
 
-# --- The ROS 1 definition of a type that only ROS 2 defines ---------------------------------------------------------
-#
-# A node of ROS 1 can ask for it by name.
+# The ROS 1 definition of a type that only ROS 2 defines. A node of ROS 1 can ask for it by name.
 
 
 _TIMES: Final = {ros2: ros1 for ros1, ros2 in TIMES.items()}
@@ -266,8 +258,6 @@ class Ros2Pairs:
         self._out: _Kept = {}
         self._in: _Kept = {}
 
-    # --- from the mesh to ROS 2 ----------------------------------------------------------------------------------
-
     def ros2_type(self, name: str) -> tuple[str, str] | None:
         """The type of ROS 2 for a ROS 1 type, and its hash.
 
@@ -327,8 +317,6 @@ class Ros2Pairs:
                 f"a rule maps {name} to {pair.name}, which is not known here: let a ROS 2 node that has it offer "
                 "get_type_description, or map it to another type"
             ) from None
-
-    # --- from ROS 2 to the mesh ----------------------------------------------------------------------------------
 
     def ros1_name(self, name: str) -> str:
         """The name of ROS 1 for a type of ROS 2, ``package/msg/Name``."""

@@ -106,8 +106,6 @@ class Ros2Neighbour:
             "problems": dict(self.context.problems),
         }
 
-    # --- changes of both graphs -----------------------------------------------------------------------------------
-
     def _token(self, key: str, alive: bool) -> None:
         if self._closed:
             return
@@ -147,8 +145,6 @@ class Ros2Neighbour:
     def _offer(self, source: MeshSource, *, there: bool) -> None:
         any(part.mesh_source(source, there=there) for part in self._parts)
 
-    # --- ``rmpa why`` ---------------------------------------------------------------------------------------------
-
     def ways(self, name: str, site: str = "", module: str = "") -> list[Diagnosis]:
         """The ways of a topic between ROS 2 and the modules.
 
@@ -182,8 +178,6 @@ class Ros2Neighbour:
                 ends = (SITE, gateway) if coming else (gateway, SITE)
                 ways.append(_way((Check("rule", FAIL, why, _RULES),), name, node, *ends))
         return [way for way in ways if module in ("", way.peer)]
-
-    # --- questions -------------------------------------------------------------------------------------------------
 
     async def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Any:
         """The reply to one question of ``observe.operations``; raises as that says."""

@@ -42,10 +42,11 @@ if TYPE_CHECKING:
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.wire.tcpros import ServiceDescription
 
+_log = logging.getLogger(__name__)
+
 # Seconds until a service that could not be asked for its type is asked again: at first, and at most; it doubles.
 _ROS2_DESCRIBE_AGAIN: Final = (0.5, 30.0)
 
-_log = logging.getLogger(__name__)
 # RMW_GID_STORAGE_SIZE up to ROS 2 Humble.
 _GID_BYTES_BEFORE: Final = 24
 SERVICE_NEEDS: Final = Needs(
@@ -55,9 +56,7 @@ SERVICE_NEEDS: Final = Needs(
 )
 
 
-# --- A service type of ROS 1 and its counterpart in ROS 2 -----------------------------------------------------------
-#
-# Names, hash, conversion of requests and responses.
+# A service type of ROS 1 and its counterpart in ROS 2. Names, hash, conversion of requests and responses.
 #
 # ROS 2 has no reply that says "the call failed". rmw_zenoh's client prints the text of a Zenoh error reply and goes
 # on waiting (rmw_data_types.cpp, ``client_data_handler``), so a failed call of ROS 1 is answered with one, never with
@@ -279,8 +278,6 @@ class OfferedService:
         for each in self._declared:
             each.close()
 
-    # --- inside -----------------------------------------------------------------------------------------------------
-
     def _say(self, text: str) -> None:
         self._context.say(self.source.here, text)
 
@@ -375,8 +372,6 @@ class ShownRos2Service:
             self._service.close()
         if self._client is not None:
             self._client.close()
-
-    # --- inside -----------------------------------------------------------------------------------------------------
 
     async def _show(self) -> None:
         """Find the types, and show it if they are a pair."""

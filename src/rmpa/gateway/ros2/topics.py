@@ -276,8 +276,6 @@ class Ros2Import:
         self.publishers.clear()
         self._say("")
 
-    # --- demand --------------------------------------------------------------------------------------------------
-
     def demand(self, publisher: Ros2Publisher, wanted: bool) -> None:
         """A node or module wants a publisher, or none does any more."""
         publisher.wanted = wanted
@@ -337,8 +335,6 @@ class Ros2Import:
         self._adopted.clear()
         for publisher in self.publishers.values():
             publisher.kept = None
-
-    # --- messages ------------------------------------------------------------------------------------------------
 
     def _sample(self, sample: ZenohSample) -> None:
         gid, sequence = b"", 0
@@ -436,8 +432,6 @@ class Ros2Topics:
             del self.refused[next(iter(self.refused))]
         self.refused[what] = why
 
-    # --- from the mesh to ROS 2 ----------------------------------------------------------------------------------
-
     def mesh_source(self, source: MeshSource, *, there: bool) -> bool:
         """Put a topic of a module into ROS 2's graph, or take it out."""
         if source.kind is not SourceKind.TOPIC:
@@ -487,8 +481,6 @@ class Ros2Topics:
             text = mismatch(dialect.endpoint.endpoint, other, self.context.types.distribution)
             if text:
                 self.context.say(f"{other.name} of {other.node.name}", text)
-
-    # --- from ROS 2 to the mesh ----------------------------------------------------------------------------------
 
     def endpoint(self, endpoint: Ros2Endpoint, *, there: bool) -> bool:
         """Show a publisher of ROS 2 in the gateway's graph, or take it out; compare it with what is here."""

@@ -124,8 +124,6 @@ class FunctionText:
         """Add lines at the present indentation."""
         self._lines += [" " * self._indent + line for line in lines]
 
-    # --- what moves both places ----------------------------------------------------------------------------------
-
     def _moved(self, size: int) -> None:
         self._rest = (self._rest + size) % self._known
 
@@ -165,8 +163,6 @@ class FunctionText:
             self._forget(size)
         else:
             self._moved(padding)
-
-    # --- parts ---------------------------------------------------------------------------------------------------
 
     def _sides(self, part: LayoutPart) -> tuple[bool, bool]:
         """Whether the target has a part, and whether the source has it."""

@@ -90,9 +90,7 @@ class Ros2Sequences:
         self._last.clear()
 
 
-# --- The types of ROS 2 ---------------------------------------------------------------------------------------------
-#
-# Their fields, their hashes, and the ROS 2 form of a type that ROS 1 defines.
+# The types of ROS 2. Their fields, their hashes, and the ROS 2 form of a type that ROS 1 defines.
 #
 # rosbags knows the types of each ROS 2 distribution. A type that it does not know, because a user defined it, is made
 # from its ROS 1 definition: ROS 2 packages that were ported keep the fields, ``time`` and ``duration`` become
@@ -292,9 +290,7 @@ class Ros2Types:
         return self.type_hash(name)
 
 
-# --- How large a type is with all that it embeds --------------------------------------------------------------------
-#
-# Definitions of a few bytes can embed types billions of times.
+# How large a type is with all that it embeds. Definitions of a few bytes can embed types billions of times.
 
 
 def check_size(name: str, fields_of: Callable[[str], Iterable[Field]]) -> None:
@@ -329,9 +325,7 @@ def check_size(name: str, fields_of: Callable[[str], Iterable[Field]]) -> None:
         raise RemoteProtocolError(f"{name} has arrays of more than {limits.ROS2_ARRAY_MAX} elements")
 
 
-# --- The service ``~/get_type_description`` of ROS 2 nodes (REP 2016) -----------------------------------------------
-#
-# Its request, and the fields in its response.
+# The service ``~/get_type_description`` of ROS 2 nodes (REP 2016). Its request, and the fields in its response.
 #
 # A response is checked before it is used: rosbags makes Python code of the names in it.
 

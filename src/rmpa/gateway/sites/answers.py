@@ -118,9 +118,6 @@ def _printable(stage: Check) -> Check:
     return Check(printable(stage.name), stage.level, printable(stage.text), printable(stage.remedy))
 
 
-# --- The stages, from what a part of the neighbour reports of a topic or service ------------------------------------
-
-
 def sent_stages(site: str, export: Export, *, asked: bool) -> list[Check]:
     """The stages of a topic behind its rule at the exporting gateway.
 
@@ -230,8 +227,6 @@ class SiteAnswers:
         """Whether what a module of this site has is told by this gateway: the others it asks itself."""
         return not self._rules.secured or asker in ("", module)
 
-    # --- what is there ----------------------------------------------------------------------------------------------
-
     def _report(self, names: list[str], asker: str, *, sources: bool) -> SitesReport:
         endpoints = self._sites.context.session.endpoints
         return SitesReport(
@@ -301,8 +296,6 @@ class SiteAnswers:
                 here = entry.source.name if entry is not None and self._sites.leads else ""
                 yield _source_info(source, module.name, here, refused.get(source, ""))
 
-    # --- ``rmpa why`` -----------------------------------------------------------------------------------------------
-
     async def ways(
         self, name: str, site: str = "", module: str = "", asker: str = "", *, service: bool = False
     ) -> list[Diagnosis]:
@@ -350,8 +343,6 @@ class SiteAnswers:
             return mine and source.kind in kinds
 
         return [*ways, *(msgspec.structs.replace(way, name=name) for way in self._leaving(own))]
-
-    # --- what comes in ----------------------------------------------------------------------------------------------
 
     async def _way(self, there: SiteSource, entry: SiteImport | None, refused: str) -> Diagnosis:
         site, module = there.site, there.module.name
@@ -405,8 +396,6 @@ class SiteAnswers:
         to = f"site {self._site}"
         return Diagnosis.of(until_failure(stages), kind=KINDS[kind], name=name, peer=peer, to=to, node=node)
 
-    # --- what goes out ----------------------------------------------------------------------------------------------
-
     def _leaving(self, meant: Callable[[MeshSource], bool], asking: str = "") -> Iterator[Diagnosis]:
         """The ways of sources of this site to the one that is ``asking``; empty: for its own module, to all."""
         for source, entries in self._sites.exports.offered():
@@ -447,8 +436,6 @@ class SiteAnswers:
             to=f"site {asking or to}" if asking or to else "other sites",
             node=source.node,
         )
-
-    # --- the other gateway --------------------------------------------------------------------------------------
 
     async def _ask(
         self, site: str, name: str, module: str, *, service: bool = False

@@ -86,8 +86,6 @@ class SiteCatalogue:
         self._by_token: dict[str, SiteModule | SiteSource] = {}
         self.counters = counters if counters is not None else Counters()
 
-    # --- what is there ------------------------------------------------------------------------------------------
-
     @property
     def sites(self) -> tuple[str, ...]:
         """The names of the other sites, in order."""
@@ -116,8 +114,6 @@ class SiteCatalogue:
             for module in self.modules(site):
                 yield module
                 yield from self.sources(module)
-
-    # --- tokens -------------------------------------------------------------------------------------------------
 
     def token(self, key: str, now: float, *, alive: bool) -> SiteModule | SiteSource | SiteGateway | None:
         """A liveliness token came or went. What is none is counted and ignored.
@@ -258,9 +254,7 @@ class SiteCatalogue:
             del self._sites[name]
 
 
-# --- Which gateway of a site leads, where there are several ---------------------------------------------------------
-#
-# The others stand by, so that no message crosses twice.
+# Which gateway of a site leads, where there are several. The others stand by, so that no message crosses twice.
 
 
 class Leader:
@@ -316,9 +310,7 @@ class Leader:
             self._best_since = now
 
 
-# --- Which sites were there and are not, and what they had ----------------------------------------------------------
-#
-# For "unreachable since".
+# Which sites were there and are not, and what they had. For "unreachable since".
 
 
 class SiteHistory:

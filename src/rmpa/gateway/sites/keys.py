@@ -146,9 +146,6 @@ def _read(raw: bytes, at: int) -> tuple[str, int]:
         raise RemoteProtocolError(f"an attachment of a site has a name that is not UTF-8: {error}") from error
 
 
-# --- What gateways tell of a publisher, and what follows from the numbers of its messages ---------------------------
-
-
 _T = TypeVar("_T")
 _Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
@@ -270,9 +267,7 @@ class SequenceCounter:
         self._run, self._last, self._announced, self._expects_first = run, sequence, sequence, False
 
 
-# --- The keys of a site's sources in Zenoh, and the liveliness tokens that announce them ----------------------------
-#
-# ::
+# The keys of a site's sources in Zenoh, and the liveliness tokens that announce them::
 #
 #     rmpa/1/<site>/<module>/t/<package>%<Type>/<topic>          messages
 #     rmpa/1/<site>/<module>/s/<package>%<Type>/<service>        calls (queryable)

@@ -206,12 +206,11 @@ def _problem(announced: SiteSource) -> str:
     return ""
 
 
-# --- Which sources of other sites are shown here, and under which names ---------------------------------------------
-#
-# A source is known by site, module, kind, node and name; a new run of its module continues it. Of two sources that
-# want one name here with different types (or two services of one name) the first is shown, and one of this site's own
-# modules goes before all others; the reason is told for the other, which is shown once the name is free. Of one name
-# only the first ``limits.SITE_NAMES_WAITING_MAX`` wait.
+# Which sources of other sites are shown here, and under which names. A source is known by site, module, kind, node
+# and name; a new run of its module continues it. Of two sources that want one name here with different types (or two
+# services of one name) the first is shown, and one of this site's own modules goes before all others; the reason is
+# told for the other, which is shown once the name is free. Of one name only the first
+# ``limits.SITE_NAMES_WAITING_MAX`` wait.
 
 
 # Site, module, kind, node, name there.

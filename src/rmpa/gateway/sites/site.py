@@ -96,8 +96,6 @@ class SiteNeighbour:
         """Which sites are there, as JSON values."""
         return {"sites": self.catalogue.sites, "leads": self.leads}
 
-    # --- changes --------------------------------------------------------------------------------------------------
-
     def _on_token(self, key: str, alive: bool) -> None:
         if self._closed:
             return
@@ -159,8 +157,6 @@ class SiteNeighbour:
         (self.imports.found if there else self.imports.gone)(item)
         if there or self.catalogue.gateways(item.site):
             self.history.source(item, there=there)
-
-    # --- what the plans say -----------------------------------------------------------------------------------------
 
     def _lead(self) -> None:
         _log.info("= this gateway leads site %s", self.own.site)

@@ -257,8 +257,6 @@ class ImportedTopic:
         self._topic.close()
         return interrupted
 
-    # --- demand ---------------------------------------------------------------------------------------------------
-
     def _demand(self, wanted: bool) -> None:
         self._stop_lingering()
         if not wanted:
@@ -304,8 +302,6 @@ class ImportedTopic:
         else:
             self._ask()
             self._check_in(min(pause * 2, _IDLE_CHECK_MAX))
-
-    # --- the header -----------------------------------------------------------------------------------------------
 
     def _ask(self) -> None:
         if self._task is None or self._task.done():
@@ -412,8 +408,6 @@ class SiteTopics:
             lambda: session.queryable(f"{prefix}/m/*", self._asked_definition, _DEFINITION_NEEDS),
         )
 
-    # --- what the neighbour says ----------------------------------------------------------------------------------
-
     def export(self, entry: SiteExport) -> None:
         """Declare a publisher of this site, for other sites."""
         source, announced, context = entry.source, entry.announced, self.context
@@ -460,8 +454,6 @@ class SiteTopics:
         """End it: everything was withdrawn and hidden before."""
         await self._headers.close()
 
-    # --- what comes in --------------------------------------------------------------------------------------------
-
     def subscribe(self, topic: ImportedTopic) -> None:
         """Subscribe to the key of a topic."""
         announced = topic.entry.announced
@@ -501,8 +493,6 @@ class SiteTopics:
                     counters.add("site.message.unkept")
                 else:
                     known[source.node] = sample.payload, sequence, source
-
-    # --- questions of other sites -----------------------------------------------------------------------------------
 
     def _asked_header(self, query: ArrivedQuery) -> None:
         module, _, topic = query.key.removeprefix(f"{ROOT}/{self.context.name}/").partition("/d/t/")

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.trust.certificates import DenyList
 
+_log = logging.getLogger(__name__)
+
 # Seconds of the line's rate that the kernel's buffer of a connection holds, which counts them twice. In that buffer
 # there are no priorities: on 1 Mbit/s with images a command waited 2.7 s with Linux's own size, 0.3 s with this one,
 # and as many images came.
@@ -197,11 +199,9 @@ def _is_loopback(address: str) -> bool:
     return host in ("localhost", "[::1]") or host.startswith("127.")
 
 
-# --- Which certificates may use a router ----------------------------------------------------------------------------
-#
-# Zenoh's table of access knows the name in a certificate alone. So a router has one rule: members may use the keys
-# of sites, and those that were revoked may use nothing. Which topics, services and parameters a site may have is
-# judged by the gateways at both ends, and by the modules.
+# Which certificates may use a router. Zenoh's table of access knows the name in a certificate alone. So a router has
+# one rule: members may use the keys of sites, and those that were revoked may use nothing. Which topics, services and
+# parameters a site may have is judged by the gateways at both ends, and by the modules.
 
 
 _MESSAGES: Final = (
@@ -307,7 +307,6 @@ def _deny_list(settings: Settings) -> DenyList | None:
 # for in this process.
 
 
-_log = logging.getLogger(__name__)
 _FILES: Final = Path("/proc/self/fd")
 _STREAMS: Final = frozenset({"tcp", "tls", "ws"})
 

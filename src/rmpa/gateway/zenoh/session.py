@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from rmpa.gateway.zenoh.threads import ZenohQos, ZenohReply
     from rmpa.ros.wire.tcpros import Buffer
 
+_log = logging.getLogger(__name__)
+
 # Seconds between two looks at which connections Zenoh has, to bound what the kernel holds of new ones.
 _LOOK_AT_LINKS: Final = 2.0
 # Seconds that closing a session may take before it is given up; its threads do not keep the process from ending.
@@ -45,7 +47,6 @@ _CLOSE_MAX: Final = 3.0
 # Seconds beyond a query's own time-out after which its answers are no longer waited for.
 _GET_GRACE: Final = 1.0
 
-_log = logging.getLogger(__name__)
 _WILD: Final = frozenset("*$")
 
 

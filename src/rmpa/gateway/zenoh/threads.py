@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
     from rmpa.ros.wire.tcpros import Buffer
 
+_log = logging.getLogger(__name__)
+
 # Messages of one publisher that are sent in one turn, while others of its priority wait.
 _TURN_MESSAGES: Final = 64
 # Bytes of one publisher in one turn: one batch of Zenoh. One message always fits.
@@ -41,7 +43,6 @@ _DRAIN_BYTES: Final = 8 * 1024 * 1024
 _BUSY_MESSAGES: Final = 8
 
 _T = TypeVar("_T")
-_log = logging.getLogger(__name__)
 
 
 class ZenohPriority(IntEnum):
@@ -364,12 +365,11 @@ class Arrivals:
         return _DRAIN_MESSAGES - messages
 
 
-# --- Publishers behind bounded queues, and the threads that put their messages to Zenoh -----------------------------
-#
-# A put of a reliable publisher waits while the transport's queue of its priority is full: Zenoh has one such queue
-# for each priority. So each priority in use has one thread here, and within it the publishers take turns. What waits
-# for a full bulk lane holds no command up, and nothing holds the event loop up. Behind a full transport the oldest
-# messages of each publisher are dropped, and counted.
+# Publishers behind bounded queues, and the threads that put their messages to Zenoh. A put of a reliable publisher
+# waits while the transport's queue of its priority is full: Zenoh has one such queue for each priority. So each
+# priority in use has one thread here, and within it the publishers take turns. What waits for a full bulk lane holds
+# no command up, and nothing holds the event loop up. Behind a full transport the oldest messages of each publisher
+# are dropped, and counted.
 
 
 class QueuedPublisher(BoundedQueue[tuple[bytes, bytes]]):

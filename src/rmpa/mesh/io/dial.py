@@ -62,9 +62,6 @@ _EXPRESS_RTO_MIN_US: Final = 5000
 _EXPRESS_RTO_MAX_MS: Final = 1000
 
 
-# --- Options and kernel statistics of the connections' sockets ------------------------------------------------------
-
-
 _RTO_MIN_US: Final = 45
 # Options with their values on the express lane, and Linux's own; Python's ``socket`` lacks these numbers of
 # linux/tcp.h.

@@ -184,8 +184,6 @@ class Connection(ConnectionProtocol):
         self.close(reason, self.mesh.clock.now(), moves=moves)
         self.flush()
 
-    # --- what the machine reports -------------------------------------------------------------------------------
-
     def judge(self, hello: Hello) -> Refuse | None:
         """Decide on the remote side's hello or welcome."""
         return self.mesh.judge(self, hello) or super().judge(hello)
@@ -238,8 +236,6 @@ class Connection(ConnectionProtocol):
         self._timer.close()
         # Later, not from here: this may be ``receive``, or a ``send`` within a loop over the links.
         asyncio.get_running_loop().call_soon(self._report_end, reason)
-
-    # --- inside ---------------------------------------------------------------------------------------------------
 
     def _express_of(self) -> PeerLink | None:
         """The link whose express lane this connection is, if it is the one that is used with its peer."""
@@ -470,8 +466,6 @@ class PeerLink:
     def close_route(self, route: int) -> int:
         """Discard the waiting messages of a closed route, and its drop counts; return the number of messages."""
         return self.express.close_route(route) + self.bulk.close_route(route)
-
-    # --- for the mesh -----------------------------------------------------------------------------------------
 
     def use(self, *, used: bool) -> None:
         """Begin to use this link, or stop: then data and marks that arrive are dropped."""

@@ -187,8 +187,6 @@ class Mesh:
         """The link that is used with this peer."""
         return next((link for link in self.links() if link.guid == guid), None)
 
-    # --- what connections and links report ------------------------------------------------------------------------
-
     def judge(self, connection: Connection, hello: Hello) -> Refuse | None:
         """Decide on the hello or welcome of the remote side; the peering machine knows the links that are up."""
         refuse = self._prove(connection, hello)
@@ -296,8 +294,6 @@ class Mesh:
                 _log.info("= %s: the bulk lane is gone (%s); small messages go on", link.name, reason)
                 self.dial_bulk(link, link.backoff.delay() if link.dialled else 0.0)
 
-    # --- acting on the peering machine ----------------------------------------------------------------------------
-
     def _act(self) -> None:
         """Carry out what the peering machine asks for; a call from within a callback leaves it to the outer call."""
         if self._acting:
@@ -340,8 +336,6 @@ class Mesh:
     def _due(self, now: float) -> None:
         self._peering.handle_timer(now)
         self._act()
-
-    # --- dialling -------------------------------------------------------------------------------------------------
 
     async def _dial(self, guid: Guid, endpoints: tuple[SocketAddress, ...], *, briefly: bool) -> None:
         places = ", ".join(f"{host}:{port}" for host, port in endpoints)
@@ -437,8 +431,6 @@ class Mesh:
         self._connections[number] = Connection(
             number, self, sock, endpoint, dialled=guid is not None, expected=guid, lane=lane, secured=secured
         )
-
-    # --- accepting ------------------------------------------------------------------------------------------------
 
     def _accepted(self, sock: socket.socket, address: SocketAddress) -> None:
         if self._securing is not None:

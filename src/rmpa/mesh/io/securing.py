@@ -129,9 +129,6 @@ def tls_failure(error: ssl.SSLError) -> SecuringError:
     return SecuringError(refusal(TrustReason.DOWNGRADE, f"it does not speak TLS 1.3 ({name})"), by_us=True)
 
 
-# --- dialled connections ----------------------------------------------------------------------------------------
-
-
 async def secure_dialled(sock: socket.socket, security: Membership) -> SecuredSocket:
     """Do the TLS handshake of a connection that this side dialled; the caller closes it.
 
@@ -181,9 +178,6 @@ async def _plain_refusal(sock: socket.socket, data: bytes) -> SecuringError:
     return SecuringError(refusal(TrustReason.DOWNGRADE, "it answers by something else than TLS"), by_us=False)
 
 
-# --- both -------------------------------------------------------------------------------------------------------
-
-
 async def _shake(sock: socket.socket, handshake: TlsHandshake, data: bytes) -> None:
     """Pass bytes between socket and handshake until it is done; an alert is sent before the error is raised."""
     loop = asyncio.get_running_loop()
@@ -207,9 +201,6 @@ def _secured(sock: socket.socket, handshake: TlsHandshake) -> SecuredSocket:
         text = f"it speaks {tls.version()} with {tls.selected_alpn_protocol()}, not TLSv1.3 with {ALPN_LINK}"
         raise SecuringError(refusal(TrustReason.DOWNGRADE, text), by_us=True)
     return handshake.secure(sock), tls.getpeercert() or {}
-
-
-# --- accepted connections ---------------------------------------------------------------------------------------
 
 
 @dataclass(eq=False)

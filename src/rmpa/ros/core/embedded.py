@@ -296,8 +296,6 @@ class RosCore(Core):
                 carry_out=self._carry_out,
             )
 
-    # --- its life ---------------------------------------------------------------------------------------------
-
     async def start(self) -> None:
         """Restore the stored state; listen; set ``/run_id``, ``/rosdistro`` and ``/rosversion``; start ``/rosout``.
 
@@ -340,8 +338,6 @@ class RosCore(Core):
         """The port at which the core listens."""
         return self._server.port
 
-    # --- asking it --------------------------------------------------------------------------------------------
-
     def call(self, method: str, *params: XmlRpcValue) -> RosReply:
         """Call a method of the Master or Parameter Server API, as over XML-RPC but at once.
 
@@ -371,8 +367,6 @@ class RosCore(Core):
 
     def restored(self) -> str:
         return self.stored.summary() if self.stored is not None else ""
-
-    # --- inside -----------------------------------------------------------------------------------------------
 
     def _answer(self, method: str, params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
         try:

@@ -247,8 +247,6 @@ class ExternalCore(Core):
         self._seen = b""
         self._pace = _MASTER_LOOK_FIRST
 
-    # --- its life ---------------------------------------------------------------------------------------------
-
     async def start(self) -> None:
         """Poll the master for the first time; one that does not answer is polled again in the background."""
         self._loop = asyncio.get_running_loop()
@@ -288,8 +286,6 @@ class ExternalCore(Core):
             return (f"{where}, and each undoes what the other registers: end one, or give it a roscore of its own",)
         return ()
 
-    # --- asking it --------------------------------------------------------------------------------------------
-
     def call(self, method: str, *params: XmlRpcValue) -> RosReply:
         """Queue a registration or a write of a parameter, after all previous calls."""
         yield_to_data()
@@ -325,8 +321,6 @@ class ExternalCore(Core):
         if node not in self._mirror.ours():
             self.liveness.suspect(node)
         self._poll_soon()
-
-    # --- the one task -----------------------------------------------------------------------------------------
 
     async def _work(self) -> None:
         checked = self._loop.time()
@@ -421,8 +415,6 @@ class ExternalCore(Core):
         self._mirror.forget(write)
         self._report_changes()
 
-    # --- polling ----------------------------------------------------------------------------------------------
-
     async def _poll(self) -> None:
         """Poll the master once, and schedule the next poll."""
         begin = self._loop.time()
@@ -497,8 +489,6 @@ class ExternalCore(Core):
         if not isinstance(answers, list) or len(answers) != len(calls):
             raise RemoteProtocolError(f"{len(calls)} calls were answered with {brief(answers)}")
         return answers
-
-    # --- changes of the graph and of the master ---------------------------------------------------------------
 
     def _report_changes(self) -> None:
         _, changes = self.registrations.take()  # the master itself notifies the nodes

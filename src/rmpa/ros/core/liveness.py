@@ -66,9 +66,6 @@ _TOPICS_ASKED: Final = 2
 _PORTIONS: Final = 10
 
 
-# --- which node is at an address: its port may be another node's by now (ros_comm#2018, #2241) ---------------------
-
-
 async def name_at(api: str, topics: Sequence[str] = ()) -> str | None:
     """Ask the node with this slave API for its name.
 
@@ -104,12 +101,10 @@ async def name_at(api: str, topics: Sequence[str] = ()) -> str | None:
     return None
 
 
-# --- nodes that died without unregistering -------------------------------------------------------------------------
-#
-# A killed node leaves its registrations behind, and roscpp does so even on SIGTERM. For a node on this machine the
-# kernel's table shows whether it still listens, which spares the connection (rospy starts a thread for each). Other
-# nodes, and all where the kernel does not tell, are checked by connecting. Only two refused connects prove a node
-# dead: a network that is down does not.
+# Nodes that died without unregistering. A killed node leaves its registrations behind, and roscpp does so even on
+# SIGTERM. For a node on this machine the kernel's table shows whether it still listens, which spares the connection
+# (rospy starts a thread for each). Other nodes, and all where the kernel does not tell, are checked by connecting.
+# Only two refused connects prove a node dead: a network that is down does not.
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,9 +283,6 @@ async def try_connect(api: str) -> str:
     return ""
 
 
-# --- calls to one node's slave API ----------------------------------------------------------------------------------
-
-
 async def ping_node(node: str, uri: str, caller_id: str) -> NodePing:
     """Ask a node for its process id, and measure the time of the call.
 
@@ -369,11 +361,10 @@ async def _call(node: str, uri: str, method: str, *params: str) -> RosReply:
         raise PeerRefused(node, error.text) from error
 
 
-# --- the master's calls of slaves -----------------------------------------------------------------------------------
-#
-# rosmaster has three threads for all slaves, so three stopped nodes stop every notification; here each URI has its
-# own queue. For each topic only the latest list of publishers is queued. Parameter updates are all sent, until
-# ``_NOTIFY_COALESCE`` notifications wait; from then on a newer update of a parameter replaces an older one.
+# The master's calls of slaves. rosmaster has three threads for all slaves, so three stopped nodes stop every
+# notification; here each URI has its own queue. For each topic only the latest list of publishers is queued.
+# Parameter updates are all sent, until ``_NOTIFY_COALESCE`` notifications wait; from then on a newer update of a
+# parameter replaces an older one.
 
 
 # The caller id of masters in calls to slaves.

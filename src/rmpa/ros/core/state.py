@@ -180,8 +180,6 @@ class CoreState:
         self._writer: asyncio.Task[None] | None = None
         self._news, self._ending = asyncio.Event(), asyncio.Event()
 
-    # --- the start --------------------------------------------------------------------------------------------
-
     async def restore(self) -> None:
         """Read the file, ask its nodes, and restore what shall be; to be called before the core listens."""
         try:
@@ -277,8 +275,6 @@ class CoreState:
         for topic in topics:
             table.notify_subscribers(topic)
 
-    # --- what people see --------------------------------------------------------------------------------------
-
     def restored(self) -> str:
         """What became of the file's content at the start; empty if there was none."""
         parts = [self._dropped]
@@ -314,8 +310,6 @@ class CoreState:
                 if self._api.registrations.node_api(node) is None
             ]
         return tuple(notes)
-
-    # --- writing ----------------------------------------------------------------------------------------------
 
     def note_change(self) -> None:
         """Write soon, if something has changed."""
@@ -410,9 +404,6 @@ class CoreState:
 def _first(names: list[str]) -> str:
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + more
-
-
-# --- asking the nodes of the run before -----------------------------------------------------------------------------
 
 
 async def _is_there(api: str, nodes: dict[str, NodeRecord]) -> bool | None:

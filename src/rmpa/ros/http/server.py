@@ -127,8 +127,6 @@ class HttpConnection(asyncio.Protocol):
         """Whether the client takes too long for its call or for reading the answer."""
         return now - self.begun > _HTTP_SLOW_AFTER and self.pace(now) < _HTTP_PACE_MIN
 
-    # --- asyncio's side ---------------------------------------------------------------------------------------
-
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Ask the server for room."""
         assert isinstance(transport, asyncio.Transport)  # noqa: S101 - a TCP server's is one; for mypy
@@ -193,8 +191,6 @@ class HttpConnection(asyncio.Protocol):
         if self.receiving:
             self._server.refuse("http.timeout", self, "a request was not finished in time")
         self.abort()
-
-    # --- requests ---------------------------------------------------------------------------------------------
 
     def _begin(self) -> None:
         """Start the time-out of a request, whose first byte has arrived."""
@@ -270,8 +266,6 @@ class HttpConnection(asyncio.Protocol):
             self._transport.write_eof()
             self._requests.receiving = False
             self._expect(runtime_limits.DRAIN_TIMEOUT)
-
-    # --- the end ----------------------------------------------------------------------------------------------
 
     def close_when_answered(self) -> None:
         """Close now, or after the answer to the call under way."""
@@ -379,8 +373,6 @@ class XmlRpcServer:
         for connection in list(self._connections):
             connection.abort()
 
-    # --- room for connections and calls ------------------------------------------------------------------------
-
     def admit(self, connection: HttpConnection) -> bool:
         """Whether there is room for a new connection; another one may be closed for it."""
         if len(self._connections) >= limits.HTTP_CONNECTIONS_MAX and not self._evict():
@@ -446,8 +438,6 @@ class XmlRpcServer:
         """Count a refusal by its name, and log it."""
         now = asyncio.get_running_loop().time()
         self._refusals.refuse(now, name, connection.client, f"{self._name}: {connection.client}: {text}")
-
-    # --- calls -------------------------------------------------------------------------------------------------
 
     def answer(self, body: memoryview, connection: HttpConnection) -> bytes | Awaitable[bytes]:
         """Answer one call: at once, unless the handler has to wait, or there is much to read or write."""

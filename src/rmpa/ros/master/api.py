@@ -94,8 +94,6 @@ class MasterApi:
         self.service_lookup: Callable[[str, str, str, str], str] | None = None
         self._methods = self._table()
 
-    # --- calling ----------------------------------------------------------------------------------------------
-
     def call(self, method: str, arguments: Sequence[XmlRpcValue]) -> RosReply:
         """Call a method of the Master or Parameter Server API.
 
@@ -153,14 +151,10 @@ class MasterApi:
                 problem = RosFault(1, f"{brief(call)} is not a struct of methodName and params")
         return {"faultCode": problem.number, "faultString": problem.text}
 
-    # --- the node's own API -----------------------------------------------------------------------------------
-
     def _shutdown(self, caller_id: str, reason: XmlRpcValue) -> RosReply:
         _log.warning("< %s asks this core to end: %s [core-asked-to-end]", caller_id, brief(reason))
         self._on_shutdown(f"{caller_id}: {brief(reason)}")
         return RosReply(SUCCESS, "the core ends", 0)
-
-    # --- parameters -------------------------------------------------------------------------------------------
 
     def _delete_param(self, _caller_id: str, key: str) -> RosReply:
         try:
@@ -206,8 +200,6 @@ class MasterApi:
         # rosmaster answers 1 whether it was subscribed or not.
         return RosReply(SUCCESS, f"not subscribed to parameter {key}", 1)
 
-    # --- topics and services ----------------------------------------------------------------------------------
-
     def _register(self, kind: RegistrationKind, caller_id: str, key: str, detail: str, api: str) -> RosReply:
         self.registrations.register(kind, key, caller_id, api, detail)
         return RosReply(SUCCESS, f"{caller_id} {_DOES[kind]} {key}", self.registrations.counterparts(kind, key))
@@ -224,8 +216,6 @@ class MasterApi:
         if self.service_lookup is not None:
             uri = self.service_lookup(service, uri, caller_id, self.registrations.node_api(caller_id) or "") or uri
         return RosReply(SUCCESS, f"the provider of {service}", uri)
-
-    # --- the graph --------------------------------------------------------------------------------------------
 
     def _lookup_node(self, _caller_id: str, node: str) -> RosReply:
         api = self.registrations.node_api(node)

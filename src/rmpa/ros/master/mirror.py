@@ -185,8 +185,6 @@ class Mirror:
         self._orphans: dict[str, str] = {}
         self._run = ""
 
-    # --- questions --------------------------------------------------------------------------------------------
-
     def ours(self) -> dict[str, str]:
         """The nodes for which the agent registered something, with their slave APIs."""
         return {node: api for (_, _, node), (api, _) in self._own.items()}
@@ -199,8 +197,6 @@ class Mirror:
     def unregister_calls(self) -> list[Call]:
         """The calls that unregister all that the agent registered, the latest registration first."""
         return [_unregister(entry, *own) for entry, own in reversed(self._own.items())]
-
-    # --- the agent's own registrations ------------------------------------------------------------------------
 
     def apply(self, method: str, params: Sequence[XmlRpcValue]) -> RosReply:
         """Apply a call of the agent, one of ``REGISTRATIONS``, to the copy; the caller sends it to the master.
@@ -240,8 +236,6 @@ class Mirror:
     def _forget(self, entry: Entry) -> None:
         (kind, key, node), (api, detail) = entry, self._own.pop(entry)
         self.registrations.unregister(kind, key, node, detail if kind is RegistrationKind.SERVICE else api)
-
-    # --- the others -------------------------------------------------------------------------------------------
 
     def mark_dead(self, node: str, api: str) -> None:
         """Remove a dead node from the copy, and ignore the registrations that the master still has of it.

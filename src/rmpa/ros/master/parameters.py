@@ -79,9 +79,7 @@ class GraphState:
     nodes: dict[str, str]
 
 
-# --- Names as rosmaster resolves them -------------------------------------------------------------------------------
-#
-# Any characters, relative to the caller.
+# Names as rosmaster resolves them. Any characters, relative to the caller.
 #
 # Stricter rules (``core.identity``) hold for names that RMPA makes; a master accepts what rosmaster accepts.
 
@@ -122,10 +120,9 @@ def with_slash(key: str) -> str:
     return key if key == "/" else canonical(key) + "/"
 
 
-# --- The parameter tree, and the notifications for its subscribers --------------------------------------------------
-#
-# The tree is never changed in place: a change copies the dicts along its path, so values that callers hold stay as
-# they are. Keys are resolved names; a value that is a dict is a namespace.
+# The parameter tree, and the notifications for its subscribers. The tree is never changed in place: a change copies
+# the dicts along its path, so values that callers hold stay as they are. Keys are resolved names; a value that is a
+# dict is a namespace.
 
 
 Tree: TypeAlias = "dict[str, XmlRpcValue]"

@@ -61,8 +61,6 @@ class Registrations:
         self.calls: list[SlaveCall] = []
         self.changes: list[GraphChange] = []
 
-    # --- questions --------------------------------------------------------------------------------------------
-
     def node_api(self, node: str) -> str | None:
         """The slave API of a node; ``None`` if the node has no registration."""
         return self._apis.get(node)
@@ -124,8 +122,6 @@ class Registrations:
                 self.nodes(),
             )
         return self._state
-
-    # --- changes ----------------------------------------------------------------------------------------------
 
     def register(self, kind: RegistrationKind, key: str, node: str, api: str, detail: str = "") -> None:
         """Add a registration.
@@ -219,8 +215,6 @@ class Registrations:
         taken = self.calls, self.changes
         self.calls, self.changes = [], []
         return taken
-
-    # --- the tables -------------------------------------------------------------------------------------------
 
     def _claim_name(self, node: str, api: str) -> None:
         """Make the node's entry; a node of that name at another URI loses its registrations and is asked to end."""

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     # Takes ownership of an accepted, non-blocking socket; the second argument is the client's address.
     Adopt = Callable[[socket.socket, tuple[str, int]], None]
 
+_log = logging.getLogger(__name__)
+
 # Time-out of the test whether addresses of 127/8 other than 127.0.0.1 work here; if so, it takes a millisecond.
 SHARED_PROBE_TIMEOUT: Final = 1.0
 # Time before a freed loopback address is used again: three times the 20 s for which roscpp dials an old one.
@@ -59,9 +61,7 @@ def local_addresses() -> list[str]:
     return sorted(found, key=lambda address: address.startswith("127."))
 
 
-# --- Assigns loopback addresses ``127.a.b.c`` to nodes that share one port ------------------------------------------
-#
-# The dialled address identifies the node.
+# Assigns loopback addresses ``127.a.b.c`` to nodes that share one port. The dialled address identifies the node.
 
 
 # Values of ``a``, from 1 on: 127.0/16 has localhost, Debian's 127.0.1.1 and the resolvers; 127.255/16 broadcasts.
@@ -134,12 +134,7 @@ class LoopbackAddresses:
             yield f"127.{1 + first}.{second}.{1 + third}"
 
 
-# --- The listening TCPROS socket of one node ------------------------------------------------------------------------
-#
-# Passes each connection to the publication or service of its header.
-
-
-_log = logging.getLogger(__name__)
+# The listening TCPROS socket of one node. Passes each connection to the publication or service of its header.
 
 
 class TcprosServer:
@@ -271,9 +266,7 @@ class TcprosServer:
         self._refusals.refuse(now, f"tcpros.refused.{kind}", connection.peer[0], f"{self._name}: {text}")
 
 
-# --- Two listening sockets for any number of nodes ------------------------------------------------------------------
-#
-# Each node has a loopback address, all have the same two ports.
+# Two listening sockets for any number of nodes. Each node has a loopback address, all have the same two ports.
 #
 # A socket that listens at all addresses and is bound to the device ``lo`` accepts connections to any address
 # ``127.a.b.c`` (there are 16 million), and none from the network. The local address of the accepted socket identifies

@@ -58,6 +58,8 @@ if TYPE_CHECKING:
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
+_log = logging.getLogger(__name__)
+
 # Time between a node's checks whether its master knows it: a restarted core has the node back within a second.
 NODE_MASTER_CHECK: Final = 0.5
 
@@ -66,7 +68,6 @@ _RECEIVED_QUEUE: Final = 1000
 
 __all__ = ["Node", "Publisher", "Received", "Service", "ServiceClient", "Subscriber"]
 
-_log = logging.getLogger(__name__)
 _NO_DEFAULT: Final = object()
 # Time between two look-ups of a service that is waited for.
 _SERVICE_CHECK: Final = 0.2
@@ -173,8 +174,6 @@ class Node(MasterClient):
     async def close(self) -> None:
         """Unregister everything and close; may be called twice."""
         await asyncio.shield(self._begin_close())
-
-    # --- topics -----------------------------------------------------------------------------------------------
 
     async def advertise(
         self,
@@ -287,8 +286,6 @@ class Node(MasterClient):
         remedy = refused or f"`rmpa why {subscriber.topic}` says what is missing"
         raise UnreachableError(f"publisher of {subscriber.topic}", where, remedy)
 
-    # --- services ---------------------------------------------------------------------------------------------
-
     async def advertise_service(
         self,
         name: str,
@@ -398,8 +395,6 @@ class Node(MasterClient):
         finally:
             client.close()
 
-    # --- the master -------------------------------------------------------------------------------------------
-
     async def get_published_topics(self, subgraph: str = "") -> list[tuple[str, str]]:
         """Topics that have a publisher, with their types."""
         value = await self.call_master("getPublishedTopics", subgraph)
@@ -453,8 +448,6 @@ class Node(MasterClient):
         resolved = self._resolve(key)
         self._followed[resolved] = callback
         return await self.call_master("subscribeParam", self.uri, resolved)
-
-    # --- time and log -----------------------------------------------------------------------------------------
 
     def rate(self, hz: float) -> AsyncIterator[int]:
         """The numbers 0, 1, 2 … at a rate, the first one at once, until the node closes.
@@ -522,8 +515,6 @@ class Node(MasterClient):
         )
         logger.addHandler(self._rosout)
         return logger
-
-    # --- inside -----------------------------------------------------------------------------------------------
 
     async def _version_of(self, uri: str, service: str, found: ServiceType) -> ServiceType | None:
         """Find the server's version of a service type; ``None`` if it is the same or is not on this machine."""

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
     from rmpa.ros.node.endpoints import Publisher
 
+_log = logging.getLogger(__name__)
+
 TOPIC: Final = "/rosout"
 TYPE: Final = "rosgraph_msgs/Log"
 # Records that wait for the connection of the core's /rosout; above it the oldest is dropped.
@@ -28,8 +30,6 @@ _RETRY: Final = 1.0
 # Of rosgraph_msgs/Log, by the least level of Python's.
 _LEVELS: Final = {logging.CRITICAL: 16, logging.ERROR: 8, logging.WARNING: 4, logging.INFO: 2}
 _DEBUG: Final = 1
-
-_log = logging.getLogger(__name__)
 
 
 class RosoutHandler(logging.Handler):

@@ -212,8 +212,6 @@ class ServiceConnection:
         self._on_closed = None
         self._stop("the connection was closed")
 
-    # --- inside -----------------------------------------------------------------------------------------------
-
     def _was_closed_by_server(self) -> bool:
         """Whether the server has closed the connection since the last call; cheaper than a call that fails."""
         try:
@@ -290,12 +288,11 @@ def _checked(fields: tcpros.Header | None, service: str, md5sum: str) -> tcpros.
     return fields
 
 
-# --- Finds out whether the TCPROS server of a node can be reached, without a trace at that node ---------------------
-#
-# rospy reads the header of a connection in the thread that accepts, so that one that says nothing shuts out all
-# others (trap 11); and it logs a warning for each connection whose header does not come, or is for a topic or service
-# that it does not have. A service's probe (wiki.ros.org/ROS/TCPROS, section 1.1; what ``wait_for_service`` sends)
-# avoids both: its header leaves with the connect, and the node answers with its own header and closes.
+# Finds out whether the TCPROS server of a node can be reached, without a trace at that node. rospy reads the header
+# of a connection in the thread that accepts, so that one that says nothing shuts out all others (trap 11); and it
+# logs a warning for each connection whose header does not come, or is for a topic or service that it does not have. A
+# service's probe (wiki.ros.org/ROS/TCPROS, section 1.1; what ``wait_for_service`` sends) avoids both: its header
+# leaves with the connect, and the node answers with its own header and closes.
 
 
 _CALLER_ID: Final = "/rmpa"

@@ -23,11 +23,10 @@ if TYPE_CHECKING:
     from rmpa.ros.node.publication import AcceptedConnection
     from rmpa.runtime.stream import Stream
 
+_log = logging.getLogger(__name__)
+
 # Time within which the next bytes of a service request (of a single call also the first) must arrive.
 SERVICE_STALL: Final = 30.0
-
-
-# --- Sends large requests and responses in parts; other pending data is served between two parts --------------------
 
 
 # The outbox key of requests and responses.
@@ -51,8 +50,6 @@ async def send_large(stream: Stream, head: bytes, body: tcpros.Buffer) -> None:
         yield_to_data()
         await asyncio.sleep(0)
 
-
-_log = logging.getLogger(__name__)
 
 Describe = Callable[[], Awaitable[tcpros.ServiceDescription | str]]
 Serve = Callable[["ServiceCall"], None]
@@ -288,8 +285,6 @@ class _ClientConnection:
         if not self._ended:
             self._respond(ok, body)
 
-    # --- requests ---------------------------------------------------------------------------------------------
-
     def _take(self, data: memoryview) -> tuple[int, int]:
         consumed, wanted, self._taking = 0, 0, True
         try:
@@ -370,8 +365,6 @@ class _ClientConnection:
         self._respond(False, text.encode())
         self._watch(self._connection.bytes_in)
 
-    # --- replies ----------------------------------------------------------------------------------------------
-
     def _respond(self, ok: bool, body: tcpros.Buffer) -> None:
         self._stop_timer()
         if ok and len(body) > limits.SERVICE_MESSAGE_MAX:
@@ -421,8 +414,6 @@ class _ClientConnection:
         """Take what is buffered, unless this is within the read that would take it."""
         if not self._taking and not self._ended:
             self._connection.feed(b"")
-
-    # --- the end ----------------------------------------------------------------------------------------------
 
     def _watch(self, seen: int) -> None:
         """Close the connection if no bytes arrive within ``SERVICE_STALL`` seconds."""

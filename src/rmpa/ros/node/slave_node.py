@@ -36,9 +36,6 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 
-# --- The servers of one node, XML-RPC and TCPROS at one address, with its topics and services -----------------------
-
-
 _log = logging.getLogger(__name__)
 
 
@@ -204,8 +201,6 @@ class SlaveNode:
         endpoint = self._services.pop(service, None)
         if endpoint is not None:
             endpoint.withdraw(text)
-
-    # --- the Slave API ----------------------------------------------------------------------------------------
 
     def publications(self) -> dict[str, str]:
         """Published topics and types; ``*`` where the type is not known yet."""

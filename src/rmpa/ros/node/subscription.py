@@ -387,8 +387,6 @@ class InProcessConnection(TopicConnection):
         self._next = asyncio.get_running_loop().call_later(self._backoff.delay(), self._attach)
         self._on_lost(reason)
 
-    # --- called by the publication ----------------------------------------------------------------------------
-
     def accept(self, header: Mapping[str, str], _queue_messages: int, _queue_bytes: int) -> None:
         """Take the publisher's header; messages may follow."""
         if not self.closed:

@@ -100,8 +100,6 @@ class MessageCodec:
         """Bytes of the default of a type, which may be a primitive."""
         return _DEFAULTS[kind] if kind in _DEFAULTS else self.measure(kind)[1]
 
-    # --- bytes to values -------------------------------------------------------------------------------------
-
     @functools.cached_property
     def json_values(self) -> Read:
         """Makes values for msgspec, which writes NaN and infinity as null, and memoryviews (of uint8) in base64."""
@@ -154,8 +152,6 @@ class MessageCodec:
             raise MessageError(f"{size} bytes are not a {self.name}: {problem}")
 
         return convert
-
-    # --- values to bytes -------------------------------------------------------------------------------------
 
     def write(self, values: Any, now_ns: int) -> Written:
         """The message of a mapping of fields; those that are not given are zero, false or empty, and stamps now.
@@ -273,9 +269,6 @@ def codec_for(kind: DefinedType) -> MessageCodec:
 @functools.lru_cache(maxsize=_CODECS_MAX)
 def _codec(name: str, definition: str) -> MessageCodec:
     return MessageCodec(name, parse_definition(name, definition))
-
-
-# --- what generated readers call ----------------------------------------------------------------------------------
 
 
 def _slice(buf: memoryview, at: int, size: int) -> memoryview:
@@ -405,9 +398,6 @@ class _ReaderText:
             return [*lines, f"{value} = [{expression} for ({variables},) in {step}({view})]", skip]
         item = f"item, at = {self._function(field.type)}(buf, at, left)"
         return [*lines, f"{value} = []", f"for _ in range({count}):", f"    {item}", f"    {value}.append(item)"]
-
-
-# --- what writers are made of -------------------------------------------------------------------------------------
 
 
 def _count(field: Field, count: int, written: Written) -> None:

@@ -329,9 +329,8 @@ def known_description(name: str) -> TopicDescription:
     return TopicDescription(name, md5sum(name, known), full_text(name, known))
 
 
-# --- Serializes ``diagnostic_msgs/DiagnosticArray`` (REP 107), which an agent publishes on /diagnostics -------------
-#
-# The code is written by hand, because the agent needs few messages, and rosbags with numpy would double its memory.
+# Serializes ``diagnostic_msgs/DiagnosticArray`` (REP 107), which an agent publishes on /diagnostics. The code is
+# written by hand, because the agent needs few messages, and rosbags with numpy would double its memory.
 
 
 ARRAY_TYPE: Final = "diagnostic_msgs/DiagnosticArray"

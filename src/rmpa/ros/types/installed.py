@@ -94,9 +94,7 @@ def _pieces(text: str) -> list[str]:
     return pieces
 
 
-# --- Service types --------------------------------------------------------------------------------------------------
-#
-# Their definitions, MD5 sums, and requests and responses as Python objects.
+# Service types. Their definitions, MD5 sums, and requests and responses as Python objects.
 #
 # A definition is the request's text, a line that begins with ``---``, and the response's text (wiki.ros.org/srv).
 # Texts of both halves and MD5 sum are equal to genmsg's to the byte. rmpa brings the definitions of ROS's own
@@ -169,12 +167,11 @@ def known_service(name: str) -> str:
     return text
 
 
-# --- Finds the ROS packages below a folder as rospack does (wiki.ros.org/rospack) -----------------------------------
-#
-# A folder with a ``package.xml`` (catkin) or ``manifest.xml`` (rosbuild) is a package, and none is within another.
-# ``CATKIN_IGNORE`` hides a folder and all below it, ``rospack_nosubdirs`` only the folders below. Symbolic links are
-# followed; each folder is searched once. The search is bounded (``limits.PACKAGE_*``) and breadth first; unreadable
-# folders are skipped. Only folders with definitions (``msg``, ``srv``, ``action``) are found.
+# Finds the ROS packages below a folder as rospack does (wiki.ros.org/rospack). A folder with a ``package.xml``
+# (catkin) or ``manifest.xml`` (rosbuild) is a package, and none is within another. ``CATKIN_IGNORE`` hides a folder
+# and all below it, ``rospack_nosubdirs`` only the folders below. Symbolic links are followed; each folder is searched
+# once. The search is bounded (``limits.PACKAGE_*``) and breadth first; unreadable folders are skipped. Only folders
+# with definitions (``msg``, ``srv``, ``action``) are found.
 
 
 # The folders of a package with definitions.
@@ -277,9 +274,7 @@ def read_text(path: Path, size_max: int) -> str | None:
         return None
 
 
-# --- Definitions on this machine ------------------------------------------------------------------------------------
-#
-# In the sourced workspaces, and where ROS is installed.
+# Definitions on this machine. In the sourced workspaces, and where ROS is installed.
 #
 # The search order is, in the workspaces:
 #

@@ -147,8 +147,6 @@ class MessageType(DefinedType):
         """Convert a message object to plain values; times are ``{secs, nsecs}``."""
         return codec_for(self).plain_values(memoryview(self.serialize(message)))
 
-    # --- inside -----------------------------------------------------------------------------------------------
-
     @functools.cached_property
     def _store(self) -> Typestore:
         # rosbags has most of the types that rmpa brings, but not TFMessage.

@@ -213,8 +213,6 @@ class RequestParser:
             self._refused = True
             self._found.append(HttpRefusal(status, text, counter))
 
-    # --- called by the parser ---------------------------------------------------------------------------------
-
     def on_message_begin(self) -> None:
         """Begin a request at its first byte."""
         self.receiving = True
@@ -303,8 +301,6 @@ class ResponseParser:
     def close(self) -> None:
         """Parse no more; this breaks a reference cycle, which would wait for the garbage collector."""
         self._parser = None
-
-    # --- called by the parser ---------------------------------------------------------------------------------
 
     def on_message_begin(self) -> None:
         """Begin a response, or the one after a status of 1xx."""

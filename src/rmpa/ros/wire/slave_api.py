@@ -121,9 +121,7 @@ def bus_info(connections: Iterable[BusConnection]) -> list[XmlRpcValue]:
     return [[c.number, c.other, c.direction, TCPROS, c.topic, c.connected, c.info] for c in connections]
 
 
-# --- What other nodes answer to ``getBusInfo`` ----------------------------------------------------------------------
-#
-# Their topic connections. Pure.
+# What other nodes answer to ``getBusInfo``. Their topic connections. Pure.
 #
 # The wiki (wiki.ros.org/ROS/Slave_API) leaves much open, and the libraries differ. A row that cannot be read is left
 # out, and so is what is unknown in one that can: a node may be of any library.

@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 
-# --- TCPROS ---------------------------------------------------------------------------------------------------------
-#
-# Connection headers and message framing (wiki.ros.org/ROS/TCPROS, wiki.ros.org/ROS/Connection%20Header).
+# TCPROS. Connection headers and message framing (wiki.ros.org/ROS/TCPROS, wiki.ros.org/ROS/Connection%20Header).
 #
 # Pure: bytes in, values out. Each side of a connection sends one header; the publisher alone decides whether they
 # match (``check_subscriber``). After the headers messages follow, each with its length in front. All integers are
@@ -82,9 +80,6 @@ def printable(text: str) -> str:
     """Make received text safe for logs and terminals: replace control characters and surrogates, cut long text."""
     shown = text if len(text) <= _SHOWN else text[:_SHOWN] + "…"
     return "".join(c if c.isprintable() else "�" for c in shown)
-
-
-# --- header codec ---------------------------------------------------------------------------------------------
 
 
 def encode_header(fields: Mapping[str, str]) -> bytes:
@@ -149,9 +144,6 @@ def parse_header(data: Buffer) -> tuple[Header | None, int, int]:
     return decode_header(memoryview(data)[LENGTH.size : end]), end, LENGTH.size
 
 
-# --- messages -------------------------------------------------------------------------------------------------
-
-
 def frame_message(payload: Buffer) -> bytes:
     """A message with its length in front.
 
@@ -193,9 +185,6 @@ def split_messages(data: memoryview) -> tuple[list[memoryview], int, int]:
         messages.append(data[start:end])
         start = end
     return messages, start, LENGTH.size
-
-
-# --- matching ---------------------------------------------------------------------------------------------------
 
 
 def subscriber_header(
@@ -345,9 +334,6 @@ class ServiceDescription:
         return f"{printable(self.type)}/{printable(self.md5sum)}"
 
 
-# --- headers --------------------------------------------------------------------------------------------------
-
-
 def client_header(
     service: str, caller_id: str, *, md5sum: str = ANY, persistent: bool = False, probe: bool = False
 ) -> Header:
@@ -408,9 +394,6 @@ def check_server(fields: Mapping[str, str], service: str, md5sum: str = ANY) -> 
     if md5sum not in (ANY, fields["md5sum"]):
         return f"the server of {service} has md5sum [{printable(fields['md5sum'])}], not [{printable(md5sum)}]"
     return None
-
-
-# --- requests and replies -------------------------------------------------------------------------------------
 
 
 def frame_reply(ok: bool, body: Buffer) -> tuple[bytes, Buffer]:

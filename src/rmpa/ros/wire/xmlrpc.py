@@ -27,10 +27,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 
-# --- Writes values as XML-RPC, piece by piece, so that other work can be done between two pieces --------------------
-#
-# The text is exactly that of Python's ``xmlrpc.client``, because XmlRpc++ (roscpp) is known to read it: that parser
-# compares strings, and stops without an error at ``<string/>`` or ``<i8>``.
+# Writes values as XML-RPC, piece by piece, so that other work can be done between two pieces. The text is exactly
+# that of Python's ``xmlrpc.client``, because XmlRpc++ (roscpp) is known to read it: that parser compares strings, and
+# stops without an error at ``<string/>`` or ``<i8>``.
 
 
 # XML 1.0, section 2.2: characters that a document cannot hold, not even escaped.
