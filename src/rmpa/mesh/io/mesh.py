@@ -16,7 +16,7 @@ from rmpa.core.statistics import Counters
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FULL, Lane, Refusal, Refuse
 from rmpa.mesh.io.dial import Dialler, unacknowledged
-from rmpa.mesh.io.link import Connection, LinkHandlers, PeerLink
+from rmpa.mesh.io.link import Connection, LinkHandlers, LinkOwner, PeerLink
 from rmpa.mesh.io.securing import Securing, SecuringError, prove, secure_dialled
 from rmpa.mesh.keepalive import rest_lease
 from rmpa.mesh.peering import REPLACED, RESTARTED, Peer, Peering, PeeringOutput
@@ -53,7 +53,7 @@ def _log_refusal(peer: object, refuse: Refuse) -> None:
     _log.warning("! %s refuses a link: %s [%s]", peer, refuse.text, codes.of_counter(kind))
 
 
-class Mesh:
+class Mesh(LinkOwner):
     """The links to all peers; of several links with one peer, one is used.
 
     Args:
@@ -81,13 +81,7 @@ class Mesh:
         security: Membership | None = None,
         on_join: OnJoin | None = None,
     ) -> None:
-        self.identity = identity
-        self.handlers = handlers
-        self.clock = clock or SystemClock()
-        self.counters = Counters()
-        self.rng = rng
-        # What this agent promises on links at rest.
-        self.rest_lease = limits.IDLE_LEASE
+        super().__init__(identity, handlers, clock or SystemClock(), Counters(), rng)
         self._acceptor = Acceptor(listen_socket, self._accepted, name="links to peers", use=Use.LINK)
         self._refusals = RefusalLog(_log, self.counters)
         self.dialler: Final = dialler or Dialler(lanes or LaneSettings(), self.counters)
