@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import URGENT, Outbox
-from rmpa.runtime.stream import LATER, Stream
-from rmpa.runtime.tls import CollectedSends, after_read
+from rmpa.runtime.stream import LATER, CollectedSends, Stream, after_read
 from tests.runtime.message_streams import End
 
 if TYPE_CHECKING:

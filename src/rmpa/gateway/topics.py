@@ -11,7 +11,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.core.timers import TokenBucket
 from rmpa.gateway import limits
 from rmpa.observe.peer_info import OK, WARN, Check
-from rmpa.runtime.tls import after_read
+from rmpa.runtime.stream import after_read
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -61,7 +61,7 @@ class ExportDialect(Protocol):
             keeps: Whether its last message is kept for late subscribers, of which one has come.
         """
 
-    def told(self, problem: str) -> None:
+    def say(self, problem: str) -> None:
         """Why its messages do not cross has changed; empty for nothing."""
 
     def close(self) -> None:
@@ -107,7 +107,7 @@ class TopicLimits:
             yield self._size, size
 
 
-class Export:
+class ExportedTopic:
     """Subscribes to one local publisher while there is demand, and puts its messages to Zenoh.
 
     The Zenoh publisher is declared all the time, since it tells of demand. It is declared anew where its key or QoS
@@ -229,7 +229,7 @@ class Export:
         self._disconnect()
         if self._publisher is not None:
             self._publisher.close()
-        self._dialect.told("")
+        self._dialect.say("")
         self._dialect.close()
 
     def _announce(self) -> None:
@@ -310,7 +310,7 @@ class Export:
 
     def _tell(self, problem: str) -> None:
         self.problem = problem
-        self._dialect.told(problem)
+        self._dialect.say(problem)
 
     def _message(self, body: memoryview) -> None:
         if self._failed or (payload := self._dialect.payload(body)) is None:

@@ -341,9 +341,9 @@ class Adapter(RuntimePart):
     def _requirement_received(self, message: Received) -> None:
         client, stamp, now = message.caller_id, message.message.header.stamp, self._loop.time()
         mark = next((str(s.hardware_id) for s in message.message.status), "")
-        told = f"{stamp.sec}.{stamp.nanosec:09}" if stamp.sec or stamp.nanosec else ""
+        sent = f"{stamp.sec}.{stamp.nanosec:09}" if stamp.sec or stamp.nanosec else ""
         try:
-            requirement = self.clients.read(client, mark, told, _pairs(message), now)
+            requirement = self.clients.read(client, mark, sent, _pairs(message), now)
         except ConfigError as error:
             self.refuse(client, str(error))
             return

@@ -23,7 +23,6 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import ABORT, FIRST, LAST, URGENT, Framer, Outbox, QueuedMessage
 from rmpa.runtime import limits
-from rmpa.runtime import tls as corking
 from rmpa.runtime.tls import INCOMPLETE, Buffer, SecureSocket, unsent
 
 _log = logging.getLogger(__name__)
@@ -44,6 +43,42 @@ LATER: Final = -1
 
 OnBytes = Callable[[memoryview], tuple[int, int]]
 OnClose = Callable[[Exception | None], None]
+
+# One loop and one thread handle reads, one after the other; a read may be handled within another one.
+# Called in order at the end of the read that is handled now; ``None``: nothing is collected.
+collected: list[Callable[[], None]] | None = None
+
+
+class CollectedSends:
+    """A context that collects the messages that are sent within, whose parts must not change until its end.
+
+    At its end each stream sends them by one system call.
+    """
+
+    __slots__ = ("_outer",)
+
+    def __enter__(self) -> None:
+        """Begin to collect."""
+        global collected  # noqa: PLW0603 - one loop, one thread
+        self._outer = collected
+        collected = []
+
+    def __exit__(self, *_: object) -> None:
+        """Send what was collected."""
+        global collected  # noqa: PLW0603 - as above
+        try:
+            for end in collected or ():
+                end()
+        finally:
+            collected = self._outer
+
+
+def after_read(call: Callable[[], None]) -> None:
+    """Call ``call`` once the present read is handled; at once if none is, or if it is of a few bytes."""
+    if collected is not None:
+        collected.append(call)
+    else:
+        call()
 
 
 class Stream:
@@ -157,7 +192,7 @@ class Stream:
             return 0
         if self._writing:
             return self._queue(b"".join(parts), key)
-        if corking.collected is not None:
+        if collected is not None:
             self._cork(parts, key)
             return 0
         return self._send_now(parts, key)
@@ -258,7 +293,7 @@ class Stream:
             return dropped
         parts: list[Buffer] = self._framed(parcel, view) if self._frame is not None else [view]
         parcel.sent += len(view)
-        if corking.collected is not None:
+        if collected is not None:
             self._cork(parts, parcel.key, part=True)
             return 0
         return self._send_now(parts, parcel.key, part=True)
@@ -304,11 +339,10 @@ class Stream:
 
     def _cork(self, parts: Sequence[Buffer], key: int, *, part: bool = False) -> None:
         """Keep a message until the present read is handled; all kept messages are then sent in one system call."""
-        collected = corking.collected
         if self._collection is not collected:
             # Each read has its own: its views end with it.
             self._collection = collected
-            corking.after_read(self._uncork)
+            after_read(self._uncork)
         self._kept.append((parts, key, part))
         for buffer in parts:
             self._kept_bytes += len(buffer)
@@ -485,9 +519,9 @@ class Stream:
     def _deliver(self) -> None:
         # A few bytes are one or two messages, sent at once unless an outer read collects. What is collected is sent
         # before anything moves in the buffer, because it is views of it.
-        collects = self._filled > _CORK_ABOVE or corking.collected is not None
+        collects = self._filled > _CORK_ABOVE or collected is not None
         try:
-            with corking.CollectedSends() if collects else _NOTHING_COLLECTED:
+            with CollectedSends() if collects else _NOTHING_COLLECTED:
                 consumed, wanted = self._on_bytes(self._view[: self._filled])
         except Exception as error:  # noqa: BLE001 - a callback's top: else the same bytes would be offered for ever
             if not isinstance(error, RemoteProtocolError):

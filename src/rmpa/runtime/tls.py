@@ -1,4 +1,4 @@
-"""TLS for a stream: a socket with records, corking, and what a partial write leaves of its buffers."""
+"""TLS for a stream: a socket with records, and what a partial write leaves of its buffers."""
 
 from __future__ import annotations
 
@@ -27,47 +27,6 @@ def unsent(parts: Sequence[Buffer], sent: int) -> list[Buffer]:
             left.append(memoryview(part)[sent:] if sent else part)
             sent = 0
     return left
-
-
-# Corking. What is collected while one read is handled is passed on once, at its end, as TCP_CORK does.
-#
-# One loop and one thread handle reads, one after the other; a read may be handled within another one.
-
-
-# Called in order at the end of the read that is handled now; ``None``: nothing is collected.
-collected: list[Callable[[], None]] | None = None
-
-
-class CollectedSends:
-    """A context that collects the messages that are sent within, whose parts must not change until its end.
-
-    At its end each stream sends them by one system call.
-    """
-
-    __slots__ = ("_outer",)
-
-    def __enter__(self) -> None:
-        """Begin to collect."""
-        global collected  # noqa: PLW0603 - one loop, one thread
-        self._outer = collected
-        collected = []
-
-    def __exit__(self, *_: object) -> None:
-        """Send what was collected."""
-        global collected  # noqa: PLW0603 - as above
-        try:
-            for end in collected or ():
-                end()
-        finally:
-            collected = self._outer
-
-
-def after_read(call: Callable[[], None]) -> None:
-    """Call ``call`` once the present read is handled; at once if none is, or if it is of a few bytes."""
-    if collected is not None:
-        collected.append(call)
-    else:
-        call()
 
 
 # TLS below a ``Stream``. A socket whose ``sendmsg`` and ``recv_into`` encrypt and decrypt, by OpenSSL's memory BIOs.

@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, StartError, UnreachableError
 from rmpa.core.log import RefusalLog
 from rmpa.trust import certificates, limits, tokens
-from rmpa.trust import store as files_of
 from rmpa.trust.certificates import DenyList, KeyList, read_document
 from rmpa.trust.membership import new_key, private_key
 from rmpa.trust.permissions import JoinStep, MemberInfo, TokenInfo, TrustError, TrustReason, TrustStatus
-from rmpa.trust.store import ALPN_JOIN, MemberFiles, join_context, member_context
+from rmpa.trust.store import ALPN_JOIN, CERTIFICATE, KEY, MemberFiles, join_context, member_context
 
 if TYPE_CHECKING:
     import socket
@@ -250,7 +249,7 @@ async def join_mesh(token: Token, name: str) -> MemberFiles:
         RemoteProtocolError: The other side is not the authority.
     """
     pem = new_key()
-    request = certificates.make_request(private_key(pem, files_of.KEY), name)
+    request = certificates.make_request(private_key(pem, KEY), name)
 
     def question(server: bytes) -> tokens.Join:
         return tokens.Join(token.token_id, request, tokens.proof_of(token.key, request, server))
@@ -284,7 +283,7 @@ def check_grant(grant: tokens.CertificateGrant, name: str, request: bytes) -> No
 async def renew_at_authority(membership: Membership, address: str, port: int) -> None:
     """Renew a certificate, which may have ended, over a connection of its own; raises as ``join_mesh``."""
     store = membership.store
-    files = store.path(files_of.CERTIFICATE), store.path(files_of.KEY)
+    files = store.path(CERTIFICATE), store.path(KEY)
 
     def question(server: bytes) -> tokens.Renew:
         name = certificates.verify(server, membership.files.ca, None).name

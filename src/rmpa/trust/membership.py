@@ -19,11 +19,22 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RemoteProtocolError, StartError
 from rmpa.trust import certificates, limits
-from rmpa.trust import store as files_of
 from rmpa.trust.certificates import CURVE, DenyList, KeyList, ModuleCertificate, read_document, sign
 from rmpa.trust.packets import GroupKey, KeyRing, PacketTrust
 from rmpa.trust.permissions import Document, TrustError, TrustReason, server_names
-from rmpa.trust.store import ALPN_JOIN, ALPN_LINK, Issued, MemberFiles, member_context, unusable
+from rmpa.trust.store import (
+    ALPN_JOIN,
+    ALPN_LINK,
+    CA_KEY,
+    CERTIFICATE,
+    DENY,
+    KEY,
+    KEYS,
+    Issued,
+    MemberFiles,
+    member_context,
+    unusable,
+)
 from rmpa.trust.tokens import CertificateGrant, Token, fingerprint_of
 
 if TYPE_CHECKING:
@@ -87,13 +98,13 @@ class Membership:
         self.files = files
         self._clock = clock
         self._machine_wall = wall
-        with _named(store, files_of.CERTIFICATE):
+        with _named(store, CERTIFICATE):
             self._ca_key = certificates.ca_public_key(files.ca)
             self.certificate = certificates.verify(files.certificate, files.ca, None)
-        with _named(store, files_of.KEYS):
+        with _named(store, KEYS):
             # The list of group keys that holds.
             self.keys = read_document(files.keys, self._ca_key, KeyList)
-        with _named(store, files_of.DENY):
+        with _named(store, DENY):
             # The deny list that holds.
             self.deny = read_document(files.deny, self._ca_key, DenyList) if files.deny else DenyList()
         proves_from, age = self.keys.proves_from, self._age(self.keys, limits.KEY_SPREAD)
@@ -152,7 +163,7 @@ class Membership:
 
     def request(self, hosts: Iterable[str] = ()) -> bytes:
         """A request (DER) for a newer certificate of this module and its key, with these hosts of its page."""
-        key = private_key(self.files.key, str(self.store.path(files_of.KEY)))
+        key = private_key(self.files.key, str(self.store.path(KEY)))
         return certificates.make_request(key, self.name, hosts)
 
     def accept_document(self, kind: Document, data: bytes) -> bool:
@@ -179,7 +190,7 @@ class Membership:
             self.keys, self.files = keys, replace(self.files, keys=data)
             self.ring.take(keys.keys, self._clock.now(), proves_from=keys.proves_from, age=self._age(keys, 0.0))
         try:
-            self.save(files_of.DENY if kind is Document.DENY else files_of.KEYS, data)
+            self.save(DENY if kind is Document.DENY else KEYS, data)
         except StartError as error:
             _log.error("! %s [%s]", error, error.code)
         return True
@@ -201,7 +212,7 @@ class Membership:
         found = certificates.verify(certificate, self.files.ca, self.wall(), name=self.name)
         if found.public_key != self.certificate.public_key:
             raise TrustError(TrustReason.FOREIGN, "the certificate is of another key")
-        self.store.write(files_of.CERTIFICATE, ssl.DER_cert_to_PEM_cert(certificate).encode())
+        self.store.write(CERTIFICATE, ssl.DER_cert_to_PEM_cert(certificate).encode())
         self.certificate, self.files = found, replace(self.files, certificate=certificate)
         self._make_contexts()
 
@@ -212,7 +223,7 @@ class Membership:
 
     def _make_contexts(self) -> None:
         """Make the contexts for connections that are accepted, joins at the authority too, and for dialled ones."""
-        files, ca = (self.store.path(files_of.CERTIFICATE), self.store.path(files_of.KEY)), self.files.ca
+        files, ca = (self.store.path(CERTIFICATE), self.store.path(KEY)), self.files.ca
         joins = [ALPN_JOIN] if self.store.is_authority else []
         self.server_context = member_context(*files, ca, ALPN_LINK, *joins, server_side=True)
         self.client_context = member_context(*files, ca, ALPN_LINK, server_side=False)
@@ -272,12 +283,12 @@ def found_mesh(store: TrustStore, name: str, label: str, wall: float) -> None:
     if wall < limits.EARLIEST_TIME:
         raise StartError("the clock of this machine", "is not set", _CLOCK, code="clock-not-set")
     ca_pem, key_pem = new_key(), new_key()
-    ca_key, key = private_key(ca_pem, files_of.CA_KEY), private_key(key_pem, files_of.KEY)
+    ca_key, key = private_key(ca_pem, CA_KEY), private_key(key_pem, KEY)
     ca = certificates.make_ca(ca_key, label, _serial(), wall)
     request = certificates.read_request(certificates.make_request(key, name))
     certificate = certificates.issue(request, ca, ca_key, _serial(), wall)
     keys = KeyList(1, (GroupKey(1, os.urandom(limits.GROUP_KEY_BYTES)),), name)
-    store.write(files_of.CA_KEY, ca_pem)
+    store.write(CA_KEY, ca_pem)
     store.save(MemberFiles(key_pem, certificate, ca, sign(keys, ca_key)))
     store.save_issued([_issued(name, wall, request.public_key)])
 
@@ -295,9 +306,9 @@ class MeshAuthority:
     def __init__(self, membership: Membership) -> None:
         self.membership = membership
         self._store = store = membership.store
-        self._ca_key = private_key(store.load_ca_key(), str(store.path(files_of.CA_KEY)))
+        self._ca_key = private_key(store.load_ca_key(), str(store.path(CA_KEY)))
         if self._ca_key.public_key() != certificates.ca_public_key(membership.files.ca):
-            raise unusable(store.path(files_of.CA_KEY), "is not the key of ca.crt", "take it from a copy")
+            raise unusable(store.path(CA_KEY), "is not the key of ca.crt", "take it from a copy")
         self._issued = store.load_issued()
         # The tokens.
         self.book = store.load_tokens()

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.policy import PermissionGate
     from rmpa.config.rules import CrossingRule
     from rmpa.gateway.sites.topics import ImportedTopic
-    from rmpa.gateway.topics import Export
+    from rmpa.gateway.topics import ExportedTopic
 
 MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
 
@@ -64,7 +64,7 @@ class Site:
     def shows(self, name: str, node: str = "/talker") -> bool:
         return (name, node) in self.graph.topics
 
-    def exported(self, name: str, to: str = "") -> Export:
+    def exported(self, name: str, to: str = "") -> ExportedTopic:
         """A topic that goes out, to all or ``to`` one site."""
         entries = self.neighbour.exports.entries
         entry = next(each for each in entries if (each.announced.name, each.announced.to) == (name, to))

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.ros2.topics import Ros2Dialect, Ros2Import, Ros2Publisher
     from rmpa.gateway.rules import MeshSource
-    from rmpa.gateway.topics import Export
+    from rmpa.gateway.topics import ExportedTopic
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
     from rmpa.observe.operations import SiteAnswerer
     from rmpa.ros.types.messages import MessageType
@@ -183,8 +183,8 @@ class Ros2Neighbour:
         """The reply to one question of ``observe.operations``; raises as that says."""
         name, site, module = (str(args.get(key) or "") for key in ("name", "site", "module"))
         if what == WHY:
-            told = any(self.permissions.tells(asker, kind, name) for kind in SourceKind)
-            ways = self.ways(name, site, module) if told and args.get("service") is not True else []
+            visible = any(self.permissions.tells(asker, kind, name) for kind in SourceKind)
+            ways = self.ways(name, site, module) if visible and args.get("service") is not True else []
             return [*ways, *(await self.sites.answer(what, args, asker) if self.sites is not None else ())]
         if what == REPORT or (what == INFO and site == SITE):
             report = await self._report(asker)
@@ -245,7 +245,7 @@ def _way(stages: tuple[Check, ...], name: str, node: str, peer: str, to: str) ->
     return Diagnosis.of(stages, name=name, peer=peer, to=to, node=node)
 
 
-def _out_stages(export: Export, dialect: Ros2Dialect, problems: Mapping[str, str]) -> Iterator[Check]:
+def _out_stages(export: ExportedTopic, dialect: Ros2Dialect, problems: Mapping[str, str]) -> Iterator[Check]:
     yield Check("rule", OK, dialect.why)
     if export.problem:
         yield Check("type", FAIL, export.problem)

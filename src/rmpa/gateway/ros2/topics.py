@@ -23,7 +23,7 @@ from rmpa.gateway.ros2.graph import SITE, gid_of, mismatch, valid_name
 from rmpa.gateway.ros2.pairs import Ros2Pairs
 from rmpa.gateway.ros2.types import Ros2Sequences
 from rmpa.gateway.rules import ForeignSource, SourceKind
-from rmpa.gateway.topics import Export
+from rmpa.gateway.topics import ExportedTopic
 from rmpa.gateway.zenoh.threads import BoundedQueue
 from rmpa.ros.types.find import find_message_type, type_of_header
 from rmpa.ros.wire.tcpros import TopicDescription
@@ -71,7 +71,7 @@ _SEQ: Final = struct.Struct("<I")
 
 
 class Ros2Dialect:
-    """The dialect of an ``Export`` to ROS 2: messages are converted, and a token has the type's hash.
+    """The dialect of an ``ExportedTopic`` to ROS 2: messages are converted, and a token has the type's hash.
 
     A type that ROS 2's distribution does not have is learnt first from the publisher's header: its hash is part of
     the key. A latched topic becomes transient local, and stays connected once it was wanted, so that what is kept for
@@ -134,7 +134,7 @@ class Ros2Dialect:
         except ConversionError as error:
             self.unconverted += 1
             if self.unconverted == 1:
-                self.told(str(error))
+                self.say(str(error))
             return None
 
     def attachment(self, sequence: int, stamp: int) -> bytes:
@@ -145,7 +145,7 @@ class Ros2Dialect:
         """Of ``ExportDialect``."""
         return None if keeps else 0.0
 
-    def told(self, problem: str) -> None:
+    def say(self, problem: str) -> None:
         """Of ``ExportDialect``."""
         self._part.context.say(f"{self.source.here} of {self.source.proxy}", problem)
 
@@ -412,7 +412,7 @@ class Ros2Topics:
         self.pairs: Final = Ros2Pairs(context.types, context.mapping, find)
         self.refused: dict[str, str] = {}
         # By name here, then by proxy.
-        self._exports: dict[str, dict[str, tuple[Export, Ros2Dialect]]] = {}
+        self._exports: dict[str, dict[str, tuple[ExportedTopic, Ros2Dialect]]] = {}
         self.imports: dict[str, Ros2Import] = {}
         self._looks = asyncio.Semaphore(_LATCH_LOOKS_AT_ONCE)
 
@@ -423,7 +423,7 @@ class Ros2Topics:
         for imported in self.imports.values():
             imported.close()
 
-    def exports(self) -> list[tuple[Export, Ros2Dialect]]:
+    def exports(self) -> list[tuple[ExportedTopic, Ros2Dialect]]:
         """The topics of modules in ROS 2's graph, each with its dialect."""
         return [each for exports in self._exports.values() for each in exports.values()]
 
@@ -448,7 +448,9 @@ class Ros2Topics:
             self._refuse(what, decision.why)
         elif there:
             dialect = Ros2Dialect(self, source, decision)
-            export = Export(source, self.context.graph, self.context.session, dialect, decision.rate, decision.size)
+            export = ExportedTopic(
+                source, self.context.graph, self.context.session, dialect, decision.rate, decision.size
+            )
             exports[source.proxy] = export, dialect
             export.start()
             if export.announced and not dialect.latched and source.type not in _STREAMS:
@@ -457,7 +459,7 @@ class Ros2Topics:
             del self._exports[source.here]
         return True
 
-    async def _look(self, export: Export) -> None:
+    async def _look(self, export: ExportedTopic) -> None:
         """Ask the publisher once for its header, which tells whether it latches, unless it was asked before."""
         await asyncio.sleep(limits.LATCH_LOOK_AFTER)
         async with self._looks:

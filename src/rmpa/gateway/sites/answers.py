@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.sites.keys import SiteModule, SiteSource
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
     from rmpa.gateway.sites.topics import ImportedTopic
-    from rmpa.gateway.topics import Export
+    from rmpa.gateway.topics import ExportedTopic
     from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import OpenSession
     from rmpa.ros.wire.tcpros import Buffer
@@ -118,7 +118,7 @@ def _printable(stage: Check) -> Check:
     return Check(printable(stage.name), stage.level, printable(stage.text), printable(stage.remedy))
 
 
-def sent_stages(site: str, export: Export, *, asked: bool) -> list[Check]:
+def sent_stages(site: str, export: ExportedTopic, *, asked: bool) -> list[Check]:
     """The stages of a topic behind its rule at the exporting gateway.
 
     Args:
@@ -244,11 +244,11 @@ class SiteAnswers:
     def _this_site(self, name: str, asker: str, sources: bool) -> SiteInfo:
         offered = [(source, "") for source, _ in self._sites.exports.offered()]
         refused = [each for each in self._sites.exports.refusals() if self._owns(asker, each[0].module)]
-        told = [each for each in offered if self._owns(asker, each[0].module)]
+        visible = [each for each in offered if self._owns(asker, each[0].module)]
         modules = sorted({(source.module, source.instance) for source, _ in offered})
         rows = [
             _source_info(source, source.module, source.here, why)
-            for source, why in sorted([*told, *refused], key=lambda each: (each[0].name, each[0].module))
+            for source, why in sorted([*visible, *refused], key=lambda each: (each[0].name, each[0].module))
         ]
         return SiteInfo(
             name=name,
@@ -321,12 +321,12 @@ class SiteAnswers:
         # Its name there is asked for with its site alone.
         shown = [each for each in found if name in (each[1].source.name, each[0].name if site else "")]
         refused = [(there, None, why) for there, why in self._sites.imports.refusals() if meant(there)]
-        told = [
+        visible = [
             (there, entry, why)
             for there, entry, why in (*shown, *(each for each in refused if each[0].name == name))
             if self._rules.tells(asker, there.kind, entry.source.name if entry is not None else there.name)
         ]
-        ways = list(await asyncio.gather(*(self._way(*each) for each in told)))
+        ways = list(await asyncio.gather(*(self._way(*each) for each in visible)))
         permitted = [kind for kind in kinds if self._rules.tells(asker, kind, name)]
         if site and not ways and permitted:
             ways.append(await self._no_way(name, site, module, permitted))
@@ -348,8 +348,8 @@ class SiteAnswers:
         site, module = there.site, there.module.name
         ways, refusal = await self._ask(site, there.name, module)
         mine = KINDS[there.kind], module
-        told = next((way for way in ways if (way.kind, way.peer) == mine and way.node in (there.node, "")), None)
-        stages = [self._site_stage(site), *_told(site, module, there.name, told, refusal)]
+        found = next((way for way in ways if (way.kind, way.peer) == mine and way.node in (there.node, "")), None)
+        stages = [self._site_stage(site), *_told(site, module, there.name, found, refusal)]
         topic = self._sites.topics.imported(entry) if entry is not None else None
         if entry is None:
             here = [_refused_stage("here", refused, self._site)]
@@ -410,8 +410,10 @@ class SiteAnswers:
                 yield self._way_out(source, asking, entry, refused)
         for source, why in self._sites.exports.refusals():
             if meant(source):
-                told = self._rules.refusal(asking, source.module, source.name, ACCESS[source.kind]) if asking else ""
-                yield self._way_out(source, asking, None, told or why)
+                denied = (
+                    self._rules.refusal(asking, source.module, source.name, ACCESS[source.kind]) if asking else ""
+                )
+                yield self._way_out(source, asking, None, denied or why)
 
     def _way_out(self, source: MeshSource, asking: str, entry: SiteExport | None, refused: str) -> Diagnosis:
         where, to = "there" if asking else "here", entry.announced.to if entry is not None else ""

@@ -67,11 +67,11 @@ def read_description(data: Buffer) -> ServiceDescription:
     Raises:
         RemoteProtocolError: It is none, or names no type.
     """
-    told = read_json(data, ServiceDescription, "a description of a service", _SERVICE_DESCRIPTION_MAX)
-    hexadecimal = len(told.md5sum) == _MD5_LENGTH and not told.md5sum.strip("0123456789abcdef")
-    if not is_type_name(told.type) or not hexadecimal:
-        raise RemoteProtocolError(f"not a description of a service: {told.type[:80]!r}, {told.md5sum[:40]!r}")
-    return told
+    found = read_json(data, ServiceDescription, "a description of a service", _SERVICE_DESCRIPTION_MAX)
+    hexadecimal = len(found.md5sum) == _MD5_LENGTH and not found.md5sum.strip("0123456789abcdef")
+    if not is_type_name(found.type) or not hexadecimal:
+        raise RemoteProtocolError(f"not a description of a service: {found.type[:80]!r}, {found.md5sum[:40]!r}")
+    return found
 
 
 def asked_type(key: str) -> str:

@@ -17,7 +17,7 @@ from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.foreign import Answering
 from rmpa.gateway.sites.keys import ROOT, AttachmentReader, MessageSource, SequenceCounter, TopicHeader
-from rmpa.gateway.topics import Export
+from rmpa.gateway.topics import ExportedTopic
 from rmpa.gateway.zenoh.threads import PRIORITIES, BoundedQueue, ZenohPriority, ZenohQos, first_answer
 from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.tasks import keep_task
@@ -112,7 +112,7 @@ def qos_of(contract: Contract, *, latching: bool = False, large: bool = False) -
 
 
 class SiteDialect:
-    """To other sites messages go as they are: the dialect of an ``Export``.
+    """To other sites messages go as they are: the dialect of an ``ExportedTopic``.
 
     Args:
         entry: The source.
@@ -150,7 +150,7 @@ class SiteDialect:
         reliable = self._contract.reliability is Reliability.RELIABLE
         return max(_TAP_LINGER, self._contract.resume_window if reliable else 0.0)
 
-    def told(self, problem: str) -> None:
+    def say(self, problem: str) -> None:
         """``rmpa why`` tells it, and no log."""
 
     def close(self) -> None:
@@ -396,7 +396,7 @@ class SiteTopics:
     def __init__(self, context: SiteContext) -> None:
         self.context = context
         # By module and topic, then by node and the site that it is for (empty: for all).
-        self._exported: dict[tuple[str, str], dict[tuple[str, str], tuple[Export, SiteDialect]]] = {}
+        self._exported: dict[tuple[str, str], dict[tuple[str, str], tuple[ExportedTopic, SiteDialect]]] = {}
         self._imported: dict[_Ident, ImportedTopic] = {}
         self._interrupted: dict[_Ident, Interrupted] = {}
         self._subscriptions: dict[str, _Subscription] = {}
@@ -412,7 +412,7 @@ class SiteTopics:
         """Declare a publisher of this site, for other sites."""
         source, announced, context = entry.source, entry.announced, self.context
         dialect = SiteDialect(entry, context.contracts.of(source.here, announced.type))
-        export = Export(source, context.graph, context.session, dialect, entry.rate, entry.size)
+        export = ExportedTopic(source, context.graph, context.session, dialect, entry.rate, entry.size)
         self._exported.setdefault((source.module, source.name), {})[source.node, announced.to] = export, dialect
         export.start()
 
@@ -440,7 +440,7 @@ class SiteTopics:
             if len(self._interrupted) > limits.INTERRUPTED_TOPICS_MAX:
                 del self._interrupted[next(iter(self._interrupted))]
 
-    def exported(self, entry: SiteExport) -> Export | None:
+    def exported(self, entry: SiteExport) -> ExportedTopic | None:
         """A topic that goes out."""
         topics = self._exported.get((entry.source.module, entry.source.name), {})
         found = topics.get((entry.source.node, entry.announced.to))
@@ -510,12 +510,12 @@ class SiteTopics:
             self._headers.take(query, partial(self._header, *found))
 
     @staticmethod
-    async def _header(export: Export, dialect: SiteDialect, _query: ArrivedQuery) -> tuple[bytes, bytes]:
+    async def _header(export: ExportedTopic, dialect: SiteDialect, _query: ArrivedQuery) -> tuple[bytes, bytes]:
         about = await export.header(_HEADER_TIMEOUT * 0.8)
         definition = about.definition.encode(errors="replace").decode()  # JSON has no bytes that are not UTF-8
         fields = about.type, about.md5sum, definition, about.latching
-        told = TopicHeader(*fields, export.source.node, dialect.run, export.messages, export.waiting)
-        return msgspec.json.encode(told), b""
+        header = TopicHeader(*fields, export.source.node, dialect.run, export.messages, export.waiting)
+        return msgspec.json.encode(header), b""
 
     def _asked_definition(self, query: ArrivedQuery) -> None:
         module, _, md5 = query.key.removeprefix(f"{ROOT}/{self.context.name}/").partition("/d/m/")

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from rmpa.core.contract import Priority
 from rmpa.gateway import limits
-from rmpa.runtime.tls import CollectedSends
+from rmpa.runtime.stream import CollectedSends
 
 if TYPE_CHECKING:
     import asyncio

@@ -217,14 +217,14 @@ class Rosout:
             self._changed.clear()
 
     async def _restart(self) -> None:
-        told = False
+        warned = False
         while self._node is None:
             if (holder := self._core.registrations.node_api(NODE)) is not None:
-                if not told:
+                if not warned:
                     _log.warning(
                         "= another node has the name %s, at %s; ours waits until it ends [name-taken]", NODE, holder
                     )
-                    told = True
+                    warned = True
                 with contextlib.suppress(TimeoutError):
                     # The end of a node that only subscribed to parameters is not reported, so it is polled for.
                     async with asyncio.timeout(ROSOUT_LOOK):

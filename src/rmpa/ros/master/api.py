@@ -11,8 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from rmpa.ros import limits
-from rmpa.ros.master import parameters as params
-from rmpa.ros.master.parameters import RegistrationKind, resolve, with_slash
+from rmpa.ros.master.parameters import Parameters, RegistrationKind, holds_nil, resolve, updates, with_slash
 from rmpa.ros.master.registrations import ANY_TYPE, Registrations
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief
 
@@ -90,7 +89,7 @@ class MasterApi:
         self._pid = pid
         self._on_shutdown = on_shutdown
         self.registrations = Registrations()
-        self.parameters = params.Parameters()
+        self.parameters = Parameters()
         self.service_lookup: Callable[[str, str, str, str], str] | None = None
         self._methods = self._table()
 
@@ -161,14 +160,14 @@ class MasterApi:
             self.parameters.delete(key)
         except KeyError:
             return RosReply(ERROR, f"there is no parameter {key} to delete", 0)
-        self.registrations.calls += params.updates(self._param_subscribers, key, {})
+        self.registrations.calls += updates(self._param_subscribers, key, {})
         return RosReply(SUCCESS, f"deleted {key}", 0)
 
     def _set_param(self, caller_id: str, key: str, value: XmlRpcValue) -> RosReply:
-        if params.holds_nil(value, self._yielder):
+        if holds_nil(value, self._yielder):
             raise ValueError("value is nil or contains one, which ROS does not have")
         self.parameters.set(key, value)
-        self.registrations.calls += params.updates(self._param_subscribers, key, value, caller_id, self._yielder)
+        self.registrations.calls += updates(self._param_subscribers, key, value, caller_id, self._yielder)
         return RosReply(SUCCESS, f"set {key}", 0)
 
     @property

@@ -547,18 +547,18 @@ class Node(MasterClient):
 
     def _param_update(self, key: str, value: XmlRpcValue) -> bool:
         # An update of a namespace concerns subscriptions below it, and the other way round.
-        told = [
+        concerned = [
             callback
             for f, callback in self._followed.items()
             if key == f or key.startswith(f.rstrip("/") + "/") or f.startswith(key.rstrip("/") + "/")
         ]
-        for callback in (*told, self._on_param_update) if told else ():
+        for callback in (*concerned, self._on_param_update) if concerned else ():
             try:
                 if callback is not None:
                     callback(key, value)
             except Exception:  # noqa: BLE001 - the top of the user's code
                 _log.exception("! %s: the callback for parameter %s failed", self.name, key)
-        return bool(told)
+        return bool(concerned)
 
     async def _stopped_before(self, due: float) -> bool:
         try:
