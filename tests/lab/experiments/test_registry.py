@@ -21,14 +21,6 @@ PLANS = [
 ]
 
 
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_each_has_its_name_and_says_what_it_is(name: str) -> None:
-    found = find_experiment(name)
-    assert found.name == name
-    assert found.title
-    assert found.about
-
-
 @pytest.mark.parametrize("plan", PLANS)
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_the_cells_of_each_plan_are_fit_for_a_run_directory(name: str, plan: Plan, tmp_path: Path) -> None:
@@ -41,8 +33,3 @@ def test_the_cells_of_each_plan_are_fit_for_a_run_directory(name: str, plan: Pla
     assert all(cell.seconds > 0 for cell in cells)
     assert found.cells(plan) == cells  # by its seed, not by chance
     Store.create(tmp_path / "run", plan, CODE, MACHINE).expect(name, found.title, cells)
-
-
-def test_a_short_run_is_short() -> None:
-    for name in EXPERIMENTS:
-        assert sum(cell.seconds for cell in find_experiment(name).cells(Plan(size="short"))) <= 70, name
