@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import ssl
 from typing import TYPE_CHECKING
 
 import pytest
@@ -46,30 +45,6 @@ async def test_all_sizes_in_order_both_ways(tls: SecurePairs, most: int) -> None
     assert other.got == one.got == messages
     assert one.stream.bytes_out == other.stream.bytes_in == sum(sizes) + 4 * len(sizes)
     assert not one.stream.pending_bytes
-
-
-async def test_16_mb_both_ways_at_once(tls: SecurePairs) -> None:
-    one, other = ends(tls)
-    message = bytes(range(256)) * (16 * MIB // 256)
-    one.send(message)
-    other.send(message)
-    await until(lambda: len(one.got) == len(other.got) == 1)
-    assert one.got == other.got == [message]
-
-
-async def test_part_of_a_record_is_a_sign_of_life(tls: SecurePairs) -> None:
-    """A record of 16 KiB takes 1.3 s at 100 kbit/s, longer than the lease of the express lane."""
-    sender, receiver = tls.secured(100)
-    end = End(tls.sockets[1], secure=receiver)
-    sender.sendmsg(((5000).to_bytes(4, "big"), b"x" * 5000))
-    for _ in range(5):
-        before = end.stream.last_in
-        sender.flush()
-        await until(lambda before=before: end.stream.last_in > before)  # type: ignore[misc]
-        assert not end.stream.bytes_in
-    while not sender.flush():
-        await asyncio.sleep(0)
-    await until(lambda: end.got == [b"x" * 5000])
 
 
 async def test_ciphertext_never_comes_into_a_kept_outbox(tls: SecurePairs) -> None:
@@ -134,38 +109,3 @@ async def test_drained_waits_for_ciphertext(tls: SecurePairs) -> None:
     one.send(b"x" * 5000)
     await one.stream.drained(20)
     await until(lambda: other.got == [b"x" * 5000])
-
-
-async def test_bytes_behind_the_handshake_are_read(tls: SecurePairs) -> None:
-    """They are in OpenSSL already when the stream is made, so the loop does not report them."""
-    one, other = tls.secured()
-    one.sendmsg((b"\0\0\0\5hello",))
-    ciphertext = b""
-    while not ciphertext:
-        try:
-            ciphertext = tls.sockets[1].recv(65536)
-        except BlockingIOError:
-            await asyncio.sleep(0)
-    other._incoming.write(ciphertext)
-    other.readable = True
-    end = End(tls.sockets[1], secure=other)
-    await until(lambda: end.got == [b"hello"])
-
-
-async def test_an_end_in_the_middle_of_a_record_is_the_end(tls: SecurePairs) -> None:
-    one, other = tls.secured(100)
-    end = End(tls.sockets[1], secure=other)
-    one.sendmsg((b"x" * 5000,))
-    one.close()
-    await until(lambda: bool(end.ends))
-    assert end.ends == [None]
-    assert not end.got
-
-
-async def test_what_is_no_tls_ends_the_connection(tls: SecurePairs) -> None:
-    _, other = tls.secured()
-    end = End(tls.sockets[1], secure=other)
-    tls.sockets[0].send(b"\0\0\0\5plain")
-    await until(lambda: bool(end.ends))
-    assert isinstance(end.ends[0], ssl.SSLError)
-    assert not end.got
