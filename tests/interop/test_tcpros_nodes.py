@@ -7,12 +7,10 @@ import json
 import os
 import signal
 import socket
-import struct
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.node import Node
@@ -21,58 +19,26 @@ from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.types.definitions import known_types
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import frame_message
+from tests.interop.conftest import framed, until
 from tests.interop.nodes.payload import Pattern, Tally
 from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
     from lab.bed.processes import Process
+    from rmpa.ros.core.embedded import RosCore
     from rmpa.ros.node.node import Publisher, Received
-    from tests.interop.conftest import ShellFactory
     from tests.interop.ros import Ros
 
 pytestmark = pytest.mark.ros
 libraries = pytest.mark.parametrize("library", ["rospy", "roscpp"])
 BYTES = "std_msgs/UInt8MultiArray"
 DEADLINE = 40.0
-EMPTY_LAYOUT = bytes(8)  # no dimensions, offset 0
-
-
-def framed(payload: bytes) -> bytes:
-    """A std_msgs/UInt8MultiArray as raw bytes."""
-    return EMPTY_LAYOUT + struct.pack("<I", len(payload)) + payload
 
 
 def content(received: Received) -> bytes:
     """The bytes in a std_msgs/UInt8MultiArray of ours or of the real nodes."""
     message = received.message
     return bytes(message.data)
-
-
-@pytest.fixture
-async def core() -> AsyncIterator[RosCore]:
-    made = RosCore("127.0.0.1", 0)
-    await made.start()
-    yield made
-    await made.close()
-
-
-@pytest.fixture
-async def node(core: RosCore) -> AsyncIterator[Node]:
-    async with Node("ours", master_uri=core.uri, environment=RosEnvironment()) as made:
-        yield made
-
-
-@pytest.fixture
-def ros(core: RosCore, shell: ShellFactory) -> Ros:
-    return shell(port=core.port)
-
-
-async def until(condition: Any) -> None:
-    async with asyncio.timeout(DEADLINE):
-        while not condition():
-            await asyncio.sleep(0.005)
 
 
 async def event(process: Process, name: str) -> dict[str, Any]:
