@@ -247,7 +247,7 @@ def change(client: Process, **values: object) -> Event:
 
 
 def rmpa_of(module: Module, *words: str) -> str:
-    code, out = module.agent.rmpa_of(*words)
+    code, out = module.agent.rmpa(*words)
     assert code == 0, out
     return out
 
@@ -309,10 +309,10 @@ def test_rmpa_sees_and_sets_it_from_another_module(pair: list[Module]) -> None:
     assert "Health: OK: profile slow" in info
     assert rmpa_of(pc, "profile", "set", far, "fast") == ""
     assert rmpa_of(robot, "profile", "get").strip() == rmpa_of(pc, "profile", "get", "/lamp").strip() == "fast"
-    code, out = pc.agent.rmpa_of("profile", "set", far, "broken")
+    code, out = pc.agent.rmpa("profile", "set", far, "broken")
     assert code == 1
     assert "profile broken: it could not be applied: OSError: no such bulb; what was chosen before stays" in out
-    code, out = pc.agent.rmpa_of("context", "set", far, "hoem")
+    code, out = pc.agent.rmpa("context", "set", far, "hoem")
     assert code == 2
     rmpa_of(pc, "profile", "set", far, "--auto")
 
@@ -327,6 +327,6 @@ def test_rmpa_sees_and_sets_it_from_another_module(pair: list[Module]) -> None:
     assert rmpa_of(pc, "profile", "get", far).strip() == "fast"
     alarms = json.loads(rmpa_of(pc, "alarm", "list", "--all", "--json"))
     assert [(one["resource"], one["peer"]) for one in alarms] == [("/lamp", robot.name)]
-    code, out = pc.agent.rmpa_of("resource", "info", f"{robot.name}:/lmap")
+    code, out = pc.agent.rmpa("resource", "info", f"{robot.name}:/lmap")
     assert code == 1
     assert f"did you mean {far}?" in out
