@@ -1,4 +1,4 @@
-"""Meshes on loopback: dialling, accepting, refusing, ends; the lanes are in ``test_mesh_lanes.py``."""
+"""A mesh over real sockets: links, and how they end."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import asyncio
 import contextlib
 import errno
 import fcntl
+import gc
 import socket
+import struct
 import sys
+import weakref
 from dataclasses import replace
 from ipaddress import IPv4Address
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
@@ -35,6 +38,11 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import DESCRIPTORS
 from tests.mesh.io.meshes import DEADLINE, Peer, linked_pair, peers, raw, until
 from tests.runtime.descriptors_left import descriptors_left
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rmpa.mesh.io.link import Connection
 
 _SIOCOUTQNSD = 0x894B  # linux/sockios.h: bytes that were not sent yet
 
@@ -361,3 +369,141 @@ async def test_silent_connections_from_one_address_are_bounded() -> None:
         assert len(one.mesh.connections()) == limits.PENDING_PER_ADDRESS
         for writer in writers:
             writer.close()
+
+
+STRANGER = Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "stranger")
+
+
+def how(peer: Peer) -> tuple[bool, bool]:
+    """Of the only link that went down: whether its agent crashed, and whether the peer may soon be back."""
+    ((link, _),) = peer.downs
+    return link.crashed, link.silent
+
+
+async def test_a_killed_agent_is_a_crash() -> None:
+    async with linked_pair() as (one, other):
+        other.kill()
+        await until(lambda: bool(one.downs), "it is seen")
+        assert how(one)[0]
+        await until(lambda: bool(other.downs), "its own side")
+        assert how(other)[0] is False, "it gave up the link itself"
+
+
+async def test_a_bye_is_none() -> None:
+    async with linked_pair() as (one, other):
+        one.mesh.peer_gone(other.identity.guid)
+        other.mesh.peer_gone(one.identity.guid)
+        one.link(other).close("maintenance")
+        await until(lambda: bool(one.downs) and bool(other.downs), "both down")
+        assert (how(one), how(other)) == ((False, False), (False, False))
+
+
+async def test_a_reset_is_a_crash_with_bytes_unread() -> None:
+    async with peers(1) as (one,):
+        sock, _ = await raw(one, STRANGER, lease=60.0)
+        await until(lambda: bool(one.ups), "a link")
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        sock.close()
+        await until(lambda: bool(one.downs), "reset")
+        assert how(one) == (True, True)
+
+
+async def test_a_lease_that_ends_is_silence_and_no_crash() -> None:
+    async with peers(1) as (one,):
+        await raw(one, STRANGER, lease=0.3)
+        await until(lambda: bool(one.downs), "the lease is over")
+        assert how(one) == (False, True)
+
+
+async def test_a_peer_that_breaks_the_protocol_has_not_crashed() -> None:
+    async with peers(1) as (one,):
+        sock, _ = await raw(one, STRANGER, lease=60.0)
+        await until(lambda: bool(one.ups), "a link")
+        await asyncio.get_running_loop().sock_sendall(sock, b"\xff" * 64)
+        await until(lambda: bool(one.downs), "closed")
+        assert how(one) == (False, False)
+
+
+async def test_the_end_of_the_bulk_lane_is_not_that_of_the_link() -> None:
+    async with linked_pair() as (one, other):
+        bulk = one.link(other).bulk_connection
+        assert bulk is not None
+        bulk.lost("a test")
+        await until(lambda: bool(other.lanes_lost), "lost")
+        await until(lambda: one.both_lanes(other) and other.both_lanes(one), "a new one")
+        assert (one.downs, other.downs) == ([], [])
+        assert not one.link(other).crashed
+
+
+@pytest.mark.parametrize(
+    ("number", "crashed"),
+    [
+        (errno.ECONNRESET, True),
+        (errno.EPIPE, True),
+        (errno.ETIMEDOUT, False),
+        (errno.EHOSTUNREACH, False),
+        (errno.ENETUNREACH, False),
+        (errno.ENETDOWN, False),
+        (errno.ECONNABORTED, False),
+    ],
+)
+async def test_each_error_of_a_socket_says_whether_the_host_is_still_there(number: int, *, crashed: bool) -> None:
+    async with linked_pair() as (one, other):
+        connection = one.link(other).connection
+        connection._lost(OSError(number, "made up"))
+        await until(lambda: bool(one.downs), "down")
+        assert how(one)[0] is crashed
+
+
+@pytest.mark.parametrize(("instance", "silent"), [(b"s", True), (b"t", False)])
+async def test_a_link_that_another_one_replaces_leaves_direct_connections_alone(
+    instance: bytes, monkeypatch: pytest.MonkeyPatch, *, silent: bool
+) -> None:
+    monkeypatch.setattr(limits, "GHOST_QUIET", 0.0)  # the first one counts as quiet at once
+    async with peers(1) as (one,):
+        await raw(one, STRANGER, lease=60.0)
+        await until(lambda: bool(one.ups), "a link")
+        _, answer = await raw(one, Identity(STRANGER.guid, instance * 16, "stranger"), lease=60.0)
+        assert answer.kind is FrameKind.WELCOME
+        await until(lambda: len(one.ups) == 2, "the same run of it by another path, or another run")
+        assert how(one) == (True, silent)
+
+
+MB = 1 << 20
+
+
+@pytest.fixture
+def no_collector() -> Iterator[None]:
+    gc.disable()
+    yield
+    gc.enable()
+
+
+def references(one: Peer, other: Peer) -> list[weakref.ref[PeerLink] | weakref.ref[Connection]]:
+    """A peer's link to another one, and its two connections."""
+    link = one.link(other)
+    assert link.bulk_connection is not None
+    return [weakref.ref(link), weakref.ref(link.connection), weakref.ref(link.bulk_connection)]
+
+
+@pytest.mark.usefixtures("no_collector")
+@pytest.mark.parametrize("way", ["close", "abort", "end"])
+async def test_an_ended_link_is_gone_with_what_waited(way: str) -> None:
+    async with linked_pair(lanes=False) as (one, other):
+        one.link(other).bulk._on_wanted()
+        await until(lambda: one.link(other).bulk_connection is not None, "a bulk lane")
+        await until(lambda: other.link(one).bulk_connection is not None, "a bulk lane")
+        links = [*references(one, other), *references(other, one)]
+        for _ in range(20):
+            one.link(other).bulk.send(1, 1, 0, bytes(MB))
+        assert one.link(other).queue_bytes
+        if way == "end":
+            await other.mesh.close()
+        else:
+            getattr(one.link(other), way)("the test says so")
+        for peer in (one, other):
+            await until(lambda peer=peer: peer.downs, "the end")  # type: ignore[misc]
+        for peer in (one, other):
+            for seen in (peer.ups, peer.downs, peer.clocks, peer.lanes_lost):
+                seen.clear()
+        await until(lambda: not any(link() for link in links), "nobody holds the old links")

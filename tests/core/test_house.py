@@ -1,13 +1,17 @@
-"""Each error, warning and problem that a user sees has a code of the table, and each code of the table is used."""
+"""What holds for all of the tree: class names, imports, codes."""
+
+from __future__ import annotations
 
 import ast
 import logging
 import re
-from collections.abc import Iterator
+from collections import defaultdict
+from graphlib import TopologicalSorter
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
 from pkgutil import walk_packages
+from typing import TYPE_CHECKING, Final
 
 import pytest
 
@@ -16,6 +20,9 @@ from rmpa.core import codes
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.log import RefusalLog, configure_logging
 from rmpa.core.statistics import Counters
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 SRC = Path(rmpa.__path__[0])
 CODES = codes.texts()
@@ -185,3 +192,33 @@ def test_a_log_line_shows_the_code_of_a_refusal_and_of_a_fault(as_json: bool) ->
     assert "! a part failed [internal-error]" in fault
     if as_json:
         assert '"code": "other-release"' in refused
+
+
+def test_no_two_public_classes_have_one_name() -> None:
+    source = Path(rmpa.__path__[0])
+    places: defaultdict[str, list[str]] = defaultdict(list)
+    for path in sorted(source.rglob("*.py")):
+        for item in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(item, ast.ClassDef) and not item.name.startswith("_"):
+                places[item.name].append(str(path.relative_to(source)))
+    assert {name: files for name, files in places.items() if len(files) > 1} == {}
+
+
+SOURCE: Final = Path(rmpa.__path__[0])
+
+
+def _module(path: Path) -> str:
+    parts = ("rmpa", *path.relative_to(SOURCE).with_suffix("").parts)
+    return ".".join(parts).removesuffix(".__init__")
+
+
+def test_no_modules_import_each_other() -> None:
+    modules = {_module(path): ast.parse(path.read_text(encoding="utf-8")) for path in SOURCE.rglob("*.py")}
+    imports: dict[str, set[str]] = {name: set() for name in modules}
+    for name, tree in modules.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("rmpa"):
+                found = {f"{node.module}.{alias.name}" for alias in node.names} & modules.keys()
+                imports[name] |= found or {node.module}
+    assert sum(map(len, imports.values())) > len(modules), "too few imports were found to prove anything"
+    TopologicalSorter(imports).prepare()  # raises CycleError, which names the circle
