@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from lab.bed.processes import CommandFailed, eventually
-from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.ros.node.service_client import ServiceFailed
+from rmpa.core.errors import RmpaError
 from rmpa.ros.types.installed import ServiceType
-from tests.interop.nodes.payload import Pattern
 from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
@@ -304,60 +302,3 @@ async def test_real_clients_call_our_service(node: Node, ros: Ros, library: str)
     gone = await order(caller, "echo 0 100 1 once")
     assert gone["ok"] == 0
     assert len(service.endpoint._clients) == 0
-
-
-@libraries
-async def test_our_client_calls_a_real_service(node: Node, ros: Ros, library: str) -> None:
-    worker = ros.node(library, "worker", "__name:=worker")
-    await worker.expect_event("up", DEADLINE)
-    data = list(Pattern(300).payload(1, 1))
-    response = await node.call_service("/work", WORK, ["echo", 0, data], DEADLINE)
-    assert response.text == "echo"
-    assert response.data.tolist() == data
-    async with asyncio.timeout(DEADLINE):
-        client = await node.connect_service("/work", WORK)
-        assert client.connection.caller_id == "/worker"
-        assert client.connection.description == WORK.describe()
-        for _ in range(50):
-            assert (await client.call({"op": "echo", "data": data})).data.tolist() == data
-        large = Pattern(5_000_000).payload(1, 2)
-        request = WORK.request.serialize(WORK.request.make(["echo", 0, []]))[:-4]
-        ok, body = await client.connection.call(request + len(large).to_bytes(4, "little") + large)
-        assert ok
-        assert body.endswith(large)
-        with pytest.raises(PeerRefused, match="gripper is jammed" if library == "rospy" else "service /work refused"):
-            await client.call(["fail", 0, []])
-        if library == "roscpp":
-            # rospy closes behind an error, though the connection is persistent.
-            assert not client.closed
-        client.close()
-    sleeping = await node.connect_service("/work", WORK)
-    with pytest.raises(ServiceFailed, match=r"no answer within 0\.3 s"):
-        await sleeping.call(["sleep", 2, []], timeout=0.3)
-    with pytest.raises(PeerRefused, match="md5sum"):
-        await node.call_service("/work", "std_srvs/Trigger")
-    with pytest.raises(ServiceFailed, match=r"died.* in the middle of the call"):
-        await node.call_service("/work", WORK, ["die", 0, []], DEADLINE)
-    with pytest.raises(RmpaError, match="no server of service /work answers"):
-        await node.call_service("/work", WORK, ["echo", 0, []], DEADLINE)
-
-
-async def test_the_stock_tools_show_and_call_our_service(node: Node, ros: Ros) -> None:
-    def set_bool(request: Any) -> dict[str, object]:
-        return {"success": not request.data, "message": "ü <ok>"}
-
-    async def tool(*words: str) -> str:
-        return (await asyncio.to_thread(ros.tool, *words)).strip()
-
-    await node.advertise_service("/arm/enable", "std_srvs/SetBool", set_bool)
-    uri = node.slave.service_uri
-    assert "/arm/enable" in (await tool("rosservice", "list")).splitlines()
-    assert await tool("rosservice", "type", "/arm/enable") == "std_srvs/SetBool"
-    assert await tool("rosservice", "find", "std_srvs/SetBool") == "/arm/enable"
-    assert await tool("rosservice", "args", "/arm/enable") == "data"
-    assert await tool("rosservice", "uri", "/arm/enable") == uri
-    info = (await tool("rosservice", "info", "/arm/enable")).splitlines()
-    assert info == ["Node: /ours", f"URI: {uri}", "Type: std_srvs/SetBool", "Args: data"]
-    answer = await tool("rosservice", "call", "/arm/enable", "data: false")
-    assert answer.splitlines()[0] == "success: True"
-    assert " * /arm/enable" in (await tool("rosnode", "info", "/ours")).splitlines()

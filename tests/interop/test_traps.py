@@ -355,17 +355,6 @@ def test_an_early_subscriber_loses_nothing(two: Two, library: str) -> None:
     assert "layout:" in anything.output
 
 
-@pytest.mark.trap(38)
-def test_an_early_listener_of_another_type_is_refused_at_both_ends(two: Two) -> None:
-    wrong = two.at_b.rospy("listener", "__name:=wrong", topic="/mixed")
-    wrong.wait_event("up")
-    two.at_a.rospy("talker", "__name:=speaker", topic="/mixed", type="String", rate=50)
-    for side in (two.a, two.b):
-        side.process.wait_for("(?i)warning.*/wrong.*/mixed.*type/md5sum")
-    assert wrong.events("first") == []
-    assert wrong.returncode is None
-
-
 @pytest.mark.trap(17, 39)
 async def test_every_byte_of_a_message_arrives_unchanged(two: Two) -> None:
     kind = MessageType("sensor_msgs/Joy")
