@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import asynccontextmanager
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 
 from rmpa.bridge.messages import ServiceOffer
-from rmpa.config.peer_rules import PeerRule, ServiceRule
-from rmpa.config.settings import ServiceSettings, Settings
 from rmpa.core.errors import PeerRefused
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
@@ -24,6 +21,7 @@ if TYPE_CHECKING:
 
     from rmpa.agent.agent import Agent
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.config.settings import Settings
     from rmpa.mesh.io.link import PeerLink
 
 MD5 = "6a2e34150c00229791cc89ff309fff21"
@@ -183,24 +181,6 @@ async def test_a_removed_proxy_comes_back(served: Served) -> None:
     assert provider(b) == ""
     b.services.reconcile()
     assert provider(b) == "/rmpa/a/adder"
-
-
-async def test_peer_rules_hold_for_services_and_reload(
-    settings: Callable[..., Settings],
-) -> None:
-    mine = replace(settings("b"), peers=(PeerRule("a", prefix="/robot1"),))
-    async with running(settings("a"), mine) as (a, b), serving(a), serving(a, "/sub", "/other"):
-        await until(lambda: provider(b, "/robot1/add") == "/rmpa/a/adder")
-        await until(lambda: provider(b, "/robot1/sub"))
-        connection = await connect(b, "/robot1/add")
-        assert await connection.call(b"1", 20.0) == (True, b"1")
-        quick = ServiceSettings(deny=("/robot1/sub",), rules=(ServiceRule(("/robot1/**",), 0.2),))
-        b.bridge.reload(replace(mine, services=quick))
-        await until(lambda: not provider(b, "/robot1/sub"))
-        assert await connection.call(b"2", 20.0) == (True, b"2"), "what is not touched goes on"
-        connection.close()
-        b.bridge.reload(replace(mine, peers=()))
-        await until(lambda: provider(b) == "/rmpa/a/adder" and not provider(b, "/robot1/add"))
 
 
 async def test_a_service_without_a_server_is_refused_with_the_reason(
