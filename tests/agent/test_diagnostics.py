@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from rmpa.core.contract import ContractRule
 from rmpa.observe.control_client import ControlClient
 from rmpa.observe.health import TOPIC
 from rmpa.observe.snapshot import Snapshot
@@ -52,40 +50,6 @@ class Statuses:
         self.headers.add((received.header["type"], received.header["md5sum"]))
         for s in received.message.status:
             self.found[s.name] = (s.level, s.message, {v.key: v.value for v in s.values})
-
-
-async def test_figures_of_a_topic_that_crosses(settings: Callable[..., Settings], tmp_path: Path) -> None:
-    rule = ContractRule(("/chatter",), (), {"deadline": 30.0})
-    async with (
-        running(settings("a"), replace(settings("b"), contracts=(rule,))) as (a, b),
-        node("talker", a) as talker,
-        node("hearer", b) as hearer,
-    ):
-        publisher = await talker.advertise("/chatter", "std_msgs/String")
-        subscriber = await hearer.subscribe("/chatter")
-        await until(lambda: publisher.subscribers and subscriber.publishers)
-        await until(lambda: all(at.link.clock_offset is not None for at in b.bridge.sessions.linked()))
-        await send(publisher, 20, 0.01)
-        await until(
-            lambda: all(
-                flow.quality.messages == 20
-                for at in b.bridge.sessions.linked()
-                for flow in b.bridge.topics.peers[at.peer].flows.values()
-            )
-        )
-        route = await shown("b", tmp_path, "/chatter")
-        assert (route.peer, route.direction, route.messages, route.lost) == ("a", "in", 20, 0)
-        assert route.rate is not None
-        assert 5 < route.rate < 200
-        assert route.period is not None
-        assert route.period.count == 19
-        assert route.latency is not None
-        assert route.latency.min > -route.latency.error
-        assert route.latency.max < 1
-        assert 0 < route.latency.error < 0.5
-        assert route.contract == {"deadline": 30.0}
-        there = await shown("a", tmp_path, "/chatter")
-        assert (there.peer, there.direction, there.messages, there.rate) == ("b", "out", 20, None)
 
 
 async def test_diagnostics_of_a_link_its_topics_and_their_end(settings: Callable[..., Settings]) -> None:

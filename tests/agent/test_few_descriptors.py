@@ -22,20 +22,17 @@ from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge import proxies as proxy_nodes
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.core.log import RefusalLog
-from rmpa.core.statistics import Counters
 from rmpa.observe.control_client import ControlClient
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.core import liveness
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.http.rpc import call_api
-from rmpa.ros.node.listeners import SharedListener, TcprosServer
-from rmpa.ros.node.publication import Publication
-from rmpa.ros.node.subscription import PublisherConnection
-from rmpa.ros.wire.tcpros import TopicDescription, encode_header, subscriber_header
+from rmpa.ros.node.listeners import SharedListener
+from rmpa.ros.wire.tcpros import encode_header, subscriber_header
 from rmpa.ros.wire.xmlrpc import serialize_call
 from rmpa.runtime import accept as descriptors
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.accept import DESCRIPTORS, Use
+from rmpa.runtime.accept import DESCRIPTORS
 from tests.agent.test_agent import node, running, until
 from tests.runtime.descriptors_left import descriptors_left
 
@@ -49,7 +46,6 @@ if TYPE_CHECKING:
 
 HARD = 64
 NODES = 40
-STRING = TopicDescription("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n")
 
 
 @pytest.fixture
@@ -61,61 +57,10 @@ def fresh(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(liveness, "ask_listening_ports", lambda: None)
 
 
-def refused(use: Use) -> int:
-    return DESCRIPTORS.counters[f"descriptors.refused.{use.name.lower()}"]
-
-
 def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
     """What is logged of the shortage; that trust is off is said once by each agent, at its start."""
     texts = [r.getMessage() for r in caplog.records if r.levelno > logging.INFO or "descriptors" in r.getMessage()]
     return [text for text in texts if "trust is off" not in text]
-
-
-@pytest.mark.usefixtures("fresh")
-async def test_subscribers_are_served_again(caplog: pytest.LogCaptureFixture) -> None:
-    publication = Publication("/t", "/p", STRING)
-    server = TcprosServer("/p", {"/t": publication}, counters=Counters())
-    server.start()
-    client = socket.socket()
-    client.setblocking(False)
-    try:
-        with descriptors_left(DESCRIPTORS.reserve):  # plenty for the core, none for data
-            await asyncio.get_running_loop().sock_connect(client, server.address)
-            async with asyncio.timeout(10):
-                assert await asyncio.get_running_loop().sock_recv(client, 1) == b"", "refused at once"
-            client.close()
-        client = socket.socket()
-        client.setblocking(False)
-        await asyncio.get_running_loop().sock_connect(client, server.address)
-        await until(lambda: len(server._waiting) == 1)
-        await until(lambda: not DESCRIPTORS.problem)
-    finally:
-        client.close()
-        server.close()
-        publication.withdraw()
-    assert len(lines(caplog)) <= 2
-
-
-@pytest.mark.usefixtures("fresh")
-async def test_a_failed_dial_is_logged_and_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rmpa.ros.node.subscription.TCPROS_RETRY_FIRST", 0.01)
-    monkeypatch.setattr("rmpa.ros.node.subscription.TCPROS_RETRY_MAX", 0.02)
-    core = RosCore("127.0.0.1", 0)
-    await core.start()
-    lost: list[str] = []
-    link = PublisherConnection("/t", core.uri, "/s", on_message=lambda _: None, on_lost=lost.append)
-    try:
-        with descriptors_left(0):
-            with pytest.raises(UnreachableError, match="no file descriptor is left for a connection"):
-                await call_api(core.uri, "getPid", "/test")
-            link.start()
-            await until(lambda: len(lost) >= 3)
-            assert all("no file descriptor left" in reason for reason in lost)
-            lost.clear()
-        await until(lambda: any("requestTopic" in reason for reason in lost))  # a core has none: it was asked
-    finally:
-        link.close()
-        await core.close()
 
 
 @pytest.mark.usefixtures("fresh")

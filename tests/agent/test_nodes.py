@@ -122,14 +122,6 @@ async def test_killing_a_proxy_ends_its_node(settings: Callable[..., Settings]) 
         assert "/talker" not in b.core.state().nodes
 
 
-async def test_a_node_is_ended_by_name(settings: Callable[..., Settings]) -> None:
-    async with running(settings("a"), settings("b")) as (a, b), mortal("talker", b) as (talker, ended):
-        await talker.advertise("/chatter", "std_msgs/String")
-        assert (await ask(a, dict[str, bool], "node.kill", "/talker"))["gone"]
-        await asyncio.wait_for(ended.wait(), 20)
-        assert "/talker" not in b.core.state().nodes
-
-
 async def test_a_node_is_not_ended_without_permission(settings: Callable[..., Settings]) -> None:
     b_settings = replace(settings("b"), nodes=NodeSettings(kill=("/demo/**",)))
     async with running(settings("a"), b_settings) as (a, b), mortal("talker", b) as (talker, ended):

@@ -15,16 +15,14 @@ import pytest
 
 from rmpa.agent.agent import Agent, permission_notes
 from rmpa.bridge.nodes import INFO, KILL, LIST, PING
-from rmpa.bridge.sessions import PeerSession
 from rmpa.config.peer_rules import Effect, PermissionRule
 from rmpa.config.settings import NodeSettings, ServiceSettings, Settings, TrustSettings
 from rmpa.core.contract import ContractRule, Transport
 from rmpa.core.errors import PeerRefused
 from rmpa.observe import limits as observe_limits
 from rmpa.trust.permissions import Permissions
-from tests.agent.test_agent import Sink, node, running, until
+from tests.agent.test_agent import node, running, until
 from tests.agent.test_services import serving
-from tests.agent.test_services_direct import about, transport
 from tests.agent.test_why import ask, stopped_at
 
 if TYPE_CHECKING:
@@ -67,48 +65,6 @@ def with_rules(made: Settings, *rules: PermissionRule) -> Settings:
 
 def stage(found: tuple[Diagnosis, ...], name: str) -> str:
     return next(stage.text for one in found for stage in one.stages if stage.name == name)
-
-
-async def test_a_topic_flows_while_both_sides_permit_it_and_no_longer(
-    settings: Callable[..., Settings],
-) -> None:
-    a_settings = with_rules(settings("a"), allow("b", subscribe="/odom"), deny("b", subscribe="/secret/**"))
-    b_settings = with_rules(settings("b"), allow("a", publish="/**"))
-    async with secured(a_settings, b_settings) as (a, b), node("talker", a) as talker, node("hearer", b) as hearer:
-        odom = await talker.advertise("/odom", "std_msgs/String")
-        await talker.advertise("/secret/key", "std_msgs/String")
-        sink = Sink()
-        subscriber = await hearer.subscribe("/odom", "std_msgs/String", sink)
-        await until(lambda: odom.subscribers and subscriber.publishers)
-        odom.publish(odom.make({"data": "one"}))
-        await until(lambda: sink.count(1))
-        found = await ask(b, "/odom", "a")
-        assert stage(found, "permission there") == "a lets b subscribe to it"
-        assert stage(found, "permission here") == "[[permission]] 1 allows publish of '/**' to 'a'"
-        assert stage(await ask(a, "/odom", "b"), "permission here") == "b lets a publish it", "no rule of b for a"
-        assert a.bridge.counters["permission.subscribe"] == 1
-
-        a.apply_settings(with_rules(a_settings, allow("b", subscribe="/tf")))
-        await until(lambda: not odom.subscribers and not subscriber.publishers)
-        name, text = stopped_at((await ask(b, "/odom", "a"))[:1])
-        assert (name, text) == (
-            "permission there",
-            "the permissions of a do not let b subscribe to /odom, nor call it if it is a service",
-        )
-        a.apply_settings(a_settings)
-        await until(lambda: odom.subscribers and subscriber.publishers)
-
-        b.apply_settings(with_rules(b_settings, deny("a", publish="/odom"), allow("*", publish="/**")))
-        await until(lambda: not odom.subscribers and not subscriber.publishers)
-        name, text = stopped_at(await ask(b, "/odom", "a"))
-        assert name == "permission here"
-        assert text == "a may not publish /odom here: [[permission]] 1 denies publish of '/odom' to 'a'"
-        (there,) = await ask(a, "/odom", "b")
-        assert there.failed is not None
-        assert there.failed.text == "the permissions of b do not let a publish /odom"
-        assert "1 denies" not in str(there), "the rule is b's own"
-        b.apply_settings(b_settings)
-        await until(lambda: odom.subscribers and subscriber.publishers)
 
 
 async def test_why_tells_nothing_of_topics_and_services_that_the_asker_may_not_have(
@@ -220,53 +176,3 @@ def test_the_start_says_that_permissions_without_trust_have_no_effect_and_what_i
     for secure in (False, True):
         assert not list(permission_notes(Settings(name="a"), secured=secure))
     assert not list(permission_notes(ruled, secured=True))
-
-
-async def test_the_start_writes_it_once(
-    settings: Callable[..., Settings],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    async with running(with_rules(settings("a"), allow("b", publish="/x"))):
-        pass
-    assert caplog.text.count("[[permission]] has no effect") == 1
-
-
-async def test_direct_transport_is_off_between_machines_until_both_modules_allow_it(
-    settings: Callable[..., Settings], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(PeerSession, "same_machine", property(lambda _: False))
-    services = ServiceSettings(transport=Transport.AUTO)
-    closed = TrustSettings(default="allow")
-    opened = replace(closed, direct=True)
-    a_settings, b_settings = (
-        replace(settings(name), services=services, transport=Transport.AUTO, trust=closed) for name in "ab"
-    )
-
-    def topic(agent: Agent) -> tuple[str, str]:
-        routes = [r for t in agent.operations.snapshot({}).topics if t.name == "/odom" for r in t.routes]
-        found = [one for route in routes for one in route.subscribers]
-        return (found[0].transport, found[0].condition) if found else ("", "")
-
-    async with (
-        secured(a_settings, b_settings) as (a, b),
-        serving(a),
-        node("talker", a) as talker,
-        node("hearer", b) as hearer,
-    ):
-        await talker.advertise("/odom", "std_msgs/String")
-        subscriber = await hearer.subscribe("/odom", "std_msgs/String", Sink())
-        await until(lambda: subscriber.publishers and transport(b) == ("relay", "trust"))
-        await until(lambda: topic(b) == ("relay", "trust"))
-        b.apply_settings(replace(b_settings, trust=opened))
-        await until(lambda: (found := about(b)) is not None and "server's module" in found.relayed_because)
-        assert transport(b) == ("relay", "trust"), "a does not allow it"
-        assert topic(b)[1] == "subscriber", "the next condition: this node is bound to loopback"
-        a.apply_settings(replace(a_settings, trust=opened))
-        await until(lambda: transport(b) == ("direct", ""))
-        a.apply_settings(a_settings)
-        await until(lambda: transport(b) == ("relay", "trust"))
-        a.apply_settings(replace(a_settings, trust=opened))
-        await until(lambda: transport(b) == ("direct", ""))
-        b.apply_settings(replace(b_settings, trust=replace(opened, rules=(deny("a", serve="/**", publish="/**"),))))
-        await until(lambda: not subscriber.publishers and not b.core.state().services.get("/add"))
-        assert b.bridge.counters["direct.service_stopped"] == 1, "also connections of persistent clients end"

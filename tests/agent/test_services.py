@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import asynccontextmanager
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 
 from rmpa.bridge.messages import ServiceOffer
-from rmpa.config.peer_rules import PeerRule, ServiceRule
-from rmpa.config.settings import ServiceSettings, Settings
 from rmpa.core.errors import PeerRefused
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
@@ -24,6 +21,7 @@ if TYPE_CHECKING:
 
     from rmpa.agent.agent import Agent
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.config.settings import Settings
     from rmpa.mesh.io.link import PeerLink
 
 MD5 = "6a2e34150c00229791cc89ff309fff21"
@@ -176,36 +174,6 @@ async def test_a_short_outage_keeps_services_and_answers_calls(served: Served) -
     connection.close()
 
 
-async def test_a_link_that_stays_away_takes_its_services_and_tells_who_waits(served: Served) -> None:
-    a, b, _server = served
-    connection = await connect(b)
-    links = fall_silent(a, b)
-    ok, text = await connection.call(b"1", 20.0)
-    assert not ok
-    assert b"/add] of a: a is gone" in text
-    assert provider(b) == ""
-    come_back(reversed(links))
-    await until(lambda: provider(b) == "/rmpa/a/adder")
-    connection = await connect(b)
-    assert await connection.call(b"2", 20.0) == (True, b"2")
-    connection.close()
-
-
-async def test_a_local_service_hides_the_peers_until_it_ends(served: Served) -> None:
-    _a, b, _server = served
-    seen: list[str] = []
-    b.core.on_change(lambda change: seen.append(provider(b)) if change.name == "/add" else None)
-    async with serving(b, name="/mine"):
-        await until(lambda: provider(b) == "/mine")
-        b.services.reconcile()
-        await asyncio.sleep(0.05)
-        assert provider(b) == "/mine"
-        (info,) = [i for i in b.operations.snapshot({}).services if i.peer == "a"]
-        assert (info.state, info.hidden) == ("hidden", "/mine of this module provides it itself")
-    await until(lambda: provider(b) == "/rmpa/a/adder")
-    assert seen == ["/mine", "/mine", "", "/rmpa/a/adder"], "ours went, its came; its went, ours came"
-
-
 async def test_a_removed_proxy_comes_back(served: Served) -> None:
     _a, b, _server = served
     (uri,) = b.core.state().services["/add"].values()
@@ -213,67 +181,6 @@ async def test_a_removed_proxy_comes_back(served: Served) -> None:
     assert provider(b) == ""
     b.services.reconcile()
     assert provider(b) == "/rmpa/a/adder"
-
-
-async def test_a_server_at_a_new_address_is_found(served: Served) -> None:
-    a, b, _server = served
-    connection = await connect(b)
-    assert await connection.call(b"1", 20.0) == (True, b"1")
-    async with serving(a):  # the same node once more: the master ends the first one
-        await until(lambda: any(shown.caller is None for shown in b.services))
-        again = await connect(b)
-        assert await again.call(b"2", 20.0) == (True, b"2")
-        again.close()
-    connection.close()
-
-
-async def test_another_md5_sum_is_refused_and_both_sides_say_so(
-    served: Served, caplog: pytest.LogCaptureFixture
-) -> None:
-    a, b, _server = served
-    with pytest.raises(PeerRefused, match=MD5):
-        await connect(b, md5sum="f" * 32)
-    await until(lambda: a.bridge.counters["service.mismatch_remote"])
-    assert b.bridge.counters["service.mismatch"] == 1
-    (info,) = [i for i in b.operations.snapshot({}).services if i.name == "/add"]
-    assert "md5sum" in info.problem
-    said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert sum(MD5 in line for line in said) == 2
-    connection = await connect(b, md5sum=MD5)
-    connection.close()
-
-
-async def test_peer_rules_hold_for_services_and_reload(
-    settings: Callable[..., Settings],
-) -> None:
-    mine = replace(settings("b"), peers=(PeerRule("a", prefix="/robot1"),))
-    async with running(settings("a"), mine) as (a, b), serving(a), serving(a, "/sub", "/other"):
-        await until(lambda: provider(b, "/robot1/add") == "/rmpa/a/adder")
-        await until(lambda: provider(b, "/robot1/sub"))
-        connection = await connect(b, "/robot1/add")
-        assert await connection.call(b"1", 20.0) == (True, b"1")
-        quick = ServiceSettings(deny=("/robot1/sub",), rules=(ServiceRule(("/robot1/**",), 0.2),))
-        b.bridge.reload(replace(mine, services=quick))
-        await until(lambda: not provider(b, "/robot1/sub"))
-        assert await connection.call(b"2", 20.0) == (True, b"2"), "what is not touched goes on"
-        connection.close()
-        b.bridge.reload(replace(mine, peers=()))
-        await until(lambda: provider(b) == "/rmpa/a/adder" and not provider(b, "/robot1/add"))
-
-
-async def test_the_deadline_of_a_call_is_the_callers(settings: Callable[..., Settings]) -> None:
-    mine = replace(settings("b"), services=ServiceSettings(timeout=0.3))
-    async with running(settings("a"), mine) as (a, b), serving(a) as server:
-        await until(lambda: provider(b) == "/rmpa/a/adder")
-        server.keeps = True
-        connection = await connect(b)
-        ok, text = await connection.call(b"1", 20.0)
-        assert not ok
-        assert b"0.3 s" in text
-        server.calls[0].reply(True, b"too late")
-        server.keeps = False
-        assert await connection.call(b"2", 20.0) == (True, b"2")
-        connection.close()
 
 
 async def test_a_service_without_a_server_is_refused_with_the_reason(

@@ -10,10 +10,8 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition
 from rmpa.bridge.policy import Needs
-from rmpa.config.peer_rules import ServiceRule
 from rmpa.config.settings import ServiceSettings
 from rmpa.core.contract import Transport
-from rmpa.core.errors import PeerRefused
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.service_server import ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode
@@ -96,30 +94,6 @@ async def test_the_proxy_answers_where_the_lookup_says_so(direct: Served) -> Non
     register(b)
     b.core.call("registerService", "/mine", "/add", "rosrpc://127.0.0.1:9", "http://127.0.0.1:9/")
     assert lookup(b) == "rosrpc://127.0.0.1:9"
-
-
-async def test_a_restarted_server_is_asked_for_anew(pair: tuple[Settings, Settings]) -> None:
-    async with running(*pair) as (a, b):
-        register(b)
-        async with serving(a) as first:
-            await until(lambda: lookup(b) == own_uri(first))
-            async with serving(a) as second:  # of the same name, at another port
-                await until(lambda: lookup(b) == own_uri(second))
-        await until(lambda: not provider(b))
-        assert lookup(b) == ""
-
-
-async def test_both_modules_must_want_it(pair: tuple[Settings, Settings]) -> None:
-    relay = ServiceSettings(rules=(ServiceRule(("/add",), transport=Transport.RELAY),))
-    async with running(*pair) as (a, b), serving(a):
-        await until(lambda: transport(b) == ("direct", ""))
-        for agent, own in zip((a, b), pair, strict=True):
-            agent.bridge.reload(replace(own, services=relay))
-            await until(lambda: transport(b) == ("relay", "transport"))
-            await until(lambda: not list(a.services.direct_exports))
-            agent.bridge.reload(own)
-            await until(lambda: transport(b) == ("direct", ""))
-            await until(lambda: list(a.services.direct_exports))
 
 
 async def test_direct_warns_once_where_it_cannot_be_had(
@@ -206,24 +180,6 @@ def crash(agent: Agent) -> None:
     (session,) = agent.bridge.sessions.linked()
     session.link.crashed = True
     agent.bridge.sessions.link_down(session.link)
-
-
-async def test_after_a_crash_direct_services_stay(pair: tuple[Settings, Settings]) -> None:
-    relay = ServiceRule(("/sub",), transport=Transport.RELAY)
-    mine = replace(pair[1], services=ServiceSettings(transport=Transport.AUTO, rules=(relay,)))
-    async with running(pair[0], mine) as (a, b), serving(a, "/sub", "/other"), serving(a) as server:
-        await until(lambda: transport(b)[0] == "direct" and provider(b, "/sub"))
-        register(b)
-        crash(b)
-        assert provider(b)
-        assert lookup(b) == own_uri(server)
-        await until(lambda: not provider(b, "/sub"))
-        (uri,) = b.core.state().services["/add"].values()
-        connection = await ServiceConnection.open(lookup(b), "/add", CLIENT)
-        assert await connection.call(b"1", 20.0) == (True, b"1")
-        connection.close()
-        with pytest.raises(PeerRefused, match="has crashed"):  # at once, instead of waiting for a link
-            await ServiceConnection.open(uri, "/add", "/local")
 
 
 async def test_after_a_crash_direct_services_do_not_stay_for_ever(

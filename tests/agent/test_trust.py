@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from rmpa.trust.permissions import TrustStatus
     from rmpa.trust.store import MemberFiles
 
 
@@ -263,21 +262,6 @@ async def test_the_user_who_invites_is_told_what_came_of_the_token(fleet: Fleet)
     await join_mesh(token, "arm")
     step = await fleet.command("base", "step", id=token.token_id.hex(), after=1)
     assert (step.step, step.state, step.module) == (2, "joined", "arm")  # type: ignore[attr-defined]
-
-
-async def test_a_module_without_trust_is_not_linked_and_told_why(fleet: Fleet) -> None:
-    with pytest.raises(StartError, match=r"the module plain: has no keys, .* beside keys of base"):
-        await fleet.start("plain")
-    plain = await fleet.start("plain", trust=TrustSettings(insecure=True))
-    base = fleet.agents["base"]
-    await until(lambda: base.snapshots.build().counters.get("beacon.untagged"))
-    await until(lambda: _refusals(base, "plain"))
-    assert not peers_of(base)
-    assert not peers_of(plain)
-    with pytest.raises(PeerRefused, match="it runs without trust; rmpa trust init, or rmpa trust join TOKEN"):
-        await fleet.command("plain", "invite")
-    status: TrustStatus = await fleet.command("plain", "status")  # type: ignore[assignment]
-    assert (status.on, status.agent, status.problems) == (False, "plain", ())
 
 
 async def test_only_the_authority_invites_and_revokes_and_the_snapshot_shows_who_it_is(fleet: Fleet) -> None:

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.bridge.peer_offers import CONFLICT
-from rmpa.config.peer_rules import PeerRule, PolicySettings
+from rmpa.config.peer_rules import PeerRule
 from rmpa.core.errors import ConfigError
 from rmpa.observe import limits as observe_limits
 from tests.agent.test_agent import DEADLINE, node, running, until
@@ -49,35 +48,6 @@ def stopped_at(found: tuple[Diagnosis, ...]) -> tuple[str, str]:
     assert not diagnosis.flows
     assert diagnosis.failed.remedy
     return diagnosis.failed.name, diagnosis.failed.text
-
-
-@pytest.mark.parametrize("where", ["there", "here"])
-async def test_policy_of_either_side(settings: Callable[..., Settings], where: str) -> None:
-    deny = PolicySettings(deny=("/secret",))
-    a, b = (settings("a", deny), settings("b")) if where == "there" else (settings("a"), settings("b", deny))
-    async with running(a, b) as (first, second), node("talker", first) as talker:
-        await talker.advertise("/secret", "std_msgs/String")
-        if where == "here":
-            await until(lambda: next(iter(second.bridge.topics.imports), None))
-        for found in (await ask(second, "/secret", "a"), await ask(second, "/secret")):
-            stage, text = stopped_at(found)
-            assert stage == f"policy {where}"
-            assert "bridge.deny has '/secret'" in text
-
-
-async def test_built_in_rules_and_other_types(settings: Callable[..., Settings]) -> None:
-    async with running(settings("a"), settings("b")) as (a, b), node("one", a) as one, node("two", b) as two:
-        await one.advertise("/clock", "rosgraph_msgs/Clock")
-        stage, text = stopped_at(await ask(b, "/clock", "a"))
-        assert stage == "policy there"
-        assert "time does not cross" in text
-        await one.advertise("/x", "std_msgs/String")
-        await two.advertise("/x", "std_msgs/Bool")
-        await until(lambda: any(entry.cause == CONFLICT for _, _, entry in b.bridge.topics.imports))
-        stage, text = stopped_at(await ask(b, "/x", "a"))
-        assert stage == "type"
-        assert "std_msgs/String" in text
-        assert "std_msgs/Bool" in text
 
 
 async def test_unknown_peers_and_names(settings: Callable[..., Settings]) -> None:

@@ -6,7 +6,6 @@ import pytest
 from rich.console import Console
 
 import table
-from trail import draw
 from watch import COMMAND, ORDER, PoseView, Watch
 
 ODOM = "/odom"
@@ -39,26 +38,6 @@ def test_figures_of_a_steady_drive() -> None:
     assert view.unanswered == 0
 
 
-def test_the_agent_tells_the_latency_of_what_has_no_header() -> None:
-    watch = Watch(100.0)
-    watch.latency(ORDER, 100.0, 9.0)  # before the first message there is nothing to measure
-    drive(watch, 100.0, 1.0)
-    watch.latency(ORDER, 100.5, 9.0)  # still settling
-    drive(watch, 101.0, 2.0)
-    watch.latency(ORDER, 103.0, 0.0004)
-    for whole in (False, True):
-        latency = watch.view(103.0, whole=whole).topics[ORDER].latency
-        assert latency is not None
-        assert (latency.count, latency.maximum) == (1, 0.0004)
-
-
-def test_a_silent_topic_keeps_its_figures_without_a_rate() -> None:
-    watch = Watch(100.0)
-    drive(watch, 100.0, 5.0)
-    assert watch.view(108.0).topics[COMMAND].rate == 0
-    assert watch.view(108.0, whole=True).topics[COMMAND].rate == pytest.approx(10)
-
-
 def test_a_lost_order_is_counted() -> None:
     watch = Watch(100.0)
     drive(watch, 100.0, 3.0)
@@ -68,15 +47,6 @@ def test_a_lost_order_is_counted() -> None:
     view = watch.view(103.2)
     assert view.unanswered == 1
     assert view.command_to_velocity.maximum == pytest.approx(0.002)
-
-
-def test_an_order_before_its_command_shifts_nothing() -> None:
-    watch = Watch(100.0)
-    drive(watch, 100.0, 3.0)
-    watch.message(ORDER, 102.9995)
-    watch.message(COMMAND, 103.0)
-    drive(watch, 103.1, 1.0)
-    assert watch.view(104.2).command_to_velocity.maximum == pytest.approx(0.002)
 
 
 def test_an_outage_of_a_module_is_no_period() -> None:
@@ -117,13 +87,6 @@ def test_an_outage_of_a_module_is_no_period() -> None:
     assert view.topics[ODOM].period.maximum == pytest.approx(0.02)
 
 
-def test_a_module_that_was_never_seen_is_waited_for_not_gone() -> None:
-    watch = Watch(0.0)
-    watch.peers({"base": "linking"}, 1.0)
-    states = {name: module.state for name, module in watch.view(1.0).modules.items()}
-    assert states == {"joystick": "waiting", "velocity": "waiting", "base": "linking", "pc": "here"}
-
-
 def test_everything_can_be_shown() -> None:
     watch = Watch(100.0)
     console = Console(width=80, record=True, force_terminal=True)
@@ -146,21 +109,3 @@ def test_everything_can_be_shown() -> None:
     assert "CMD 10.0 Hz" in table.line(watch.view(105.0))
     assert json.loads(table.json_line(Watch(0.0).view(0.0)))["command_to_velocity"]["mean"] is None
     assert json.loads(table.json_summary(view))["summary"]["topics"][ODOM]["messages"] == 500
-
-
-def test_the_trail_of_a_square_in_ascii() -> None:
-    corners = [(0.0, 0.0), (2.0, 0.0), (2.0, 2.0), (0.0, 2.0)]
-    assert draw(corners, 0.0, 9, 5, unicode=False) == [
-        ">       .",
-        "         ",
-        "         ",
-        "         ",
-        ".       .",
-    ]
-
-
-def test_the_trail_in_braille_keeps_to_its_size() -> None:
-    lines = draw([(0.0, 0.0), (5.0, 0.1), (5.0, -3.0)], -1.6, 20, 6)
-    assert [len(line) for line in lines] == [20] * 6
-    assert "↓" in "".join(lines)
-    assert draw([], 0.0, 3, 2) == ["   ", "   "]

@@ -50,9 +50,3 @@ def test_any_bytes(name: str) -> None:
         target.fuzz(data)
 
     run()
-
-
-def test_mutations_replay_from_their_seed() -> None:
-    seeds = [b"RMPA" * 5, b"", b"x"]
-    first, second = (random.Random(7) for _ in range(2))
-    assert [mutate(first, seeds) for _ in range(200)] == [mutate(second, seeds) for _ in range(200)]

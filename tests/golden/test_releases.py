@@ -46,7 +46,7 @@ from tests.mesh import test_frames
 from tests.mesh.worlds import ACCEPTOR, DIALLER, HIGH, LOW, Side, Time, deliver
 from tests.observe.samples import SNAPSHOT
 from tests.resource import test_saved
-from tests.trust import test_join, test_packets, test_tokens
+from tests.trust import test_packets, test_tokens
 from tests.trust.authority import WALL
 from tests.trust.io.member_files import KEYS, SecuredMesh
 
@@ -107,7 +107,7 @@ def samples() -> Iterator[tuple[str, Sample]]:
         yield f"frame {number} {frame.kind.name}", Sample(frame.serialize(), frame, frame_of, "link")
     for number, (message, _) in enumerate(test_messages.GOLDEN):
         yield f"control {number} {type(message).__name__}", Sample(encode(message), message, decode, "link")
-    for asked, data in test_join.GOLDEN.items():
+    for asked, data in test_tokens.GOLDEN.items():
         yield f"join {type(asked).__name__}", Sample(data[4:], asked, decode_message, "join")
     token = test_tokens.TOKEN
     yield "token", Sample(token.serialize().encode(), token, lambda data: Token.parse(data.decode()), "join token")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import asyncio
+import struct
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final
 
@@ -11,6 +13,9 @@ import pytest
 from lab.bed import namespaces, processes
 from lab.bed.agents import Agent
 from lab.bed.namespaces import MACHINE, Host, Lab
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.environment import RosEnvironment
+from rmpa.ros.node.node import Node
 from tests.interop import forks
 from tests.interop.modules import Bed, Module, start_linked
 from tests.interop.ros import Ros, free_port
@@ -58,6 +63,42 @@ def shell(tmp_path: Path) -> Iterator[ShellFactory]:
             return made
 
         yield make
+
+
+@pytest.fixture
+async def core() -> AsyncIterator[RosCore]:
+    """Our core on a free port."""
+    made = RosCore("127.0.0.1", 0)
+    await made.start()
+    yield made
+    await made.close()
+
+
+@pytest.fixture
+async def ros(core: RosCore, shell: ShellFactory) -> AsyncIterator[Ros]:
+    """A shell at our core. Its nodes may wait for the core as they end: that has its turn meanwhile."""
+    made = shell(port=core.port)
+    yield made
+    await asyncio.to_thread(made.close)
+
+
+@pytest.fixture
+async def node(core: RosCore) -> AsyncIterator[Node]:
+    """A node of ours at our core."""
+    async with Node("ours", master_uri=core.uri, environment=RosEnvironment()) as made:
+        yield made
+
+
+async def until(condition: Callable[[], object], within: float = 40.0) -> None:
+    """Wait in the event loop until something holds."""
+    async with asyncio.timeout(within):
+        while not condition():
+            await asyncio.sleep(0.005)
+
+
+def framed(payload: bytes) -> bytes:
+    """A std_msgs/UInt8MultiArray as raw bytes: no dimensions, offset 0."""
+    return bytes(8) + struct.pack("<I", len(payload)) + payload
 
 
 @pytest.fixture

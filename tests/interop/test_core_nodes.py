@@ -1,4 +1,4 @@
-"""Real rospy and roscpp nodes at our core: twins, deaths, reconnections."""
+"""The embedded core with real nodes: twins, dead and stopped ones, probes, and connections that are read."""
 
 from __future__ import annotations
 
@@ -9,22 +9,21 @@ import pytest
 
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.liveness import name_at
+from rmpa.ros.http.rpc import call, call_api
+from rmpa.ros.node.service_client import probe
+from rmpa.ros.wire.slave_api import read_bus_info
+from rmpa.ros.wire.tcpros import parse_service_uri
+from tests.interop.conftest import until
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
+    from rmpa.ros.wire.slave_api import BusLink
     from tests.interop.conftest import ShellFactory
+    from tests.interop.ros import Ros
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
-
-DEADLINE: Final = 30.0
-KINDS: Final = pytest.mark.parametrize("kind", ["rospy", "roscpp"])
-
-
-async def until(wanted: Callable[[], bool]) -> None:
-    async with asyncio.timeout(DEADLINE):
-        while not wanted():
-            await asyncio.sleep(0.01)
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
+DEADLINE: Final = 90.0
+LIBRARIES: Final = ("rospy", "roscpp")
+KINDS: Final = pytest.mark.parametrize("kind", LIBRARIES)
 
 
 @pytest.mark.trap(33)
@@ -89,3 +88,111 @@ async def test_a_stopped_node_is_kept_and_gets_the_latest_update(kind: str, shel
     assert talker.returncode is later.returncode is None
     assert core.counters["notify.failed"] == 0
     await core.close()
+
+
+libraries = pytest.mark.parametrize("library", LIBRARIES)
+SERVICE: Final = "/talker/get_loggers"
+
+
+async def publisher_at(core: RosCore) -> tuple[str, int]:
+    """The address of the talker, as its subscribers are told it, which is also that of its services."""
+    talker = (await call_api(core.uri, "lookupNode", "/test", "/talker")).value
+    match (await call_api(str(talker), "requestTopic", "/test", "/chatter", [["TCPROS"]])).value:
+        case ["TCPROS", str(host), int(port)]:
+            uri = (await call_api(core.uri, "lookupService", "/test", SERVICE)).value
+            assert parse_service_uri(str(uri)) == (host, port)
+            return host, port
+    raise AssertionError
+
+
+@pytest.mark.trap(11)
+@libraries
+async def test_a_probe_leaves_no_trace_at_a_real_publisher(core: RosCore, ros: Ros, library: str) -> None:
+    """The talker says ``connected`` once it counts a subscriber; the real one afterwards is served at once."""
+    talker = ros.node(library, "talker", "__name:=talker", topic="/chatter", rate=100, wait=1)
+    await talker.expect_event("up", DEADLINE)
+    host, port = await publisher_at(core)
+    for _ in range(20):
+        assert await probe(host, port, SERVICE, timeout=DEADLINE, node="/talker") == ""
+    at_once = [probe(host, port, SERVICE, timeout=DEADLINE, node="/talker") for _ in range(20)]
+    assert set(await asyncio.gather(*at_once)) == {""}
+    assert "connected" not in talker.output
+    listener = ros.node(library, "listener", topic="/chatter", count=20)
+    connected = await talker.expect_event("connected", DEADLINE)
+    assert connected["subscribers"] == 1
+    await listener.expect_event("done", DEADLINE)
+    problem = await probe(host, port, SERVICE, timeout=DEADLINE, node="/camera")
+    assert problem == "another node listens there: /talker"
+    logs = "".join(path.read_text(errors="replace") for path in (ros.home / "log").rglob("*talker*"))
+    for text in (talker.output, logs):
+        for bad in ("WARN", "ERROR", "Traceback", "terminated"):
+            assert bad not in text, text
+
+
+@libraries
+async def test_a_service_that_the_node_has_not(core: RosCore, ros: Ros, library: str) -> None:
+    """rospy names itself in its refusal, roscpp does not: then any node could be there."""
+    talker = ros.node(library, "talker", "__name:=talker", topic="/chatter")
+    await talker.expect_event("up", DEADLINE)
+    host, port = await publisher_at(core)
+    problem = await probe(host, port, "/camera/get_loggers", timeout=DEADLINE, node="/talker")
+    if library == "rospy":
+        assert problem == ""
+    else:
+        assert "not the expected one: received a tcpros connection for a nonexistent service" in problem
+
+
+async def test_a_probe_without_a_service_makes_roscpp_log_nothing(core: RosCore, ros: Ros) -> None:
+    talker = ros.roscpp("talker", "__name:=talker", topic="/chatter")
+    await talker.expect_event("up", DEADLINE)
+    host, port = await publisher_at(core)
+    for _ in range(5):
+        assert await probe(host, port, "", timeout=DEADLINE) == ""
+    assert await probe(host, port, SERVICE, timeout=DEADLINE, node="/talker") == "", "it has taken those before"
+    assert "WARN" not in talker.output
+    assert "ERROR" not in talker.output
+
+
+async def test_a_node_that_is_gone(core: RosCore, ros: Ros) -> None:
+    talker = ros.rospy("talker", "__name:=talker", topic="/chatter")
+    await talker.expect_event("up", DEADLINE)
+    host, port = await publisher_at(core)
+    talker.kill()
+    assert await probe(host, port, SERVICE, timeout=DEADLINE, node="/talker") == "connection refused"
+
+
+TOPIC = "/chatter"
+COUNT, SIZE = 50, 64
+
+
+def uri_of(core: RosCore, node: str) -> str:
+    state = core.state()
+    return next(nodes[node] for nodes in (*state.publishers.values(), *state.subscribers.values()) if nodes.get(node))
+
+
+async def links(core: RosCore, node: str) -> list[BusLink]:
+    """A node's connections of the topic."""
+    return [one for one in read_bus_info(await call(uri_of(core, node), "getBusInfo", "/t")) if one.topic == TOPIC]
+
+
+@pytest.mark.trap(41)
+async def test_connections_of_real_nodes_are_read(core: RosCore, shell: ShellFactory) -> None:
+    ros = shell(port=core.port)
+    processes = [ros.node(library, "listener", name=f"hears_{library}", count=2 * COUNT) for library in LIBRARIES]
+    for library in LIBRARIES:
+        ros.node(library, "talker", name=f"says_{library}", count=COUNT, size=SIZE, rate=100, wait=2)
+    for process in processes:
+        await asyncio.to_thread(process.wait_event, "done", timeout=DEADLINE)
+    for talker in LIBRARIES:
+        sent = await links(core, f"/says_{talker}")
+        assert {(one.other, one.inbound, one.connected) for one in sent} == {
+            ("/hears_rospy", False, True),
+            ("/hears_roscpp", False, True),
+        }
+        for listener in LIBRARIES:
+            (end,) = (one for one in sent if one.other == f"/hears_{listener}")
+            (start,) = (
+                one for one in await links(core, f"/hears_{listener}") if one.other == uri_of(core, f"/says_{talker}")
+            )
+            assert (start.inbound, start.connected, start.remote) == (True, True, ("127.0.0.1", end.local_port))
+            assert end.remote == ("127.0.0.1", start.local_port)

@@ -1,27 +1,29 @@
-"""Parameters and time across modules, with real ROS: rosparam beside rmpa param, followed keys, a clock."""
+"""Parameters and dynamic_reconfigure between modules."""
 
 from __future__ import annotations
 
+import ast
 import json
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
 from lab.bed.agents import RMPA
 from lab.bed.processes import Process, eventually
 from tests.interop.modules import Module
-from tests.interop.ros import free_port
+from tests.interop.ros import PYTHON, free_port, lacks
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Iterator
 
     from lab.bed.namespaces import Lab
+    from lab.bed.processes import Event
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
     from tests.interop.ros import Ros
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(150)]
-
 Configured = Callable[..., list[Module]]
 URDF = (
     "<?xml version='1.0'?>\n<robot name=\"one\">\n  <link name='base'/>  <!-- it's \"here\" & <there> -->\n</robot>\n"
@@ -220,3 +222,111 @@ def test_time_comes_from_one_simulator(configured: Configured) -> None:
     assert code == 0, output
     has(other, "/use_sim_time", "true")
     other.wait_topic("/clock")
+
+
+LAMP: Final = Path(__file__).parent / "resources" / "lamp.py"
+DYNPARAM: Final = "/usr/lib/dynamic_reconfigure/dynparam"
+LONG: Final = 40.0
+
+
+@pytest.fixture
+def pair(modules: ModuleFactory) -> Iterator[list[Module]]:
+    """The lamp's module, where it runs, and another one."""
+    both = modules("robot", "pc")
+    argv = both[0].host.command([RMPA, "run", LAMP, "--name", both[0].name])
+    with Process(argv, env=both[0].agent.env, name="lamp.py") as process:
+        process.wait_for("active on", LONG)
+        both[1].wait_topic("/lamp/parameter_descriptions")
+        yield both
+
+
+def change(client: Process, **values: object) -> Event:
+    since = client.mark_events()
+    client.tell(json.dumps(values))
+    return client.wait_event("configured", LONG, since=since)
+
+
+def rmpa_of(module: Module, *words: str) -> str:
+    code, out = module.agent.rmpa(*words)
+    assert code == 0, out
+    return out
+
+
+@pytest.mark.netns
+@pytest.mark.skipif(bool(lacks("dynamic_reconfigure")), reason=lacks("dynamic_reconfigure") or "it is there")
+def test_dynamic_reconfigure_works_from_another_module(pair: list[Module]) -> None:
+    robot, pc = pair
+    client = pc.ros.rospy("configurer", name="far", commands=True)
+    up = client.wait_event("up", LONG)
+    assert up["servers"] == ["/lamp"]
+    first = {"level": 1.0, "steps": 3, "on": True, "colour": "white", "profile": "", "context": ""}
+    assert up["config"] == first
+    described: Any = {each["name"]: each for each in up["descriptions"]}  # type: ignore[attr-defined] # JSON
+    assert (described["level"]["min"], described["level"]["max"], described["level"]["type"]) == (0.0, 10.0, "double")
+    assert described["level"]["description"] == "of the supply [V]"
+    assert "'value': 'blue'" in described["colour"]["edit_method"]
+    for name, each in described.items():  # what rqt_reconfigure's editors look up when they are opened
+        if each["edit_method"]:
+            values = [item["value"] for item in ast.literal_eval(each["edit_method"])["enum"]]
+            assert each["default"] in values, name
+            assert first[name] in values, name
+        elif each["type"] == "int":  # a slider's ends have 32 bits
+            assert -(2**31) <= int(each["min"]) < int(each["max"]) < 2**31, name
+
+    since = client.mark_events()
+    done = change(client, level=99, steps="7", on="false", colour="BLUE", profile="fast")
+    now = {"level": 10.0, "steps": 7, "on": False, "colour": "blue", "profile": "fast", "context": ""}
+    assert done["answer"] == now, done
+    update = client.wait_event("update", LONG, since=since)
+    assert update["config"] == now  # all of it at once
+    eventually(lambda: robot.ros.tool("rosparam", "get", "/lamp/colour").strip() == "blue", what="the mirror")
+    assert robot.ros.tool("rostopic", "echo", "-n1", "/lamp/profile").splitlines()[0] == 'data: "fast"'
+
+    for wrong in ({"profile": "fsat"}, {"colour": "pink"}, {"profile": "broken", "level": 1}, {"context": "home"}):
+        refused = change(client, **wrong)
+        assert "service call failed" in str(refused["error"]), wrong
+    assert change(client)["answer"] == now
+    assert change(client, profile="automatic", context="away")["answer"] == now | {"profile": "", "context": "away"}
+    client.end()
+
+    for module in pair:  # the command-line tool, near and far
+        module.ros.tool(PYTHON, DYNPARAM, "set", "/lamp", "level", "2.5")
+        assert "'level': 2.5" in module.ros.tool(PYTHON, DYNPARAM, "get", "/lamp")
+        module.ros.tool(PYTHON, DYNPARAM, "set", "/lamp", "{'level': 3, 'colour': 'white'}")
+    said = pc.ros.tool("rosservice", "call", "/lamp/set_parameters", "config: {doubles: [{name: level, value: 4}]}")
+    assert "value: 4.0" in said
+
+
+@pytest.mark.netns
+@pytest.mark.skipif(bool(lacks("dynamic_reconfigure")), reason=lacks("dynamic_reconfigure") or "it is there")
+def test_rmpa_sees_and_sets_it_from_another_module(pair: list[Module]) -> None:
+    robot, pc = pair
+    far = f"{robot.name}:/lamp"
+    (listed,) = json.loads(rmpa_of(pc, "resource", "list", "--json"))
+    assert (listed["name"], listed["peer"], listed["profile"]) == ("/lamp", robot.name, "slow")
+    info = rmpa_of(pc, "resource", "info", far)
+    assert f"Node: /lamp of peer {robot.name}" in info
+    assert "Health: OK: profile slow" in info
+    assert rmpa_of(pc, "profile", "set", far, "fast") == ""
+    assert rmpa_of(robot, "profile", "get").strip() == rmpa_of(pc, "profile", "get", "/lamp").strip() == "fast"
+    code, out = pc.agent.rmpa("profile", "set", far, "broken")
+    assert code == 1
+    assert "profile broken: it could not be applied: OSError: no such bulb; what was chosen before stays" in out
+    code, out = pc.agent.rmpa("context", "set", far, "hoem")
+    assert code == 2
+    rmpa_of(pc, "profile", "set", far, "--auto")
+
+    # A rule over a topic of another module and a parameter.
+    rmpa_of(pc, "context", "set", far, "away")
+    assert rmpa_of(robot, "context", "get").strip() == "away"
+    rmpa_of(pc, "context", "set", far, "--auto")
+    pc.ros.start("rostopic", "pub", "-l", "/battery/charging", "std_msgs/Bool", "true")
+    robot.ros.tool(PYTHON, DYNPARAM, "set", "/lamp", "level", "5")
+    eventually(lambda: rmpa_of(robot, "context", "get").strip() == "docked", LONG, what="the rule to hold")
+    assert "context docked" in rmpa_of(pc, "profile", "explain", far)
+    assert rmpa_of(pc, "profile", "get", far).strip() == "fast"
+    alarms = json.loads(rmpa_of(pc, "alarm", "list", "--all", "--json"))
+    assert [(one["resource"], one["peer"]) for one in alarms] == [("/lamp", robot.name)]
+    code, out = pc.agent.rmpa("resource", "info", f"{robot.name}:/lmap")
+    assert code == 1
+    assert f"did you mean {far}?" in out

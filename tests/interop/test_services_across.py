@@ -1,25 +1,28 @@
-"""Services of one module, called by unmodified clients of another: as under one master, with clear errors."""
+"""Services between modules, and real clients and servers at our own."""
 
 from __future__ import annotations
 
+import asyncio
 import signal
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from lab.bed.processes import CommandFailed, eventually
+from rmpa.core.errors import RmpaError
+from rmpa.ros.types.installed import ServiceType
 from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
     from lab.bed.namespaces import Lab
     from lab.bed.processes import Event, Process
+    from rmpa.ros.node.node import Node
     from tests.interop.conftest import ModuleFactory, ShellFactory
     from tests.interop.modules import Module
     from tests.interop.ros import Ros
 
-pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
-
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 CLIENTS = ["rospy", "roscpp"]
 LARGE = 5_000_000
 _SWITCH = """
@@ -63,6 +66,7 @@ def _wait_services(ros: Ros, *services: str, there: bool = True) -> None:
     eventually(seen, what=f"{services} {'in' if there else 'out of'} {ros.host.name}")
 
 
+@pytest.mark.netns
 def test_calls_of_both_libraries_to_both_libraries(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     for kind in CLIENTS:
@@ -88,6 +92,7 @@ def test_calls_of_both_libraries_to_both_libraries(modules: ModuleFactory) -> No
             caller.end()
 
 
+@pytest.mark.netns
 def test_a_server_that_is_killed_in_the_middle_of_a_call(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     worker = _worker(a, "rospy", "/work")
@@ -111,6 +116,7 @@ def test_a_server_that_is_killed_in_the_middle_of_a_call(modules: ModuleFactory)
     assert _calls(caller, "echo 0 10 2 persistent")["same"] == 2
 
 
+@pytest.mark.netns
 def test_a_killed_server_is_gone_everywhere_within_a_second(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     worker = _worker(a, "roscpp", "/work")
@@ -129,6 +135,7 @@ def test_a_killed_server_is_gone_everywhere_within_a_second(modules: ModuleFacto
     assert gone - began < 4.0, "1 s, and what a shared machine adds"
 
 
+@pytest.mark.netns
 def test_a_server_that_hangs_costs_one_deadline(modules: ModuleFactory) -> None:
     config = "[services]\ntimeout = 10\n[[service]]\nnames = ['/slow/**']\ntimeout = '1 s'\n"
     a, b = modules("a", "b", config=config)
@@ -146,6 +153,7 @@ def test_a_server_that_hangs_costs_one_deadline(modules: ModuleFactory) -> None:
     assert _calls(caller, "echo 0 10 2 once")["same"] == 2
 
 
+@pytest.mark.netns
 def test_a_lost_link_fails_calls_and_its_return_restores_services(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     worker = _worker(a, "rospy", "/work", quiet=False)
@@ -168,6 +176,7 @@ def test_a_lost_link_fails_calls_and_its_return_restores_services(modules: Modul
     _wait_services(b.ros, "/work", there=False)
 
 
+@pytest.mark.netns
 def test_the_stock_tools_say_what_they_say_under_one_roscore(
     modules: ModuleFactory, shell: ShellFactory, lab: Lab
 ) -> None:
@@ -204,6 +213,7 @@ def test_the_stock_tools_say_what_they_say_under_one_roscore(
     assert mesh == one
 
 
+@pytest.mark.netns
 def test_whose_service_is_shown_and_which_stay_home(modules: ModuleFactory) -> None:
     config = "[services]\ndeny = ['/secret']\n"
     a, b, c = modules("a", "b", "c", config=config)
@@ -228,6 +238,7 @@ def test_whose_service_is_shown_and_which_stay_home(modules: ModuleFactory) -> N
     )
 
 
+@pytest.mark.netns
 def test_another_release_of_the_type_is_refused_on_both_sides(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     _worker(a, "rospy", "/work")
@@ -240,3 +251,54 @@ def test_another_release_of_the_type_is_refused_on_both_sides(modules: ModuleFac
     b.agent.process.wait_for(r"! .*/work.*md5sum")
     good = _caller(b, "roscpp", "/work")
     assert _calls(good, "echo 0 10 1 once")["same"] == 1
+
+
+libraries = pytest.mark.parametrize("library", ["rospy", "roscpp"])
+WORK = ServiceType("rmpa_test/Work", "string op\nfloat64 seconds\nuint8[] data\n---\nstring text\nuint8[] data\n")
+DEADLINE = 40.0
+
+
+async def work(request: Any) -> Any:
+    """What the workers do."""
+    if request.op == "fail":
+        raise RmpaError("the gripper is jammed")
+    if request.op == "sleep":
+        await asyncio.sleep(request.seconds)
+    response = WORK.response.make({"text": request.op})
+    response.data = request.data
+    return response
+
+
+async def order(caller: Process, words: str) -> dict[str, Any]:
+    """Make a caller call, and return the outcome."""
+    since = caller.mark_events()
+    caller.tell(words)
+    return dict(await caller.expect_event("done", DEADLINE, since=since))
+
+
+@pytest.mark.trap(24, 25, 26)
+@libraries
+async def test_real_clients_call_our_service(node: Node, ros: Ros, library: str) -> None:
+    service = await node.advertise_service("/work", WORK, work, timeout=1.0)
+    start = ros.rospy if library == "rospy" else ros.roscpp
+    caller = start("caller", commands=True, wait=True)
+    await caller.expect_event("there", DEADLINE)
+    for how, size, count in (("once", 100, 50), ("persistent", 100, 50), ("once", 5_000_000, 2)):
+        done = await order(caller, f"echo 0 {size} {count} {how}")
+        assert (done["ok"], done["same"]) == (count, count), how
+    done = await order(caller, "sleep 0.5 100 12 parallel")
+    assert done["same"] == 12
+    assert done["took"] < 3, "concurrent calls wait for each other"
+    failed, late = await order(caller, "fail 0 100 1 persistent"), await order(caller, "sleep 9 100 1 once")
+    assert failed["ok"] == late["ok"] == 0
+    if library == "rospy":
+        assert "the gripper is jammed" in failed["errors"][0]
+        assert "service [/work] did not answer within 1 s" in late["errors"][0]
+        other = ros.rospy("caller", "__name:=other", commands=True, other_release=True)
+        await other.expect_event("up", DEADLINE)
+        refused = await order(other, "echo 0 100 1 once")
+        assert "wants service /work to have md5sum [ffff" in refused["errors"][0]
+    await service.close()
+    gone = await order(caller, "echo 0 100 1 once")
+    assert gone["ok"] == 0
+    assert len(service.endpoint._clients) == 0

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.bed.processes import CommandFailed, eventually
+from lab.bed.processes import eventually
 from tests.interop.modules import Module
 from tests.interop.ros import PYTHON
 from tests.interop.transports import reload
@@ -25,18 +25,6 @@ pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 AUTO = '[services]\ntransport = "auto"\n'
 CLIENTS = ["rospy", "roscpp"]
-SWITCH = """
-import rospy
-from std_srvs.srv import SetBool
-def switch(request):
-    if not request.data:
-        raise rospy.ServiceException("it sticks")
-    return True, "on"
-rospy.init_node("switch")
-service = rospy.Service("/switch", SetBool, switch)
-print("up", flush=True)
-rospy.spin()
-"""
 
 
 def on_network(*modules: Module) -> None:
@@ -141,21 +129,6 @@ def test_the_graph_does_not_change(modules: ModuleFactory) -> None:
     assert "direct for b" in a.agent.rmpa("service", "info", "/work")[1]
     assert calls(client, "echo 0 10 2 once")["same"] == 2
     assert known(b)["calls"] == 0
-
-
-def test_the_stock_tools_call_directly_too(modules: ModuleFactory) -> None:
-    a, b = modules("a", "b", config=AUTO)
-    on_network(a, b)
-    a.ros.start(PYTHON, "-c", SWITCH).wait_for("up")
-    wait_transport(b, "direct", service="/switch")
-    assert "Node: /rmpa/a/switch" in b.ros.tool("rosservice", "info", "/switch")
-    assert "success: True" in b.ros.tool("rosservice", "call", "/switch", "true")
-    assert known(b, "/switch")["calls"] == 0
-    with pytest.raises(CommandFailed, match="it sticks"):
-        b.ros.tool("rosservice", "call", "/switch", "false")
-    code, output = b.agent.rmpa("service", "call", "/switch", "data: true")
-    assert (code, "success: True" in output) == (0, True), output
-    assert known(b, "/switch")["calls"] == 1, "rmpa's own calls go by the agents, which measure them"
 
 
 def test_a_server_that_restarts_on_another_port_is_found_again(modules: ModuleFactory) -> None:
@@ -281,22 +254,6 @@ def test_the_transport_follows_the_rules_of_both_modules(modules: ModuleFactory)
     assert "[name" in b.agent.rmpa("why", "/robot/work")[1] or "(name)" in b.agent.rmpa("why", "/robot/work")[1]
 
 
-def test_nodes_that_are_bound_to_loopback_are_relayed(modules: ModuleFactory) -> None:
-    a, b = modules("a", "b", config='[services]\ntransport = "direct"\n')
-    worker(a)  # listens at 127.0.0.1
-    info = wait_transport(b, "relay", "listening")
-    assert "loopback" in str(info["relayed_because"])
-    a.agent.process.wait_for('although transport is "direct".*loopback')
-    b.agent.process.wait_for('although transport is "direct".*loopback')
-    on_network(a, b)
-    worker(a, "roscpp", "/there")
-    wait_transport(b, "direct", service="/there")
-    local = caller_at_loopback(b)
-    assert calls(local, "echo 0 10 3 once")["same"] == 3
-    assert known(b)["calls"] == 3
-    assert lookup(b, "/local", "/there").startswith("rosrpc://127.")
-
-
 @pytest.mark.parametrize("kind", CLIENTS)
 def test_a_port_that_a_firewall_closes_is_relayed_soon(modules: ModuleFactory, kind: str) -> None:
     a, b = modules("a", "b", config=AUTO)
@@ -332,17 +289,3 @@ def test_a_roscore_answers_all_nodes_alike_so_its_module_is_relayed(
     assert calls(caller(a, "rospy", "/mine"), "echo 0 10 2 once")["same"] == 2
     assert calls(caller(b), "echo 0 10 2 once")["same"] == 2
     assert (known(a, "/mine")["calls"], known(b)["calls"]) == (0, 2)
-
-
-def test_modules_of_one_machine_call_over_loopback(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:
-    host = lab.host("both")
-    a = Module(host, agent(host, name="a", config=AUTO, core_port=11311), shell(host, port=11311))
-    b = Module(host, agent(host, name="b", config=AUTO, core_port=11411), shell(host, port=11411))
-    a.agent.wait_peer("b")
-    worker(a)  # at 127.0.0.1
-    info = wait_transport(b, "direct")
-    assert str(info["address"]).startswith("rosrpc://127.0.0.1:")
-    client = caller(b)
-    for how in ("once", "persistent", "parallel"):
-        assert calls(client, f"echo 0 1000 4 {how}")["same"] == 4
-    assert known(b)["calls"] == 0

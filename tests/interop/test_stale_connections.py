@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from rmpa.runtime.kernel_tcp import connections, end_connections, may_end_connections
-from tests.interop.test_probe import publisher_at
+from tests.interop.test_core_nodes import publisher_at
 from tests.interop.test_realtime import Prefixed, runs
-from tests.interop.test_service_nodes import core, ros
 from tests.ros.node.peers import RawSubscriber
 
 if TYPE_CHECKING:
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from tests.interop.conftest import AgentFactory
     from tests.interop.ros import Ros
 
-__all__ = ["core", "ros"]
 
 WITHOUT_NET_ADMIN: Final = ("setpriv", "--bounding-set=-net_admin")
 DEADLINE: Final = 60.0

@@ -7,72 +7,29 @@ import json
 import os
 import signal
 import socket
-import struct
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.rpc import call_api
-from rmpa.ros.node.node import Node
 from rmpa.ros.node.publication import AcceptedConnection, Publication, PublicationEvents
 from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.types.definitions import known_types
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import frame_message
-from tests.interop.nodes.payload import Pattern, Tally
+from tests.interop.conftest import framed, until
+from tests.interop.nodes.payload import Pattern
 from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
     from lab.bed.processes import Process
-    from rmpa.ros.node.node import Publisher, Received
-    from tests.interop.conftest import ShellFactory
+    from rmpa.ros.core.embedded import RosCore
+    from rmpa.ros.node.node import Node, Publisher, Received
     from tests.interop.ros import Ros
 
 pytestmark = pytest.mark.ros
 libraries = pytest.mark.parametrize("library", ["rospy", "roscpp"])
 BYTES = "std_msgs/UInt8MultiArray"
 DEADLINE = 40.0
-EMPTY_LAYOUT = bytes(8)  # no dimensions, offset 0
-
-
-def framed(payload: bytes) -> bytes:
-    """A std_msgs/UInt8MultiArray as raw bytes."""
-    return EMPTY_LAYOUT + struct.pack("<I", len(payload)) + payload
-
-
-def content(received: Received) -> bytes:
-    """The bytes in a std_msgs/UInt8MultiArray of ours or of the real nodes."""
-    message = received.message
-    return bytes(message.data)
-
-
-@pytest.fixture
-async def core() -> AsyncIterator[RosCore]:
-    made = RosCore("127.0.0.1", 0)
-    await made.start()
-    yield made
-    await made.close()
-
-
-@pytest.fixture
-async def node(core: RosCore) -> AsyncIterator[Node]:
-    async with Node("ours", master_uri=core.uri, environment=RosEnvironment()) as made:
-        yield made
-
-
-@pytest.fixture
-def ros(core: RosCore, shell: ShellFactory) -> Ros:
-    return shell(port=core.port)
-
-
-async def until(condition: Any) -> None:
-    async with asyncio.timeout(DEADLINE):
-        while not condition():
-            await asyncio.sleep(0.005)
 
 
 async def event(process: Process, name: str) -> dict[str, Any]:
@@ -95,34 +52,6 @@ async def send(publisher: Publisher, count: int, size: int, rate: float) -> None
         await asyncio.sleep(max(0.0, due - loop.time()))
 
 
-@libraries
-@pytest.mark.parametrize(("count", "size", "rate"), [(1000, 64, 1000), (30, 1_000_000, 30)])
-async def test_a_real_listener_gets_every_byte(
-    node: Node, ros: Ros, library: str, count: int, size: int, rate: float
-) -> None:
-    publisher = await node.advertise("/chatter", BYTES)
-    listener = ros.node(library, "listener", count=count)
-    await asyncio.wait_for(publisher.wait_for_subscriber(), DEADLINE)
-    await send(publisher, count, size, rate)
-    report = await event(listener, "done")
-    assert (report["count"], report["bad"], report["gaps"], report["doubled"]) == (count, 0, 0, 0)
-    assert report["bytes"] == count * size
-    assert publisher.publication.dropped == 0
-
-
-@libraries
-@pytest.mark.parametrize(("count", "size", "rate"), [(1000, 64, 1000), (30, 1_000_000, 30)])
-async def test_a_real_talker_is_heard_to_the_byte(
-    node: Node, ros: Ros, library: str, count: int, size: int, rate: int
-) -> None:
-    tally = Tally()
-    await node.subscribe("/chatter", BYTES, lambda received: tally.take(content(received)))
-    ros.node(library, "talker", count=count, size=size, rate=rate, wait=1)
-    await until(lambda: tally.count >= count)
-    report = tally.report()
-    assert (report["count"], report["bad"], report["gaps"], report["doubled"]) == (count, 0, 0, 0)
-
-
 @pytest.mark.trap(2)
 @libraries
 async def test_the_real_talkers_own_definition_is_handed_on(node: Node, ros: Ros, library: str) -> None:
@@ -136,31 +65,6 @@ async def test_the_real_talkers_own_definition_is_handed_on(node: Node, ros: Ros
     # genmsg for C++ ends the text with one more newline than genpy; the bytes of the publisher are what counts.
     assert header["message_definition"].rstrip("\n") == kind.definition.rstrip("\n")
     assert got[0].kind.md5sum == kind.md5sum
-
-
-@pytest.mark.trap(10)
-@libraries
-async def test_trap_10_a_real_latched_message_reaches_us_late(node: Node, ros: Ros, library: str) -> None:
-    talker = ros.node(library, "talker", count=1, latch=True)
-    await event(talker, "done")
-    got: list[Received] = []
-    await node.subscribe("/chatter", BYTES, got.append)
-    await until(lambda: got)
-    assert got[0].header["latching"] == "1"
-
-
-@pytest.mark.trap(10)
-@libraries
-async def test_trap_10_our_latched_message_reaches_each_listener_once(node: Node, ros: Ros, library: str) -> None:
-    publisher = await node.advertise("/chatter", BYTES, latch=True)
-    await send(publisher, 3, 64, 1000)
-    first = ros.node(library, "listener")
-    assert (await event(first, "first"))["last"] == 3
-    second = ros.node(library, "listener", count=2)
-    assert (await event(second, "first"))["last"] == 3
-    publisher.publish_raw(framed(Pattern(64).payload(1, 4)))
-    report = await event(second, "done")
-    assert (report["count"], report["last"], report["doubled"], report["gaps"]) == (2, 4, 0, 0)
 
 
 @pytest.mark.trap(9)
@@ -202,19 +106,6 @@ async def test_trap_2_rosbag_records_our_definition_byte_for_byte(node: Node, ro
     recorded, real, md5, axes = json.loads(await tool(ros, PYTHON, "-c", program, str(bag)))
     assert recorded == real == MessageType("sensor_msgs/Joy").definition
     assert (md5, axes) == (MessageType("sensor_msgs/Joy").md5sum, [0.5])
-
-
-@pytest.mark.trap(5)
-@libraries
-async def test_trap_5_a_listener_of_another_type_is_refused(node: Node, ros: Ros, library: str) -> None:
-    publisher = await node.advertise("/chatter", "std_msgs/Int32", latch=True)
-    publisher.publish(publisher.make(7))
-    listener = ros.node(library, "listener", name="wrong")
-    await until(lambda: publisher.refusals)
-    assert "client [/wrong] wants topic /chatter to have type/md5sum" in publisher.refusals["/wrong"]
-    assert publisher.subscribers == 0
-    assert listener.returncode is None
-    assert not listener.events("first")
 
 
 @pytest.mark.trap(15, 38)
@@ -286,39 +177,6 @@ async def test_a_listener_that_was_stopped_finds_a_topic_that_was_gone_meanwhile
         await publisher.close()
 
 
-@libraries
-async def test_a_killed_talker_is_heard_again_when_it_is_back(node: Node, ros: Ros, library: str) -> None:
-    got: list[Received] = []
-    subscriber = await node.subscribe("/chatter", BYTES, got.append)
-    talker = ros.node(library, "talker", name="talker", rate=100)
-    await until(lambda: len(got) > 10)
-    talker.kill()
-    await until(lambda: subscriber.publishers == 0)
-    before = len(got)
-    ros.node(library, "talker", name="talker", rate=100)
-    await until(lambda: len(got) > before + 10)
-    assert subscriber.publishers == 1
-
-
-@pytest.mark.trap(19)
-@libraries
-async def test_trap_19_a_stopped_listener_delays_nobody(node: Node, ros: Ros, library: str) -> None:
-    publisher = await node.advertise("/chatter", BYTES, queue_messages=5)
-    slow = ros.node(library, "listener", name="slow")
-    fast = ros.node(library, "listener", name="fast", count=60)
-    await until(lambda: publisher.subscribers == 2)
-    os.kill(slow.pid, signal.SIGSTOP)
-    try:
-        await send(publisher, 60, 1_000_000, 25)  # which a busy machine reads as it comes
-        report = await event(fast, "done")
-    finally:
-        os.kill(slow.pid, signal.SIGCONT)
-    assert (report["count"], report["bad"], report["gaps"]) == (60, 0, 0)
-    drops = {c.other: c.dropped for c in publisher.publication.connections()}
-    assert drops["/slow"] > 0
-    assert drops["/fast"] == 0
-
-
 @pytest.mark.trap(11)
 @libraries
 async def test_trap_11_a_silent_connection_hurts_no_real_listener(node: Node, ros: Ros, library: str) -> None:
@@ -344,47 +202,6 @@ async def test_trap_21_requestTopic_answers_as_rospy_does(node: Node, ros: Ros, 
     assert [type(part) for part in theirs.value] == [type(part) for part in own.value]
     assert theirs.value[:2] == own.value[:2]
     assert (await call_api(node.uri, "requestTopic", "/x", "/other", [["TCPROS"]])).code == -1
-
-
-async def test_the_stock_tools_show_our_node(node: Node, ros: Ros) -> None:
-    publisher = await node.advertise("/chatter", BYTES)
-    ros.roscpp("listener", name="listener")
-    await asyncio.wait_for(publisher.wait_for_subscriber(), DEADLINE)
-    output = await tool(ros, "rosnode", "info", "/ours")
-    assert "* topic: /chatter" in output
-    assert "* to: /listener" in output
-    assert f"Pid: {os.getpid()}" in output
-    assert "/ours" in await tool(ros, "rosnode", "list")
-
-
-async def test_rosnode_kill_ends_our_node(core: RosCore, ros: Ros) -> None:
-    async with Node("victim", master_uri=core.uri, environment=RosEnvironment()) as victim:
-        await victim.advertise("/t", BYTES)
-        await tool(ros, "rosnode", "kill", "/victim")
-        await asyncio.wait_for(victim.stopped.wait(), DEADLINE)
-        await victim.close()
-        assert "/t" not in core.state().publishers
-
-
-async def test_definitions_and_sums_match_the_installed_packages(ros: Ros) -> None:
-    program = (
-        "import glob, importlib, json\n"
-        "found = {}\n"
-        "for path in glob.glob('/usr/lib/python3/dist-packages/*/msg/__init__.py'):\n"
-        "    for value in vars(importlib.import_module(path.split('/')[-3] + '.msg')).values():\n"
-        "        if hasattr(value, '_full_text'):\n"
-        "            found[value._type] = [value._md5sum, value._full_text]\n"
-        "print(json.dumps(found))\n"
-    )
-    real = json.loads(await tool(ros, PYTHON, "-c", program))
-    compared = 0
-    for name in real.keys() & set(known_types()):
-        kind = MessageType(name)
-        assert [kind.md5sum, kind.definition] == real[name], name
-        compared += 1
-    assert compared > 80
-    for name, (md5, text) in real.items():
-        assert MessageType.learn(name, text, md5).md5sum == md5
 
 
 async def test_our_bytes_are_what_rospy_writes_and_reads(ros: Ros) -> None:

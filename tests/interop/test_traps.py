@@ -6,7 +6,6 @@ import asyncio
 import itertools
 import logging
 import signal
-import struct
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -29,13 +28,14 @@ from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import encode_header, frame_message, subscriber_header
+from tests.interop.conftest import framed, until
 from tests.interop.modules import flows, whole
 from tests.interop.nodes.payload import Pattern
 from tests.interop.ros import PYTHON
 from tests.ros.node.peers import RawSubscriber
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator
 
     from lab.bed.agents import Agent
     from lab.bed.processes import Process
@@ -50,24 +50,6 @@ BYTES = "std_msgs/UInt8MultiArray"
 DEADLINE = 40.0
 
 
-def framed(payload: bytes) -> bytes:
-    """A std_msgs/UInt8MultiArray as raw bytes."""
-    return bytes(8) + struct.pack("<I", len(payload)) + payload
-
-
-@pytest.fixture
-async def core() -> AsyncIterator[RosCore]:
-    made = RosCore("127.0.0.1", 0)
-    await made.start()
-    yield made
-    await made.close()
-
-
-@pytest.fixture
-def ros(core: RosCore, shell: ShellFactory) -> Ros:
-    return shell(port=core.port)
-
-
 @pytest.fixture
 async def closing(core: RosCore) -> AsyncIterator[AsyncExitStack]:
     async with AsyncExitStack() as stack:
@@ -77,12 +59,6 @@ async def closing(core: RosCore) -> AsyncIterator[AsyncExitStack]:
 def node(name: str, core: RosCore | Agent) -> Node:
     uri = core.uri if isinstance(core, RosCore) else f"http://127.0.0.1:{core.core_port}/"
     return Node(name, master_uri=uri, environment=RosEnvironment())
-
-
-async def until(condition: Callable[[], object]) -> None:
-    async with asyncio.timeout(DEADLINE):
-        while not condition():
-            await asyncio.sleep(0.005)
 
 
 # --- at one core ----------------------------------------------------------------------------------------------
@@ -377,17 +353,6 @@ def test_an_early_subscriber_loses_nothing(two: Two, library: str) -> None:
     two.at_a.node(library, "talker", "__name:=other", topic="/other", rate=20)
     assert anything.wait() == 0
     assert "layout:" in anything.output
-
-
-@pytest.mark.trap(38)
-def test_an_early_listener_of_another_type_is_refused_at_both_ends(two: Two) -> None:
-    wrong = two.at_b.rospy("listener", "__name:=wrong", topic="/mixed")
-    wrong.wait_event("up")
-    two.at_a.rospy("talker", "__name:=speaker", topic="/mixed", type="String", rate=50)
-    for side in (two.a, two.b):
-        side.process.wait_for("(?i)warning.*/wrong.*/mixed.*type/md5sum")
-    assert wrong.events("first") == []
-    assert wrong.returncode is None
 
 
 @pytest.mark.trap(17, 39)

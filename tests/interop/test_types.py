@@ -1,4 +1,4 @@
-"""Types of a user's own packages: built on the robot alone, and used by a computer that does not have them."""
+"""Types: definitions of all kinds, and releases that differ."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from lab.bed.agents import RMPA
-from lab.bed.processes import run
+from lab.bed.processes import eventually, run
 from rmpa.ros.types.definitions import known_text
 from rmpa.ros.types.find import find_message_type, find_service_type
-from tests.interop.ros import NODES, PYTHON
+from tests.interop.modules import flows
+from tests.interop.ros import NODES, PYTHON, lacks
 from tests.ros.types.genmsg_cases import MESSAGES, SERVICES, VALUES, VALUES_OF
 from tests.ros.types.workspaces import package
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from lab.bed.processes import Process
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
-
 LONG: Final = 40.0
 PACKAGES: Final = "/usr/lib/python3/dist-packages"
 GENPY: Final = "/usr/lib/genpy/genmsg_py.py"
@@ -129,3 +130,87 @@ def test_types_of_the_robot_work_without_its_package(modules: ModuleFactory, tmp
         argv = (RMPA, "topic", "pub", topic, "my_msgs/Path", said, "--master", robot.ros.uri)
         robot.ros.start(*argv, env=robot.agent.env | {known: env[known]})
         hears(robot, topic, "x: 1.5\n +name: .dock", env)
+
+
+TOPIC = "/mixed"
+
+
+def loud(module: Module, diagnostics: Process, wanted: str) -> None:
+    """Fail unless a module says it in its log, in ``rmpa topic info`` and in /diagnostics."""
+    module.agent.process.wait_for(rf"(?i)(warning|error).*{TOPIC}.*{wanted}")
+    eventually(lambda: mismatches(module), what=f"a mismatch of {TOPIC} at {module.name}")
+    assert wanted in " ".join(mismatches(module))
+    code, shown = module.agent.rmpa("topic", "info", TOPIC)
+    assert code == 0
+    assert wanted in shown
+    diagnostics.wait_for(rf"message: .*{wanted}", since=max(0, diagnostics.mark() - 1))
+
+
+def mismatches(module: Module) -> list[str]:
+    """What ``rmpa topic info`` says does not fit."""
+    code, output = module.agent.rmpa("topic", "info", TOPIC, "--json")
+    assert code == 0, output
+    found: list[str] = json.loads(output)["mesh"]["mismatches"]
+    return found
+
+
+def mended(module: Module) -> None:
+    """Wait until the mismatch is no longer reported."""
+    eventually(lambda: not mismatches(module), what=f"nothing wrong at {module.name}")
+
+
+def diagnostics(module: Module) -> Process:
+    """/diagnostics as the stock tool prints it."""
+    return module.ros.start("rostopic", "echo", "/diagnostics", name="diagnostics")
+
+
+@pytest.mark.netns
+@pytest.mark.skipif(bool(lacks("diagnostic_msgs")), reason=lacks("diagnostic_msgs"))
+@pytest.mark.trap(1)
+@pytest.mark.parametrize("kind", ["rospy", "roscpp"])
+def test_another_md5_is_refused_at_both_ends(modules: ModuleFactory, kind: str) -> None:
+    a, b = modules("a", "b")
+    steady = b.ros.roscpp("listener", topic="/steady")
+    a.ros.roscpp("talker", topic="/steady", rate=100, wait=1)
+    a.ros.rospy("talker", topic=TOPIC, rate=50, another_md5=True, name="speaker")
+    tells = [diagnostics(module) for module in (a, b)]
+    b.wait_topic(TOPIC)
+    heard = b.ros.node(kind, "listener", topic=TOPIC, name="wrong")
+    heard.wait_event("up")
+    for module, told in zip((a, b), tells, strict=True):
+        loud(module, told, "md5sum")
+    assert heard.events("first") == []
+    # The listener leaves: nothing is wrong any more, at either end, and no other topic has noticed.
+    heard.interrupt()
+    for module in (a, b):
+        mended(module)
+    report = flows(steady, 50)
+    assert (report["gaps"], report["doubled"], report["bad"]) == (0, 0, 0)
+
+
+@pytest.mark.netns
+@pytest.mark.skipif(bool(lacks("diagnostic_msgs")), reason=lacks("diagnostic_msgs"))
+def test_another_type_is_refused_at_both_ends(modules: ModuleFactory) -> None:
+    a, b = modules("a", "b")
+    steady = b.ros.roscpp("listener", topic="/steady")
+    a.ros.roscpp("talker", topic="/steady", rate=100, wait=1)
+    at_home = b.ros.rospy("talker", topic=TOPIC, rate=50, type="String", name="texts")
+    heard = b.ros.rospy("listener", topic=TOPIC, type="String")
+    heard.wait_event("text")
+    a.ros.roscpp("talker", topic=TOPIC, rate=50, name="bytes")
+    tells = [diagnostics(module) for module in (a, b)]
+    for module, told in zip((a, b), tells, strict=True):
+        loud(module, told, "std_msgs/String")
+    # The local topic is what it was: its type, its publishers, its messages.
+    assert b.ros.tool("rostopic", "type", TOPIC).strip() == "std_msgs/String"
+    assert "/rmpa/a/bytes" not in b.ros.tool("rostopic", "info", TOPIC)
+    heard.wait_event("text", since=heard.mark_events())
+    # The local publisher leaves: the remote one takes its place, and nothing is wrong any more.
+    heard.interrupt()
+    at_home.interrupt()
+    eventually(lambda: "/rmpa/a/bytes" in b.ros.tool("rostopic", "info", TOPIC), what="the remote publisher")
+    flows(b.ros.roscpp("listener", topic=TOPIC), 5)
+    for module in (a, b):
+        mended(module)
+    report = flows(steady, 50)
+    assert (report["gaps"], report["doubled"], report["bad"]) == (0, 0, 0)

@@ -1,12 +1,20 @@
-"""Against samples whose statistics are known: Anscombe's quartet, NIST's reference data, and flows made by hand."""
+"""Statistics: against samples whose figures are known."""
 
 from __future__ import annotations
 
+import io
+import json
 import math
 import random
+from typing import TYPE_CHECKING
 
 import pytest
+from rich.console import Console
 
+from lab import results
+from lab.findings import Claim
+from lab.machine import histogram
+from lab.samples import percentile, summary
 from lab.statistics import (
     Outage,
     Ratio,
@@ -18,6 +26,11 @@ from lab.statistics import (
     ratio,
     spread,
 )
+from lab.tables import dash, size, us
+from lab.usage import Usage, add
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 SECOND = 1_000_000_000
 
@@ -144,3 +157,58 @@ def test_a_thinned_distribution_keeps_its_tail_and_stays_true(tail: bool) -> Non
     assert xs[-400:] == [float(i) for i in range(count - 400 - tail, count - tail)]
     for x, share in zip(xs, shares, strict=True):
         assert share == pytest.approx((count - 1 - x) / count if tail else (x + 1) / count)
+
+
+def test_nearest_rank() -> None:
+    ordered = [float(n) for n in range(1, 101)]
+    assert [percentile(ordered, p) for p in (0, 1, 50, 99, 99.9, 100)] == [1, 1, 50, 99, 100, 100]
+
+
+@pytest.mark.parametrize(("count", "p99", "p999"), [(999, False, False), (1000, True, False), (10_000, True, True)])
+def test_percentiles_need_samples_beyond_them(count: int, p99: bool, p999: bool) -> None:
+    made = summary([1.0] * count)
+    assert (made.p99 is not None, made.p999 is not None) == (p99, p999)
+
+
+def test_loss_is_counted_and_nothing_is_made_of_no_samples() -> None:
+    made = summary([], lost=7)
+    assert (made.count, made.lost, made.p50, made.largest) == (0, 7, None, None)
+
+
+def test_histogram_counts_each_sample_once() -> None:
+    classes = histogram([1.0, 20.0, 20.1, 9_999.0, 1e9])
+    assert sum(classes.values()) == 5
+    assert (classes["≤20"], classes["≤50"], classes[">10000"]) == (2, 1, 1)
+
+
+def test_spans_of_one_process_add_up() -> None:
+    joined = add({"a": Usage(1.0, 2.0, 10)}, {"a": Usage(1.0, 2.0, 30)})
+    assert joined["a"] == Usage(2.0, 4.0, 30)
+    assert joined["a"].percent == 50.0
+
+
+@pytest.mark.parametrize(
+    ("value", "at_least", "reached"),
+    [(0.9, False, True), (1.1, False, False), (1.1, True, True), (0.9, True, False), (None, False, None)],
+)
+def test_a_claim_is_reached_missed_or_unknown(value: float | None, at_least: bool, reached: bool | None) -> None:
+    assert Claim("x", value, 1.0, at_least=at_least).reached is reached
+
+
+def test_a_measurement_ends_with_verdicts_and_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(results, "RESULTS", tmp_path / "results")
+    out = io.StringIO()
+    claims = [Claim("p99", 2.0, 1.0), Claim("share", None, 0.9, at_least=True)]
+    console = Console(file=out, width=200)
+    results.finish(console, "short", {"hz": 1}, {"rows": []}, tmp_path / "copy", claims=claims)
+    assert "p99: 2.00 (to reach: ≤ 1): not reached" in out.getvalue()
+    assert "share: - (to reach: ≥ 0.9): too few samples to say" in out.getvalue()
+    document = json.loads((tmp_path / "copy").read_text())
+    assert [row["reached"] for row in document["result"]["targets"]] == [False, None]
+    assert (document["measurement"], document["settings"]) == ("short", {"hz": 1})
+    assert sorted(path.suffix for path in (tmp_path / "results").iterdir()) == [".json"]
+
+
+def test_numbers_as_text() -> None:
+    assert [us(None), us(12.34), us(1234.5), dash(None), dash(0.954)] == ["-", "12.3", "1234", "-", "0.95"]
+    assert [size(64), size(64 * 1024), size(1024 * 1024)] == ["64 B", "64 KB", "1 MB"]

@@ -1,5 +1,8 @@
+"""Quality, and which profile is decided by it."""
+
 from __future__ import annotations
 
+import contextlib
 import math
 
 import pytest
@@ -9,7 +12,24 @@ from hypothesis import strategies as st
 from rmpa.core.errors import ConfigError
 from rmpa.resource.decision import Decider, ProfileScore
 from rmpa.resource.declare import Profile
-from rmpa.resource.quality import MEASURED, Attribute, Bound, Direction, Scale
+from rmpa.resource.quality import (
+    MEASURED,
+    Attribute,
+    Bound,
+    Direction,
+    QoSRequest,
+    Requirement,
+    Scale,
+    at_least,
+    at_most,
+    between,
+    exactly,
+    merge,
+    parse_bound,
+    parse_request,
+    parse_requirement,
+    quantity,
+)
 from tests.resource.rig import bound
 
 RATE, LATENCY = MEASURED["rate"], MEASURED["latency"]
@@ -217,3 +237,231 @@ def test_worse_profile_within_the_range_changes_nothing(
 def test_ties_go_to_the_one_declared_first(profiles: list[Profile], asked: dict[str, Bound]) -> None:
     twins = [*profiles, *(Profile(f"twin of {p.name}", p.offers) for p in profiles)]
     assert decide(plane(twins), asked).profile == decide(plane(profiles), asked).profile
+
+
+RATE, LATENCY = MEASURED["rate"], MEASURED["latency"]
+ZOOM = Attribute("zoom", Direction.TARGET)
+
+
+@pytest.mark.parametrize(
+    ("text", "to", "value"),
+    [
+        ("20 Hz", "Hz", 20.0),
+        ("0.02 kHz", "Hz", 20.0),
+        ("50ms", "s", 0.05),
+        ("  1e3 µs ", "ms", 1.0),
+        (".5", "m", 0.5),
+        (3, "m", 3.0),
+        ("10 Mbit/s", "B/s", 1_250_000.0),
+        ("5 %", "", 0.05),
+        ("36 km/h", "m/s", 10.0),
+        ("7 widgets", "widgets", 7.0),
+    ],
+)
+def test_quantity_is_converted_to_the_unit(text: str | float, to: str, value: float) -> None:
+    assert quantity(text, to, "rate") == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "to", "said"),
+    [
+        ("fast", "Hz", "not a number with a unit; for example 20 Hz"),
+        ("20 kHzz", "Hz", "'kHzz' is not a unit known here; did you mean kHz?"),
+        ("20 s", "Hz", "'s' is a unit of time; latency is a frequency, in 'Hz'"),
+        ("20 s", "widgets", "'s' is a unit of time; latency is of its own, in 'widgets'"),
+        (True, "Hz", "True is not a number with a unit"),
+        (float("nan"), "Hz", "nan is not a number"),
+        (float("inf"), "Hz", "inf is not a number"),
+        ("1e999", "Hz", "inf is not a number"),
+        ("", "Hz", "'' is not a number"),
+    ],
+)
+def test_invalid_quantity_is_refused(text: str | float, to: str, said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        quantity(text, to, "latency")
+    assert said in str(caught.value)
+
+
+def test_known_units_convert_both_ways() -> None:
+    assert quantity(f"{quantity('33 deg', 'rad', 'x')} rad", "deg", "x") == pytest.approx(33.0)
+
+
+def test_bounds_are_read_with_their_units() -> None:
+    assert bound(RATE, at_least="0.02 kHz") == Bound(low=math.log(20))
+    assert bound(LATENCY, at_most="50 ms", weight=2, hard=True) == Bound(high=math.log(0.05), weight=2, hard=True)
+    assert bound(ZOOM, at_least=1, at_most=3) == Bound(1, 3)
+    assert bound(ZOOM, exactly=2) == Bound(2, 2)
+    assert bound(MODE, at_least="medium") == Bound(low=1)
+    assert bound(FRAME, exactly=("map", "odom")) == Bound(words=frozenset({"map", "odom"}))
+    assert bound(FRAME, exactly="map") == Bound(words=frozenset({"map"}))
+
+
+def test_an_exact_value_where_more_is_better_is_a_lower_bound() -> None:
+    assert bound(RATE, exactly=20) == Bound(low=math.log(20))
+    assert bound(LATENCY, exactly=0.1) == Bound(high=math.log(0.1))
+
+
+@pytest.mark.parametrize(
+    ("attribute", "asked", "said"),
+    [
+        (ZOOM, {"at_least": 3, "at_most": 1}, "the bounds are the wrong way round"),
+        (ZOOM, {}, "nothing is asked of it; give at_least, at_most or exactly"),
+        (ZOOM, {"at_least": 1, "exactly": 2}, "give one or the other"),
+        (ZOOM, {"exactly": ("a",)}, "it takes no such words"),
+        (
+            RATE,
+            {"at_most": 20},
+            "more is better, so a bound on the other side asks for nothing; give at_least (>=) alone",
+        ),
+        (RATE, {"at_least": 5, "at_most": 3}, "the bounds are the wrong way round"),
+        (RATE, {"at_least": 5, "at_most": 20}, "give at_least (>=) alone"),
+        (LATENCY, {"at_least": 20}, "less is better"),
+        (RATE, {"at_least": -5}, "-5 is below 0; rate has a logarithmic scale"),
+        (RATE, {"at_least": "20 s"}, "'s' is a unit of time"),
+        (MODE, {"at_least": "huge"}, "'huge' is no value of mode; it is one of low, medium, high"),
+        (FRAME, {"exactly": "moon"}, "'moon' is no value of frame"),
+        (FRAME, {"at_least": "map"}, "give exactly, one word or more"),
+        (RATE, {"at_least": 5, "weight": 0}, "a weight of 0"),
+        (RATE, {"at_least": 5, "weight": math.nan}, "a weight of nan"),
+    ],
+)
+def test_invalid_request_is_refused(attribute: Attribute, asked: dict[str, object], said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        bound(attribute, **asked)
+    assert said in str(caught.value)
+    assert f"requirement of {attribute.name}" in str(caught.value)
+
+
+def test_intervals_are_intersected() -> None:
+    one = Requirement("a", {"zoom": Bound(1, 5, weight=2)})
+    other = Requirement("b", {"zoom": Bound(3, 9, hard=True), "rate": Bound(low=1)})
+    assert merge([one, other]) == ({"zoom": Bound(3, 5, weight=2, hard=True), "rate": Bound(low=1)}, [])
+    touching = Requirement("c", {"zoom": Bound(5, 7)})
+    assert merge([one, touching]) == ({"zoom": Bound(5, 5, weight=2)}, [])
+
+
+def test_an_empty_intersection_is_resolved_by_priority_and_reported() -> None:
+    low = Requirement("low", {"zoom": Bound(1, 2, weight=9)}, priority=0)
+    high = Requirement("high", {"zoom": Bound(3, 4)}, priority=5)
+    conflict = "low", "zoom: what low asks contradicts high and is left out"
+    assert merge([low, high]) == ({"zoom": Bound(3, 4)}, [conflict])
+
+
+def test_of_equal_priorities_the_earlier_one_stays() -> None:
+    both = [Requirement(name, {"frame": Bound(words=frozenset({name}))}) for name in ("map", "odom")]
+    bounds, conflicts = merge(both)
+    assert bounds["frame"].words == {"map"}
+    assert [client for client, _ in conflicts] == ["odom"]
+
+
+_bounds = st.tuples(st.integers(0, 9), st.integers(0, 9)).map(lambda ends: Bound(min(ends), max(ends)))
+_requirements = st.lists(
+    st.builds(Requirement, st.uuids().map(str), st.dictionaries(st.sampled_from("abc"), _bounds), st.integers(0, 3)),
+    max_size=8,
+)
+
+
+@given(_requirements)
+def test_merge_satisfies_all_but_reported_conflicts(requirements: list[Requirement]) -> None:
+    bounds, conflicts = merge(requirements)
+    told = {(client, text.partition(":")[0]) for client, text in conflicts}
+    for requirement in requirements:
+        for name, asked in requirement.bounds.items():
+            both = bounds[name]
+            assert both.low <= both.high
+            if (requirement.client, name) not in told:
+                assert asked.low <= both.low <= both.high <= asked.high
+
+
+@given(_requirements)
+def test_highest_priority_never_conflicts(requirements: list[Requirement]) -> None:
+    if requirements:
+        highest = max(requirements, key=lambda requirement: requirement.priority)
+        assert highest.client not in dict(merge(requirements)[1])
+
+
+# --- texts
+
+
+@pytest.mark.parametrize(
+    ("text", "wish"),
+    [
+        (">= 20 Hz", at_least("20 Hz")),
+        (">=20Hz hard", at_least("20Hz", hard=True)),
+        ("<= 50 ms hard weight=2", at_most("50 ms", hard=True, weight=2)),
+        ("<= 50 ms weight=2.5  hard ", at_most("50 ms", hard=True, weight=2.5)),
+        ("1 .. 3 m", between("1", "3 m")),
+        ("= map", exactly("map")),
+        ("== map", exactly("map")),
+        ("= map | odom", exactly("map", "odom")),
+    ],
+)
+def test_what_people_write_is_read(text: str, wish: QoSRequest) -> None:
+    assert parse_request(text, "x") == wish
+
+
+WISHES = {
+    "rate": RATE,
+    "latency": LATENCY,
+    "zoom": Attribute("zoom", Direction.TARGET, "m"),
+    "frame": FRAME,
+}
+
+
+def test_an_interval_has_one_unit() -> None:
+    assert parse_bound("1 .. 300 cm", "zoom", WISHES, "camera") == Bound(0.01, 3.0)
+    assert parse_bound("1 m .. 300 cm", "zoom", WISHES, "camera") == Bound(1.0, 3.0)
+    assert parse_bound("1 .. 3", "zoom", WISHES, "camera") == Bound(1.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "said"),
+    [
+        ("rate", "20 Hz", "'20 Hz' is no bound; write"),
+        ("rate", "", "'' is no bound"),
+        ("rate", ">=", "'>=' lacks a value"),
+        ("rate", ">= 20 Hz weight=much", "'weight=much' is no weight"),
+        ("rate", ">= 20 Hz weight=-1", "a weight of -1"),
+        ("rate", ">= 20 m", "'m' is a unit of length"),
+        ("rats", ">= 20 Hz", "camera has no such attribute; did you mean rate?"),
+        ("zoom", "3 .. 1 m", "the bounds are the wrong way round"),
+        ("frame", "= moon", "'moon' is no value of frame"),
+        ("priority", "high", "'high' is no whole number"),
+        ("expires", "-3 s", "'-3 s' is over already"),
+        ("expires", "3 m", "'m' is a unit of length"),
+        ("rate", "x" * 2000, "2000 characters"),
+    ],
+)
+def test_unreadable_requirement_is_refused(key: str, text: str, said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_requirement("/c", [(key, text)], WISHES, "camera", 0.0)
+    assert said in str(caught.value)
+
+
+def test_a_whole_requirement() -> None:
+    asked = [("rate", ">= 20 Hz"), ("priority", " 3 "), ("expires", "1 min"), ("frame", "= map|odom hard")]
+    bounds = {"rate": Bound(low=math.log(20)), "frame": Bound(words=frozenset({"map", "odom"}), hard=True)}
+    assert parse_requirement("/c", asked, WISHES, "camera", 100.0) == Requirement("/c", bounds, 3, 160.0)
+    with pytest.raises(ConfigError, match="it is asked twice"):
+        parse_requirement("/c", [("rate", ">= 1"), ("rate", ">= 2")], WISHES, "camera", 0.0)
+    with pytest.raises(ConfigError, match="more than 256 bounds"):
+        parse_requirement("/c", [("priority", "1")] * 300, WISHES, "camera", 0.0)
+
+
+_wishes = st.one_of(
+    st.builds(at_least, st.sampled_from(["20 Hz", "3"]), hard=st.booleans(), weight=st.sampled_from([1.0, 2.0, 0.5])),
+    st.builds(at_most, st.sampled_from(["20 ms", "3"]), hard=st.booleans()),
+    st.builds(between, st.sampled_from(["1"]), st.sampled_from(["3 m"]), hard=st.booleans()),
+    st.builds(lambda words: exactly(*words), st.lists(st.sampled_from("abc"), min_size=1, max_size=3)),
+)
+
+
+@given(_wishes)
+def test_what_a_wish_shows_is_read_as_the_same(wish: QoSRequest) -> None:
+    assert parse_request(str(wish), "x") == wish
+
+
+@given(st.text(max_size=80))
+def test_no_text_does_worse_than_a_config_error(text: str) -> None:
+    with contextlib.suppress(ConfigError):
+        parse_requirement("/c", [("rate", text), ("zoom", text), ("frame", text)], WISHES, "camera", 0.0)

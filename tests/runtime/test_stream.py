@@ -1,10 +1,11 @@
-"""The stream on a socket pair."""
+"""Streams of messages over real sockets."""
 
 from __future__ import annotations
 
 import asyncio
 import errno
 import logging
+import math
 import socket
 from typing import TYPE_CHECKING
 
@@ -12,10 +13,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from rmpa.bridge.topics.part import STALE_TICK
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import URGENT, Outbox
+from rmpa.runtime import limits
+from rmpa.runtime.loop import AgentLoop
 from rmpa.runtime.stream import LATER, CollectedSends, Stream, after_read
+from rmpa.runtime.tls import Buffer, unsent
 from tests.runtime.message_streams import End
 
 if TYPE_CHECKING:
@@ -355,3 +360,89 @@ async def test_a_read_within_a_read_moves_nothing_that_still_waits(sockets: Sock
     end.stream.close()
     a_far.close()
     b_far.close()
+
+
+PARTS: list[Buffer] = [b"ab", b"", memoryview(b"cde"), bytearray(b"f")]
+WHOLE = b"abcdef"
+
+
+def test_each_cut_leaves_the_rest() -> None:
+    for sent in range(len(WHOLE) + 1):
+        left = unsent(PARTS, sent)
+        assert b"".join(left) == WHOLE[sent:]
+        assert all(len(part) for part in left[1:]) or sent == 0
+
+
+def test_whole_parts_are_not_copied() -> None:
+    assert unsent(PARTS, 2)[-1] is PARTS[-1]
+
+
+async def after(silence: float, tick: float | None) -> float:
+    """Let a stream hear nothing for so long, awake every ``tick`` seconds or not at all; its ``resumed_at``."""
+    near, far = socket.socketpair()
+    near.setblocking(False)
+    heard = asyncio.Event()
+
+    def take(view: memoryview) -> tuple[int, int]:
+        heard.set()
+        return len(view), 0
+
+    stream = Stream(near, on_bytes=take, on_close=lambda _: None, outbox=Outbox(1, 1))
+    try:
+        loop = asyncio.get_running_loop()
+        until = loop.time() + silence
+        while tick is not None and loop.time() < until:
+            await asyncio.sleep(tick)
+        stream.last_in -= 0.0 if tick is not None else silence  # as if this process had been stopped
+        far.send(b"x")
+        await asyncio.wait_for(heard.wait(), 10.0)
+        return stream.resumed_at
+    finally:
+        stream.close()
+        far.close()
+
+
+def run(silence: float, tick: float | None) -> float:
+    with asyncio.Runner(loop_factory=AgentLoop) as runner:
+        return runner.run(after(silence, tick))
+
+
+def test_a_silence_that_was_watched_ends_with_the_next_bytes() -> None:
+    assert run(3 * limits.STALE_AGE, STALE_TICK) > 0.0
+
+
+def test_a_pause_is_none() -> None:
+    assert run(0.0, STALE_TICK) == -math.inf
+
+
+def test_silence_ends_where_a_pause_of_this_process_begins() -> None:
+    """What was sent during the pause did not wait for the network."""
+
+    async def watch() -> tuple[float, float]:
+        near, far = socket.socketpair()
+        near.setblocking(False)
+        heard = asyncio.Event()
+        loop = asyncio.get_running_loop()
+
+        def take(view: memoryview) -> tuple[int, int]:
+            heard.set()
+            return len(view), 0
+
+        stream = Stream(near, on_bytes=take, on_close=lambda _: None, outbox=Outbox(1, 1))
+        try:
+            until = loop.time() + 2 * limits.STALE_AGE
+            while loop.time() < until:
+                await asyncio.sleep(STALE_TICK)
+            paused = loop.time()
+            while loop.time() < paused + 2 * limits.STALE_AGE:
+                pass  # as a process that gets no CPU
+            far.send(b"x")
+            await asyncio.wait_for(heard.wait(), 10.0)
+            return stream.resumed_at, paused
+        finally:
+            stream.close()
+            far.close()
+
+    with asyncio.Runner(loop_factory=AgentLoop) as runner:
+        resumed_at, paused = runner.run(watch())
+    assert paused - limits.STALE_AGE < resumed_at <= paused

@@ -1,9 +1,12 @@
-"""Tasks: none ends unseen, and what must go on is started again."""
+"""Tasks, and work in threads."""
 
 from __future__ import annotations
 
 import ast
 import asyncio
+import contextvars
+import sys
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +14,7 @@ import pytest
 
 import rmpa
 from rmpa.runtime import tasks
+from rmpa.runtime.accept import in_thread
 from rmpa.runtime.tasks import OwnedTasks, end_tasks, keep_task, start_task
 
 if TYPE_CHECKING:
@@ -99,3 +103,39 @@ def test_tasks_are_started_in_one_place_only() -> None:
         for node in _unseen(ast.parse(path.read_text()))
     ]
     assert not found, "rmpa.runtime.tasks starts tasks, so that each failure is logged"
+
+
+WHERE: contextvars.ContextVar[str] = contextvars.ContextVar("where", default="nowhere")
+
+
+async def test_a_function_runs_elsewhere_and_in_the_same_context() -> None:
+    WHERE.set("here")
+    name, where = await in_thread(lambda: (threading.current_thread().name, WHERE.get()), "worker")
+    assert (name, where) == ("worker", "here")
+
+
+@pytest.mark.parametrize(
+    ("function", "error"),
+    [
+        (lambda: 1 / 0, ZeroDivisionError),
+        (lambda: next(iter(())), RuntimeError),
+        (lambda: sys.exit(3), RuntimeError),
+    ],
+)
+async def test_what_it_raises_is_raised_here(function: object, error: type[Exception]) -> None:
+    with pytest.raises(error):
+        await in_thread(function, "worker")  # type: ignore[arg-type]
+
+
+async def test_any_number_may_hang() -> None:
+    release = threading.Event()
+    hung = [asyncio.create_task(in_thread(release.wait, f"hung {number}")) for number in range(50)]
+    await asyncio.sleep(0)
+    for task in hung:
+        task.cancel()
+    await asyncio.gather(*hung, return_exceptions=True)
+    assert await in_thread(lambda: "well", "worker") == "well"
+    release.set()
+    for thread in threading.enumerate():
+        if thread.name.startswith("hung"):
+            await asyncio.to_thread(thread.join, 20)

@@ -30,10 +30,6 @@ def test_a_release_that_was_lost_with_its_link_is_made_again() -> None:
     DirectScenario(416).play()
 
 
-def test_a_seed_replays_exactly() -> None:
-    assert DirectScenario(7).play() == DirectScenario(7).play()
-
-
 def test_without_troubles_every_subscriber_of_a_free_name_is_direct() -> None:
     scenario = DirectScenario(1)
 

@@ -56,8 +56,3 @@ def test_failure_at_every_byte_leaves_no_half_message(trouble: str) -> None:
     for point in range(TROUBLES.index(trouble), LENGTH, len(TROUBLES) * max(1, 4 // FACTOR)):
         for turn in range(min(max(1, FACTOR // 4), len(COURSES))):
             PointScenario(COURSES[(point // len(TROUBLES) + turn) % len(COURSES)], trouble, point).run()
-
-
-def test_one_seed_gives_one_run() -> None:
-    first, second = (LanesScenario(1, 3).play() for _ in range(2))
-    assert first == second

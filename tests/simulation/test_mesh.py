@@ -6,12 +6,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pytest
 
+from rmpa.mesh import limits
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.network import Weather
 from tests.simulation.rests_scenario import RestsScenario
 from tests.simulation.scenario import FACTOR
+
+if TYPE_CHECKING:
+    from tests.simulation.mesh_peer import MeshPeer
 
 pytestmark = pytest.mark.timeout(300)  # seconds of computing, beside parts of the suite that compute too
 
@@ -65,6 +71,51 @@ def test_crossing_dials_leave_one_link(seed: int, monkeypatch: pytest.MonkeyPatc
     assert all("replaced" in line or "linked already" in line for line in fell), fell
 
 
-def test_one_seed_gives_one_run() -> None:
-    first, second = (MeshScenario(1, 4).play() for _ in range(2))
-    assert first == second
+def living(scenario: MeshScenario) -> list[MeshPeer]:
+    return [peer for peer in scenario.peers if peer.alive]
+
+
+def links(scenario: MeshScenario) -> list[int]:
+    return [len(peer.mesh.links()) for peer in living(scenario)]
+
+
+def test_a_mesh_of_twenty_loses_only_the_module_that_was_switched_off() -> None:
+    scenario = MeshScenario(1, 20, keep=True, calm=True)
+    scenario.network.segments = {peer.host: 1 for peer in scenario.peers}
+    scenario.network.weather = Weather(loss=0.01)
+    world, (off, *others) = scenario.world, scenario.peers
+    with scenario.simulated():
+        for peer in scenario.peers:
+            peer.seeds, peer.multicast = (), True
+            peer.start()
+        world.run(world.now + 30)
+        before = scenario.network.datagrams
+        world.run(world.now + 20)
+        assert scenario.network.datagrams - before < 20 * 20 * 20 / 4, "a heartbeat in five seconds"
+        assert links(scenario) == [19] * 20
+        scenario.network.sides = {off.host: 1}
+        world.run(world.now + 22)
+        assert links(scenario) == [0] + [18] * 19, "a lease of beacons, and what the check of a link takes"
+        assert not any(off.identity in peer.view() for peer in others)
+        lost = [line.split() for line in world.lines if "= lost" in line]
+        assert {who for _, who, *_ in lost} == {peer.name for peer in scenario.peers}
+        assert all((who == off.name) is (what[2] != off.name) for _, who, *what in lost), lost
+
+
+def test_a_full_mesh_refuses_one_more_undisturbed_until_a_place_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "MODULES_MAX", 6)
+    scenario = MeshScenario(1, 7, calm=True)
+    scenario.network.segments = {peer.host: 1 for peer in scenario.peers}
+    world, (*members, extra) = scenario.world, scenario.peers
+    with scenario.simulated():
+        for peer in scenario.peers:
+            peer.seeds, peer.multicast = (), True
+        for peer in members:
+            peer.start()
+        world.run(world.now + 10)
+        extra.start()
+        world.run(world.now + 30)
+        assert links(scenario) == [5] * 6 + [0]
+        members[0].kill()
+        world.run(world.now + 45)
+        assert links(scenario) == [5] * 6, "a lease of the killed one, one of its beacons, and a pause of the dial"

@@ -23,8 +23,3 @@ def test_what_is_lost_is_told_and_nothing_comes_twice(block: int, relays: int) -
 @pytest.mark.parametrize("seed", range(FACTOR))
 def test_ten_minutes_of_three_relays(seed: int) -> None:
     play(1000 + seed, relays=3, seconds=600.0)
-
-
-def test_one_seed_gives_one_run() -> None:
-    first, second = (play(3, relays=2) for _ in range(2))
-    assert first == second

@@ -1,19 +1,16 @@
-"""Certificates: what is issued is verified, and each other one is refused with its reason."""
+"""Certificates, and the names in them."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-
-pytest.importorskip("cryptography")
-
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 from cryptography.x509.oid import NameOID
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rmpa.trust import limits
 from rmpa.trust.certificates import (
@@ -26,10 +23,13 @@ from rmpa.trust.certificates import (
     read_request,
     verify,
 )
-from rmpa.trust.permissions import TrustError, TrustReason
+from rmpa.trust.permissions import TrustError, TrustReason, host_names, page_hosts, server_names
 from rmpa.trust.tokens import fingerprint_of
 from tests.runtime.secure_pairs import make_context, shake
 from tests.trust.authority import WALL, Authority, new_key
+
+pytest.importorskip("cryptography")
+
 
 LAB, OTHER = Authority(), Authority()
 ARM_KEY = new_key()
@@ -74,7 +74,7 @@ def test_browsers_find_the_hosts_that_follow_from_the_modules_name() -> None:
 
 
 def test_tls_accepts_members() -> None:
-    """And no others: ``tests/runtime/test_record_layer.py``."""
+    """And no others: ``tests/runtime/test_tls.py``."""
     client, _ = shake((make_context(LAB, server_side=False), make_context(LAB, server_side=True)))
     assert client.tls.getpeercert()["subjectAltName"][0] == ("URI", "urn:rmpa:arm")  # type: ignore[index] # there is one
 
@@ -222,3 +222,44 @@ def test_anything_at_all_is_refused(data: bytes) -> None:
     _refused(data)
     with pytest.raises(TrustError):
         read_request(data)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "given"),
+    [
+        ("Robot1", "robot1"),
+        ("robot1.local", "robot1.local"),
+        ("arm.hall.lan.", "arm.hall.lan"),
+        ("nas.home.arpa", "nas.home.arpa"),
+        ("10.0.0.7", "10.0.0.7"),
+        ("192.168.1.7", "192.168.1.7"),
+        ("169.254.3.4", "169.254.3.4"),
+        ("100.64.0.3", "100.64.0.3"),
+        ("fd00::1", "fd00::1"),
+        ("example.com", ""),  # the CA is to vouch for no host of the Internet
+        ("robots.example.com", ""),
+        ("local", "local"),
+        ("8.8.8.8", ""),
+        ("2001:4860:4860::8888", ""),
+        ("127.0.0.2", ""),  # each machine's own
+        ("localhost", ""),
+        ("0.0.0.0", ""),
+        ("224.0.0.1", ""),
+        ("*.local", ""),
+        ("a b", ""),
+        ("-a.local", ""),
+        ("", ""),
+    ],
+)
+def test_hosts_of_the_local_network_alone(wanted: str, given: str) -> None:
+    assert page_hosts([wanted]) == ((given,) if given else ())
+
+
+def test_hosts_are_bounded_and_without_repetition() -> None:
+    many = [f"10.0.0.{number}" for number in range(100)]
+    assert page_hosts(["a", "A", *many]) == ("a", *many)[: limits.PAGE_HOSTS_MAX]
+
+
+def test_the_names_of_a_machine_and_of_a_module() -> None:
+    assert host_names("Robot-1.lab.example") == ("robot-1.lab.example", "robot-1", "robot-1.local")
+    assert server_names("robot_1") == ("robot-1", "robot-1.local", "localhost")

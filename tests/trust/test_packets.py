@@ -1,4 +1,4 @@
-"""The trailer of packets: golden bytes, damage in every byte, rotation, clocks, repeats."""
+"""Tags of packets: keys, and packets that come again."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 import hmac
 from ipaddress import IPv4Address
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -20,6 +21,7 @@ from rmpa.trust.packets import (
     GroupKey,
     KeyRing,
     PacketTrust,
+    ReplayWindow,
     Verdict,
     Verification,
 )
@@ -197,3 +199,168 @@ def test_anything_at_all_is_refused(data: bytes) -> None:
 def test_what_is_signed_is_accepted(packet: bytes, wall: float) -> None:
     signed = _trust(wall=wall).sign(packet, NOW)
     assert _verify(_trust(), signed, wall) == Verification(Verdict.ACCEPTED, len(packet), 0)
+
+
+def key(number: int) -> GroupKey:
+    return GroupKey(number, bytes([number & 0xFF]) * 32)
+
+
+def test_a_tag_is_made_by_the_key_of_its_purpose() -> None:
+    derived = hmac.new(b"\x01" * 32, b"rmpa beacon 1", hashlib.sha256).digest()
+    assert key(1).tag(b"packet") == hmac.new(derived, b"packet", hashlib.sha256).digest()[:16]
+
+
+def test_secrets_are_never_shown() -> None:
+    secret = b"secret".ljust(32, b"!")
+    shown = repr(GroupKey(1, secret)) + str(GroupKey(1, secret)) + repr(KeyRing([GroupKey(1, secret)], 0.0))
+    assert "secret" not in shown
+    assert shown.endswith("KeyRing([1])")
+
+
+@pytest.mark.parametrize(("number", "secret"), [(0, bytes(32)), (1 << 32, bytes(32)), (1, bytes(31)), (1, b"")])
+def test_a_key_that_cannot_be_is_refused(number: int, secret: bytes) -> None:
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.convert({"number": number, "key": secret}, GroupKey)
+
+
+def test_a_ring_needs_a_key() -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        KeyRing([], 0.0)
+
+
+def test_the_newest_key_of_the_files_signs_at_once() -> None:
+    ring = KeyRing([key(2), key(1)], 100.0)
+    assert ring.signing(100.0) == ring.newest == key(2)
+    assert ring.verifies(key(2), 1e9)
+    assert not ring.verifies(key(1), 100.0)
+    assert ring.find(1) == key(1)
+
+
+def test_two_keys_verify_during_a_rotation() -> None:
+    ring = KeyRing([key(1)], 0.0)
+    ring.take([key(2)], 10.0)
+    signs = 10.0 + limits.KEY_SPREAD
+    assert ring.signing(signs - 0.1) == key(1)
+    assert ring.signing(signs) == key(2)
+    for now in (10.0, signs, signs + limits.KEY_OVERLAP):
+        assert ring.verifies(key(1), now)
+        assert ring.verifies(key(2), now)
+    assert not ring.verifies(key(1), signs + limits.KEY_OVERLAP + 0.1)
+    assert ring.find(1) == key(1)
+
+
+def test_after_a_revocation_the_new_key_signs_and_older_ones_recognise_at_once() -> None:
+    ring = KeyRing([key(1)], 0.0)
+    ring.take([key(2)], 5.0)
+    ring.take([key(2), key(3)], 10.0, proves_from=3)
+    assert ring.signing(10.0) == key(3)
+    assert not ring.verifies(key(1), 10.0)
+    assert not ring.verifies(key(2), 10.0)
+    assert ring.find(2) == key(2)
+
+
+def test_a_member_that_was_away_during_two_rotations_takes_the_revocation_among_them() -> None:
+    ring = KeyRing([key(1)], 0.0)
+    ring.take([key(1), key(2), key(3)], 10.0, proves_from=2, age=limits.KEY_SPREAD - 10)
+    assert not ring.verifies(key(1), 10.0)
+    assert ring.signing(10.0) == key(2)
+    assert ring.signing(20.0) == key(3)
+
+
+def test_members_that_learn_a_key_at_different_times_understand_each_other() -> None:
+    early, late = KeyRing([key(1)], 0.0), KeyRing([key(1)], 0.0)
+    early.take([key(2)], 0.0)
+    late.take([key(2)], limits.KEY_SPREAD - 1)
+    for now in (0.0, 29.0, 31.0, 60.0, 600.0):
+        for sender, receiver in ((early, late), (late, early)):
+            signing = sender.signing(now)
+            if now < limits.KEY_SPREAD - 1 and receiver is late:
+                assert signing == key(1)
+            assert receiver.verifies(signing, now)
+
+
+def test_an_older_or_known_key_is_ignored() -> None:
+    ring = KeyRing([key(5)], 0.0)
+    ring.take([key(5), key(4)], 1.0, proves_from=5)
+    assert ring.keys == (key(5),)
+
+
+def test_the_oldest_key_is_forgotten() -> None:
+    ring = KeyRing([key(1)], 0.0)
+    for number in range(2, 20):
+        ring.take([key(number)], float(number))
+    assert [k.number for k in ring.keys] == list(range(20 - limits.KEYS_MAX, 20))
+    assert ring.find(1) is None
+
+
+def test_of_equal_low_bits_the_newest_key_is_meant() -> None:
+    ring = KeyRing([key(1), GroupKey(0x10001, bytes(32))], 0.0)
+    assert ring.find(1) == GroupKey(0x10001, bytes(32))
+
+
+A_RUN = (1, bytes(16))
+BEGIN = 5.0
+
+
+def test_what_is_behind_the_window_is_stale() -> None:
+    window = ReplayWindow()
+    window.take(A_RUN, 1000, BEGIN)
+    assert window.take(A_RUN, 1001 - limits.REPLAY_WINDOW, BEGIN) is Verdict.ACCEPTED
+    assert window.take(A_RUN, 1000 - limits.REPLAY_WINDOW, BEGIN) is Verdict.REPLAYED
+    assert window.take(A_RUN, 0, BEGIN) is Verdict.REPLAYED
+
+
+def test_zero_is_never_new() -> None:
+    assert ReplayWindow().take(A_RUN, 0, BEGIN) is Verdict.REPLAYED
+
+
+def test_the_highest_number_leaves_nothing_above_it() -> None:
+    window = ReplayWindow()
+    assert window.take(A_RUN, (1 << 64) - 1, BEGIN) is Verdict.ACCEPTED
+    assert window.take(A_RUN, (1 << 64) - 1, BEGIN) is Verdict.REPEATED
+    assert window.take(A_RUN, 1, BEGIN) is Verdict.REPLAYED
+
+
+def test_a_leap_is_refused_and_leaves_nothing_behind() -> None:
+    window = ReplayWindow()
+    window.take(A_RUN, 10, BEGIN)
+    assert window.take(A_RUN, (1 << 64) - 1, BEGIN) is Verdict.LEAP
+    assert window.take(A_RUN, 11 + limits.REPLAY_LEAP, BEGIN) is Verdict.LEAP
+    assert window.take(A_RUN, 11, BEGIN) is Verdict.ACCEPTED
+    assert window.take(A_RUN, 11 + limits.REPLAY_LEAP, BEGIN) is Verdict.ACCEPTED
+
+
+def test_a_run_that_was_out_of_reach_for_days_is_heard_again() -> None:
+    window, days = ReplayWindow(), 3 * 86_400
+    window.take(A_RUN, 1, BEGIN)
+    assert window.take(A_RUN, 600 * days, BEGIN + days) is Verdict.ACCEPTED
+
+
+def test_each_group_key_has_numbers_of_its_own() -> None:
+    window = ReplayWindow()
+    assert window.take((1, A_RUN[1]), (1 << 64) - 1, BEGIN) is Verdict.ACCEPTED
+    assert window.take((2, A_RUN[1]), 7, BEGIN) is Verdict.ACCEPTED
+
+
+def test_runs_are_apart_and_the_silent_one_is_forgotten() -> None:
+    window = ReplayWindow(2)
+    runs = [(1, bytes([n]) * 16) for n in range(3)]
+    for run in runs[:2]:
+        assert window.take(run, 7, BEGIN) is Verdict.ACCEPTED
+    window.take(runs[0], 8, BEGIN)
+    assert window.take(runs[2], 7, BEGIN) is Verdict.ACCEPTED
+    assert len(window) == 2
+    assert window.take(runs[0], 8, BEGIN) is Verdict.REPEATED
+    assert window.take(runs[1], 7, BEGIN) is Verdict.ACCEPTED  # it was forgotten
+
+
+@given(st.lists(st.integers(1, 200), max_size=100))
+def test_beside_a_model(numbers: list[int]) -> None:
+    window, seen = ReplayWindow(), set[int]()
+    for number in numbers:
+        if seen and max(seen) - number >= limits.REPLAY_WINDOW:
+            expected = Verdict.REPLAYED
+        else:
+            expected = Verdict.REPEATED if number in seen else Verdict.ACCEPTED
+            seen.add(number)
+        assert window.take(A_RUN, number, BEGIN) is expected

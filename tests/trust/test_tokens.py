@@ -1,8 +1,9 @@
-"""Tokens: golden text, mistakes of typing, and that each lets one module join once."""
+"""Tokens, and the messages of a join."""
 
 from __future__ import annotations
 
 import base64
+import contextlib
 import dataclasses
 import hashlib
 from ipaddress import IPv4Address
@@ -11,8 +12,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.trust import limits
-from rmpa.trust.tokens import PREFIX, Invitation, Token, TokenBook, TokenError, fingerprint_of
+from rmpa.trust.tokens import (
+    PREFIX,
+    CertificateGrant,
+    Invitation,
+    Join,
+    JoinMessage,
+    JoinRefused,
+    Renew,
+    Token,
+    TokenBook,
+    TokenError,
+    decode_message,
+    encode_message,
+    fingerprint_of,
+    message_length,
+    proof_of,
+)
 
 SECRET = bytes(range(100, 116))
 TOKEN = Token(1_790_000_000, IPv4Address("10.0.0.1"), 40001, bytes(range(16)), SECRET)
@@ -189,3 +207,45 @@ def test_anything_at_all_is_refused(text: str) -> None:
     for each in (text, PREFIX + text):
         with pytest.raises(TokenError):
             Token.parse(each)
+
+
+GOLDEN: dict[JoinMessage, bytes] = {
+    Join(b"id", b"csr", b"mac"): b'\0\0\0\x3c{"op":"join","token":"aWQ=","request":"Y3Ny","proof":"bWFj"}',
+    Renew(b"csr"): b'\0\0\0\x1f{"op":"renew","request":"Y3Ny"}',
+    CertificateGrant(
+        b"crt", b"ca", b"keys"
+    ): b'\0\0\0\x4b{"op":"grant","certificate":"Y3J0","ca":"Y2E=","keys":"a2V5cw==","deny":""}',
+    JoinRefused("expired", "too old"): b'\0\0\0\x33{"op":"refuse","reason":"expired","text":"too old"}',
+}
+
+
+@pytest.mark.parametrize("message", GOLDEN)
+def test_messages_have_their_bytes_and_survive(message: JoinMessage) -> None:
+    data = encode_message(message)
+    assert data == GOLDEN[message]
+    assert message_length(data[:4], 100) == len(data) - 4
+    assert decode_message(data[4:]) == message
+    assert "a2V5" not in repr(message)
+    assert "keys" not in repr(message)
+
+
+def test_a_long_or_malformed_message_is_refused() -> None:
+    with pytest.raises(LimitExceeded):
+        message_length(b"\0\0\0\x65", 100)
+    deep = b'{"op":"renew","x":' + b"[" * 2000
+    for text in (b"[]", b"{}", b'{"op":"grant"}', b'{"op":"renew","request":"%"}', b"\xff\xfe", deep):
+        with pytest.raises(RemoteProtocolError):
+            decode_message(text)
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_a_message_or_an_error(data: bytes) -> None:
+    with contextlib.suppress(RemoteProtocolError):
+        decode_message(data)
+
+
+def test_the_proof_is_of_one_token_one_request_and_one_connection() -> None:
+    proof = proof_of(b"k" * 32, b"request", b"server")
+    assert proof.hex() == "c6883baacff1b2839a1b5f433afc2fdac1c16203bbb4f338ff4a993a47f65200"
+    for other in ((b"x" * 32, b"request", b"server"), (b"k" * 32, b"r", b"server"), (b"k" * 32, b"request", b"s")):
+        assert proof_of(*other) != proof

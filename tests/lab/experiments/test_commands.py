@@ -54,14 +54,6 @@ def lab(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]
     return code, out, err
 
 
-def test_list_as_json(fake: FakeExperiment, capsys: pytest.CaptureFixture[str]) -> None:
-    said = json.loads(lab(capsys, "list", "--json")[1])
-    assert said["experiments"] == [
-        {"name": "fake", "about": "nothing at all", "cells": 4, "seconds": 16.0, "seconds_short": 4.0}
-    ]
-    assert said["why_not"] == ""
-
-
 def test_a_run_measures_and_writes_its_report(
     fake: FakeExperiment, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -82,26 +74,6 @@ def test_a_run_measures_and_writes_its_report(
     assert store.manifest.sessions[0].argv[:3] == ["python", "-m", "lab"]
     assert (tmp_path / "mine" / "report" / "report.html").exists()
     assert (tmp_path / "mine" / "report" / "report.md").exists()
-
-
-def test_a_run_as_json_is_one_document(fake: FakeExperiment, capsys: pytest.CaptureFixture[str]) -> None:
-    code, out, _ = lab(capsys, "run", "--short", "--out", "mine", "--json")
-    said = json.loads(out)
-    assert code == 0
-    assert (said["measured"], said["there"], said["failed"], said["directory"]) == (4, 0, [], "mine")
-    assert said["claims"] == [
-        {
-            "experiment": "fake",
-            "claim": "highest rate",
-            "wanted": 20.0,
-            "at_least": False,
-            "unit": "Hz",
-            "measured": 20.0,
-            "paper": None,
-            "reached": True,
-        }
-    ]
-    assert Path(said["html"]).exists()
 
 
 def test_a_run_goes_on_with_what_is_missing_as_it_was_begun(
@@ -151,20 +123,6 @@ def test_what_cannot_be_is_said_and_leaves_nothing_behind(
     assert (code, out) == (2, "")
     assert said in err
     assert not list(tmp_path.iterdir())
-
-
-def test_the_report_can_be_written_again(
-    fake: FakeExperiment, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    lab(capsys, "run", "--short", "--out", "mine")
-    page = tmp_path / "mine" / "report" / "report.html"
-    before = page.read_bytes()
-    page.unlink()
-    code, out, _ = lab(capsys, "report", "mine")
-    assert code == 0
-    assert "highest rate" in out
-    assert page.read_bytes() == before
-    assert json.loads(lab(capsys, "report", "mine", "--json")[1])["claims"][0]["measured"] == 20.0
 
 
 def test_two_runs_are_compared(fake: FakeExperiment, capsys: pytest.CaptureFixture[str]) -> None:

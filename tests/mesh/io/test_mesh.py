@@ -1,4 +1,4 @@
-"""Meshes on loopback: dialling, accepting, refusing, ends; the lanes are in ``test_mesh_lanes.py``."""
+"""A mesh over real sockets: links, and how they end."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import asyncio
 import contextlib
 import errno
 import fcntl
-import hashlib
+import gc
 import socket
+import struct
 import sys
+import weakref
 from dataclasses import replace
 from ipaddress import IPv4Address
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
@@ -20,7 +22,7 @@ from rmpa.core.identity import Guid, Identity
 from rmpa.core.limits import KIB, MIB
 from rmpa.core.statistics import Counters
 from rmpa.mesh import limits
-from rmpa.mesh.frames import Frame, FrameKind, Lane, Refusal, Refuse
+from rmpa.mesh.frames import FrameKind, Lane, Refusal, Refuse
 from rmpa.mesh.io.dial import (
     BULK_WINDOW_MAX,
     BULK_WINDOW_MIN,
@@ -32,33 +34,17 @@ from rmpa.mesh.io.dial import (
     repeats_quickly,
 )
 from rmpa.mesh.io.link import PeerLink
-from rmpa.mesh.peering import DIAL_FALLBACK
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import DESCRIPTORS
 from tests.mesh.io.meshes import DEADLINE, Peer, linked_pair, peers, raw, until
 from tests.runtime.descriptors_left import descriptors_left
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rmpa.mesh.io.link import Connection
+
 _SIOCOUTQNSD = 0x894B  # linux/sockios.h: bytes that were not sent yet
-
-
-@pytest.mark.parametrize("count", [2, 5])
-async def test_a_full_mesh_with_one_link_a_pair(count: int) -> None:
-    async with peers(count) as made:
-        await until(lambda: all(p.linked(*(o for o in made if o is not p)) for p in made), "a full mesh")
-        for peer in made:
-            assert len(peer.mesh.links()) == count - 1
-            for link in peer.mesh.links():
-                assert link.dialled == (peer.identity.guid < link.guid)
-            assert {s.state for s in peer.mesh.peers()} == {"linked"}
-        link = made[0].link(made[1])
-        await until(lambda: link.connection.clock.rtt is not None, "a round trip")
-        assert link.clock_offset is not None
-        assert link.clock_error is not None
-        assert abs(link.clock_offset) <= link.clock_error
-        assert not any(p.downs for p in made)
-    for peer in made:
-        assert len(peer.downs) == count - 1
-        assert not peer.mesh.connections()
 
 
 async def test_of_several_addresses_whichever_answers_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,47 +156,6 @@ async def test_a_dial_that_fails_of_a_bug_is_logged(
         assert not one.mesh._tasks
 
 
-async def test_messages_arrive_in_order_and_byte_exact() -> None:
-    async with linked_pair(lanes=False) as (one, other):
-        link = one.link(other)
-        sent: list[tuple[int, int, int, bytes]] = []
-        for i in range(10_000):
-            sent.append((1, i, i, b"%064d" % i))
-            assert link.express.send(*sent[-1]) == 0
-            if i % 500 == 0:
-                large = hashlib.sha256(bytes([i // 500])).digest() * (MIB // 32)
-                sent.append((2, i, i, large))
-                assert link.express.send(*sent[-1]) == 0
-            if link.queue_bytes or i % 500 == 0:
-                await until(lambda: link.queue_bytes < 65536, "room")
-        link.send_control(b'{"op":"end"}')
-        await until(lambda: len(other.data) == len(sent), "all messages")
-        for route in (1, 2):
-            assert [m for m in other.data if m[0] == route] == [m for m in sent if m[0] == route]
-        assert other.controls == [b'{"op":"end"}']
-        assert not link.dropped
-
-
-async def test_killed_peer_comes_back_as_a_new_instance() -> None:
-    async with peers(3) as (one, two, three):
-        await until(lambda: one.linked(two, three) and two.linked(one, three) and three.linked(one, two), "a mesh")
-        one.kill()
-        await until(lambda: len(two.downs) == 1 and len(three.downs) == 1, "both see it gone")
-        again = Peer(one.number, instance=1, port=one.port)
-        try:
-            await again.mesh.start()
-            again.mesh.peer_found(two.identity)
-            again.mesh.peer_found(three.identity)
-            await until(lambda: two.linked(again, three) and three.linked(again, two), "the mesh is whole again")
-            assert two.mesh.link(one.identity.guid) is None
-            assert {s.identity.instance for s in two.mesh.peers()} == {
-                again.identity.instance,
-                three.identity.instance,
-            }
-        finally:
-            await again.mesh.close()
-
-
 async def test_a_restarted_peer_has_the_link_at_rest_of_its_former_run_checked() -> None:
     """The former run's host lost its power: no connection ended, and at rest the silence is noticed late."""
     async with linked_pair(lanes=False) as (one, other):
@@ -267,32 +212,6 @@ async def test_another_domain_is_refused_with_what_to_do(caplog: pytest.LogCaptu
         assert [r.message for r in caplog.records if "domain" in r.message and r.levelname == "WARNING"] == [
             f"! refused a link with stranger at 127.0.0.1: {Refuse.parse(answer.payload).text} [peer-refused]"
         ]
-
-
-async def test_stopped_peer_is_down_after_its_lease(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(limits, "LANE_QUEUE_BYTES", 4 * MIB)
-    async with peers(1) as (one,):
-        stopped = Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "stopped")
-        sock, answer = await raw(one, stopped, lease=0.5)
-        assert answer.kind is FrameKind.WELCOME
-        await until(lambda: bool(one.ups), "a link")
-        link = one.ups[0]
-        got = link.bytes_in
-        began = asyncio.get_running_loop().time()
-        await asyncio.get_running_loop().sock_sendall(sock, Frame(FrameKind.PING, stamp_ns=1).serialize())
-        await until(lambda: link.bytes_in > got, "its first word, from which on the lease counts")
-        block = bytes(MIB)
-        for i in range(64):
-            link.express.send(5, i, i, block)
-            assert link.queue_bytes <= 6 * MIB
-        assert link.dropped >= 50
-        assert link.close_route(5) <= 4
-        await until(lambda: bool(one.downs), "the lease is over")
-        assert asyncio.get_running_loop().time() - began >= 0.4
-        assert "silent for its lease of 0.5 s" in one.downs[0][1]
-        sock.close()
 
 
 async def test_unread_control_frames_close_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -452,23 +371,139 @@ async def test_silent_connections_from_one_address_are_bounded() -> None:
             writer.close()
 
 
-async def test_both_dial_at_once_and_one_link_stays() -> None:
-    async with peers(2, found=False) as (one, other):
-        for a, b in ((one, other), (other, one)):
-            a.mesh._peering.peer_found(b.identity, asyncio.get_running_loop().time() - DIAL_FALLBACK)
+STRANGER = Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "stranger")
+
+
+def how(peer: Peer) -> tuple[bool, bool]:
+    """Of the only link that went down: whether its agent crashed, and whether the peer may soon be back."""
+    ((link, _),) = peer.downs
+    return link.crashed, link.silent
+
+
+async def test_a_killed_agent_is_a_crash() -> None:
+    async with linked_pair() as (one, other):
+        other.kill()
+        await until(lambda: bool(one.downs), "it is seen")
+        assert how(one)[0]
+        await until(lambda: bool(other.downs), "its own side")
+        assert how(other)[0] is False, "it gave up the link itself"
+
+
+async def test_a_bye_is_none() -> None:
+    async with linked_pair() as (one, other):
+        one.mesh.peer_gone(other.identity.guid)
+        other.mesh.peer_gone(one.identity.guid)
+        one.link(other).close("maintenance")
+        await until(lambda: bool(one.downs) and bool(other.downs), "both down")
+        assert (how(one), how(other)) == ((False, False), (False, False))
+
+
+async def test_a_reset_is_a_crash_with_bytes_unread() -> None:
+    async with peers(1) as (one,):
+        sock, _ = await raw(one, STRANGER, lease=60.0)
+        await until(lambda: bool(one.ups), "a link")
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        sock.close()
+        await until(lambda: bool(one.downs), "reset")
+        assert how(one) == (True, True)
+
+
+async def test_a_lease_that_ends_is_silence_and_no_crash() -> None:
+    async with peers(1) as (one,):
+        await raw(one, STRANGER, lease=0.3)
+        await until(lambda: bool(one.downs), "the lease is over")
+        assert how(one) == (False, True)
+
+
+async def test_a_peer_that_breaks_the_protocol_has_not_crashed() -> None:
+    async with peers(1) as (one,):
+        sock, _ = await raw(one, STRANGER, lease=60.0)
+        await until(lambda: bool(one.ups), "a link")
+        await asyncio.get_running_loop().sock_sendall(sock, b"\xff" * 64)
+        await until(lambda: bool(one.downs), "closed")
+        assert how(one) == (False, False)
+
+
+async def test_the_end_of_the_bulk_lane_is_not_that_of_the_link() -> None:
+    async with linked_pair() as (one, other):
+        bulk = one.link(other).bulk_connection
+        assert bulk is not None
+        bulk.lost("a test")
+        await until(lambda: bool(other.lanes_lost), "lost")
+        await until(lambda: one.both_lanes(other) and other.both_lanes(one), "a new one")
+        assert (one.downs, other.downs) == ([], [])
+        assert not one.link(other).crashed
+
+
+@pytest.mark.parametrize(
+    ("number", "crashed"),
+    [
+        (errno.ECONNRESET, True),
+        (errno.EPIPE, True),
+        (errno.ETIMEDOUT, False),
+        (errno.EHOSTUNREACH, False),
+        (errno.ENETUNREACH, False),
+        (errno.ENETDOWN, False),
+        (errno.ECONNABORTED, False),
+    ],
+)
+async def test_each_error_of_a_socket_says_whether_the_host_is_still_there(number: int, *, crashed: bool) -> None:
+    async with linked_pair() as (one, other):
+        connection = one.link(other).connection
+        connection._lost(OSError(number, "made up"))
+        await until(lambda: bool(one.downs), "down")
+        assert how(one)[0] is crashed
+
+
+@pytest.mark.parametrize(("instance", "silent"), [(b"s", True), (b"t", False)])
+async def test_a_link_that_another_one_replaces_leaves_direct_connections_alone(
+    instance: bytes, monkeypatch: pytest.MonkeyPatch, *, silent: bool
+) -> None:
+    monkeypatch.setattr(limits, "GHOST_QUIET", 0.0)  # the first one counts as quiet at once
+    async with peers(1) as (one,):
+        await raw(one, STRANGER, lease=60.0)
+        await until(lambda: bool(one.ups), "a link")
+        _, answer = await raw(one, Identity(STRANGER.guid, instance * 16, "stranger"), lease=60.0)
+        assert answer.kind is FrameKind.WELCOME
+        await until(lambda: len(one.ups) == 2, "the same run of it by another path, or another run")
+        assert how(one) == (True, silent)
+
+
+MB = 1 << 20
+
+
+@pytest.fixture
+def no_collector() -> Iterator[None]:
+    gc.disable()
+    yield
+    gc.enable()
+
+
+def references(one: Peer, other: Peer) -> list[weakref.ref[PeerLink] | weakref.ref[Connection]]:
+    """A peer's link to another one, and its two connections."""
+    link = one.link(other)
+    assert link.bulk_connection is not None
+    return [weakref.ref(link), weakref.ref(link.connection), weakref.ref(link.bulk_connection)]
+
+
+@pytest.mark.usefixtures("no_collector")
+@pytest.mark.parametrize("way", ["close", "abort", "end"])
+async def test_an_ended_link_is_gone_with_what_waited(way: str) -> None:
+    async with linked_pair(lanes=False) as (one, other):
+        one.link(other).bulk._on_wanted()
+        await until(lambda: one.link(other).bulk_connection is not None, "a bulk lane")
+        await until(lambda: other.link(one).bulk_connection is not None, "a bulk lane")
+        links = [*references(one, other), *references(other, one)]
+        for _ in range(20):
+            one.link(other).bulk.send(1, 1, 0, bytes(MB))
+        assert one.link(other).queue_bytes
+        if way == "end":
+            await other.mesh.close()
+        else:
+            getattr(one.link(other), way)("the test says so")
         for peer in (one, other):
-            peer.mesh._peering.handle_timer(asyncio.get_running_loop().time())
-            peer.mesh._act()
-        await until(
-            lambda: (
-                one.both_lanes(other)
-                and other.both_lanes(one)
-                and all(
-                    sorted(c.lane for c in p.mesh.connections()) == [Lane.EXPRESS, Lane.BULK] for p in (one, other)
-                )
-            ),
-            "one connection of each lane",
-        )
-        low, high = sorted((one, other), key=lambda p: p.identity.guid)
-        assert low.link(high).dialled
-        assert not high.link(low).dialled
+            await until(lambda peer=peer: peer.downs, "the end")  # type: ignore[misc]
+        for peer in (one, other):
+            for seen in (peer.ups, peer.downs, peer.clocks, peer.lanes_lost):
+                seen.clear()
+        await until(lambda: not any(link() for link in links), "nobody holds the old links")

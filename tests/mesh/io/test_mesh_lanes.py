@@ -41,24 +41,6 @@ def bulk_of(link: PeerLink) -> Connection:
 # --- coming up ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", [2, 4])
-async def test_same_side_dials_both_lanes(count: int) -> None:
-    async with peers(count) as made:
-        others = {p.number: [o for o in made if o is not p] for p in made}
-        await until(lambda: all(p.both_lanes(*others[p.number]) for p in made), "both lanes everywhere")
-        for peer in made:
-            links, connections = peer.mesh.links(), peer.mesh.connections()
-            assert len(links) == count - 1
-            assert len(connections) == 2 * len(links)
-            assert {(c.identity, c.dialled) for c in connections if c.lane == Lane.BULK} == {
-                (link.identity, link.dialled) for link in links
-            }
-            assert len(peer.ups) == count - 1, "a bulk lane is no link of its own"
-            assert not peer.downs
-            assert not peer.lanes_lost
-    assert not any(p.mesh.connections() for p in made)
-
-
 @pytest.mark.parametrize(
     ("lanes", "options"),
     [
@@ -113,47 +95,6 @@ def hold_bulk(peer: Peer, *, fails: int = 0, until_set: asyncio.Event | None = N
 
 
 # --- messages -----------------------------------------------------------------------------------------------------
-
-SIZES = [65_535, 65_536, 65_537, 131_072, 131_073, 200_000, 1 << 20, (5 << 20) + 7]
-
-
-@pytest.mark.parametrize("lane", ["express", "bulk"])
-async def test_messages_of_all_sizes_arrive_byte_for_byte(lane: str) -> None:
-    async with linked_pair() as (one, other):
-        for sender, receiver in ((one, other), (other, one)):
-            way: LaneSender = getattr(sender.link(receiver), lane)
-            sent = [(7, n, n + 1, large(n, size)) for n, size in enumerate(SIZES)]
-            for message in sent:
-                way.send(*message)
-            await until(lambda: len(receiver.data) == len(SIZES), "all messages")  # noqa: B023 - it is awaited here
-            assert receiver.data == sent
-
-
-async def test_message_sent_in_parts_arrives_as_one() -> None:
-    async with linked_pair() as (one, other):
-        lane = one.link(other).bulk
-        payload = large(1, 300_000)
-        parcel = lane.open(7, len(payload), (1 << 32) + 5, 99)
-        for start in range(0, len(payload), 70_000):
-            lane.extend(parcel, memoryview(payload)[start : start + 70_000])
-            lane.send(8, start, 0, b"in between")
-            await asyncio.sleep(0.001)
-        await until(lambda: bool(other.messages(7)), "the message")
-        assert other.messages(7) == [(5, payload)]
-        assert len(other.messages(8)) == 5
-
-
-async def test_abandoned_message_is_not_delivered() -> None:
-    async with linked_pair() as (one, other):
-        lane = one.link(other).bulk
-        parcel = lane.open(7, 300_000, 1, 0)
-        lane.extend(parcel, bytes(100_000))
-        lane.abandon(parcel)
-        lane.extend(parcel, bytes(200_000))
-        lane.send(7, 2, 0, b"next")
-        await until(lambda: bool(other.data), "the next one")
-        assert other.data == [(7, 2, 0, b"next")]
-        assert not other._begun
 
 
 async def test_each_route_has_its_own_bound_and_drops_its_own() -> None:
@@ -226,37 +167,6 @@ async def test_small_messages_go_on_while_the_bulk_lane_is_gone(by_dialler: bool
             assert link.bytes_out >= was_out + 300_000
 
 
-async def test_cut_bulk_lane_delivers_no_half_message() -> None:
-    async with linked_pair() as (one, other):
-        lane = one.link(other).bulk
-        for cut in range(5):
-            first = 100 * cut
-            for number in range(4):
-                lane.send(7 + number, first, 0, large(first + number, 3_000_000))
-                lane.send(7 + number, first + 1, 0, large(first + number, 100_000))
-            growing = lane.open(20, 400_000, first, 0)
-            lane.extend(growing, bytes(200_000))
-            bulk_of(one.link(other)).sock.shutdown(socket.SHUT_RDWR)
-            await until(lambda: len(one.lanes_lost) == cut + 1, "the lane is lost")  # noqa: B023 - awaited here
-            lane.extend(growing, bytes(200_000))
-            await until(lambda: one.both_lanes(other) and other.both_lanes(one), "it is back")
-            await until(lambda: not lane.outbox.pending_bytes, "all has left")
-        lane.send(30, 1, 0, b"end")
-        await until(lambda: bool(other.messages(30)), "the end")
-        for route, sequence, _, payload in other.data:
-            if route in range(7, 11):
-                size = 100_000 if sequence % 100 else 3_000_000
-                assert payload == large(sequence // 100 * 100 + route - 7, size)
-            elif route == 20:
-                assert payload == bytes(400_000)
-        for route in range(7, 11):
-            numbers = [sequence for sequence, _ in other.messages(route)]
-            assert numbers == sorted(set(numbers))
-            assert {100 * cut + 1 for cut in range(5)} <= set(numbers), "what had not begun was not lost"
-        assert not one.downs
-        assert not other.downs
-
-
 async def test_rest_of_a_torn_message_is_not_sent() -> None:
     async with linked_pair() as (one, other):
         lane = one.link(other).bulk
@@ -297,14 +207,6 @@ async def test_both_lanes_end_with_the_link() -> None:
         assert link.bulk.ended
         assert link.bulk.send(1, 1, 0, b"x") == link.express.send(1, 1, 0, b"x") == 0
         assert link.bulk.outbox.waiting(1) == 0
-
-
-async def test_a_killed_peer_leaves_no_lane_behind() -> None:
-    async with linked_pair() as (one, other):
-        other.kill()
-        await until(lambda: not one.mesh.connections(), "nothing is left")
-        assert len(one.downs) == 1
-        await until(lambda: not one.mesh._tasks, "no bulk lane is dialled")
 
 
 # --- a bulk lane in place of another ------------------------------------------------------------------------------
@@ -390,21 +292,6 @@ async def test_fence_is_answered_after_all_messages_before_it(way: str) -> None:
         for number, arrived in enumerate(seen):
             assert arrived[: 2 * number + 1] == list(range(2 * number + 1))
         assert not other.marks, "a fence is answered, and told to nobody"
-
-
-async def test_route_keeps_its_order_when_lanes_change() -> None:
-    async with linked_pair() as (one, other):
-        link = one.link(other)
-        number = 0
-        for change in range(12):
-            lane = link.bulk if change % 2 else link.express
-            for _ in range(20):
-                lane.send(7, number, 0, large(number, 150_000 if change % 2 else 200))
-                number += 1
-            lane.fence(7, change + 1)
-            await until(lambda: one.marks[-1:] == [(FrameKind.FENCED, 7, change + 1)], "the fence")  # noqa: B023
-        await until(lambda: len(other.data) == number, "all messages")
-        assert [sequence for _, sequence, _, _ in other.data] == list(range(number))
 
 
 async def test_fence_waits_for_the_lanes_connection() -> None:

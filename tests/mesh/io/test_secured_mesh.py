@@ -65,26 +65,6 @@ async def test_members_link_by_both_lanes_and_messages_cross(lab: Authority) -> 
         assert arm.mesh.counters.as_dict() == base.mesh.counters.as_dict() == {}
 
 
-async def test_nothing_is_readable_on_the_wire(lab: Authority) -> None:
-    """A tap between two members sees neither names nor messages."""
-    async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
-        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
-        sock = base.link(arm).connection.sock
-        seen = b""
-        arm.link(base).express.send(1, 7, 0, b"a secret text" * 100)
-        while b"\x17\x03\x03" not in seen:
-            try:
-                seen = sock.recv(65536, socket.MSG_PEEK)
-            except BlockingIOError:
-                break  # the stream was faster
-        assert b"secret" not in seen
-        await until(lambda: bool(base.data), "the message")
-        assert arm.link(base).connection.stream._secure is not None
-        bulk = base.link(arm).bulk_connection
-        assert bulk is not None
-        assert bulk.stream._secure is not None
-
-
 def _bad(lab: Authority, what: str) -> Member:
     """A module that is no member, for one reason."""
     if what == "foreign":
@@ -142,24 +122,6 @@ async def test_a_module_without_a_certificate_is_refused(lab: Authority) -> None
         writer.close()
 
 
-async def test_a_plain_module_learns_that_the_mesh_is_secured(lab: Authority) -> None:
-    async with meshes(None, Member(lab, "base")) as (plain, secured):
-        await until(lambda: status(plain, secured).state == "refused", "refused")
-        assert "plain" in status(plain, secured).last_error
-        assert "rmpa trust join" in status(plain, secured).last_error
-        assert secured.mesh.counters["link.refused.plain"] > 0
-        assert not plain.ups
-
-
-async def test_a_member_never_falls_back_to_plain(lab: Authority) -> None:
-    async with meshes(Member(lab, "arm"), None) as (secured, plain):
-        await until(lambda: status(secured, plain).state == "refused", "refused")
-        assert "unsecured" in status(secured, plain).last_error
-        assert plain.mesh.counters["link.refused.unsecured"] > 0
-        assert not secured.ups
-        assert not plain.ups
-
-
 @pytest.mark.parametrize("answer", [Refusal.DUPLICATE, TrustReason.REVOKED, TrustReason.UNSECURED, None])
 async def test_a_refusal_without_proof_is_shown_and_sets_no_pause(
     lab: Authority, monkeypatch: pytest.MonkeyPatch, answer: int | None
@@ -187,21 +149,6 @@ async def test_a_refusal_without_proof_is_shown_and_sets_no_pause(
         shown = "unsecured" if answer == TrustReason.UNSECURED else "downgrade"
         assert arm.mesh.peers()[0].last_error.startswith(shown)
         assert (answer is None) != ("go away" in arm.mesh.peers()[0].last_error)
-
-
-@pytest.mark.parametrize("dialler", [True, False])
-async def test_a_revoked_module_is_gone_at_once_at_both_ends(lab: Authority, dialler: bool) -> None:
-    members = Member(lab, "arm"), Member(lab, "base")
-    async with meshes(*members) as (arm, base):
-        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
-        judge, other = (arm, base) if dialler else (base, arm)
-        members[not dialler].revoke(other.mesh.identity.name)
-        assert not judge.linked(other), "without waiting for the other side"
-        assert judge.downs[0][1].startswith("revoked:")
-        await until(lambda: bool(other.downs), "the other side sees it")
-        assert "revoked" in other.downs[0][1]
-        await until(lambda: status(other, judge).last_error.startswith("revoked"), "it is shown there")
-        await until(lambda: not judge.mesh.connections(), "both lanes ended")
 
 
 async def test_another_modules_run_cannot_be_taken_over(lab: Authority) -> None:
@@ -305,29 +252,6 @@ async def test_a_handshake_one_byte_at_a_time_is_done(lab: Authority) -> None:
         sock.close()
 
 
-@pytest.mark.parametrize("what", [b"", b"GET / HTTP/1.1\r\n" * 20, b"\x16\x03\x01\x02\x00\x01"])
-async def test_a_flood_of_strangers_costs_no_message_and_members_still_link(
-    lab: Authority, monkeypatch: pytest.MonkeyPatch, what: bytes
-) -> None:
-    """200 connections that say nothing, garbage, or the begin of a ClientHello, from the members' own address."""
-    monkeypatch.setattr("rmpa.mesh.io.securing.SECURING_TIMEOUT", 1000.0)
-    members = Member(lab, "arm"), Member(lab, "base"), Member(lab, "crane")
-    async with meshes(*members, found=False) as (arm, base, crane):
-        introduce([arm, base])
-        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
-        for sent in range(200):
-            base.hand_made.append(sock := await _dial(base))
-            with contextlib.suppress(OSError):
-                sock.send(what)
-            arm.link(base).express.send(1, sent, 0, b"x")
-        introduce([base, crane])
-        await until(lambda: base.linked(crane), "a new member")
-        await until(lambda: len(base.data) == 200, "all messages")
-        counters = base.mesh.counters
-        assert counters["link.pending_full"] + counters["link.refused.plain"] > 100
-        assert not base.downs
-
-
 async def test_accepting_pauses_for_a_flood(lab: Authority, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rmpa.mesh.io.securing.UNPROVEN_BURST", 20)
     monkeypatch.setattr(limits, "UNPROVEN_RATE", 0.1)
@@ -337,26 +261,6 @@ async def test_accepting_pauses_for_a_flood(lab: Authority, monkeypatch: pytest.
         await until(lambda: base.mesh.counters["link.paused"] > 0, "paused")
         introduce([arm, base])
         await until(lambda: base.linked(arm), "and goes on")
-
-
-async def test_silent_connections_leave_room_for_members(lab: Authority, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The oldest ones of the busiest address are closed, so that a member need not wait until they are given up."""
-    monkeypatch.setattr("rmpa.mesh.io.securing.SECURING_TIMEOUT", 1000.0)
-    monkeypatch.setattr(limits, "PENDING_CONNECTIONS_MAX", limits.PENDING_PER_ADDRESS + 2)
-    members = Member(lab, "arm"), Member(lab, "base")
-    async with meshes(*members, found=False) as (arm, base):
-        silent = [await _dial(base) for _ in range(limits.PENDING_PER_ADDRESS + 4)]
-        await until(lambda: base.mesh.counters["link.pending_full"] == 4, "four closed")
-        assert unproven(base) == limits.PENDING_PER_ADDRESS
-        silent += [await _dial(base, "127.0.0.2") for _ in range(6)]
-        await until(lambda: base.mesh.counters["link.pending_full"] == 8, "the place is shared")
-        for sock in silent[:8]:
-            assert await asyncio.wait_for(asyncio.get_running_loop().sock_recv(sock, 1), DEADLINE) == b""
-        introduce([arm, base])
-        await until(lambda: base.both_lanes(arm), "linked at once")
-        assert base.mesh.counters["link.unfinished"] == 0
-        for sock in silent:
-            sock.close()
 
 
 @pytest.mark.parametrize("rest", [b"", b"\x16\x03\x01\x02\x00\x01", b"\x16garbage" * 20])

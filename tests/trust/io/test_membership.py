@@ -9,7 +9,6 @@ import pytest
 pytest.importorskip("cryptography")
 
 from rmpa.core.errors import RemoteProtocolError, StartError
-from rmpa.runtime.tls import TlsHandshake
 from rmpa.trust import limits
 from rmpa.trust import store as files_of
 from rmpa.trust.certificates import DenyList, KeyList, sign
@@ -20,7 +19,6 @@ from tests.trust.authority import WALL
 from tests.trust.io.member_files import KEYS, SecuredMesh
 
 if TYPE_CHECKING:
-    import ssl
     from pathlib import Path
 
 DAY = 86_400.0
@@ -32,43 +30,10 @@ def mesh(tmp_path: Path) -> SecuredMesh:
     return SecuredMesh(tmp_path)
 
 
-def shake(dialler: Membership, acceptor: Membership) -> tuple[ssl.SSLObject, ssl.SSLObject]:
-    """Both ends of a TLS connection; an error of either end is raised."""
-    ends = (
-        TlsHandshake(dialler.client_context, server_side=False),
-        TlsHandshake(acceptor.server_context, server_side=True),
-    )
-    client, server = ends
-    client.receive(b"")
-    while not (client.done and server.done):
-        server.receive(client.take_output())
-        client.receive(server.take_output())
-    return client.tls, server.tls
-
-
-def seen_by(tls: ssl.SSLObject) -> dict[str, Any]:
-    found = tls.getpeercert()
-    assert found
-    return dict(found)
-
-
 def reason_of(member: Membership, certificate: dict[str, Any] | bytes, claimed: str | None) -> TrustReason:
     with pytest.raises(TrustError) as caught:
         member.judge_member(certificate, claimed)
     return caught.value.reason
-
-
-def test_two_members_link_and_know_each_other_by_name(mesh: SecuredMesh) -> None:
-    arm, base = mesh.member("arm"), mesh.member("base")
-    # OpenSSL judges times by this machine's clock; the test's certificates are of another year.
-    mesh.clock.wall_seconds = 0.0
-    at_arm, at_base = shake(arm, base)
-    mesh.clock.wall_seconds = WALL
-    assert at_arm.version() == "TLSv1.3"
-    assert at_arm.selected_alpn_protocol() == at_base.selected_alpn_protocol() == "rmpa/1"
-    arm.judge_member(seen_by(at_arm), "base")
-    base.judge_member(seen_by(at_base), "arm")
-    assert reason_of(base, seen_by(at_base), "joystick") is TrustReason.NAME
 
 
 def test_certificates_are_judged_in_both_forms(mesh: SecuredMesh, tmp_path: Path) -> None:

@@ -1,10 +1,17 @@
-"""A web app of another site in a real Chromium: it reads the API where its origin is listed."""
+"""Pages of other origins, and what the pages compute."""
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Final
+
+import pytest
 from aiohttp import web
 
 from lab.bed.chromium import Browser, Chromium
+from tests.interop import npm
 from tests.web.server.test_server import TOKEN, running
 
 
@@ -39,3 +46,16 @@ async def test_a_link_with_the_token_on_another_site_opens_the_page_for_good(bro
                 assert await page.run(f"fetch({server!r} + 'api/v1/peers').then((answer) => answer.status)") == 200
         finally:
             await runner.cleanup()
+
+
+PAGES: Final = Path(__file__).parents[1] / "pages"
+STATIC: Final = Path(__file__).parents[3] / "src/rmpa/web/static"
+
+
+@pytest.mark.skipif(bool(npm.why_not()), reason=npm.why_not())
+def test_what_the_pages_compute(tmp_path: Path) -> None:
+    (tmp_path / "package.json").write_text('{"type": "module"}')
+    shutil.copytree(STATIC, tmp_path / "static")
+    file = shutil.copy(PAGES / "pages.test.mjs", tmp_path)
+    done = subprocess.run(["node", "--test", file], check=False, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -12,18 +12,17 @@ import struct
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import aiohttp
-import pytest
-
 from rmpa.ros.types.messages import MessageType
-from rmpa.web.hub.node_link import FULL, READ_ONLY
+from rmpa.web.hub.node_link import FULL
 from rmpa.web.server.process import CertificateFiles, tls_context
-from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
+from tests.ros.node.peers import STRING, until
 from tests.web.clients.server import Client, running_server
 from tests.web.hub.client import listen, subscribed
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+
+    import pytest
 
     from rmpa.ros.core.embedded import RosCore
     from rmpa.ros.node.node import Node
@@ -84,21 +83,6 @@ async def test_rosbridge_counts_its_clients(core: RosCore) -> None:
         assert connected["ip_address"] == "127.0.0.1"
 
 
-async def test_a_read_only_rosbridge_client_sees_topics_but_no_parameters(core: RosCore, talker: Node) -> None:
-    async with running_server(core, READ_ONLY) as server, server.client() as client:
-        await talker.set_param("/secret", 5)
-        (await talker.advertise("/t", LATCHED, latch=True)).publish_raw(ONE)
-        await client.send("subscribe", topic="/t", type="std_msgs/String")
-        assert (await client.next("publish"))["msg"] == {"data": "one"}
-        await until(lambda: server.hub.params.value("/secret") == 5)
-        await client.send("call_service", service="/rosapi/get_param", id="1", args={"name": "/secret"})
-        refused = await client.next("service_response")
-        assert (refused["result"], "this client may not read parameters" in refused["values"]) == (False, True)
-        await client.send("advertise", topic="/cmd_vel", type="geometry_msgs/Twist")
-        assert "may not publish" in (await client.next("status"))["msg"]
-        assert not core.publishers("/cmd_vel")
-
-
 # --- Foxglove ---
 
 
@@ -150,34 +134,6 @@ async def test_a_client_that_stops_reading_costs_its_bound_and_no_other_a_messag
             await until(lambda: len(server.sockets.connections) == 1)
             gone = server.sockets.figures()["foxglove"]
             assert (gone.clients, gone.queued, gone.dropped) == (1, 0, figures.dropped)
-
-
-@pytest.mark.parametrize("by_client", [False, True])
-async def test_a_close_frame_comes_behind_a_large_message_under_way(
-    core: RosCore, talker: Node, by_client: bool
-) -> None:
-    payload = payload_of(20_000_000)
-    async with running_server(core) as server, server.client(FOXGLOVE) as client:
-        publisher = await talker.advertise("/map", BYTES)
-        await subscribe(client, "/map")
-        await subscribed(server.hub, len(server.hub.clients))
-        await publisher.wait_for_subscriber()
-        client.socket._reader._protocol.pause_reading()
-        publisher.publish_raw(payload)  # which the kernel does not take whole
-        (connection,) = server.sockets.connections
-        await until(lambda: connection.unsent - connection.queue.bytes > 1_000_000)
-        if by_client:
-            await client.socket._writer.close(4000)
-            await until(lambda: not server.sockets.connections)
-        closing = asyncio.ensure_future(server.sockets.close())
-        await asyncio.sleep(0)
-        client.socket._reader._protocol.resume_reading()
-        assert (await client.next_bytes())[13:] == payload
-        async with asyncio.timeout(DEADLINE):
-            while (message := await client.socket.receive()).type != aiohttp.WSMsgType.CLOSE:
-                assert message.type == aiohttp.WSMsgType.TEXT
-        assert message.data == (1000 if by_client else 1001)
-        await closing
 
 
 async def test_the_hub_has_nothing_left_of_a_client_that_went(

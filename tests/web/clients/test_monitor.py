@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import json
 import struct
 import threading
@@ -27,7 +26,7 @@ from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.server.agent_watch import AgentWatch
 from tests.ros.node.peers import DEADLINE, until
 from tests.web.clients.server import running_server
-from tests.web.hub.client import listen, node
+from tests.web.hub.client import node
 from tests.web.monitor.patches import apply
 from tests.web.snapshots import FULL as SNAPSHOT
 
@@ -42,7 +41,6 @@ if TYPE_CHECKING:
 TEXT = MessageType("std_msgs/String")
 TWIST = MessageType("geometry_msgs/Twist")
 LOG = MessageType("rosgraph_msgs/Log")
-DRIVER = dataclasses.replace(FULL, drive=True)
 
 
 class Agent:
@@ -237,18 +235,6 @@ async def test_a_service_is_described_and_called(page: Page, talker: Node) -> No
     assert answer["response"] == {"success": True, "message": "as asked"}
     assert "data" in await page.ask("call", service="/light", request={"datum": True})
     assert "no service" in await page.ask("call", service="/none", request={})
-
-
-async def test_the_joystick_drives_and_a_lost_page_stops_the_robot(core: RosCore, talker: Node) -> None:
-    async with page_of(core, DRIVER) as page:
-        got = await listen(talker, "/cmd_vel")
-        driven = struct.pack("<6d", 0.5 * limits.DRIVE_SPEED, 0, 0, 0, 0, -limits.DRIVE_TURN)
-        async with asyncio.timeout(DEADLINE):
-            while driven not in got:
-                await page.drive(0.5, -1)
-                await asyncio.sleep(0.05)
-        page.socket._response.connection.transport.abort()  # type: ignore[union-attr]
-        await until(lambda: got[-1] == bytes(48))
 
 
 async def test_the_log_is_kept_for_pages_that_open_it(page: Page, talker: Node) -> None:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import gc
 import time
-import warnings
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -16,13 +14,10 @@ from rmpa.ros.types.definitions import SEPARATOR, known_text, parse_definition
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 from rmpa.web import limits
-from rmpa.web.hub.node_link import CONTROL_REMEDY, READ_ONLY, READ_REMEDY
 from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
 from tests.web.hub.client import FakeClient, listen, node, running_hub
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from rmpa.ros.core.embedded import RosCore
     from rmpa.ros.node.node import Node
     from rmpa.web.hub.hub import Hub
@@ -334,24 +329,6 @@ async def test_calls_share_a_connection_and_errors_are_told(hub: Hub, client: Fa
     assert hub.graph.services["/set"].type == SET_BOOL
 
 
-async def test_a_client_that_goes_right_after_its_requests_leaves_nothing(hub: Hub, client: FakeClient) -> None:
-    for work in (
-        client.get_params(),
-        client.find_service("/rosout/get_loggers"),
-        client.call("/rosout/get_loggers", "", b""),
-    ):
-        client.start(work)
-    client.close()
-    with warnings.catch_warnings(record=True) as warned:
-        warnings.simplefilter("always")
-        for _ in range(3):
-            await asyncio.sleep(0)
-        gc.collect()
-    assert not [str(each.message) for each in warned if each.category is RuntimeWarning]
-    assert not client.results
-    assert not client.errors
-
-
 async def test_clients_that_leave_in_the_middle_of_their_calls_keep_no_connection_of_the_server(
     hub: Hub,
     talker: Node,
@@ -495,22 +472,3 @@ async def test_clock_gives_the_time_where_the_parameter_says_so(hub: Hub, talker
 
 
 # --- rights ---
-
-
-@pytest.mark.parametrize(
-    ("act", "remedy"),
-    [
-        (lambda client: client.talk("/t"), CONTROL_REMEDY),
-        (lambda client: client.call("/set", SET_BOOL, b"\x01"), CONTROL_REMEDY),
-        (lambda client: client.serve("/s", SET_BOOL, print, print), CONTROL_REMEDY),
-        (lambda client: client.set_param("/p", 1), CONTROL_REMEDY),
-        (lambda client: client.delete_param("/p"), CONTROL_REMEDY),
-        (lambda client: client.get_params(), READ_REMEDY),
-        (lambda client: client.follow_params((), print), READ_REMEDY),
-        (lambda client: client.fetch_asset("package://a/b", 10), READ_REMEDY),
-    ],
-)
-async def test_a_read_only_client_changes_nothing(hub: Hub, act: Callable[[FakeClient], Any], remedy: str) -> None:
-    with pytest.raises(PeerRefused, match="may not") as refused:
-        await act(FakeClient(hub, READ_ONLY))
-    assert refused.value.remedy == remedy

@@ -1,19 +1,23 @@
+"""A session of rosbridge."""
+
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from typing import Any
 
 import cbor2
+import msgspec
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from rmpa.core.errors import PeerRefused
 from rmpa.web import limits
 from rmpa.web.clients.frame_writer import Opcode
 from rmpa.web.rosbridge.protocol import decode_png
-from tests.web.recorder import NOW_NS
-
-if TYPE_CHECKING:
-    from tests.web.rosbridge.client import Client
+from rmpa.web.rosbridge.session import OPS
+from tests.web.recorder import NOW_NS, answer
+from tests.web.rosbridge.client import Client
 
 STRING = "std_msgs/String"
 HELLO = b"\x05\0\0\0hello"
@@ -309,3 +313,48 @@ def test_what_a_client_may_have_is_bounded(client: Client) -> None:
     for number in range(limits.ADVERTISED_MAX + 5):
         client.send("advertise", topic=f"/t{number}", type=STRING)
     assert len(client.received()) == 5
+
+
+_KEY = st.text(max_size=4) | st.integers()
+_ANY = st.recursive(
+    st.one_of(
+        st.none(),
+        st.booleans(),
+        st.integers(-(2**70), 2**70),
+        st.floats(),
+        st.text(max_size=9),
+        st.binary(max_size=9),
+    ),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(_KEY, inner, max_size=3),
+    max_leaves=6,
+)
+_NAMES = ["/t", "/s", "/rosapi/topics", "/rosapi/get_param", "std_msgs/String", "std_srvs/SetBool", "actionlib/Test"]
+_VALUES = ["none", "png", "cbor", "cbor-raw", "info", "i", {"data": "x"}, {"a": 1}, [1, 2], 0, 1, 5, 1000, True, "{}"]
+_USUAL = st.sampled_from([*_NAMES, *_VALUES])
+
+
+@st.composite
+def _op(draw: st.DrawFn) -> dict[str, Any]:
+    name = draw(st.sampled_from(sorted(OPS)))
+    fields = [field.encode_name for field in msgspec.structs.fields(OPS[name])]
+    values = {field: draw(_USUAL | _USUAL | _ANY) for field in fields if draw(st.integers(0, 4))}
+    return {"op": name, **values}
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(_op(), max_size=6), st.booleans())
+def test_any_ops_in_any_order(ops: list[dict[str, Any]], binary: bool) -> None:
+    client = Client()
+    client.graph.add_topic("/t", "std_msgs/String")
+    client.graph.add_service("/s", "std_srvs/SetBool")
+    for op in ops:
+        try:
+            frame = cbor2.dumps(op) if binary else msgspec.json.encode(op).decode()
+        except (TypeError, OverflowError):
+            continue
+        for asked in client.send_raw(frame):
+            answer(asked, b"\1\0\0\0x")
+        client.advance(0.001)
+    client.advance(1000)
+    assert all("op" in each for each in client.received())
+    assert client.session.next_timer() is None

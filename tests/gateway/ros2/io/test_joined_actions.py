@@ -1,4 +1,4 @@
-"""Actions between a module and ROS 2 through the gateway's neighbour: each side's topics, services and tokens."""
+"""Actions of both ROS, and answers about ROS 2."""
 
 from __future__ import annotations
 
@@ -6,14 +6,19 @@ import asyncio
 import struct
 from typing import Any
 
+import pytest
+
+from rmpa.core.errors import UnreachableError
 from rmpa.gateway.ros2.actions import Ros2Actions
 from rmpa.gateway.ros2.conversion import ActionPair
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, data_key
 from rmpa.gateway.ros2.types import Ros2Types, TypePair
+from rmpa.observe.operations import INFO, REPORT, WHY
+from rmpa.observe.peer_info import SiteInfo, SitesReport
 from rmpa.ros.types.definitions import SEPARATOR, known_text
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_zenoh import MemoryQuery, eventually
-from tests.gateway.ros2.io.ros2_bed import STRING, Ros2Bed, cdr
+from tests.gateway.ros2.io.ros2_bed import NO_TYPE, STRING, Ros2Bed, cdr
 
 TEST = [MessageType(f"actionlib/Test{part}") for part in ("Goal", "Result", "Feedback")]
 TYPES = ActionPair(TEST, TypePair("actionlib/action/Test"), Ros2Types("jazzy")).types
@@ -122,3 +127,37 @@ async def test_other_topics_of_such_names_are_left_to_other_parts(bed: Ros2Bed) 
         ("/do/goal", ACTION["goal"], True),
     ):
         assert part.mesh_source(bed.graph.publisher(name, kind), there=True) is taken
+
+
+class OtherSites:
+    """Answers for another site."""
+
+    async def answer(self, what: str, _args: dict[str, Any], _asker: str = "", /) -> Any:
+        sites = (SiteInfo(name="hall", state="this site"),)
+        return SitesReport(gateway="gate", site="hall", sites=sites) if what == REPORT else ["of a site"]
+
+
+async def test_ros2_is_listed_with_its_topics_and_what_is_wrong_with_them(bed: Ros2Bed) -> None:
+    bed.graph.publisher("/mine", STRING)
+    bed.publisher("/chatter")
+    bed.subscribe("/mine", node="/older", type_hash=NO_TYPE)
+    await eventually(lambda: bed.problems and bed.topic("/chatter"))
+    answer = bed.neighbour.answer
+    report: SitesReport = await answer(REPORT, {})
+    assert [(site.name, site.state) for site in report.sites] == [("ros2", "joined")]
+    (info,) = (await answer(INFO, {"site": "ros2"})).sites
+    rows = {(row.name, row.node): row for row in info.sources}
+    assert rows["/chatter", "/bot"].type == "std_msgs/String"
+    assert "definitions differ" in rows["/mine", "/older"].problem
+    ways = await answer(WHY, {"name": "/chatter", "site": "ros2"})
+    assert [(way.peer, way.node) for way in ways] == [("ros2", "/bot")]
+    with pytest.raises(UnreachableError):
+        await answer(INFO, {"site": "hall"})
+
+
+async def test_questions_about_sites_go_to_what_answers_for_them(bed: Ros2Bed) -> None:
+    bed.neighbour.sites = OtherSites()
+    report: SitesReport = await bed.neighbour.answer(REPORT, {})
+    assert [site.name for site in report.sites] == ["hall", "ros2"]
+    for what, args in ((INFO, {"site": "hall"}), (WHY, {"name": "/nothing"})):
+        assert await bed.neighbour.answer(what, args) == ["of a site"]
