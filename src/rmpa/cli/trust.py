@@ -323,7 +323,7 @@ def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str
     loaded = module.loaded if config else agent_settings(module)
     permissions = Permissions(loaded.settings.trust)
     action = what in (ACTION_CLIENT, ACTION_SERVER)  # five accesses in one
-    asked = action_topics(what, name) if action else [(Access(what), name)]
+    asked = action_topics(what, name) if action else [(Access[what.upper()], name)]
     decisions = [permissions.judge(access, peer, each) for access, each in asked]
     decision = next((each for each in decisions if not each.allowed), decisions[0])
     files = sorted({str(given.path) for given in loaded.given.values() if given.path is not None})
