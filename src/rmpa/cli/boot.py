@@ -25,7 +25,7 @@ from rmpa.cli.machine import (
     remove_folder,
 )
 from rmpa.cli.options import Options, flag, json_verb
-from rmpa.cli.trust import confirm
+from rmpa.cli.output import confirm
 from rmpa.cli.units import (
     CONFIG,
     GROUP,
@@ -254,7 +254,7 @@ def _check_parts(machine: Machine, before: Former, *, web: bool, gateway: bool) 
     Raises:
         RmpaError: A library or a setting is missing, or another program has the core's port.
     """
-    from rmpa.cli.gateway import check_gateway, check_web
+    from rmpa.cli.module import check_gateway, check_web
 
     path = machine.path(CONFIG)
     settings = before.settings

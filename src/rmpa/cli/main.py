@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 VERBS: Final = {
     "up": ("agent", "Run this machine's agent: ROS core, discovery, mesh and bridge."),
     "init": ("init", "Write a first rmpa.toml, from what is found on this machine."),
-    "core": ("gateway", "Run the ROS core alone: a drop-in for roscore."),
+    "core": ("core", "Run the ROS core alone: a drop-in for roscore."),
     "run": ("run", "Run the Smart Resources of a Python file, with the agent of their module."),
     "peer": ("main", "See the peers that the agent knows."),
     "peer list": ("peer", "List the peers and the state of their links."),
@@ -103,14 +103,14 @@ VERBS: Final = {
     "explain": ("agent", "Say what the code of an error or a warning means, and what to do."),
     "doctor": ("doctor", "Check this machine: network, clock, rights, ROS environment."),
     "bug-report": ("bug_report", "Collect what a maintainer needs to know of this machine, redacted."),
-    "web": ("gateway", "Serve this module's state over HTTP: metrics, REST."),
+    "web": ("web", "Serve this module's state over HTTP: metrics, REST."),
     "gateway": ("gateway", "Join this network's modules with other sites and with ROS 2, over Zenoh."),
     "gateway zenoh-config": ("gateway", "Print a configuration for zenohd, Zenoh's own router."),
     "config": ("main", "Show the settings and where each comes from; print their JSON Schema."),
     "config show": ("agent", "Print each setting that `rmpa up` would use here, and where it comes from."),
     "config schema": ("agent", "Print the JSON Schema of rmpa.toml: editors check and complete the file with it."),
     "reload": ("agent", "Let the agent read its settings again."),
-    "completion": ("agent", "Print the script that completes rmpa's commands in a shell."),
+    "completion": ("completion", "Print the script that completes rmpa's commands in a shell."),
 }
 # What to use in place of a command that is gone, by its words behind ``rmpa``.
 REMOVED_VERBS: Final = {
@@ -273,6 +273,18 @@ class LazyGroup(PlacedHelp, click.Group):
         """Write the table's lines, without importing anything."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in self.commands_at.items()])
+
+
+def verb(*parameters: Callable[..., Any], **settings: Any) -> Callable[[Callable[..., Any]], click.Command]:
+    """Make a command of a function: ``help_of`` its docstring, and these arguments and options in order."""
+
+    def decorate(function: Callable[..., Any]) -> click.Command:
+        command = function
+        for parameter in reversed(parameters):
+            command = parameter(command)
+        return click.command(cls=PlacedHelp, **help_of(function.__doc__), **settings)(command)
+
+    return decorate
 
 
 def _group(function: Callable[[], None]) -> LazyGroup:
