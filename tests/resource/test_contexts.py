@@ -11,8 +11,9 @@ import pytest
 from rmpa.core.errors import ConfigError, PeerRefused
 from rmpa.resource.node import ResourceNode
 from rmpa.resource.quality import at_least
-from rmpa.resource.reconfigure import CONFIG_TYPE, DESCRIPTION_TYPE, SERVICE_TYPE, read_config
+from rmpa.resource.reconfigure import DESCRIPTION_TYPE, read_config
 from rmpa.resource.resource import Resource
+from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE
 from tests.resource.rig import ARRAY, DEADLINE, TEXT, listen, until
 
 if TYPE_CHECKING:

@@ -11,11 +11,12 @@ import rmpa.resource
 from rmpa.core.contract import Contract, Reliability
 from rmpa.core.errors import ConfigError, LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.resource.declare import Parameter
-from rmpa.resource.descriptor import Descriptor, describe
 from rmpa.resource.quality import at_least, at_most
 from rmpa.resource.resource import Resource, Role
+from rmpa.resource.runtime import describe
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import DefinitionError
+from rmpa.ros.types.descriptor import Descriptor
 
 if TYPE_CHECKING:
     from collections.abc import Callable

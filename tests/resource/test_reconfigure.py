@@ -8,7 +8,6 @@ import pytest
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource.reconfigure import (
-    CONFIG_TYPE,
     DESCRIPTION_TYPE,
     checked,
     config,
@@ -17,6 +16,7 @@ from rmpa.resource.reconfigure import (
     read_config,
 )
 from rmpa.resource.resource import Resource
+from rmpa.ros.types.descriptor import CONFIG_TYPE
 from rmpa.ros.types.messages import MessageType
 
 INT = 2**31

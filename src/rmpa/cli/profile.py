@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from rmpa.cli.output import Text
     from rmpa.cli.resource import ResourceGraph, SeenResource
-    from rmpa.resource.descriptor import Descriptor, ParameterDescriptor, TaskDescriptor
+    from rmpa.ros.types.descriptor import Descriptor, ParameterDescriptor, TaskDescriptor
 
 _TIMES: Final = frozenset({"deadline", "lifespan", "liveliness_lease"})
 

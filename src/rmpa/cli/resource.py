@@ -18,8 +18,8 @@ from rmpa.cli.output import Painted, Table, paint, print_json, print_text, print
 from rmpa.config.rules import ROS2
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.core.identity import proxied_node, proxied_peer
-from rmpa.resource.descriptor import TOPIC, Descriptor
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
+from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE, TOPIC, Descriptor
 from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ class ResourceGraph:
 
     async def configuration(self, one: SeenResource) -> dict[str, bool | int | float | str]:
         """The values of a resource's parameters."""
-        from rmpa.resource.reconfigure import CONFIG_TYPE, read_config
+        from rmpa.resource.reconfigure import read_config
 
         message = (await self.hear([one], "parameter_updates", CONFIG_TYPE)).get(one)
         return read_config(message) if message is not None else {}
@@ -140,7 +140,6 @@ class ResourceGraph:
         Raises:
             RmpaError: It cannot be reached, or refuses; then nothing has changed.
         """
-        from rmpa.resource.reconfigure import SERVICE_TYPE
         from rmpa.ros.types.installed import ServiceType
 
         service = GraphName(f"{one.path}/set_parameters", one.peer)

@@ -43,8 +43,9 @@ def protocols() -> dict[str, tuple[int | str, str]]:
     from rmpa.discovery import beacon
     from rmpa.gateway.sites import keys
     from rmpa.mesh import frames
-    from rmpa.resource import descriptor, saved
+    from rmpa.resource import saved
     from rmpa.ros.core import state
+    from rmpa.ros.types import descriptor
     from rmpa.trust import packets, store, tokens
     from rmpa.web import api
     from rmpa.web.monitor import messages

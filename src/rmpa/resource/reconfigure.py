@@ -21,6 +21,7 @@ from rmpa.core.errors import ConfigError, LocalProtocolError, RmpaError
 from rmpa.core.limits import INT32_MAX, INT32_MIN
 from rmpa.resource.declare import Parameter
 from rmpa.resource.runtime import RuntimePart
+from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 from rmpa.runtime.tasks import end_tasks, start_task
@@ -37,9 +38,7 @@ if TYPE_CHECKING:
     from rmpa.ros.node.endpoints import Publisher
     from rmpa.ros.types.messages import Plain
 
-CONFIG_TYPE: Final = "dynamic_reconfigure/Config"
 DESCRIPTION_TYPE: Final = "dynamic_reconfigure/ConfigDescription"
-SERVICE_TYPE: Final = "dynamic_reconfigure/Reconfigure"
 PROFILE: Final = "profile"
 CONTEXT: Final = "context"
 # Name that enumerations show for an empty ``profile`` or ``context``.

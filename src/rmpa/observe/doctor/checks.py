@@ -21,7 +21,7 @@ from rmpa.core.identity import proxied_peer
 from rmpa.observe import limits
 from rmpa.observe.doctor import machine, network, repairs
 from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check
-from rmpa.observe.why.diagnosis import misplaced, remedy_for, subscriber_text
+from rmpa.observe.why.diagnosis import judge_peer_clock, misplaced, remedy_for, subscriber_text
 from rmpa.ros.http.rpc import call_api
 from rmpa.runtime.accept import open_files_advice
 
@@ -168,7 +168,7 @@ def _peer(agent: str, peer: PeerInfo) -> Iterator[Check]:
             remedy = "`rmpa peer info` shows of which topics; docs/guides/contracts.md: max_rate, priority"
             yield check(WARN, text, remedy)
         if link.clock_offset is not None:
-            yield machine.judge_peer_clock(agent, peer.name, link.clock_offset, link.clock_error)
+            yield judge_peer_clock(agent, peer.name, link.clock_offset, link.clock_error)
 
 
 # --- which nodes of a secured module listen beyond this machine: what ROS 1 leaves open (docs/reference/security.md)
