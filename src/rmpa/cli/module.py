@@ -16,6 +16,7 @@ from rmpa.config.settings import Settings
 from rmpa.core.errors import ConfigError, StartError, UnreachableError, missing_extra
 from rmpa.core.identity import peer_name_problem
 from rmpa.observe.control_client import ControlClient, find_agents, running_agents
+from rmpa.runtime.plugins import NEIGHBOURS, find_plugins
 from rmpa.runtime.systemd import restart_text
 from rmpa.trust.permissions import TrustStatus
 from rmpa.trust.store import TrustStore
@@ -214,7 +215,7 @@ def check_gateway(settings: Settings) -> None:
     """
     _check_libraries("rmpa gateway", "zenoh", {"zenoh": "eclipse-zenoh", "xxhash": "xxhash"})
     it = settings.gateway
-    if not (it.site or it.ros2.enabled or it.router):
+    if not (it.site or it.ros2.enabled or it.router or find_plugins(NEIGHBOURS)):
         raise ConfigError("rmpa gateway", "there is nothing to join", "say --site NAME for other sites, or --ros2")
     if it.router and not it.listen:
         raise ConfigError("gateway.router", "a router that listens nowhere", "add --listen tls/0.0.0.0:7447")

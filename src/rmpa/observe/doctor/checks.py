@@ -24,6 +24,8 @@ from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.why.diagnosis import judge_peer_clock, misplaced, remedy_for, subscriber_text
 from rmpa.ros.http.rpc import call_api
 from rmpa.runtime.accept import open_files_advice
+from rmpa.runtime.plugins import CHECKS as PLUGIN_CHECKS
+from rmpa.runtime.plugins import find_plugins, load_plugin, plugin_error
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -292,6 +294,16 @@ CHECKS: Final[dict[str, Callable[[DoctorInput], Iterable[Check]]]] = {
 
 
 def examine(given: DoctorInput) -> Iterator[Check]:
-    """Run all checks; each result comes as soon as it is there. The whole takes some two seconds."""
+    """Run all checks, then those of other packages; each result comes as soon as it is there, the whole in 2 s."""
     for check in CHECKS.values():
         yield from check(given)
+    for name, entry in find_plugins(PLUGIN_CHECKS).items():
+        try:
+            for found in load_plugin(entry)(given):
+                if not isinstance(found, Check):
+                    raise plugin_error(entry, TypeError(f"{found!r} is no Check"))  # noqa: TRY301
+                yield found
+        except RmpaError as error:
+            yield Check(name, WARN, str(error), code=error.code)
+        except Exception as error:  # noqa: BLE001 - another's code
+            yield Check(name, WARN, str(plugin_error(entry, error)), code="plugin-broken")
