@@ -110,7 +110,7 @@ def test_a_broken_package_is_told_in_one_line(place: Place, other: Path, module:
 def test_a_package_with_a_broken_list_is_left_out(other: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_package(other, plugins.VERBS, entry="no list at all")
     assert plugins.find_plugins(plugins.VERBS) == {}
-    assert f"a package at {other} failed" in caplog.text
+    assert f"{other}/rmpa_other-2.0.dist-info failed: " in caplog.text
 
 
 def test_packages_in_the_working_directory_do_not_count(other: Path, monkeypatch: pytest.MonkeyPatch) -> None:
