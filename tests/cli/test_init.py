@@ -19,8 +19,8 @@ from rmpa.cli.init import _interfaces as of_interfaces
 from rmpa.cli.units import config_text
 from rmpa.config.read import load_settings
 from rmpa.core.identity import peer_name_from
+from rmpa.discovery.network import NetworkInterface
 from rmpa.observe import limits
-from rmpa.observe.doctor.machine import NetworkInterface
 from tests.cli.conftest import end, free_port, until, with_core
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from click.testing import CliRunner
 
 import rmpa
 from lab.bed.processes import eventually
-from rmpa.cli import agent as agent_verbs
+from rmpa.cli import completion
 from rmpa.cli.main import MEANT, REMOVED_VERBS, VERBS, LazyGroup, cli, main
 from rmpa.core import codes
 from tests.cli.conftest import DEADLINE, with_core
@@ -201,7 +201,7 @@ def joystick(agent: Callable[..., None], core: RosCore, listening: str) -> Itera
 
 @pytest.mark.usefixtures("joystick")
 def test_a_shell_completes_what_the_agent_knows(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(agent_verbs, "ANSWER", DEADLINE)
+    monkeypatch.setattr(completion, "ANSWER", DEADLINE)
     for line, words in {
         "peer in": ["info"],
         "peer info j": ["joystick"],
@@ -237,15 +237,15 @@ def test_bash_takes_a_peer_s_name_for_three_words(place: Place, line: str, words
     eventually(completes, what=f"{line} completed by {words}")
 
 
-def test_an_agent_that_hangs_does_not_hold_up_the_shell(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_agent_that_hangs_does_not_hold_up_the_shell() -> None:
     end = threading.Event()
 
     def hang(_: click.Context, __: str) -> list[str]:
         end.wait(DEADLINE)
         return ["late"]
 
-    monkeypatch.setitem(agent_verbs._FIND, "peer", hang)
-    assert agent_verbs.complete_names("peer", click.Context(cli), "") == []
+    complete = completion.completes(hang)
+    assert complete(click.Context(cli), click.Argument(["name"]), "") == []
     end.set()
 
 

@@ -11,11 +11,11 @@ import pytest
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource.client import ResourceClient
-from rmpa.resource.descriptor import describe
 from rmpa.resource.node import ResourceNode
 from rmpa.resource.quality import at_least, at_most
 from rmpa.resource.reconfigure import read_config
 from rmpa.resource.resource import Resource
+from rmpa.resource.runtime import describe
 from tests.resource.test_node import echo
 
 if TYPE_CHECKING:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource.declare import parse_rule
-from rmpa.resource.reconfigure import CONFIG_TYPE, ChoiceParameter, checked, config, entries, read_config
+from rmpa.resource.reconfigure import ChoiceParameter, checked, config, entries, read_config
 from rmpa.resource.resource import Resource
+from rmpa.ros.types.descriptor import CONFIG_TYPE
 from rmpa.ros.types.messages import MessageError, MessageType
 
 _ONE = Resource("one", role="sensing")

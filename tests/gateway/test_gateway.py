@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -197,3 +198,23 @@ async def test_a_gateway_that_cannot_listen_does_not_start_and_a_session_is_clos
         with pytest.raises(StartError):
             await second.gateway.start()
         assert second.events == ["session closed"]
+
+
+async def test_a_package_adds_a_neighbour_and_a_broken_one_is_left_out(
+    bed: Bed, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def make(graph: AgentGraph, _session: OpenSession, _settings: Settings) -> Neighbour:
+        return RecordedNeighbour(graph, bed.events)
+
+    def fail(*_: object) -> Neighbour:
+        raise ValueError("no cable")
+
+    entries = {make: EntryPoint("other", "", ""), fail: EntryPoint("broken", "", ""), (lambda *_: None): None}
+    monkeypatch.setattr(
+        "rmpa.gateway.gateway.load_plugins", lambda _: [(entry, each) for each, entry in entries.items()]
+    )
+    async with started(bed) as gateway:
+        assert [*gateway.neighbours] == ["sites", "other"]
+        assert bed.events == ["started in g", "started in g"]
+        assert "broken of the package  failed: ValueError: no cable [plugin-broken]" in caplog.text
+    assert bed.events[2:] == ["closed", "closed", "session closed"]

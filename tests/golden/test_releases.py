@@ -28,11 +28,12 @@ from rmpa.gateway.sites.keys import AttachmentReader, parse_token
 from rmpa.mesh.frames import Frame, Hello, Lane, Refusal, Refuse
 from rmpa.observe.control import ControlReply, ControlRequest
 from rmpa.observe.snapshot import Snapshot
-from rmpa.resource.descriptor import Descriptor, describe
+from rmpa.resource.runtime import describe
 from rmpa.resource.saved import SavedCoolDown, SavedRequirement, SavedState
 from rmpa.ros.core import state as core_state
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import NodeRecord
+from rmpa.ros.types.descriptor import Descriptor
 from rmpa.trust.certificates import DenyEntry, DenyList, KeyList, ca_public_key, read_document, verify
 from rmpa.trust.packets import Verdict
 from rmpa.trust.store import AuthorityPlace, Issued, TrustStore

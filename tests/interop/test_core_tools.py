@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]
 
-RUN: Final = "from rmpa.cli.gateway import core; core()"
+RUN: Final = "from rmpa.cli.core import core; core()"
 RUN_WITHOUT_CHECKS: Final = f"from rmpa.ros import limits; limits.NODE_CHECK_INTERVAL = 1e6; {RUN}"
 """A core that does not look by itself whether its nodes live."""
 DEADLINE: Final = 40.0

@@ -17,7 +17,7 @@ import pytest
 from lab.bed.chromium import Chromium
 from lab.bed.http_client import http_client
 from lab.bed.processes import DEADLINE
-from rmpa.resource.descriptor import Descriptor, ParameterDescriptor, ProfileDescriptor
+from rmpa.ros.types.descriptor import Descriptor, ParameterDescriptor, ProfileDescriptor
 from rmpa.web import limits
 from rmpa.web import limits as monitor_limits
 from rmpa.web.monitor.messages import SUBPROTOCOL

@@ -4,10 +4,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.resource.reconfigure import CONFIG_TYPE, DESCRIPTION_TYPE, SERVICE_TYPE
+from rmpa.resource.reconfigure import DESCRIPTION_TYPE
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import ARRAY_TYPE
+from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 

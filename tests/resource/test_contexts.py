@@ -17,8 +17,9 @@ from rmpa.resource import limits
 from rmpa.resource.declare import ContextRule, Scalar, parse_rule, split_reference
 from rmpa.resource.node import ResourceNode
 from rmpa.resource.quality import at_least
-from rmpa.resource.reconfigure import CONFIG_TYPE, DESCRIPTION_TYPE, SERVICE_TYPE, read_config
+from rmpa.resource.reconfigure import DESCRIPTION_TYPE, read_config
 from rmpa.resource.resource import Resource
+from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE
 from tests.resource.rig import ARRAY, DEADLINE, TEXT, listen, until
 
 if TYPE_CHECKING:

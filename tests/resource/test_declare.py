@@ -14,10 +14,8 @@ import rmpa.resource
 from rmpa.core.contract import Contract, Reliability
 from rmpa.core.errors import ConfigError, LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.resource.declare import Parameter
-from rmpa.resource.descriptor import Descriptor, describe
 from rmpa.resource.quality import at_least, at_most
 from rmpa.resource.reconfigure import (
-    CONFIG_TYPE,
     DESCRIPTION_TYPE,
     checked,
     config,
@@ -26,8 +24,10 @@ from rmpa.resource.reconfigure import (
     read_config,
 )
 from rmpa.resource.resource import Resource, Role
+from rmpa.resource.runtime import describe
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import DefinitionError
+from rmpa.ros.types.descriptor import CONFIG_TYPE, Descriptor
 from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused
-from rmpa.resource.descriptor import Descriptor
 from rmpa.resource.node import TRANSITIONS, ResourceNode, run_all
 from rmpa.resource.quality import at_most
 from rmpa.resource.resource import Resource
@@ -16,6 +15,7 @@ from rmpa.resource.runtime import LifecycleState
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import DiagnosticLevel
+from rmpa.ros.types.descriptor import Descriptor
 from tests.resource.rig import OK, STALE, WARN, status, until
 
 if TYPE_CHECKING:

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any, Final
 import pytest
 
 from rmpa.core.errors import LocalProtocolError
-from rmpa.resource.descriptor import Descriptor, describe
 from rmpa.resource.node import ResourceNode, run_all
 from rmpa.resource.resource import Resource
-from rmpa.resource.runtime import Runtime, RuntimePart
+from rmpa.resource.runtime import Runtime, RuntimePart, describe
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import SEPARATOR, UnknownTypeError
+from rmpa.ros.types.descriptor import Descriptor
 from rmpa.ros.types.installed import packages_below
 from rmpa.ros.types.messages import MessageError, MessageType
 from rmpa.ros.wire.tcpros import TopicDescription

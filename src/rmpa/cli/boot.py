@@ -25,7 +25,7 @@ from rmpa.cli.machine import (
     remove_folder,
 )
 from rmpa.cli.options import Options, flag, json_verb
-from rmpa.cli.trust import confirm
+from rmpa.cli.output import confirm
 from rmpa.cli.units import (
     CONFIG,
     GROUP,
@@ -51,6 +51,7 @@ from rmpa.config.read import line_of, load_settings, parse_config
 from rmpa.config.settings import Settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.core.identity import peer_name_from, peer_name_problem
+from rmpa.runtime.systemd import INSTALL, is_set_up
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -254,7 +255,7 @@ def _check_parts(machine: Machine, before: Former, *, web: bool, gateway: bool) 
     Raises:
         RmpaError: A library or a setting is missing, or another program has the core's port.
     """
-    from rmpa.cli.gateway import check_gateway, check_web
+    from rmpa.cli.module import check_gateway, check_web
 
     path = machine.path(CONFIG)
     settings = before.settings
@@ -434,8 +435,6 @@ def service_status(options: Options) -> int:
 
 
 def _state(unit: str) -> dict[str, object]:
-    from rmpa.observe.doctor.machine import is_set_up
-
     shown = _shown(unit)
     since = int(shown.get("StateChangeTimestampMonotonic") or 0) / 1e6
     installed = shown.get("LoadState") == "loaded"
@@ -456,7 +455,6 @@ def _state(unit: str) -> dict[str, object]:
 
 def _unit_lines(unit: dict[str, object]) -> Iterator[str]:
     from rmpa.cli.output import duration
-    from rmpa.observe.doctor.machine import INSTALL
 
     name, active = unit["unit"], unit["active"]
     if not unit["installed"]:

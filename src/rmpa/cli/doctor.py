@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.cli.agent import paint_level
 from rmpa.cli.options import FiniteRange, Options, config_option, flag, json_verb
-from rmpa.cli.output import Painted, print_text, printable, warn
-from rmpa.cli.trust import confirm
+from rmpa.cli.output import Painted, confirm, paint_level, print_text, printable, warn
 from rmpa.observe import limits
 from rmpa.observe.doctor.checks import examine
 from rmpa.observe.doctor.machine import look_at

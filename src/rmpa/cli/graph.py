@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.observe.peer_info import PeerInfo
+    from rmpa.observe.snapshot import RouteInfo
     from rmpa.ros.node.node import Node, Received
 
 # Seconds between two lines of figures, as rostopic has it.
@@ -433,3 +434,10 @@ async def watch_topic(
             await tick()
 
     await with_node(master, "rmpa_topic", listen)
+
+
+def shown_state(route: RouteInfo) -> str:
+    """The state of a route, where its messages pass the agents or not: ``open``, ``direct``, ``open and direct``."""
+    if route.transport == "direct":
+        return "direct"
+    return f"{route.state} and direct" if route.transport == "both" else route.state

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from rmpa.config.schema import Key
-    from rmpa.observe.doctor.machine import NetworkInterface
+    from rmpa.discovery.network import NetworkInterface
     from rmpa.observe.snapshot import AgentInfo
 
 _HEAD: Final = "# Written by `rmpa init`: the comment above each active line says what was found.\n"
@@ -148,7 +148,7 @@ def findings(environ: Mapping[str, str], notes: list[str]) -> list[Finding]:
         environ: The shell's variables.
         notes: Gets what the user should know, and what no setting has.
     """
-    from rmpa.observe.doctor.machine import read_interfaces
+    from rmpa.discovery.network import read_interfaces
 
     host, agents = socket.gethostname(), list(_agents(environ, notes))
     directory = state_dir(of_unit(environ))
@@ -201,7 +201,7 @@ def _core(agents: Sequence[AgentInfo], name: str, port: int) -> Iterator[Finding
 
 
 def _interfaces(there: Sequence[NetworkInterface]) -> Iterator[Finding]:
-    from rmpa.observe.doctor.network import CONTAINERS
+    from rmpa.discovery.network import CONTAINERS
 
     outer = [one for one in there if not one.loopback]
     inner = [one.name for one in outer if CONTAINERS.match(one.name) and one.networks]

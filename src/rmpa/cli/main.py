@@ -24,14 +24,15 @@ from rmpa.core.errors import ConfigError, RmpaError, with_places
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+    from importlib.metadata import EntryPoint
 
 # By the words behind ``rmpa``: the module of ``rmpa.cli``, and the line that the help of the group shows.
 #
 # ``rmpa topic list`` is the function ``topic_list`` of its module.
-VERBS: Final = {
+_DECLARED: Final = {
     "up": ("agent", "Run this machine's agent: ROS core, discovery, mesh and bridge."),
     "init": ("init", "Write a first rmpa.toml, from what is found on this machine."),
-    "core": ("gateway", "Run the ROS core alone: a drop-in for roscore."),
+    "core": ("core", "Run the ROS core alone: a drop-in for roscore."),
     "run": ("run", "Run the Smart Resources of a Python file, with the agent of their module."),
     "peer": ("main", "See the peers that the agent knows."),
     "peer list": ("peer", "List the peers and the state of their links."),
@@ -103,14 +104,22 @@ VERBS: Final = {
     "explain": ("agent", "Say what the code of an error or a warning means, and what to do."),
     "doctor": ("doctor", "Check this machine: network, clock, rights, ROS environment."),
     "bug-report": ("bug_report", "Collect what a maintainer needs to know of this machine, redacted."),
-    "web": ("gateway", "Serve this module's state over HTTP: metrics, REST."),
+    "web": ("web", "Serve this module's state over HTTP: metrics, REST."),
     "gateway": ("gateway", "Join this network's modules with other sites and with ROS 2, over Zenoh."),
     "gateway zenoh-config": ("gateway", "Print a configuration for zenohd, Zenoh's own router."),
     "config": ("main", "Show the settings and where each comes from; print their JSON Schema."),
     "config show": ("agent", "Print each setting that `rmpa up` would use here, and where it comes from."),
     "config schema": ("agent", "Print the JSON Schema of rmpa.toml: editors check and complete the file with it."),
     "reload": ("agent", "Let the agent read its settings again."),
-    "completion": ("agent", "Print the script that completes rmpa's commands in a shell."),
+    "completion": ("completion", "Print the script that completes rmpa's commands in a shell."),
+}
+_FAMILIES: Final = {file.removesuffix(".py") for file in os.listdir(os.path.dirname(__file__))}  # noqa: PTH208, PTH120
+_OWN: Final = {words for words, (module, _) in _DECLARED.items() if module in _FAMILIES and module != "main"}
+# Those whose module is installed, and the groups of these.
+VERBS: Final = {
+    words: about
+    for words, about in _DECLARED.items()
+    if words in _OWN or any(each.startswith(f"{words} ") for each in _OWN)
 }
 # What to use in place of a command that is gone, by its words behind ``rmpa``.
 REMOVED_VERBS: Final = {
@@ -209,17 +218,46 @@ class LazyGroup(PlacedHelp, click.Group):
         parted = [(words.rpartition(" "), about) for words, about in VERBS.items()]
         self.commands_at = {name: about for (group, _, name), about in parted if group == path}
 
-    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
-        """The names, in the order of the table."""
-        return list(self.commands_at)
+    def _plugins(self) -> dict[str, EntryPoint]:
+        """Commands that packages of others add to ``rmpa``."""
+        if self._path:
+            return {}
+        from rmpa.runtime import plugins
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002 - click's signature
-        """Import one command, or ``None``."""
+        found = plugins.find_plugins(plugins.VERBS)
+        return {name: found[name] for name in sorted(found) if name not in self.commands_at}
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
+        """The names, in the order of the table, then those of other packages."""
+        return [*self.commands_at, *self._plugins()]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import one command, or ``None``.
+
+        Raises:
+            RmpaError: It is of another package, which is broken; a shell that completes has ``None`` instead.
+        """
         if cmd_name not in self.commands_at:
-            return None
+            return self._plugin(cmd_name, quiet=ctx.resilient_parsing)
         module = importlib.import_module(f"rmpa.cli.{self.commands_at[cmd_name][0]}")
         command = getattr(module, f"{self._path} {cmd_name}".strip().replace(" ", "_").replace("-", "_"))
         assert isinstance(command, click.Command)  # noqa: S101 - a mistake in our own table
+        return command
+
+    def _plugin(self, name: str, *, quiet: bool) -> click.Command | None:
+        entry = self._plugins().get(name)
+        if entry is None:
+            return None
+        from rmpa.runtime.plugins import load_plugin, plugin_error
+
+        try:
+            command = load_plugin(entry)
+            if not isinstance(command, click.Command):
+                raise plugin_error(entry, TypeError(f"{entry.value} is no click.Command"))
+        except RmpaError:
+            if quiet:
+                return None
+            raise
         return command
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -257,22 +295,42 @@ class LazyGroup(PlacedHelp, click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find a command; for a misspelt one the error names the nearest."""
-        if args and args[0] not in self.commands_at:
+        if args and args[0] not in self.commands_at and args[0] not in self._plugins():
             words = " ".join((*ctx.command_path.split()[1:], args[0]))
             if remedy := REMOVED_VERBS.get(words):
                 raise ConfigError(f"rmpa {words}", "is not a command any more", remedy, code="removed")
             if not args[0].startswith("-"):
                 near = did_you_mean(args[0], self.commands_at)
-                others = (not self._path and MEANT.get(args[0])) or ([near] if near else [])
+                meant = (
+                    () if self._path else [each for each in MEANT.get(args[0], ()) if each in VERBS or each[0] == "-"]
+                )
+                others = meant or ([near] if near else [])
                 named = " or ".join(f"`{ctx.command_path} {other}`" for other in others)
                 hint = f"Did you mean {named}?" if others else f"There are {', '.join(self.commands_at)}."
                 ctx.fail(f"No such command {args[0]!r}. {hint}")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's
-        """Write the table's lines, without importing anything."""
+        """Write the table's lines, without importing a command."""
+        lines = [(name, text) for name, (_, text) in self.commands_at.items()]
+        if others := self._plugins():
+            from rmpa.runtime.plugins import package_of
+
+            lines += [(name, f"Of the package {package_of(entry)}.") for name, entry in others.items()]
         with formatter.section("Commands"):
-            formatter.write_dl([(name, text) for name, (_, text) in self.commands_at.items()])
+            formatter.write_dl(lines)
+
+
+def verb(*parameters: Callable[..., Any], **settings: Any) -> Callable[[Callable[..., Any]], click.Command]:
+    """Make a command of a function: ``help_of`` its docstring, and these arguments and options in order."""
+
+    def decorate(function: Callable[..., Any]) -> click.Command:
+        command = function
+        for parameter in reversed(parameters):
+            command = parameter(command)
+        return click.command(cls=PlacedHelp, **help_of(function.__doc__), **settings)(command)
+
+    return decorate
 
 
 def _group(function: Callable[[], None]) -> LazyGroup:

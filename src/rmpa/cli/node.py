@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from msgspec.structs import replace
 
+from rmpa.cli.completion import nodes
 from rmpa.cli.graph import Graph, GraphName, read_graph, read_name, require_peer, unknown_name
 from rmpa.cli.options import Options, Selection, argument, flag, graph_verb, ping_options, selection_options, summary
 from rmpa.cli.output import Table, paint, print_error, print_json, print_text, warn
@@ -151,7 +152,7 @@ def _named(master: Master, names: tuple[str, ...], *, everything: bool) -> list[
 
 
 @graph_verb(
-    argument("node", "node", default=""),
+    argument("node", nodes, default=""),
     ping_options,
     flag("-a", "--all", "everything", help="Each node of this module, once."),
 )
@@ -207,7 +208,7 @@ def _ping(master: Master, wanted: GraphName, number: int, options: Options) -> b
 
 
 @graph_verb(
-    argument("nodes", "node", nargs=-1, metavar="NODE..."),
+    argument("nodes", nodes, nargs=-1, metavar="NODE..."),
     flag("-a", "--all", "everything", help="All of this module but /rosout and the agent's own."),
 )
 def node_kill(nodes: tuple[str, ...], everything: bool, options: Options) -> int:
@@ -258,7 +259,7 @@ def _kill(master: Master, wanted: GraphName) -> tuple[str, str]:
 
 
 @graph_verb(
-    argument("namespace", "node", default=""),
+    argument("namespace", nodes, default=""),
     flag("-v", "--verbose", help="With module, address, and counts of topics and services."),
     selection_options,
 )
@@ -331,7 +332,7 @@ def _row(peer: str | None, line: NodeLine, here: str | None) -> list[str]:
     return [str(GraphName(line.name, peer)), peer or here or "-", *counts, line.uri or "-"]
 
 
-@graph_verb(argument("node", "node"))
+@graph_verb(argument("node", nodes))
 def node_info(node: str, options: Options) -> None:
     """Show a node's module, address, process, topics and services, and whether it answers.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import importlib
 import math
 import os
 import sys
@@ -14,12 +13,14 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
-from rmpa.cli.main import PlacedHelp, help_of
+from rmpa.cli.completion import agents, completes
+from rmpa.cli.main import verb
 from rmpa.config.settings import SETTINGS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable
 
+    from rmpa.cli.completion import Find
     from rmpa.cli.graph import Graph, Master
     from rmpa.cli.output import Text
     from rmpa.config.schema import Setting
@@ -29,18 +30,6 @@ _T = TypeVar("_T")
 _Function = TypeVar("_Function", bound="Callable[..., Any]")
 # Lines of a long list that a terminal shows.
 LINES: Final = 100
-
-
-def verb(*parameters: Callable[..., Any], **settings: Any) -> Callable[[Callable[..., Any]], click.Command]:
-    """Make a command of a function: ``help_of`` its docstring, and these arguments and options in order."""
-
-    def decorate(function: Callable[..., Any]) -> click.Command:
-        command = function
-        for parameter in reversed(parameters):
-            command = parameter(command)
-        return click.command(cls=PlacedHelp, **help_of(function.__doc__), **settings)(command)
-
-    return decorate
 
 
 def json_verb(*parameters: Callable[..., Any], **settings: Any) -> Callable[[Callable[..., Any]], click.Command]:
@@ -58,25 +47,9 @@ def graph_verb(*parameters: Callable[..., Any], **settings: Any) -> Callable[[Ca
     return verb(*parameters, _as_options(json_option, agent_option, _master_option), **settings)
 
 
-def argument(name: str, kind: str = "", **settings: Any) -> Callable[[_Function], _Function]:
-    """An argument that a shell completes with names of a kind, if one is given."""
-    return click.argument(name, shell_complete=completes(kind) if kind else None, **settings)
-
-
-def completes(kind: str) -> Callable[[click.Context, click.Parameter, str], list[str]]:
-    """A function that completes names in a shell, for ``shell_complete`` of an argument or option.
-
-    Args:
-        kind: ``peer``, ``agent``, ``topic``, ``service``, ``node``, ``param``, ``resource``, ``profile`` or
-            ``context``. Of a peer's own names, ``PEER:/name``, those of that peer are offered.
-    """
-
-    def complete(ctx: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
-        # By its name, as commands are: it asks the agent by the modules of the commands, which import this one.
-        found: list[str] = importlib.import_module("rmpa.cli.agent").complete_names(kind, ctx, incomplete)
-        return found
-
-    return complete
+def argument(name: str, find: Find | None = None, **settings: Any) -> Callable[[_Function], _Function]:
+    """An argument that a shell completes with the names that are found, as ``completion.completes`` does."""
+    return click.argument(name, shell_complete=completes(find) if find else None, **settings)
 
 
 class FiniteRange(click.FloatRange):
@@ -98,7 +71,7 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON; 
 agent_option = click.option(
     "--agent",
     metavar="NAME",
-    shell_complete=completes("agent"),
+    shell_complete=completes(agents),
     help="Which agent of this machine to ask, if several run. [env: RMPA_AGENT]",
 )
 _master_option = click.option(

@@ -15,12 +15,14 @@ from unicodedata import combining, east_asian_width
 import click
 import msgspec
 
-from rmpa.core.errors import with_places
+from rmpa.core.errors import ConfigError, with_places
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
 _INDENT: Final = "    "
+# Of the levels of ``rmpa doctor`` and ``rmpa why``, on a terminal; of all others yellow.
+_COLOURS: Final = {"ok": "green", "fail": "red", "skipped": "cyan"}
 
 
 class Painted(str):
@@ -121,6 +123,11 @@ def paint(text: str, colour: str | None) -> Painted:
     return Painted(click.style(printable(text), fg=colour) if colour else printable(text))
 
 
+def paint_level(text: str, level: str) -> Painted:
+    """A text in the colour of a result."""
+    return paint(text, _COLOURS.get(level, "yellow"))
+
+
 def warn(text: str, code: str = "") -> None:
     """One line on stderr with a code of ``core.codes``, yellow on a terminal; control characters are escaped."""
     click.secho(f"! {with_places(printable(text))}" + (f" [{code}]" if code else ""), err=True, fg="yellow")
@@ -130,6 +137,28 @@ def print_error(error: object, code: str) -> None:
     """``rmpa: … [code]`` on stderr. It may hold the words of a peer or a node: control characters are escaped."""
     first, *more = f"rmpa: {error}".split("\n")
     click.echo(with_places("\n".join(map(printable, (f"{first} [{code}]", *more)))), err=True)
+
+
+def confirm(question: str) -> bool:
+    """Ask the user on the terminal, on standard error, also where standard input is used up; no answer is a no.
+
+    Raises:
+        ConfigError: There is nothing to read an answer from.
+    """
+    from pathlib import Path
+
+    click.echo(f"{question} [y/N] ", err=True, nl=False)
+    line = sys.stdin.readline()
+    if not line:
+        try:
+            with Path("/dev/tty").open(encoding="utf-8") as terminal:
+                line = terminal.readline()
+        except OSError:
+            click.echo(err=True)
+            raise ConfigError(
+                "the question", "has no answer: there is no terminal", "add --yes", code="not-confirmed"
+            ) from None
+    return line.strip().lower() in {"y", "yes"}
 
 
 def printable(text: str) -> str:

@@ -18,8 +18,9 @@ import click
 import yaml
 
 from rmpa.bridge.params.rules import key_problem
+from rmpa.cli.completion import completes, peers
 from rmpa.cli.graph import suggestion
-from rmpa.cli.options import Options, agent_verb, argument, completes, flag, graph_verb
+from rmpa.cli.options import Options, agent_verb, argument, flag, graph_verb
 from rmpa.cli.output import Painted, Table, json_text, size, warn
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.identity import is_legal_name, resolve_name
@@ -29,7 +30,7 @@ from rmpa.observe.snapshot import FollowedInfo
 from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rmpa.cli.graph import Master
     from rmpa.cli.output import Text
@@ -47,10 +48,21 @@ _OPERATORS: Final[dict[type[ast.AST], Callable[..., float]]] = {
     ast.USub: operator.neg,
     ast.UAdd: operator.pos,
 }
+
+
+def param_names(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    """Parameters, and namespaces of them, for ``completion.completes``."""
+    before = incomplete.partition(":")[0] + ":" if ":" in incomplete else ""
+    peer, _ = split_peer(ctx.params.get("peer"), incomplete)
+    options = Options(as_json=False, agent=ctx.params.get("agent"), master_uri=ctx.params.get("master"))
+    for name in open_store(peer, options).names():
+        yield from (before + each for each in with_namespaces(name))  # rosparam's verbs take namespaces too
+
+
 peer_option: Final = click.option(
     "--peer",
     metavar="PEER",
-    shell_complete=completes("peer"),
+    shell_complete=completes(peers),
     help="The parameters of this peer's module (or its GUID).",
 )
 
@@ -337,7 +349,7 @@ def param_verb(*parameters: Any, **settings: Any) -> Callable[[Callable[..., Non
 
 
 @param_verb(
-    argument("key", "param"),
+    argument("key", param_names),
     flag("-p", "--pretty", help="Print a string as it is, without YAML's quotes and folding."),
 )
 def param_get(key: str, pretty: bool, peer: str | None, options: Options) -> None:
@@ -360,7 +372,7 @@ def param_get(key: str, pretty: bool, peer: str | None, options: Options) -> Non
 
 
 @param_verb(
-    argument("key", "param"),
+    argument("key", param_names),
     argument("value", required=False),
     click.option("-t", "--textfile", metavar="FILE", help="Set it to this file's text."),
     click.option("-b", "--binfile", metavar="FILE", help="Set it to this file's bytes."),
@@ -397,7 +409,7 @@ def param_set(
     options.show({"key": name, "set": open_store(peer, options).set(name, found)})
 
 
-@param_verb(argument("namespace", "param", default=""))
+@param_verb(argument("namespace", param_names, default=""))
 def param_list(namespace: str, peer: str | None, options: Options) -> None:
     """List the names of all parameters, or of those in NAMESPACE.
 
@@ -415,7 +427,7 @@ def param_list(namespace: str, peer: str | None, options: Options) -> None:
     options.show(names, names)
 
 
-@param_verb(argument("key", "param"))
+@param_verb(argument("key", param_names))
 def param_delete(key: str, peer: str | None, options: Options) -> None:
     """Delete the parameter KEY, or all of the namespace KEY.
 
@@ -433,7 +445,7 @@ def param_delete(key: str, peer: str | None, options: Options) -> None:
     options.show({"key": name, "deleted": True})
 
 
-@param_verb(argument("file", default="-"), argument("namespace", "param", default=""))
+@param_verb(argument("file", default="-"), argument("namespace", param_names, default=""))
 def param_dump(file: str, namespace: str, peer: str | None, options: Options) -> None:
     """Write all parameters, or those in NAMESPACE, as YAML to FILE, or to standard output (-).
 
@@ -456,7 +468,7 @@ def param_dump(file: str, namespace: str, peer: str | None, options: Options) ->
         raise RmpaError(f"{file} cannot be written: {error.strerror}", code="directory-unusable") from None
 
 
-@param_verb(argument("file"), argument("namespace", "param", default=""))
+@param_verb(argument("file"), argument("namespace", param_names, default=""))
 def param_load(file: str, namespace: str, peer: str | None, options: Options) -> None:
     """Set the parameters of a YAML FILE (- for standard input), below NAMESPACE if one is given.
 

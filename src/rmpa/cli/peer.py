@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import click
 import msgspec
 
-from rmpa.cli.graph import find_peer, suggestion
+from rmpa.cli.completion import peers
+from rmpa.cli.graph import find_peer, shown_state, suggestion
 from rmpa.cli.options import Options, Selection, agent_verb, argument, flag, limit_options, ping_options, summary
 from rmpa.cli.output import Table, duration, printable, size, warn
-from rmpa.cli.topic import shown_state
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.core.statistics import SampleSummary
 from rmpa.observe import limits
@@ -45,7 +45,7 @@ _BRIEF: Final = "PEER, STATE, >SINCE, ADDRESS, RTT"
 
 
 @agent_verb(
-    argument("pattern", "peer", default=""),
+    argument("pattern", peers, default=""),
     flag("-v", "--verbose", help="With the side that dialled, clock, traffic, queue and drops."),
     click.option("--state", "states", multiple=True, help="Only peers in this state; may be given again."),
     *limit_options,
@@ -152,7 +152,7 @@ def _troubles(snapshot: Snapshot, peers: list[PeerInfo]) -> list[tuple[str, str]
     return found
 
 
-@agent_verb(argument("name", "peer"))
+@agent_verb(argument("name", peers))
 def peer_info(name: str, options: Options) -> None:
     """Show all that is known of the peer NAME (or of one by its GUID).
 
@@ -232,7 +232,7 @@ def _facts(info: PeerInfo) -> Iterator[tuple[str, str]]:
     yield from (("Conflict", conflict) for conflict in info.conflicts)
 
 
-@agent_verb(argument("name", "peer"), ping_options)
+@agent_verb(argument("name", peers), ping_options)
 def peer_ping(name: str, count: int | None, interval: float, options: Options) -> int:
     """Measure the round trip to the peer NAME over the mesh.
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any, Final
 
+import click
 import msgspec
 
+from rmpa.cli.completion import completes
 from rmpa.cli.options import Options, argument, flag, graph_verb
 from rmpa.cli.output import Table, warn
-from rmpa.cli.resource import known_name, resource_verb, run_with_resources, status_of
+from rmpa.cli.resource import known_name, resource_names, resource_verb, run_with_resources, status_of
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.resource.quality import MEASURED
 from rmpa.ros.types.definitions import ARRAY_TYPE
@@ -17,11 +19,9 @@ from rmpa.ros.types.definitions import ARRAY_TYPE
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    import click
-
     from rmpa.cli.output import Text
     from rmpa.cli.resource import ResourceGraph, SeenResource
-    from rmpa.resource.descriptor import Descriptor, ParameterDescriptor, TaskDescriptor
+    from rmpa.ros.types.descriptor import Descriptor, ParameterDescriptor, TaskDescriptor
 
 _TIMES: Final = frozenset({"deadline", "lifespan", "liveliness_lease"})
 
@@ -96,8 +96,21 @@ async def profile_get(graph: ResourceGraph, one: SeenResource, options: Options)
 
 def _set_verb(what: str, auto: str) -> Callable[[Callable[..., Any]], click.Command]:
     """A verb that chooses a profile or context by hand, or lets the resource decide again."""
-    name = argument("name", what, required=False, metavar=f"[{what.upper()}]")
-    return graph_verb(argument("resource", "resource"), name, flag("--auto", help=auto))
+
+    def offered(ctx: click.Context, _: str) -> Iterable[str]:
+        """The profiles or contexts of the resource that stands before them in the line."""
+        found: list[str] = []
+
+        async def body(graph: ResourceGraph) -> None:
+            one = graph.pick(ctx.params.get("resource")).descriptor
+            found.extend(each.name for each in (one.profiles if what == "profile" else one.contexts))
+
+        run_with_resources(Options(False, ctx.params.get("agent"), ctx.params.get("master")), body)
+        return found
+
+    complete = completes(offered, "rmpa.ros.node.node")
+    name = click.argument("name", required=False, metavar=f"[{what.upper()}]", shell_complete=complete)
+    return graph_verb(argument("resource", resource_names), name, flag("--auto", help=auto))
 
 
 def _set(what: str, resource: str, name: str | None, *, auto: bool, options: Options) -> None:

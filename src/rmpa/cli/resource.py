@@ -11,14 +11,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.policy import OUTSIDE_GUID
+from rmpa.cli.completion import graph_of, of_peer
 from rmpa.cli.graph import GraphName, read_graph, read_name, run_stream, suggestion, with_node
 from rmpa.cli.options import Options, argument, count_option, flag, graph_verb
 from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, warn
 from rmpa.config.rules import ROS2
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.core.identity import proxied_node, proxied_peer
-from rmpa.resource.descriptor import TOPIC, Descriptor
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
+from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE, TOPIC, Descriptor
 from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
@@ -128,7 +129,7 @@ class ResourceGraph:
 
     async def configuration(self, one: SeenResource) -> dict[str, bool | int | float | str]:
         """The values of a resource's parameters."""
-        from rmpa.resource.reconfigure import CONFIG_TYPE, read_config
+        from rmpa.resource.reconfigure import read_config
 
         message = (await self.hear([one], "parameter_updates", CONFIG_TYPE)).get(one)
         return read_config(message) if message is not None else {}
@@ -139,7 +140,6 @@ class ResourceGraph:
         Raises:
             RmpaError: It cannot be reached, or refuses; then nothing has changed.
         """
-        from rmpa.resource.reconfigure import SERVICE_TYPE
         from rmpa.ros.types.installed import ServiceType
 
         service = GraphName(f"{one.path}/set_parameters", one.peer)
@@ -229,6 +229,14 @@ async def _first_messages(node: Node, wanted: Iterable[tuple[str, str]], kind: s
     return found
 
 
+def resource_names(ctx: click.Context, _: str) -> Iterable[str]:
+    """Resources of the graph, for ``completion.completes``."""
+    ending = f"/{TOPIC}"
+    for topic, nodes in graph_of(ctx).publishers.items():
+        if topic.endswith(ending):
+            yield from (of_peer(topic.removesuffix(ending), node) for node in nodes)
+
+
 def resource_verb(*parameters: Any) -> Callable[[Callable[..., Awaitable[None]]], click.Command]:
     """A ``graph_verb`` about one resource: its function gets the graph, the resource, the options, and parameters."""
 
@@ -237,7 +245,7 @@ def resource_verb(*parameters: Any) -> Callable[[Callable[..., Awaitable[None]]]
         def command(resource: str | None, options: Options, **given: Any) -> None:
             run_with_resources(options, lambda graph: function(graph, graph.pick(resource), options, **given))
 
-        return graph_verb(argument("resource", "resource", required=False), *parameters)(command)
+        return graph_verb(argument("resource", resource_names, required=False), *parameters)(command)
 
     return decorate
 
@@ -314,7 +322,7 @@ def alarm_list(everything: bool, options: Options) -> None:
     run_with_resources(options, body)
 
 
-@graph_verb(argument("resource", "resource", required=False), count_option("alarms"))
+@graph_verb(argument("resource", resource_names, required=False), count_option("alarms"))
 def alarm_echo(resource: str | None, count: int | None, options: Options) -> None:
     """Print alarms as they are raised and cleared, of all resources or of one RESOURCE, until Ctrl-C.
 

@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING, Final, NoReturn, Self
 
 import click
 
-from rmpa.cli.options import argument, flag, verb
+from rmpa.cli.main import verb
+from rmpa.cli.options import argument, flag
 from rmpa.cli.output import print_error, printable
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.runtime import limits

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
+from rmpa.cli.completion import services
 from rmpa.cli.graph import marked, origin_json, origin_text, peers_of, read_graph, read_name, require_peer
-from rmpa.cli.messages import fill_stamps, read_values, to_text
 from rmpa.cli.options import FiniteRange, Options, Selection, argument, flag, graph_verb, selection_options, summary
 from rmpa.cli.output import Table, duration, print_json, printable, warn
+from rmpa.cli.values import fill_stamps, read_values, to_text
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api
@@ -161,7 +162,7 @@ def _json(graph: Graph, name: str, found: Probed | None = None) -> dict[str, obj
 
 
 @graph_verb(
-    argument("namespace", "service", default=""),
+    argument("namespace", services, default=""),
     flag("-v", "--verbose", help="Types and nodes too; each server is asked."),
     selection_options,
 )
@@ -226,7 +227,7 @@ def _find(text: str, options: Options) -> tuple[GraphName, Master, Graph]:
     return wanted, master, graph
 
 
-@graph_verb(argument("service", "service"))
+@graph_verb(argument("service", services))
 def service_info(service: str, options: Options) -> None:
     """Show a service's node, address, type and arguments, and what crosses the mesh.
 
@@ -277,7 +278,7 @@ def service_info(service: str, options: Options) -> None:
     options.show(_json(graph, wanted.name, found) | names | {"mesh": mesh}, text())
 
 
-@graph_verb(argument("service", "service"))
+@graph_verb(argument("service", services))
 def service_type(service: str, options: Options) -> None:
     """Print a service's type.
 
@@ -312,7 +313,7 @@ def service_find(kind: str, options: Options) -> None:
 
 
 @graph_verb(
-    argument("service", "service"),
+    argument("service", services),
     argument("values", nargs=-1),
     flag("-w", "--wait", help="Wait until the service exists, at most --timeout."),
     click.option(

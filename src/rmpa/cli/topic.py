@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from rmpa.cli.completion import topics
 from rmpa.cli.graph import (
     Enough,
     marked,
@@ -20,6 +21,7 @@ from rmpa.cli.graph import (
     read_name,
     require_peer,
     run_stream,
+    shown_state,
     warn_unpublished,
     watch_topic,
 )
@@ -80,13 +82,6 @@ def _losses_text(route: RouteInfo) -> str:
             lost = f"loss unknown ({_times(unknown)})" + (f", {route.lost} more lost" if route.lost else "")
         return f"{lost}, {route.late} late, {route.expired} expired, {ours}"
     return f"{route.lost} lost to {route.peer}" if route.contract.get("reliability") == "reliable" else ours
-
-
-def shown_state(route: RouteInfo) -> str:
-    """The state of a route, where its messages pass the agents or not: ``open``, ``direct``, ``open and direct``."""
-    if route.transport == "direct":
-        return "direct"
-    return f"{route.state} and direct" if route.transport == "both" else route.state
 
 
 def _interruption_text(one: SubscriberTransport) -> str:
@@ -153,7 +148,7 @@ def _json(graph: Graph, name: str) -> dict[str, object]:
 
 
 @graph_verb(
-    argument("namespace", "topic", default=""),
+    argument("namespace", topics, default=""),
     flag("-v", "--verbose", help="Types and counts, publishers and subscribers apart."),
     flag("-p", "--publishers", help="Only topics that have a publisher."),
     flag("-s", "--subscribers", help="Only topics that have a subscriber."),
@@ -226,7 +221,7 @@ def _find(text: str, options: Options) -> tuple[GraphName, Master, Graph]:
     return wanted, master, graph
 
 
-@graph_verb(argument("topic", "topic"))
+@graph_verb(argument("topic", topics))
 def topic_info(topic: str, options: Options) -> None:
     """Show a topic's type, publishers and subscribers, and what crosses the mesh.
 
@@ -287,7 +282,7 @@ def route_line(route: RouteInfo) -> str:
     return f" * {way} {route.peer}: {route.node} {shown_state(route)}{passed}"
 
 
-@graph_verb(argument("topic", "topic"))
+@graph_verb(argument("topic", topics))
 def topic_type(topic: str, options: Options) -> None:
     """Print a topic's type.
 
@@ -493,7 +488,7 @@ def _figures_verb(window: int) -> Callable[[Callable[..., None]], click.Command]
     type_ = click.IntRange(2, 1_000_000)
     how_many = "Over how many messages."
     messages = click.option("-w", "--window", type=type_, default=window, show_default=True, help=how_many)
-    return graph_verb(argument("topic", "topic"), messages, count_option("messages"))
+    return graph_verb(argument("topic", topics), messages, count_option("messages"))
 
 
 @_figures_verb(50_000)

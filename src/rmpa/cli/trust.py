@@ -5,207 +5,35 @@ from __future__ import annotations
 import functools
 import os
 import socket
-import sys
 import time
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from rmpa.cli.completion import peers
+from rmpa.cli.module import agent_settings, find_module
 from rmpa.cli.options import Options, argument, config_option, flag, json_verb
-from rmpa.cli.output import Table, duration, warn
+from rmpa.cli.output import Table, confirm, duration, warn
 from rmpa.cli.units import STATE
 from rmpa.config import module_name
 from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, Access
-from rmpa.config.read import Loaded, load_settings
-from rmpa.config.settings import Settings
-from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError, missing_extra
+from rmpa.config.read import load_settings
+from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.core.identity import is_global_name, peer_name_problem
-from rmpa.observe.control_client import ControlClient, find_agents, running_agents
 from rmpa.runtime.systemd import restart_text
 from rmpa.trust.permissions import Permissions, TrustReply, TrustStatus, action_topics
 from rmpa.trust.store import TrustStore, keys_elsewhere, modules_with_keys
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator
 
+    from rmpa.cli.module import Module
     from rmpa.cli.output import Text
-    from rmpa.config.module_name import ModuleName
-    from rmpa.trust.membership import Membership, MeshAuthority
 
-_T = TypeVar("_T")
 # The codes of files that this user cannot use.
 _CLOSED: Final = ("keys-unusable", "directory-unusable")
 _WORDS: Final = (*(access.value for access in Access), ACTION_CLIENT, ACTION_SERVER)
-
-
-@dataclass(frozen=True, slots=True)
-class Module:
-    """The module of this machine that a command beside an agent is about.
-
-    Attributes:
-        chosen: Its name, and why it was chosen.
-        loaded: The settings, with that name.
-        state: Its state directory; ``None``: there is none.
-        socket: The control socket of its agent; ``None``: none runs.
-        trust: What its agent says of trust; ``None``: none runs.
-        config_file: The settings of its agent; empty: it has none, or none runs.
-        pid: The process of its agent; 0: none runs.
-    """
-
-    chosen: ModuleName
-    loaded: Loaded
-    state: Path | None
-    socket: Path | None = None
-    trust: TrustStatus | None = None
-    config_file: str = ""
-    pid: int = 0
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-        return self.chosen.name
-
-    @property
-    def agent(self) -> str:
-        """How its agent runs: ``secured``, ``plain`` or ``off``."""
-        return "off" if self.trust is None else self.trust.agent
-
-    def restart(self, start: str = "rmpa up") -> str:
-        """What is said of its agent, which does not have its keys yet."""
-        return f"the agent {self.name} runs without its keys; restart it: {restart_text(self.pid, start)}"
-
-    @property
-    def place(self) -> Path:
-        """Its state directory.
-
-        Raises:
-            StartError: There is none.
-        """
-        if self.state is None:
-            raise StartError(
-                "the state directory",
-                "is not known: there is no home",
-                "set RMPA_STATE_DIR",
-                code="no-state-directory",
-            )
-        return self.state
-
-    @property
-    def store(self) -> TrustStore:
-        """Its keys and certificates.
-
-        Raises:
-            StartError: There is no state directory.
-        """
-        return TrustStore(self.place, self.name)
-
-    def call(self, what: str, reply: type[_T], **args: object) -> _T:
-        """Let the agent do something.
-
-        Raises:
-            UnreachableError: No agent runs, or it does not answer.
-            PeerRefused: It refuses, and says why.
-        """
-        if self.socket is None:
-            raise UnreachableError(f"agent {self.name!r}", "this machine", "start it: rmpa up")
-        with ControlClient(self.socket) as client:
-            return client.call("trust", reply, what=what, **args)
-
-    def membership(self) -> Membership:
-        """What the files say, without the agent.
-
-        Raises:
-            StartError: Trust is off here, or the files are broken.
-        """
-        check_library()
-        if not self.store.exists:
-            remedy = "make a mesh: rmpa trust init; or join one: rmpa trust join TOKEN"
-            raise StartError(f"the module {self.name}", "has joined no secured mesh", remedy, code="not-a-member")
-        from rmpa.runtime.loop import SystemClock
-        from rmpa.trust.membership import Membership
-
-        return Membership.load(self.store, SystemClock(), time.time)
-
-    def authority(self) -> MeshAuthority:
-        """What the files say, without the agent, of the authority.
-
-        Raises:
-            StartError: Trust is off here, this module is not the authority, or a file is broken.
-        """
-        membership = self.membership()
-        from rmpa.trust.membership import MeshAuthority
-
-        if not self.store.is_authority:
-            place = self.store.load_authority()
-            where = f"do it at {place.name}" if place is not None and place.name else "do it at the authority"
-            raise StartError(
-                f"the module {self.name}", "is not the authority of its mesh", where, code="not-authority"
-            )
-        return MeshAuthority(membership)
-
-    def refuse_member(self, leaving: str) -> None:
-        """Check that the module has no keys yet.
-
-        Args:
-            leaving: What is said of ``rmpa trust leave``.
-
-        Raises:
-            StartError: It has.
-        """
-        check_library()
-        if self.store.exists:
-            remedy = f"rmpa trust status shows it; rmpa trust leave {leaving}"
-            raise StartError(
-                f"the module {self.name}", "is a member of a secured mesh already", remedy, code="already-a-member"
-            )
-
-
-def find_module(
-    name: str | None, options: Mapping[str, object], environ: Mapping[str, str], option: str = "--name"
-) -> Module:
-    """The module that a command beside an agent is about, as its agent knows it if that runs.
-
-    Args:
-        name: As the command's option names it.
-        options: As for ``load_settings``.
-        environ: The environment's variables.
-        option: The command's option, for errors.
-
-    Raises:
-        ConfigError: The name cannot be one, or a setting cannot be used.
-        RmpaError: Several agents run, and none is meant; or the agent does not answer.
-    """
-    environ = module_name.of_unit(environ)
-    for source, text in ((option, name), ("RMPA_AGENT", environ.get("RMPA_AGENT"))):
-        if text and (problem := peer_name_problem(text)):
-            raise ConfigError(source, problem)
-    loaded = load_settings(options, environ, host_name=socket.gethostname())
-    agents = find_agents(environ)
-    names = {**loaded.names, module_name.NameSource.AGENT_VARIABLE: environ.get("RMPA_AGENT", "")}
-    if name:
-        names[module_name.NameSource.OPTION] = name
-    chosen = module_name.choose_name(names, *running_agents(agents, environ))
-    loaded = replace(loaded, settings=replace(loaded.settings, name=chosen.name))
-    path = next((agent.path for agent in agents if agent.name == chosen.name), None)
-    if path is None:
-        return Module(chosen, loaded, module_name.state_dir(environ, loaded.settings.state_dir))
-    with ControlClient(path) as client:
-        trust, agent = client.call("trust", TrustStatus, what="status"), client.agent()
-    # The agent may have been started with another state directory than this shell has.
-    state = Path(trust.folder).parent.parent if trust.folder else None
-    return Module(chosen, loaded, state, path, trust, agent.config_file, agent.pid)
-
-
-def agent_settings(module: Module) -> Loaded:
-    """The settings whose rules the module's agent applies: of its own file, also where this shell finds another."""
-    file = module.loaded.settings.config_file
-    if module.socket is None or module.config_file == (str(file.absolute()) if file is not None else ""):
-        return module.loaded
-    if not module.config_file:
-        return Loaded(Settings())
-    return load_settings({"config": module.config_file}, os.environ, host_name=socket.gethostname())
 
 
 def trust_verb(*parameters: Any) -> Callable[[Callable[..., None]], click.Command]:
@@ -256,35 +84,6 @@ def keep_member_name(module: Module) -> str:
     return "rmpa up" if usual == module.name else f"rmpa up --name {module.name}"
 
 
-def check_library() -> None:
-    """Raise ``StartError`` if the library for certificates is missing."""
-    try:
-        import cryptography  # noqa: F401
-    except ModuleNotFoundError:
-        problem = "the library cryptography is not installed"
-        raise StartError("rmpa trust", problem, missing_extra("trust"), code="extra-missing") from None
-
-
-def confirm(question: str) -> bool:
-    """Ask the user on the terminal, on standard error, also where standard input is used up; no answer is a no.
-
-    Raises:
-        ConfigError: There is nothing to read an answer from.
-    """
-    click.echo(f"{question} [y/N] ", err=True, nl=False)
-    line = sys.stdin.readline()
-    if not line:
-        try:
-            with Path("/dev/tty").open(encoding="utf-8") as terminal:
-                line = terminal.readline()
-        except OSError:
-            click.echo(err=True)
-            raise ConfigError(
-                "the question", "has no answer: there is no terminal", "add --yes", code="not-confirmed"
-            ) from None
-    return line.strip().lower() in {"y", "yes"}
-
-
 def date_of(wall: float) -> str:
     """A time for people: ``2026-11-22 21:43``."""
     return time.strftime("%Y-%m-%d %H:%M", time.localtime(wall))
@@ -296,7 +95,7 @@ def grouped(digits: str) -> str:
 
 
 @json_verb(
-    argument("peer", "peer"),
+    argument("peer", peers),
     argument("what", type=click.Choice(_WORDS), metavar="|".join(_WORDS)),
     argument("name"),
     config_option,
@@ -323,7 +122,7 @@ def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str
     loaded = module.loaded if config else agent_settings(module)
     permissions = Permissions(loaded.settings.trust)
     action = what in (ACTION_CLIENT, ACTION_SERVER)  # five accesses in one
-    asked = action_topics(what, name) if action else [(Access(what), name)]
+    asked = action_topics(what, name) if action else [(Access[what.upper()], name)]
     decisions = [permissions.judge(access, peer, each) for access, each in asked]
     decision = next((each for each in decisions if not each.allowed), decisions[0])
     files = sorted({str(given.path) for given in loaded.given.values() if given.path is not None})

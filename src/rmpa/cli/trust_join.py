@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Final
 import click
 import msgspec
 
+from rmpa.cli.module import check_library
 from rmpa.cli.options import Options, argument, flag
-from rmpa.cli.output import print_json, warn
-from rmpa.cli.trust import check_library, confirm, date_of, grouped, keep_member_name, trust_verb
+from rmpa.cli.output import confirm, print_json, warn
+from rmpa.cli.trust import date_of, grouped, keep_member_name, trust_verb
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
 from rmpa.core.identity import peer_name_problem
 from rmpa.runtime.systemd import restart_text
@@ -26,7 +27,7 @@ from rmpa.trust import limits
 from rmpa.trust.permissions import InviteReply, JoinStep, TrustError, TrustReply
 
 if TYPE_CHECKING:
-    from rmpa.cli.trust import Module
+    from rmpa.cli.module import Module
     from rmpa.trust.store import MemberFiles
 
 _LIFETIME: Final = re.compile(r"([0-9]{1,6})\s*(s|min|h|d)")

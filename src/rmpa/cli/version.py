@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
+from typing import Final
 
 import rmpa
 
@@ -35,31 +37,34 @@ def about() -> dict[str, object]:
     }
 
 
+# The number of each format that other programs or later runs read: its module, its name there, and what has it.
+_FORMATS: Final = {
+    "beacon": ("discovery.beacon", "VERSION", "how modules find each other (UDP)"),
+    "link": (
+        "mesh.frames",
+        "VERSION",
+        "how modules speak with each other (TCP): handshake, frames, control messages",
+    ),
+    "secured link": ("trust.store", "ALPN_LINK", "links with trust on, inside TLS 1.3"),
+    "join": ("trust.store", "ALPN_JOIN", "`rmpa trust join` and renewals"),
+    "beacon proof": ("trust.packets", "FORMAT", "the trailer of beacons with trust on"),
+    "join token": ("trust.tokens", "FORMAT", "what `rmpa trust invite` prints"),
+    "sites": ("gateway.sites.keys", "VERSION", "gateways over Zenoh: keys, tokens, attachments"),
+    "monitor": ("web.monitor.messages", "SUBPROTOCOL", "the pages of `rmpa web`"),
+    "REST": ("web.api", "PREFIX", "the JSON of `rmpa web`"),
+    "resource": ("ros.types.descriptor", "VERSION", "the descriptor of a Smart Resource, a topic"),
+    "core file": ("ros.core.state", "FORMAT", "`core-PORT.state`: registrations and parameters over a restart"),
+    "resource file": ("resource.saved", "FORMAT", "`RESOURCE.json`: what a Smart Resource keeps"),
+}
+
+
 def protocols() -> dict[str, tuple[int | str, str]]:
-    """The number of each format that other programs or later runs read, and what has it.
+    """The number of each format of the rooms that are installed, and what has it.
 
     docs/reference/compatibility.md shows them of each release; tests/golden has bytes of each.
     """
-    from rmpa.discovery import beacon
-    from rmpa.gateway.sites import keys
-    from rmpa.mesh import frames
-    from rmpa.resource import descriptor, saved
-    from rmpa.ros.core import state
-    from rmpa.trust import packets, store, tokens
-    from rmpa.web import api
-    from rmpa.web.monitor import messages
-
     return {
-        "beacon": (beacon.VERSION, "how modules find each other (UDP)"),
-        "link": (frames.VERSION, "how modules speak with each other (TCP): handshake, frames, control messages"),
-        "secured link": (store.ALPN_LINK, "links with trust on, inside TLS 1.3"),
-        "join": (store.ALPN_JOIN, "`rmpa trust join` and renewals"),
-        "beacon proof": (packets.FORMAT, "the trailer of beacons with trust on"),
-        "join token": (tokens.FORMAT, "what `rmpa trust invite` prints"),
-        "sites": (keys.VERSION, "gateways over Zenoh: keys, tokens, attachments"),
-        "monitor": (messages.SUBPROTOCOL, "the pages of `rmpa web`"),
-        "REST": (api.PREFIX, "the JSON of `rmpa web`"),
-        "resource": (descriptor.VERSION, "the descriptor of a Smart Resource, a topic"),
-        "core file": (state.FORMAT, "`core-PORT.state`: registrations and parameters over a restart"),
-        "resource file": (saved.FORMAT, "`RESOURCE.json`: what a Smart Resource keeps"),
+        name: (getattr(import_module(f"rmpa.{module}"), number), about)
+        for name, (module, number, about) in _FORMATS.items()
+        if (Path(rmpa.__file__).parent / module.partition(".")[0]).is_dir()
     }

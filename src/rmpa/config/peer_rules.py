@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from rmpa.config import limits, values
 from rmpa.config.schema import NEEDED, Setting, keys_of, rules_of, setting
@@ -187,20 +187,30 @@ class Effect(StrEnum):
 
 
 class Access(StrEnum):
-    """What another module does with something of this module, or brings to it."""
+    """What another module does with something of this module, or brings to it; a word of ``[[permission]]``.
 
-    # Its topic is shown here.
-    PUBLISH = "publish"
-    # It gets a topic of this module.
-    SUBSCRIBE = "subscribe"
-    # It calls a service of this module.
-    CALL = "call"
-    # Its service is shown here.
-    SERVE = "serve"
-    # It reads, follows, sets or deletes a parameter of this module.
-    PARAM = "param"
-    # It ends a node of this module.
-    KILL = "kill"
+    Attributes:
+        verb: What it does, for texts: ``arm may not subscribe to /scan``.
+        over: What its globs are over.
+        about: What the reference of the settings says of it.
+    """
+
+    verb: str
+    over: str
+    about: str
+
+    def __new__(cls, word: str, verb: str, over: str, about: str) -> Self:
+        """Make a word of it that has the others beside it."""
+        made = str.__new__(cls, word)
+        made._value_, made.verb, made.over, made.about = word, verb, over, about
+        return made
+
+    PUBLISH = "publish", "publish", "topic", "Topics of the module that it may show here, by their names here."
+    SUBSCRIBE = "subscribe", "subscribe to", "topic", "Topics of this module that it may subscribe to."
+    CALL = "call", "call", "service", "Services of this module that it may call."
+    SERVE = "serve", "serve", "service", "Services of the module that it may offer here, by their names here."
+    PARAM = "param", "read or set", "parameter", "Parameters of this module that it may read or set, within [params]."
+    KILL = "kill", "end", "node", "Nodes of this module that it may end, within [nodes] kill."
 
 
 # The key of a rule about actions of this module, whose client the other module is.
@@ -256,12 +266,7 @@ def _globs_over(what: str) -> values.ValueType[tuple[str, ...]]:
 
 
 _NAME_KEYS: Final = {
-    "publish": Setting(_globs_over("topic"), "Topics of the module that it may show here, by their names here."),
-    "subscribe": Setting(_globs_over("topic"), "Topics of this module that it may subscribe to."),
-    "call": Setting(_globs_over("service"), "Services of this module that it may call."),
-    "serve": Setting(_globs_over("service"), "Services of the module that it may offer here, by their names here."),
-    "param": Setting(_globs_over("parameter"), "Parameters of this module that it may read or set, within [params]."),
-    "kill": Setting(_globs_over("node"), "Nodes of this module that it may end, within [nodes] kill."),
+    **{access.value: Setting(_globs_over(access.over), access.about) for access in Access},
     ACTION_CLIENT: Setting(_globs_over("topic"), "Actions of this module that it may use."),
     ACTION_SERVER: Setting(_globs_over("topic"), "Actions of the module that nodes here may use."),
 }

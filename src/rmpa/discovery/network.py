@@ -8,11 +8,12 @@ import ctypes
 import errno
 import logging
 import random
+import re
 import socket
 import struct
 from dataclasses import dataclass
 from functools import partial
-from ipaddress import IPv4Address
+from ipaddress import IPv4Address, IPv4Interface
 from typing import TYPE_CHECKING, Final
 
 import psutil
@@ -47,6 +48,8 @@ _SO_ATTACH_FILTER: Final = 26  # asm-generic/socket.h; not in Python's socket mo
 _RTMGRP_LINK: Final = 0x1
 _RTMGRP_IPV4_IFADDR: Final = 0x10
 _LOOPBACK: Final = IPv4Address("127.0.0.1")
+# Names of interfaces of containers and virtual machines.
+CONTAINERS: Final = re.compile(r"(docker|br-|veth|virbr|lxc|lxd|cni|flannel|podman|cali)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +103,50 @@ def list_interfaces() -> tuple[Interface, ...]:
 def choose(interfaces: Iterable[Interface], wanted: tuple[str, ...] = ()) -> tuple[Interface, ...]:
     """The usable interfaces among those that the user named; among all if none was named."""
     return tuple(i for i in interfaces if i.usable and (not wanted or i.name in wanted))
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkInterface:
+    """One network interface.
+
+    Args:
+        name: As in ``ip link``.
+        networks: Its IPv4 addresses with their networks.
+        up: Whether it is up and has a carrier.
+        multicast: Whether its flags say so.
+        loopback: Whether it never leaves this machine.
+        used: Whether an agent started here would use it.
+    """
+
+    name: str
+    networks: tuple[IPv4Interface, ...] = ()
+    up: bool = True
+    multicast: bool = True
+    loopback: bool = False
+    used: bool = True
+
+
+def read_interfaces(wanted: tuple[str, ...]) -> tuple[NetworkInterface, ...]:
+    """All interfaces; ``wanted`` are the names that the settings give, none for all that can be used."""
+    there = list_interfaces()
+    used = {interface.name for interface in choose(there, wanted)}
+    masks = {
+        (name, address.address): address.netmask or "255.255.255.255"
+        for name, addresses in psutil.net_if_addrs().items()
+        for address in addresses
+        if address.family == socket.AF_INET
+    }
+    return tuple(
+        NetworkInterface(
+            one.name,
+            tuple(IPv4Interface(f"{a}/{masks.get((one.name, str(a)), '255.255.255.255')}") for a in one.addresses),
+            one.up,
+            one.multicast,
+            one.loopback,
+            one.name in used,
+        )
+        for one in there
+    )
 
 
 def unknown_names(interfaces: Iterable[Interface], wanted: tuple[str, ...]) -> str | None:

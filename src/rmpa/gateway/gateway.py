@@ -17,6 +17,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.own_graph import AgentGraph
 from rmpa.gateway.zenoh.session import open_trusted_session
 from rmpa.observe.control import GATEWAY_REPORT, GATEWAY_ROLE, ROLE
+from rmpa.runtime.plugins import NEIGHBOURS, load_plugins, plugin_error
 from rmpa.runtime.tasks import keep_task, start_task
 
 if TYPE_CHECKING:
@@ -207,7 +208,19 @@ class Gateway:
         self.neighbours = dict(self._make_neighbours(self.graph, session, self._settings))
         for neighbour in self.neighbours.values():
             neighbour.start()
+        self._join_others(session)
         _log.info("= joined: %s; zenoh session %s", ", ".join(self.neighbours) or "none", session.zid)
+
+    def _join_others(self, session: OpenSession) -> None:
+        """Make and start the neighbours of other packages; one that fails is logged, and left out."""
+        for entry, make in load_plugins(NEIGHBOURS):
+            try:
+                neighbour = make(self.graph, session, self._settings)
+                if neighbour is not None:
+                    neighbour.start()
+                    self.neighbours[entry.name] = neighbour
+            except Exception as error:  # noqa: BLE001 - another's code
+                _log.warning("! %s [plugin-broken]", plugin_error(entry, error))
 
     def _failed(self, error: StartError) -> None:
         if str(error) != self._problem:

@@ -23,6 +23,7 @@ from rmpa.resource.quality import Requirement
 from rmpa.resource.runtime import CALLER, RuntimePart
 from rmpa.resource.saved import Clients, SavedState
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
+from rmpa.ros.types.descriptor import LEVEL_FOR
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import LENGTH, printable
 from rmpa.runtime.accept import in_thread
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 # The value of ``quality`` that has how long its level has stood: an age, since the clocks of modules differ.
-LEVEL_FOR: Final = "level_for"
 # The longest time in seconds between two looks whether a profile has been applied.
 _WAIT: Final = 0.25
 # Seconds between checks whether clients are still connected.

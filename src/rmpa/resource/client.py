@@ -22,10 +22,10 @@ import time
 from typing import TYPE_CHECKING, Any, Self
 
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
-from rmpa.resource.descriptor import TOPIC, Descriptor
 from rmpa.resource.quality import EXPIRES, PRIORITY, RequirementAnswer
 from rmpa.resource.runtime import RuntimePart
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
+from rmpa.ros.types.descriptor import TOPIC, Descriptor
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.tasks import end_tasks, keep_task, start_task

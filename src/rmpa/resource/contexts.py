@@ -18,8 +18,7 @@ from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource import limits
 from rmpa.resource.adapter import HungError, call_function
 from rmpa.resource.declare import Context, parse_rule, split_reference
-from rmpa.resource.descriptor import topic_of
-from rmpa.resource.runtime import RuntimePart
+from rmpa.resource.runtime import RuntimePart, topic_of
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.loop import MachineTimer

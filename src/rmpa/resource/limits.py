@@ -4,13 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.limits import MIB
-
-# [Resources] Characters of a descriptor
-# At it: clients do not accept it
-# Told in: their error
-# Why: One with a hundred profiles of twenty attributes has about 100 KB.
-DESCRIPTOR_MAX: Final = 1 * MIB
 # [Resources] Characters in the request for one attribute
 # At it: it is refused
 # Told in: its response

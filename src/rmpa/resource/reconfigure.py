@@ -21,6 +21,7 @@ from rmpa.core.errors import ConfigError, LocalProtocolError, RmpaError
 from rmpa.core.limits import INT32_MAX, INT32_MIN
 from rmpa.resource.declare import Parameter
 from rmpa.resource.runtime import RuntimePart
+from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 from rmpa.runtime.tasks import end_tasks, start_task
@@ -39,9 +40,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-CONFIG_TYPE: Final = "dynamic_reconfigure/Config"
 DESCRIPTION_TYPE: Final = "dynamic_reconfigure/ConfigDescription"
-SERVICE_TYPE: Final = "dynamic_reconfigure/Reconfigure"
 PROFILE: Final = "profile"
 CONTEXT: Final = "context"
 # Name that enumerations show for an empty ``profile`` or ``context``.

@@ -11,18 +11,31 @@ import time
 from collections import Counter, deque
 from contextvars import ContextVar
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+import msgspec
+
+from rmpa.core.contract import KEYS, Contract
 from rmpa.core.errors import RmpaError
 from rmpa.resource import limits
-from rmpa.resource.descriptor import TOPIC, describe, topic_of
+from rmpa.ros.types.descriptor import (
+    TOPIC,
+    AttributeDescriptor,
+    ContextDescriptor,
+    DemandDescriptor,
+    Descriptor,
+    ParameterDescriptor,
+    ProfileDescriptor,
+    TaskDescriptor,
+    TopicDescriptor,
+)
 from rmpa.ros.types.messages import HeaderNumbers, MessageError, MessageType
 from rmpa.ros.wire.tcpros import printable
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Mapping
 
-    from rmpa.resource.declare import Input, Output, Parameter
+    from rmpa.resource.declare import DeclaredTopic, Input, Output, Parameter
     from rmpa.resource.quality import Value
     from rmpa.resource.resource import Resource
     from rmpa.ros.node.endpoints import Publisher, Received, Subscriber
@@ -30,6 +43,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _CLOSED: Final = "life cycle"
+_DEFAULT: Final = Contract()
+_Kind = TypeVar("_Kind", bound=msgspec.Struct)
 # ``profile`` or ``context`` in such a function and in the coroutines, tasks and ``asyncio.to_thread`` calls that it
 # begins; else empty.
 CALLER: ContextVar[str] = ContextVar("caller", default="")
@@ -317,3 +332,57 @@ class Runtime:
         now_ns = time.time_ns()
         for part in self.parts:
             part.published(output, raw, now_ns)
+
+
+def describe(resource: Resource, node: str) -> Descriptor:
+    """Make the descriptor of a declared resource.
+
+    Args:
+        resource: The resource, completely declared.
+        node: Global name of the resource's node.
+    """
+    return Descriptor(
+        name=resource.name,
+        node=node,
+        role=resource.role.value,
+        physical=resource.physical,
+        description=resource.description,
+        outputs=tuple(_topic(output, node) for output in resource.outputs.values()),
+        inputs=tuple(_topic(item, node, required=item.required) for item in resource.inputs.values()),
+        parameters=tuple(_convert(p, ParameterDescriptor) for p in resource.parameters.values()),
+        attributes=tuple(
+            AttributeDescriptor(name, a.direction, a.unit, a.scale, a.category, a.tolerance, a.words)
+            for name, a in resource.attributes.items()
+        ),
+        profiles=tuple(_convert(p, ProfileDescriptor) for p in resource.profiles.values()),
+        contexts=tuple(
+            ContextDescriptor(c.name, c.when, {k: str(v) for k, v in c.requires.items()}, c.profiles, c.outputs)
+            for c in resource.contexts.values()
+        ),
+        tasks=tuple(
+            TaskDescriptor(
+                t.name, t.rate, t.on.name if t.on else "", t.rate_parameter.name if t.rate_parameter else ""
+            )
+            for t in resource.tasks.values()
+        ),
+        asks=tuple(
+            DemandDescriptor(d.resource, {k.replace("__", "."): str(v) for k, v in d.requests.items()}, d.priority)
+            for d in resource.demands.values()
+        ),
+    )
+
+
+def _convert(declared: object, kind: type[_Kind]) -> _Kind:
+    """Make a descriptor from a declaration's attributes of the same names."""
+    return msgspec.convert(declared, kind, from_attributes=True)
+
+
+def topic_of(name: str, node: str) -> str:
+    """The global name of an output or input; relative names are in the resource's own namespace."""
+    return name if name.startswith("/") else f"{node}/{name}"
+
+
+def _topic(topic: DeclaredTopic, node: str, *, required: bool = True) -> TopicDescriptor:
+    values = {key: getattr(topic.contract, key) for key in KEYS}
+    contract = {key: value for key, value in values.items() if value != getattr(_DEFAULT, key)}
+    return TopicDescriptor(topic.name, topic_of(topic.name, node), topic.type_name, contract, required)

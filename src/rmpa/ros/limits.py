@@ -196,3 +196,8 @@ CORE_STATE_ASK: Final = 1.0
 # Told in: `node kill`, log
 # Why: One with much to save takes a second or two.
 NODE_KILL_WAIT: Final = 3.0
+# [Resources] Characters of a descriptor
+# At it: clients do not accept it
+# Told in: their error
+# Why: One with a hundred profiles of twenty attributes has about 100 KB.
+DESCRIPTOR_MAX: Final = 1 * MIB

@@ -19,6 +19,11 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+# The agent's unit, as ``rmpa service install`` and the Debian package name it.
+UNIT: Final = "rmpa.service"
+# How one is started that does not start with the machine; and one that has no name and keys.
+START: Final = "sudo systemctl enable --now rmpa"
+INSTALL: Final = "sudo rmpa service install"
 # What systemd sets for the process that it starts, and that means no child of it.
 SERVICE_VARIABLES: Final = ("NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC")
 # Seconds after which a sign of life that could not be sent is tried again.
@@ -44,6 +49,14 @@ def unit_of(pid: int | str = "self") -> str:
     except OSError:
         return ""
     return found[1] if found else ""
+
+
+def is_set_up(unit: Mapping[str, str]) -> bool:
+    """Whether a unit has the user's name and keys: it runs, or ``rmpa service install`` or the user made its file.
+
+    The Debian package's may never have had them. ``rmpa service install`` changes nothing where it has.
+    """
+    return unit.get("ActiveState") != "inactive" or unit.get("FragmentPath", "").startswith("/etc/")
 
 
 def restart_text(pid: int | str = "self", start: str = "rmpa up") -> str:

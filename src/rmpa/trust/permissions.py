@@ -38,15 +38,6 @@ _ACTION_TOPICS: Final = {
     (ACTION_SERVER, Access.PUBLISH): _SERVER_SENDS,
     (ACTION_SERVER, Access.SUBSCRIBE): _CLIENT_SENDS,
 }
-# Each access as a verb, for texts.
-_DONE: Final = {
-    Access.PUBLISH: "publish",
-    Access.SUBSCRIBE: "subscribe to",
-    Access.CALL: "call",
-    Access.SERVE: "serve",
-    Access.PARAM: "read or set",
-    Access.KILL: "end",
-}
 
 
 class PermissionDecision(NamedTuple):
@@ -98,7 +89,7 @@ class Permissions:
                 return decision
         if self._settings.default == Effect.ALLOW:
             return PermissionDecision(True, 'no [[permission]] fits, and trust.default = "allow"')
-        return PermissionDecision(False, f"no [[permission]] lets {asker_name(module)} {_DONE[access]} {name}")
+        return PermissionDecision(False, f"no [[permission]] lets {asker_name(module)} {access.verb} {name}")
 
     def judge_all(self, access: Access, askers: str, name: str) -> PermissionDecision | None:
         """The decision about a name that holds for all modules alike, however they are called; ``None``: it differs.
@@ -175,12 +166,12 @@ def asker_name(asker: str) -> str:
 
 def refusal(access: Access, module: str, name: str, where: str = "there") -> str:
     """What a refused module is told: that it may not, and nothing of the rules."""
-    return f"the permissions {where} do not let {asker_name(module)} {_DONE[access]} {name}"
+    return f"the permissions {where} do not let {asker_name(module)} {access.verb} {name}"
 
 
 def prohibition(access: Access, module: str, name: str) -> str:
     """That a module may not do something: ``arm2 may not publish /cmd_vel``."""
-    return f"{asker_name(module)} may not {_DONE[access]} {name}"
+    return f"{asker_name(module)} may not {access.verb} {name}"
 
 
 def action_topics(key: str, name: str) -> Iterator[tuple[Access, str]]:
@@ -202,7 +193,7 @@ def _globs(rule: PermissionRule) -> Iterator[tuple[str, str]]:
 
 def _accesses(key: str, glob: str) -> Iterable[tuple[Access, str]]:
     """What a glob behind a key of a rule is about: an action's topics, or the glob itself."""
-    return action_topics(key, glob) if key in (ACTION_CLIENT, ACTION_SERVER) else ((Access(key), glob),)
+    return action_topics(key, glob) if key in (ACTION_CLIENT, ACTION_SERVER) else ((Access[key.upper()], glob),)
 
 
 def _first(globs: tuple[str, ...], name: str) -> str | None:

@@ -409,7 +409,7 @@ def web_metrics(
     yield Metric("rmpa_web_refused", help_, "counter", reasons)
     read = [*zip(("_count", "_sum"), reads, strict=True)]
     yield Metric("rmpa_web_agent_read_seconds", "Time to read the agent's snapshot.", "summary", read)
-    clients = [(labels(protocol=name), sockets.get(name, ClientFigures())) for name in PROTOCOLS]
+    clients = [(labels(protocol=name), sockets.get(name, ClientFigures())) for name in sorted({*PROTOCOLS, *sockets})]
     counts: tuple[_Row[ClientFigures], ...] = (
         ("clients", "WebSocket clients.", "gauge", lambda x: x.clients),
         ("client_queue_bytes", "Bytes that wait for these.", "gauge", lambda x: x.queued),

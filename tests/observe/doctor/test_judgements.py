@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 import pytest
 
+from rmpa.discovery.network import NetworkInterface
 from rmpa.observe.doctor.checks import is_beyond_loopback, judge_agents, judge_exposed_nodes, judge_membership
 from rmpa.observe.doctor.machine import (
-    NetworkInterface,
     judge_clock,
-    judge_peer_clock,
     judge_rights,
     judge_sim_time,
     judge_unit,
@@ -29,6 +28,7 @@ from rmpa.observe.doctor.network import (
 )
 from rmpa.observe.peer_info import FAIL, FOREIGN, WARN, Check, PeerInfo
 from rmpa.observe.snapshot import FilesInfo, Snapshot, UnreachableInfo
+from rmpa.observe.why.diagnosis import judge_peer_clock
 from rmpa.trust.permissions import TrustStatus
 from tests.observe.samples import SNAPSHOT
 

@@ -15,8 +15,8 @@ import msgspec
 import pytest
 
 from rmpa.core.errors import UnreachableError
-from rmpa.resource.descriptor import describe
 from rmpa.resource.resource import Resource
+from rmpa.resource.runtime import describe
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import LENGTH

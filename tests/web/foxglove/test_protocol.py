@@ -77,12 +77,6 @@ def test_messages_are_those_of_the_reference(frame: OutFrame, opcode: Opcode, go
     assert (frame[0], b"".join(frame[1])) == (opcode, golden)
 
 
-def test_both_names_of_the_subprotocol_are_accepted() -> None:
-    assert protocol.choose_subprotocol(["foxglove.websocket.v1"]) == "foxglove.websocket.v1"
-    assert protocol.choose_subprotocol(["x", " foxglove.websocket.v1 ", "foxglove.sdk.v1"]) == "foxglove.sdk.v1"
-    assert protocol.choose_subprotocol(["rosbridge"]) is None
-
-
 def test_text_that_is_not_utf8_reaches_the_client_as_replacement_characters() -> None:
     assert "caf\N{REPLACEMENT CHARACTER}" in protocol.encode_json({"message": "caf\udce9"}).decode()
 

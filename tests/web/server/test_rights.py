@@ -17,7 +17,7 @@ from rmpa.config.peer_rules import Access, Effect, PermissionRule
 from rmpa.config.settings import Settings, TrustSettings, WebSettings
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.resource import Resource
-from rmpa.resource.descriptor import describe
+from rmpa.resource.runtime import describe
 from rmpa.ros.master.parameters import Parameters
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType

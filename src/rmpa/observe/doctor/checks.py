@@ -21,9 +21,11 @@ from rmpa.core.identity import proxied_peer
 from rmpa.observe import limits
 from rmpa.observe.doctor import machine, network, repairs
 from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check
-from rmpa.observe.why.diagnosis import misplaced, remedy_for, subscriber_text
+from rmpa.observe.why.diagnosis import judge_peer_clock, misplaced, remedy_for, subscriber_text
 from rmpa.ros.http.rpc import call_api
 from rmpa.runtime.accept import open_files_advice
+from rmpa.runtime.plugins import CHECKS as PLUGIN_CHECKS
+from rmpa.runtime.plugins import find_plugins, load_plugin, plugin_error
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -168,7 +170,7 @@ def _peer(agent: str, peer: PeerInfo) -> Iterator[Check]:
             remedy = "`rmpa peer info` shows of which topics; docs/guides/contracts.md: max_rate, priority"
             yield check(WARN, text, remedy)
         if link.clock_offset is not None:
-            yield machine.judge_peer_clock(agent, peer.name, link.clock_offset, link.clock_error)
+            yield judge_peer_clock(agent, peer.name, link.clock_offset, link.clock_error)
 
 
 # --- which nodes of a secured module listen beyond this machine: what ROS 1 leaves open (docs/reference/security.md)
@@ -292,6 +294,16 @@ CHECKS: Final[dict[str, Callable[[DoctorInput], Iterable[Check]]]] = {
 
 
 def examine(given: DoctorInput) -> Iterator[Check]:
-    """Run all checks; each result comes as soon as it is there. The whole takes some two seconds."""
+    """Run all checks, then those of other packages; each result comes as soon as it is there, the whole in 2 s."""
     for check in CHECKS.values():
         yield from check(given)
+    for name, entry in find_plugins(PLUGIN_CHECKS).items():
+        try:
+            for found in load_plugin(entry)(given):
+                if not isinstance(found, Check):
+                    raise plugin_error(entry, TypeError(f"{found!r} is no Check"))  # noqa: TRY301
+                yield found
+        except RmpaError as error:
+            yield Check(name, WARN, str(error), code=error.code)
+        except Exception as error:  # noqa: BLE001 - another's code
+            yield Check(name, WARN, str(plugin_error(entry, error)), code="plugin-broken")

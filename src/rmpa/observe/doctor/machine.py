@@ -15,18 +15,16 @@ import threading
 import time
 from dataclasses import dataclass, field
 from functools import partial
-from ipaddress import AddressValueError, IPv4Address, IPv4Interface
+from ipaddress import AddressValueError, IPv4Address
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
-
-import psutil
 
 from rmpa.config.read import load_settings
 from rmpa.config.settings import Settings
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.limits import KIB, MIB
-from rmpa.discovery.network import choose, list_interfaces
+from rmpa.discovery.network import NetworkInterface, read_interfaces
 from rmpa.observe import limits
 from rmpa.observe.control_client import ControlClient, find_agents
 from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check, CheckLevel
@@ -35,6 +33,7 @@ from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is
 from rmpa.ros.http.rpc import call_api
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.realtime import REMEDY
+from rmpa.runtime.systemd import INSTALL, START, UNIT, is_set_up
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -43,27 +42,6 @@ if TYPE_CHECKING:
 
 # The name under which a core is asked.
 CALLER: Final = "/rmpa_doctor"
-
-
-@dataclass(frozen=True, slots=True)
-class NetworkInterface:
-    """One network interface.
-
-    Args:
-        name: As in ``ip link``.
-        networks: Its IPv4 addresses with their networks.
-        up: Whether it is up and has a carrier.
-        multicast: Whether its flags say so.
-        loopback: Whether it never leaves this machine.
-        used: Whether an agent started here would use it.
-    """
-
-    name: str
-    networks: tuple[IPv4Interface, ...] = ()
-    up: bool = True
-    multicast: bool = True
-    loopback: bool = False
-    used: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,29 +96,6 @@ def look_at(environ: Mapping[str, str], config: str | None = None, listen: float
         except RmpaError as error:
             agents[found.name] = str(error)
     return DoctorInput(environ, settings, tuple(checks), agents, read_interfaces(settings.interfaces), listen)
-
-
-def read_interfaces(wanted: tuple[str, ...]) -> tuple[NetworkInterface, ...]:
-    """All interfaces; ``wanted`` are the names that the settings give, none for all that can be used."""
-    there = list_interfaces()
-    used = {interface.name for interface in choose(there, wanted)}
-    masks = {
-        (name, address.address): address.netmask or "255.255.255.255"
-        for name, addresses in psutil.net_if_addrs().items()
-        for address in addresses
-        if address.family == socket.AF_INET
-    }
-    return tuple(
-        NetworkInterface(
-            one.name,
-            tuple(IPv4Interface(f"{a}/{masks.get((one.name, str(a)), '255.255.255.255')}") for a in one.addresses),
-            one.up,
-            one.multicast,
-            one.loopback,
-            one.name in used,
-        )
-        for one in there
-    )
 
 
 def ask_program(*words: str) -> str | None:
@@ -267,24 +222,7 @@ async def _clock_publishers(core_uri: str) -> list[str] | None:
     return []
 
 
-def judge_peer_clock(agent: str, peer: str, offset: float, error: float | None) -> Check:
-    """Whether two modules' clocks agree well enough for tf and message filters; both in seconds."""
-    bound = f" ±{error * 1e3:.1f} ms" if error is not None else ""
-    text = f"{peer}'s clock is {abs(offset) * 1e3:.1f} ms{bound} {'ahead of' if offset > 0 else 'behind'} ours"
-    if abs(offset) - (error or 0.0) <= 0.02:  # two periods of a 100 Hz transform
-        return Check("clock", OK, text, where=f"{agent}-{peer}")
-    remedy = "let both follow one clock (chrony); until then tf says 'extrapolation into the future'"
-    return Check("clock", WARN, text, remedy, where=f"{agent}-{peer}")
-
-
 # --- the start with the machine -------------------------------------------------------------------------------------
-
-
-# The agent's unit, as ``rmpa service install`` and the Debian package name it.
-UNIT: Final = "rmpa.service"
-# How one is started that does not start with the machine; and one that has no name and keys.
-START: Final = "sudo systemctl enable --now rmpa"
-INSTALL: Final = "sudo rmpa service install"
 
 
 def at_boot(_: DoctorInput) -> Iterable[Check]:
@@ -297,14 +235,6 @@ def read_unit() -> dict[str, str]:
     properties = "--property=LoadState,ActiveState,UnitFileState,Result,FragmentPath"
     told = ask_program("systemctl", "show", UNIT, properties) or ""
     return dict(line.partition("=")[::2] for line in told.splitlines())
-
-
-def is_set_up(unit: Mapping[str, str]) -> bool:
-    """Whether a unit has the user's name and keys: it runs, or ``rmpa service install`` or the user made its file.
-
-    The Debian package's may never have had them. ``rmpa service install`` changes nothing where it has.
-    """
-    return unit.get("ActiveState") != "inactive" or unit.get("FragmentPath", "").startswith("/etc/")
 
 
 def judge_unit(unit: Mapping[str, str]) -> Check:

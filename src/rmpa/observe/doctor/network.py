@@ -26,7 +26,7 @@ import psutil
 from rmpa.core.errors import StartError
 from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import MAGIC, VERSION, BeaconKind
-from rmpa.discovery.network import choose, join_group, list_interfaces, open_receiver, receive
+from rmpa.discovery.network import CONTAINERS, choose, join_group, list_interfaces, open_receiver, receive
 from rmpa.mesh.io.dial import may_use_bbr, repeats_quickly
 from rmpa.observe import limits
 from rmpa.observe.doctor.machine import ask_program, resolve
@@ -36,12 +36,11 @@ from rmpa.runtime.kernel_tcp import program_at
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from rmpa.discovery.network import Interface
-    from rmpa.observe.doctor.machine import DoctorInput, NetworkInterface
+    from rmpa.discovery.network import Interface, NetworkInterface
+    from rmpa.observe.doctor.machine import DoctorInput
 
 # --- interfaces -----------------------------------------------------------------------------------------------------
 
-CONTAINERS: Final = re.compile(r"(docker|br-|veth|virbr|lxc|lxd|cni|flannel|podman|cali)")
 _TUNNELS: Final = re.compile(r"(tun|tap|wg|zt|tailscale|ppp|utun|nordlynx|proton)")
 _CONTAINER_MARKS: Final = (Path("/.dockerenv"), Path("/run/.containerenv"))
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, Self
 import msgspec
 
 from rmpa.config.peer_rules import Access
-from rmpa.observe.peer_info import FAIL, OK, Check
+from rmpa.observe.peer_info import FAIL, OK, WARN, Check
 from rmpa.trust.permissions import prohibition, refusal
 
 if TYPE_CHECKING:
@@ -278,3 +278,13 @@ def misplaced(route: RouteInfo) -> list[SubscriberTransport]:
 def connected_directly(route: RouteInfo) -> list[SubscriberTransport]:
     """The subscribers of a route that were answered the publisher's own address."""
     return [one for one in route.subscribers if one.transport == "direct"]
+
+
+def judge_peer_clock(agent: str, peer: str, offset: float, error: float | None) -> Check:
+    """Whether two modules' clocks agree well enough for tf and message filters; both in seconds."""
+    bound = f" ±{error * 1e3:.1f} ms" if error is not None else ""
+    text = f"{peer}'s clock is {abs(offset) * 1e3:.1f} ms{bound} {'ahead of' if offset > 0 else 'behind'} ours"
+    if abs(offset) - (error or 0.0) <= 0.02:  # two periods of a 100 Hz transform
+        return Check("clock", OK, text, where=f"{agent}-{peer}")
+    remedy = "let both follow one clock (chrony); until then tf says 'extrapolation into the future'"
+    return Check("clock", WARN, text, remedy, where=f"{agent}-{peer}")

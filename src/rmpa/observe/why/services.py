@@ -18,9 +18,15 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
 from rmpa.config.peer_rules import Access
-from rmpa.observe.doctor.machine import judge_peer_clock
 from rmpa.observe.peer_info import FAIL, OK, UNKNOWN, WARN, Check, PeerAgent
-from rmpa.observe.why.diagnosis import PERMISSION_THERE, Diagnosis, permission_here, permission_there, until_failure
+from rmpa.observe.why.diagnosis import (
+    PERMISSION_THERE,
+    Diagnosis,
+    judge_peer_clock,
+    permission_here,
+    permission_there,
+    until_failure,
+)
 from rmpa.observe.why.stages import find_peer, peer_stages
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from rmpa.runtime.tasks import start_task
 from rmpa.web import limits
 from rmpa.web.clients.frame_writer import FrameSocket
 from rmpa.web.foxglove.channels import ChannelTable
-from rmpa.web.foxglove.protocol import SUBPROTOCOLS, choose_subprotocol
+from rmpa.web.foxglove.protocol import SUBPROTOCOLS
 from rmpa.web.foxglove.session import FoxgloveSession
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.monitor.session import MonitorSession
@@ -28,7 +28,7 @@ from rmpa.web.rosbridge.protocol import PublishFrames
 from rmpa.web.rosbridge.session import RosbridgeSession
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from rmpa.web.clients.connection import ClientConnection, Session
     from rmpa.web.hub.hub import Hub
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 _log = logging.getLogger(__name__)
-# The protocols, as ``ClientConnection.kind`` names them.
+# Our own protocols, as ``Session.kind`` names them.
 PROTOCOLS: Final = ("foxglove", "monitor", "rosbridge")
 # Why WebSocket clients are refused or disconnected, as counted: a handshake that is malformed or asks for another
 # protocol; too many clients; a malformed frame or message, or one that does not end; one that is too long; too many
@@ -79,6 +79,7 @@ class WebSocketClients:
         rights: What clients may do.
         priority: The priority of a topic's messages: higher ones go first.
         monitor: Serves the pages at ``MONITOR_PATH``; without it there are none.
+        others: Further protocols.
     """
 
     def __init__(
@@ -88,6 +89,7 @@ class WebSocketClients:
         rights: Rights,
         priority: Callable[[str], int] = lambda _: 0,
         monitor: Monitor | None = None,
+        others: Sequence[type[Session]] = (),
     ) -> None:
         # Clients that were refused or disconnected, by the words of ``REASONS``.
         self.counters = Counters()
@@ -97,11 +99,17 @@ class WebSocketClients:
         self.upgraded: Callable[[web.Request, Callable[[], None]], Callable[[], int]] = lambda *_: int
         self._monitor = monitor
         self._hub = hub
-        self._server = name, secrets.token_hex(8)
         self._rights = rights
         self._priority = priority
-        self._encoder = PublishFrames()
         self._channels = ChannelTable(hub, services=rights.control)
+        foxglove = functools.partial(FoxgloveSession, table=self._channels, server=(name, secrets.token_hex(8)))
+        # By the subprotocol that a client offers; empty for none.
+        self._protocols: dict[str, Callable[[Hub, Rights, Callable[[str], int], str], Session]] = {
+            **{name: other for other in others for name in other.subprotocols},
+            **dict.fromkeys(SUBPROTOCOLS, foxglove),
+            "": functools.partial(RosbridgeSession, encoder=PublishFrames()),
+        }
+        self._kinds = *PROTOCOLS, *(other.kind for other in others)
         self._open: dict[Session, FrameSocket] = {}
         self._sent: Counter[str] = Counter()
         self._dropped: Counter[str] = Counter()
@@ -114,7 +122,7 @@ class WebSocketClients:
     def figures(self) -> dict[str, ClientFigures]:
         """What each gateway counts."""
         found = {}
-        for kind in PROTOCOLS:
+        for kind in self._kinds:
             present = [each.connection for each in self._open if each.kind == kind]
             found[kind] = ClientFigures(
                 clients=len(present),
@@ -128,25 +136,23 @@ class WebSocketClients:
         """Serve one client until it has gone."""
         lines = request.headers.getall("Sec-WebSocket-Protocol", ())
         offered = [name.strip() for name in ",".join(lines).split(",") if name.strip()]
-        protocol = choose_subprotocol(offered)
         address = request.remote or "?"
-        client = self._hub, self._rights, self._priority, address
-        session: Session
         if request.path == MONITOR_PATH:
             if self._monitor is None or SUBPROTOCOL not in offered:
                 return self._refuse_protocol(address, f"pages speak {SUBPROTOCOL} here; see /rosbridge")
             await self._monitor.mesh.first()
-            return await self._serve(request, MonitorSession(*client, self._monitor), limits.REQUEST_MAX + 1)
-        if offered and protocol is None:
-            spoken = f"Foxglove's {' and '.join(SUBPROTOCOLS)}, and rosbridge without a subprotocol"
+            page = MonitorSession(self._hub, self._rights, self._priority, address, self._monitor)
+            return await self._serve(request, page, page.frame_max)
+        chosen = next((name for name in offered if name in self._protocols), None if offered else "")
+        if chosen is None:
+            spoken = f"{', '.join(filter(None, self._protocols))}, and rosbridge without a subprotocol"
             return self._refuse_protocol(address, f"{', '.join(offered)[:80]!a} is not spoken here: {spoken} are")
         await self._hub.settled(limits.SETTLE)
+        session = self._protocols[chosen](self._hub, self._rights, self._priority, address)
         # Only a client that sends data has a use for large messages: aiohttp keeps what it has gathered to the end.
-        if protocol is not None:
-            session, most = FoxgloveSession(*client, self._channels, self._server), limits.FOXGLOVE_BINARY_MAX
-        else:
-            session, most = RosbridgeSession(*client, self._encoder), limits.FRAME_MAX
-        return await self._serve(request, session, most if self._rights.control else limits.FOXGLOVE_TEXT_MAX)
+        return await self._serve(
+            request, session, session.frame_max if self._rights.control else limits.FOXGLOVE_TEXT_MAX
+        )
 
     def _refuse_protocol(self, address: str, text: str) -> web.Response:
         self.refuse(address, "handshake", text)
@@ -154,7 +160,7 @@ class WebSocketClients:
 
     async def _serve(self, request: web.Request, session: Session, most: int) -> web.StreamResponse:
         response = FrameSocket(
-            protocols=(*SUBPROTOCOLS, SUBPROTOCOL),
+            protocols=(*filter(None, self._protocols), SUBPROTOCOL),
             autoping=False,
             compress=False,
             max_msg_size=most,

@@ -14,13 +14,13 @@ import socket
 from abc import abstractmethod
 from collections import deque
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeAlias, get_type_hints
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeAlias, get_type_hints
 
 import msgspec
 from aiohttp import WebSocketError, WSCloseCode, WSMsgType
 
 from rmpa.core.errors import RmpaError
-from rmpa.core.limits import KIB
+from rmpa.core.limits import KIB, MIB
 from rmpa.runtime.tasks import end_tasks, start_task
 from rmpa.web import limits
 from rmpa.web.clients.frame_writer import FairQueue, FrameWriter, Opcode, OutFrame
@@ -83,7 +83,11 @@ class Session(HubClient):
     """
 
     # The protocol's name, for logs and lists.
-    kind = ""
+    kind: ClassVar = ""
+    # The WebSocket subprotocols that mean it (RFC 6455, section 1.9).
+    subprotocols: ClassVar[Sequence[str]] = ()
+    # Bytes of a client's frame, where clients may send data.
+    frame_max: ClassVar = 1 * MIB
     # Whether the protocol itself says how old a command is.
     dates_commands = False
 

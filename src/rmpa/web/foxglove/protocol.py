@@ -24,7 +24,7 @@ from rmpa.web import limits
 from rmpa.web.clients.frame_writer import Opcode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Mapping
 
     from rmpa.web.clients.frame_writer import OutFrame
     from rmpa.web.hub.node_link import ParamValue, Payload
@@ -38,12 +38,6 @@ SCHEMA_ENCODING: Final = "ros1msg"
 WARNING: Final = 1
 # Levels of a status.
 ERROR: Final = 2
-
-
-def choose_subprotocol(offered: Iterable[str]) -> str | None:
-    """The subprotocol to answer a client's ``Sec-WebSocket-Protocol`` with; ``None`` if it offers none of ours."""
-    names = {name.strip() for name in offered}
-    return next((name for name in SUBPROTOCOLS if name in names), None)
 
 
 # --- from the server: JSON ---

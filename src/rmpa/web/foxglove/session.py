@@ -94,6 +94,7 @@ class FoxgloveSession(Session):
     """
 
     kind = "foxglove"
+    frame_max = limits.FOXGLOVE_BINARY_MAX
 
     # More than 12 fields: what the client has of each kind.
     def __init__(

@@ -21,8 +21,8 @@ from rmpa.core.identity import is_global_name, is_own, proxied_node, proxied_pee
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.observe.operations import PeerParams, parameters_in
-from rmpa.resource.reconfigure import SERVICE_TYPE
 from rmpa.ros.types.codec import codec_for
+from rmpa.ros.types.descriptor import SERVICE_TYPE
 from rmpa.trust.permissions import InviteReply
 from rmpa.web import limits
 from rmpa.web.monitor.state import node_key

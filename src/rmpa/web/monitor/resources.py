@@ -13,12 +13,10 @@ import msgspec
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
 from rmpa.core.limits import KIB, MIB
-from rmpa.resource.adapter import LEVEL_FOR
-from rmpa.resource.descriptor import TOPIC as DESCRIPTOR
-from rmpa.resource.descriptor import Descriptor
-from rmpa.resource.reconfigure import CONFIG_TYPE
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
+from rmpa.ros.types.descriptor import CONFIG_TYPE, LEVEL_FOR, Descriptor
+from rmpa.ros.types.descriptor import TOPIC as DESCRIPTOR
 from rmpa.web import limits
 from rmpa.web.monitor.messages import Tree, without_nulls
 
@@ -42,7 +40,7 @@ class ResourceFacts(msgspec.Struct, kw_only=True, frozen=True):
         health: The first status of ``quality``: ``level``, ``message`` and ``values`` by attribute, with units.
         parameters: Values by name.
         clients: The statuses of ``responses``: what each client asks and is told.
-        descriptor: What it declares (``resource.descriptor``), as JSON values.
+        descriptor: What it declares (``ros.types.descriptor``), as JSON values.
         decision: The last decision, as ``rmpa profile explain --json`` gives it.
         contexts: As ``rmpa context list --json`` gives them.
     """

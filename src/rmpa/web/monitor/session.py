@@ -175,6 +175,7 @@ class MonitorSession(Session):
     """
 
     kind = "monitor"
+    frame_max = limits.REQUEST_MAX + 1
     dates_commands = True
 
     def __init__(

@@ -149,6 +149,7 @@ class RosbridgeSession(Session):
     """
 
     kind = "rosbridge"
+    frame_max = limits.FRAME_MAX
 
     # More than 12 fields: what the client has of each kind, and what it has in fragments.
     def __init__(

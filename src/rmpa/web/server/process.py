@@ -16,12 +16,14 @@ from rmpa.config.module_name import module_dir, state_dir
 from rmpa.core.contract import Priority
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
 from rmpa.ros.node.node import Node
+from rmpa.runtime.plugins import WEB_PROTOCOLS, load_plugins, plugin_error
 from rmpa.runtime.systemd import feed_watchdog, notify_service_manager
 from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 from rmpa.trust.permissions import Permissions, server_names
 from rmpa.trust.store import CERTIFICATE, KEY
 from rmpa.web import limits
 from rmpa.web.clients.clients import WebSocketClients
+from rmpa.web.clients.connection import Session
 from rmpa.web.hub.hub import Hub
 from rmpa.web.hub.node_link import EVERYTHING, READ_ONLY, NodeRules, Rights
 from rmpa.web.monitor.monitor import Monitor
@@ -353,6 +355,7 @@ async def serve(
         setup.rights,
         priority_of(hub, setup.settings.make_contracts()),
         monitor,
+        other_protocols(),
     )
     certificate = ServerCertificate(setup.files)
     server = WebServer(watch, setup.policy, web.listen, sockets, web.ports, certificate.context)
@@ -376,6 +379,17 @@ async def serve(
         await server.close()
         reader.close()
     return not stop.is_set()
+
+
+def other_protocols() -> list[type[Session]]:
+    """The protocols of other packages."""
+    found = []
+    for entry, kind in load_plugins(WEB_PROTOCOLS):
+        if isinstance(kind, type) and issubclass(kind, Session):
+            found.append(kind)
+        else:
+            _log.warning("! %s [plugin-broken]", plugin_error(entry, TypeError(f"{entry.value} is no Session")))
+    return found
 
 
 async def _first_of(*awaited: Coroutine[Any, Any, object]) -> None:

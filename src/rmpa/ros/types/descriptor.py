@@ -6,22 +6,20 @@ fields are part of the wire format.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final
 
 import msgspec
 
-from rmpa.core.contract import KEYS, Contract
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.resource import limits
-
-if TYPE_CHECKING:
-    from rmpa.resource.declare import DeclaredTopic
-    from rmpa.resource.resource import Resource
+from rmpa.ros import limits
 
 VERSION: Final = 1
 TOPIC: Final = "descriptor"
-_DEFAULT: Final = Contract()
-_Kind = TypeVar("_Kind", bound=msgspec.Struct)
+# Of the topic of its parameters, and of the service that sets them.
+CONFIG_TYPE: Final = "dynamic_reconfigure/Config"
+SERVICE_TYPE: Final = "dynamic_reconfigure/Reconfigure"
+# The value of the topic ``quality`` that says for how long its level has been the same.
+LEVEL_FOR: Final = "level_for"
 
 
 class TopicDescriptor(msgspec.Struct, frozen=True):
@@ -159,57 +157,3 @@ class Descriptor(msgspec.Struct, frozen=True, kw_only=True):
         if found.version != VERSION:
             raise RemoteProtocolError(f"descriptor of version {found.version}; this release reads {VERSION}")
         return found
-
-
-def describe(resource: Resource, node: str) -> Descriptor:
-    """Make the descriptor of a declared resource.
-
-    Args:
-        resource: The resource, completely declared.
-        node: Global name of the resource's node.
-    """
-    return Descriptor(
-        name=resource.name,
-        node=node,
-        role=resource.role.value,
-        physical=resource.physical,
-        description=resource.description,
-        outputs=tuple(_topic(output, node) for output in resource.outputs.values()),
-        inputs=tuple(_topic(item, node, required=item.required) for item in resource.inputs.values()),
-        parameters=tuple(_convert(p, ParameterDescriptor) for p in resource.parameters.values()),
-        attributes=tuple(
-            AttributeDescriptor(name, a.direction, a.unit, a.scale, a.category, a.tolerance, a.words)
-            for name, a in resource.attributes.items()
-        ),
-        profiles=tuple(_convert(p, ProfileDescriptor) for p in resource.profiles.values()),
-        contexts=tuple(
-            ContextDescriptor(c.name, c.when, {k: str(v) for k, v in c.requires.items()}, c.profiles, c.outputs)
-            for c in resource.contexts.values()
-        ),
-        tasks=tuple(
-            TaskDescriptor(
-                t.name, t.rate, t.on.name if t.on else "", t.rate_parameter.name if t.rate_parameter else ""
-            )
-            for t in resource.tasks.values()
-        ),
-        asks=tuple(
-            DemandDescriptor(d.resource, {k.replace("__", "."): str(v) for k, v in d.requests.items()}, d.priority)
-            for d in resource.demands.values()
-        ),
-    )
-
-
-def _convert(declared: object, kind: type[_Kind]) -> _Kind:
-    """Make a descriptor from a declaration's attributes of the same names."""
-    return msgspec.convert(declared, kind, from_attributes=True)
-
-
-def topic_of(name: str, node: str) -> str:
-    """The global name of an output or input; relative names are in the resource's own namespace."""
-    return name if name.startswith("/") else f"{node}/{name}"
-
-
-def _topic(topic: DeclaredTopic, node: str, *, required: bool = True) -> TopicDescriptor:
-    values = {key: getattr(topic.contract, key) for key in KEYS}
-    contract = {key: value for key, value in values.items() if value != getattr(_DEFAULT, key)}
-    return TopicDescriptor(topic.name, topic_of(topic.name, node), topic.type_name, contract, required)
