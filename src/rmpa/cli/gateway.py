@@ -61,7 +61,7 @@ _DEFAULTS: Final = WebSettings()
 @config_option
 @click.pass_context
 def gateway(context: click.Context, /, **options: object) -> int:
-    """Join this network's modules with other sites and with ROS 2, over Zenoh.
+    """Join this network's modules with other sites over Zenoh, and with ROS 2.
 
     Topics, services, actions and parameters cross once a node at the other side asks for them.
 
@@ -76,6 +76,7 @@ def gateway(context: click.Context, /, **options: object) -> int:
       rmpa gateway --site warehouse --connect tls/fleet.example:7447     one site of a fleet
       rmpa gateway --router --listen tls/0.0.0.0:7447                    the router that the sites connect to
       rmpa gateway --site b --rank 200 --connect tls/fleet.example:7447  standby for the one with rank 100
+      rmpa gateway --ros2                                                ROS 2 with any RMW, once it is sourced
       rmpa gateway --ros2 --connect tcp/localhost:7447                   ROS 2 nodes beside rmw_zenohd
       rmpa gateway zenoh-config --listen tls/0.0.0.0:7447 > zenohd.json5  a router with zenohd instead
     """
@@ -85,7 +86,6 @@ def gateway(context: click.Context, /, **options: object) -> int:
             option = f"--{given[0].replace('_', '-')}"
             raise ConfigError(option, f"must come after {context.invoked_subcommand}", "write it after that")
         return 0
-    _check_gateway_libraries()
     beside = ""
     if not options["name"]:
         beside = find_module(None, {"config": options.get("config")}, _own(os.environ)).name
@@ -96,6 +96,7 @@ def gateway(context: click.Context, /, **options: object) -> int:
         return loaded
 
     loaded = load()
+    _check_gateway_libraries(loaded.settings)
     _check_agents(loaded.settings)
     writer = LogWriter(sys.stderr.fileno())
     journal = in_journal(os.environ, sys.stderr.fileno())
@@ -186,7 +187,7 @@ def _check_settings(settings: Settings) -> None:
         raise ConfigError("rmpa gateway", "there is nothing to join", "say --site NAME for other sites, or --ros2")
     if it.router and not it.listen:
         raise ConfigError("gateway.router", "a router that listens nowhere", "add --listen tls/0.0.0.0:7447")
-    if not (it.connect or it.listen):
+    if not (it.connect or it.listen) and (it.site or it.router or not it.via_rclpy):
         example = "tcp/localhost:7447 for rmw_zenohd here" if it.ros2.enabled else "tls/fleet.example:7447"
         raise ConfigError(
             "rmpa gateway", "there is no connection to other sites", f"add --connect, such as {example}"
@@ -199,12 +200,14 @@ def check_gateway(settings: Settings) -> None:
     Raises:
         ConfigError: It has not.
     """
-    _check_gateway_libraries()
+    _check_gateway_libraries(settings)
     _check_settings(settings)
 
 
-def _check_gateway_libraries() -> None:
-    _check_libraries("rmpa gateway", "zenoh", {"zenoh": "eclipse-zenoh", "xxhash": "xxhash"})
+def _check_gateway_libraries(settings: Settings) -> None:
+    it = settings.gateway
+    zenoh = {"zenoh": "eclipse-zenoh"} if it.site or it.router or not it.via_rclpy else {}
+    _check_libraries("rmpa gateway", "zenoh", {**zenoh, "xxhash": "xxhash"})
 
 
 def check_web() -> None:

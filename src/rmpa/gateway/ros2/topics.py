@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from rmpa.gateway.foreign import ProxiedTopic
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint
+    from rmpa.gateway.ros2.link import Declared
     from rmpa.gateway.ros2.services import Ros2Context
     from rmpa.gateway.rules import CrossingDecision, MeshSource
-    from rmpa.gateway.zenoh.session import Declaration
     from rmpa.gateway.zenoh.threads import ZenohQos, ZenohSample
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import Buffer
@@ -219,7 +219,7 @@ class Ros2Import:
         self._by_gid: dict[bytes, Ros2Publisher] = {}
         self._adopted: dict[bytes, Ros2Publisher] = {}
         self._has_seq = False
-        self._subscribed: tuple[Declaration, OwnEndpoint] | None = None
+        self._subscribed: tuple[Declared, OwnEndpoint] | None = None
         self._history = False
         self.sequences = Ros2Sequences()
         self.early: BoundedQueue[tuple[bytes, int, bytes]] = BoundedQueue(_ROS2_EARLY_MESSAGES, _ROS2_EARLY_BYTES)
