@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
 
@@ -18,7 +18,7 @@ from rmpa.gateway.ros2.conversion import ActionPair
 from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.messages import MessageType
 from tests.interop.ros import lacks
-from tests.interop.ros2_hall import LONG, Hall, OtherEnd, running_hall
+from tests.interop.ros2_hall import LONG, ZENOH, Hall, OtherEnd, python_of, running_hall
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -26,7 +26,13 @@ if TYPE_CHECKING:
 pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 needs_actionlib = pytest.mark.skipif(bool(lacks("actionlib")), reason=lacks("actionlib"))
-needs_sdk = pytest.mark.skipif(find_spec("zenoh_ros2_sdk") is None, reason="zenoh-ros2-sdk is not installed")
+
+
+class World(NamedTuple):
+    """A hall, and a ROS 2 node in it."""
+
+    hall: Hall
+    node: OtherEnd
 
 
 @pytest.fixture(scope="module")
@@ -36,10 +42,19 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
         yield hall
 
 
-@pytest.fixture(scope="module")
-def ros2(hall: Hall) -> OtherEnd:
-    """A ROS 2 node."""
-    return hall.end("ros2_end", hall.robot.host.address)
+@pytest.fixture(scope="module", params=[ZENOH, "jazzy", "kilted"])
+def ros2(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    """A ROS 2 node, and the hall that it is in: each way to ROS 2 has the same behaviour."""
+    if request.param == ZENOH:
+        if find_spec("zenoh_ros2_sdk") is None:
+            pytest.skip("zenoh-ros2-sdk is not installed")
+        hall = request.getfixturevalue("hall")
+        yield World(hall, hall.node("talker2"))
+        return
+    if not python_of(request.param).exists():
+        pytest.skip(f"ROS 2 {request.param} is not there: scripts/install-ros2")
+    with running_hall(tmp_path_factory.mktemp(request.param), way=request.param) as hall:
+        yield World(hall, hall.node("talker2"))
 
 
 @pytest.fixture(scope="module")
@@ -78,25 +93,25 @@ def hears_all(listener: Process, ros2: OtherEnd, text: str) -> None:
     assert heard == [f"{text} {number}" for number in range(1, 51)]
 
 
-@needs_sdk
-def test_ros2_lists_and_hears_a_rospy_talker(hall: Hall, ros2: OtherEnd) -> None:
+def test_ros2_lists_and_hears_a_rospy_talker(ros2: World) -> None:
+    hall, node = ros2
     with hall.robot.ros.rospy("talker", "__name:=talker", topic="/hello", type="String", rate=50, wait=1):
-        listed(ros2, "topics", "/hello", "std_msgs/msg/String")
-        ros2.do("subscribe", topic="/hello")
-        ros2.process.wait_event("heard", where=lambda e: e["data"] == "message 21")
-        heard = [e["data"] for e in ros2.process.events("heard") if e["topic"] == "/hello"]
+        listed(node, "topics", "/hello", "std_msgs/msg/String")
+        node.do("subscribe", topic="/hello")
+        node.process.wait_event("heard", where=lambda e: e["data"] == "message 21")
+        heard = [e["data"] for e in node.process.events("heard") if e["topic"] == "/hello"]
         assert heard[:21] == [f"message {number}" for number in range(1, 22)]
 
 
-@needs_sdk
-def test_ros1_lists_and_hears_a_ros2_talker(hall: Hall, ros2: OtherEnd) -> None:
-    ros2.do("publish", topic="/from2", text="early", count=1)
+def test_ros1_lists_and_hears_a_ros2_talker(ros2: World) -> None:
+    hall, node = ros2
+    node.do("publish", topic="/from2", text="early", count=1)
     hall.robot.wait_topic("/from2")
     assert "/rmpa/ros2/talker2" in hall.robot.ros.tool("rosnode", "list").split()
     assert "std_msgs/String" in hall.robot.ros.tool("rostopic", "info", "/from2")
     for number in range(2):
         with hall.robot.ros.rospy("listener", topic="/from2", type="String", name=f"l_{number}") as listener:
-            hears_all(listener, ros2, f"turn{number}")
+            hears_all(listener, node, f"turn{number}")
             _, text = hall.robot.agent.rmpa("why", "ros2:/from2")
             assert "std_msgs/msg/String of ROS 2 is std_msgs/String here" in text, text
     code, text = hall.robot.agent.rmpa("site", "info", "ros2")
@@ -104,25 +119,25 @@ def test_ros1_lists_and_hears_a_ros2_talker(hall: Hall, ros2: OtherEnd) -> None:
     assert "/from2" in text
 
 
-@needs_sdk
-def test_latched_is_transient_local_both_ways(hall: Hall, ros2: OtherEnd) -> None:
+def test_latched_is_transient_local_both_ways(ros2: World) -> None:
+    hall, node = ros2
     with hall.robot.ros.rospy("text_teller", topic="/map1", latch=True, commands=True) as teller:
         teller.wait_event("up")
         teller.tell(json.dumps({"data": "kept by ROS 1"}))
-        listed(ros2, "topics", "/map1", "std_msgs/msg/String")
-        ros2.do("subscribe", topic="/map1", latched=True)
-        ros2.process.wait_event("heard", where=lambda e: e["data"] == "kept by ROS 1")
+        listed(node, "topics", "/map1", "std_msgs/msg/String")
+        node.do("subscribe", topic="/map1", latched=True)
+        node.process.wait_event("heard", where=lambda e: e["data"] == "kept by ROS 1")
 
 
-@needs_sdk
-def test_services_are_called_both_ways(hall: Hall, ros2: OtherEnd) -> None:
+def test_services_are_called_both_ways(ros2: World) -> None:
+    hall, node = ros2
     with hall.robot.ros.rospy("switch", service="/lamp") as switch:
         switch.wait_event("up")
-        listed(ros2, "services", "/lamp", "std_srvs/srv/SetBool")
-        answer = ros2.ask("call", "answered", service="/lamp", data=True)
+        listed(node, "services", "/lamp", "std_srvs/srv/SetBool")
+        answer = node.ask("call", "answered", service="/lamp", data=True)
         assert (answer.get("success"), answer.get("message")) == (True, "on"), answer
         assert switch.events("call")[-1]["data"] is True
-    ros2.do("serve", service="/gate2")
+    node.do("serve", service="/gate2")
     eventually(lambda: "/gate2" in hall.robot.ros.tool("rosservice", "list").split(), what="/gate2 in ROS 1")
     assert hall.robot.ros.tool("rosservice", "type", "/gate2").strip() == "std_srvs/SetBool"
     output = hall.robot.ros.tool("rosservice", "call", "/gate2", "false")
