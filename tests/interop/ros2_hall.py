@@ -38,6 +38,8 @@ RCLPY: Final = """
 enabled = true
 python = "{python}"
 """
+SOURCED: Final = ("env", f"ROS_PACKAGE_PATH={NODES.parent / 'packages'}")
+"""The workspace of ROS 1 at the gateway: it has an action that ROS 2's test_msgs has too."""
 ROS2: Final = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"), "rmpa", "ros2")
 """Where ``scripts/install-ros2`` keeps a venv for each distribution."""
 ZENOH: Final = "zenoh"
@@ -109,7 +111,7 @@ def running_hall(home: Path, config: str = "", *, way: str = ZENOH, gateway_conf
         lab = stack.enter_context(Lab())
         robot, other = lab.hosts("robot", "other")
         agent = stack.enter_context(Agent(robot, home, name="robot", config=config))
-        gateway = stack.enter_context(GatewayProcess(robot, home, name="gate", config=text + gateway_config))
+        gateway = stack.enter_context(GatewayProcess(robot, home, name="gate", config=text + gateway_config, prefix=SOURCED))
         for one in (agent, gateway):
             one.start()
         for one in (agent, gateway):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import pytest
 
 from lab.bed.gateways import ROUTER_PORT
-from lab.bed.processes import Process, eventually
+from lab.bed.processes import Event, Process, eventually
 from rmpa.gateway.ros2.conversion import ActionPair
 from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.messages import MessageType
@@ -245,3 +245,51 @@ def test_a_client_of_ros2_uses_a_server_of_ros1(hall: Hall, kind: str) -> None:
     since = client.process.mark_events()
     server.kill()
     assert client.process.wait_event("ended", LONG, since=since)["status"] == 6
+
+
+def has_rclpy(world: World) -> Hall:
+    """The hall, for what zenoh-ros2-sdk cannot do."""
+    if world.hall.way == ZENOH:
+        pytest.skip("only rclpy has it")
+    return world.hall
+
+
+def done(client: Process, line: str) -> Event:
+    """What becomes of a goal that a client of ROS 1 sends, or of what it does else."""
+    since = client.mark_events()
+    client.tell(line)
+    return client.wait_event("done", LONG, since=since)
+
+
+@needs_actionlib
+def test_a_client_of_ros1_uses_a_server_of_rclpy(ros2: World) -> None:
+    hall = has_rclpy(ros2)
+    server = hall.node("counter2", "/fibonacci2")
+    server.do("action_serve")
+    client = hall.robot.ros.rospy("fibonacci_end", "client", action="/fibonacci2", commands=True)
+    client.wait_event("up", LONG)
+    client.tell("server 20")
+    assert client.wait_event("server", LONG)["found"]
+    ended = done(client, "send 5")
+    assert (ended["state"], ended["result"]) == ("SUCCEEDED", 5)
+    assert client.events("feedback")[-1]["value"] == 5
+    assert done(client, "send -1")["state"] == "REJECTED"
+    since = client.mark_events()
+    client.tell("send 100000")
+    client.wait_event("feedback", LONG, since=since)
+    assert done(client, "cancel")["state"] == "PREEMPTED"
+
+
+@needs_actionlib
+def test_a_client_of_rclpy_uses_a_server_of_ros1(ros2: World) -> None:
+    hall = has_rclpy(ros2)
+    hall.robot.ros.rospy("fibonacci_end", "server", action="/fibonacci1").wait_event("up", LONG)
+    client = hall.node("client2", "/fibonacci1")
+    eventually(lambda: client.ask("send", "accepted", goal=5)["ok"], LONG, what="a server of actions", every=0.2)
+    ended = client.process.wait_event("ended", LONG)
+    assert (ended["status"], ended["result"]) == (4, 5)
+    since = client.process.mark_events()
+    client.do("send", goal=100000)
+    client.process.wait_event("feedback", LONG, since=since)
+    assert client.ask("cancel", "cancelling")["code"] == 0
+    assert client.process.wait_event("ended", LONG, since=since)["status"] == 5

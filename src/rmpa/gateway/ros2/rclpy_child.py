@@ -682,15 +682,18 @@ def _service_hash(name: str) -> str:
     if name not in _HASHES:
         _HASHES[name] = ""
         package, kind, base = name.split("/")
+        file_name = (base.rpartition("_")[0] if kind == "action" else base) + ".json"
         try:
-            from ament_index_python.packages import get_package_share_directory
-
-            path = os.path.join(get_package_share_directory(package), kind, base + ".json")
-            with open(path) as file:
-                for each in json.load(file).get("type_hashes", ()):
+            folder = os.path.dirname(importlib.import_module(package).__file__ or "")
+            while not os.path.isdir(os.path.join(folder, "share", package)):
+                if folder == os.path.dirname(folder):
+                    return ""
+                folder = os.path.dirname(folder)
+            with open(os.path.join(folder, "share", package, kind, file_name)) as file:
+                for each in json.load(file)["type_hashes"]:
                     if each["type_name"] == name:
                         _HASHES[name] = each["hash_string"]
-        except Exception:  # before Iron, or a package that is not installed here
+        except (ImportError, OSError, ValueError, KeyError):  # before Iron, or a package that is not installed here
             pass
     return _HASHES[name]
 
