@@ -51,11 +51,15 @@ def ask(name: str, made: dict) -> None:
     client = actionlib.SimpleActionClient(name, made["FibonacciAction"])
 
     def obey() -> None:
+        sent = False
         for line in sys.stdin:
             word, *rest = line.split()
             if word == "server":
                 say("server", found=client.wait_for_server(rospy.Duration(float(rest[0]))))
             elif word == "send":
+                if sent:
+                    client.wait_for_result()  # it says "done" before it knows that it is
+                sent = True
                 client.send_goal(
                     made["FibonacciGoal"](int(rest[0])),
                     done_cb=lambda state, result: say(

@@ -4,6 +4,7 @@
 * ``{"do": "subscribe", "topic", "latched"}``: then ``heard`` with ``data``;
 * ``{"do": "serve", "service", "delay"}``: std_srvs/srv/SetBool; then ``asked`` with ``data``;
 * ``{"do": "call", "service", "data"}``: likewise; then ``answered`` with ``success`` and ``message``, or ``error``;
+* ``{"do": "unpublish", "topic"}``, ``{"do": "unserve", "service"}``: take it back;
 * ``{"do": "list"}``: then ``graph`` with ``topics`` and ``services``, each a list of name and types, and ``nodes``;
 * ``{"do": "action_serve"}``: rclpy's action server of test_msgs/action/Fibonacci, which rejects orders below 0;
 * ``{"do": "send", "goal"}``: by rclpy's action client; then ``accepted`` with ``ok``, ``feedback`` with ``value``,
@@ -54,6 +55,9 @@ class End:
         for number in range(1, count + 1):
             publisher.publish(String(data="%s %d" % (text, number)))
             time.sleep(1 / rate)
+
+    def unpublish(self, topic):
+        self.node.destroy_publisher(self.kept.pop("publish " + topic))
 
     def subscribe(self, topic, latched=False):
         def take(message):

@@ -256,8 +256,8 @@ def _way(stages: tuple[Check, ...], name: str, node: str, peer: str, to: str) ->
 
 def _out_stages(export: Export, dialect: Ros2Dialect, problems: Mapping[str, str]) -> Iterator[Check]:
     yield Check("rule", OK, dialect.why)
-    if export.problem:
-        yield Check("type", FAIL, export.problem)
+    if problem := export.problem or problems.get(f"{export.source.here} of {export.source.proxy}", ""):
+        yield Check("type", FAIL, problem)
     if dialect.endpoint is None:
         text = f"ROS 2 has no {export.source.type}; its publisher is being asked for the definition"
         yield Check("type", WARN, text)
