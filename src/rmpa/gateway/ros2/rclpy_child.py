@@ -394,7 +394,8 @@ class Half:
             from rclpy import qos_event as events
 
         def incompatible(info: Any) -> None:
-            policy = str(getattr(info.last_policy_kind, "name", info.last_policy_kind)).lower()
+            policy = str(getattr(info.last_policy_kind, "name", info.last_policy_kind))
+            policy = policy.replace("RMW_QOS_POLICY_", "").lower()
             self._link.say("!", number, policy=policy, count=info.total_count)
 
         made = events.PublisherEventCallbacks if publishes else events.SubscriptionEventCallbacks

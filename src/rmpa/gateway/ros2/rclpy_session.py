@@ -72,6 +72,11 @@ _RUN: Final = (
 )
 
 
+def shown_in_ros2(name: str, node: str) -> str:
+    """What a problem of an endpoint in ROS 2 is kept under, apart from those of its source."""
+    return f"{name} of {node} in ROS 2"
+
+
 class _Closer:
     """Something that is taken back once; the other declarations of a session have more to do."""
 
@@ -358,9 +363,9 @@ class RclpySession:
             if self._ready is not None and not self._ready.done():
                 self._ready.set_exception(self._no_rclpy(str(told.get("text"))))
             return
-        what = f"{endpoint.name} of {endpoint.node.name}"
+        what = shown_in_ros2(endpoint.name, endpoint.node.name)
         if policy := told.get("policy"):
-            self.say(what, f"its QoS fits {told['count']} endpoints of ROS 2 not: {policy}")
+            self.say(what, f"its QoS does not fit {told['count']} endpoints of ROS 2: {policy}")
         else:
             self.say(what, f"ROS 2 does not have it: {told.get('text')}")
 
@@ -377,6 +382,7 @@ class RclpySession:
         def end() -> None:
             del self._declared[number], self._by_gid[gid]
             self.outbox.discard(number)
+            self.say(shown_in_ros2(endpoint.name, endpoint.node.name), "")
             self.write("-", number, b"")
 
         return _Closer(end)

@@ -14,7 +14,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.ros2.actions import Ros2Actions
 from rmpa.gateway.ros2.format import Ros2Endpoint, graph_key
 from rmpa.gateway.ros2.graph import SITE
-from rmpa.gateway.ros2.rclpy_session import RclpySession
+from rmpa.gateway.ros2.rclpy_session import RclpySession, shown_in_ros2
 from rmpa.gateway.ros2.services import Ros2Context, Ros2Services
 from rmpa.gateway.ros2.topics import Ros2Topics
 from rmpa.gateway.ros2.types import DISTRIBUTIONS
@@ -256,7 +256,7 @@ def _way(stages: tuple[Check, ...], name: str, node: str, peer: str, to: str) ->
 
 def _out_stages(export: Export, dialect: Ros2Dialect, problems: Mapping[str, str]) -> Iterator[Check]:
     yield Check("rule", OK, dialect.why)
-    if problem := export.problem or problems.get(f"{export.source.here} of {export.source.proxy}", ""):
+    if problem := export.problem or problems.get(shown_in_ros2(export.source.here, export.source.proxy)):
         yield Check("type", FAIL, problem)
     if dialect.endpoint is None:
         text = f"ROS 2 has no {export.source.type}; its publisher is being asked for the definition"
