@@ -87,7 +87,7 @@ class Hall:
             return self.end("ros2_end", self.robot.host.address)
         return self.end("rclpy_end", name, *words, python=python_of(self.way))
 
-    def end(self, program: str, *words: str, python: Path = Path(sys.executable)) -> OtherEnd:  # noqa: B008 - fixed
+    def end(self, program: str, *words: str, python: Path = Path(sys.executable)) -> OtherEnd:
         """Start a program of ``nodes/`` on the other host."""
         env = {"PATH": "/usr/bin:/bin", "HOME": str(self.home), "PYTHONPATH": f"{NODES}:{NODES.parents[2]}/lab/nodes"}
         argv = self.other.command([python, NODES / f"{program}.py", *words])
@@ -111,7 +111,9 @@ def running_hall(home: Path, config: str = "", *, way: str = ZENOH, gateway_conf
         lab = stack.enter_context(Lab())
         robot, other = lab.hosts("robot", "other")
         agent = stack.enter_context(Agent(robot, home, name="robot", config=config))
-        gateway = stack.enter_context(GatewayProcess(robot, home, name="gate", config=text + gateway_config, prefix=SOURCED))
+        gateway = stack.enter_context(
+            GatewayProcess(robot, home, name="gate", config=text + gateway_config, prefix=SOURCED)
+        )
         for one in (agent, gateway):
             one.start()
         for one in (agent, gateway):

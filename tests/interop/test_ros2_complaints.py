@@ -124,7 +124,10 @@ def test_a_service_goes_with_its_server(hall: Hall, node: OtherEnd) -> None:
         in_ros2(node, "services", "/mortal1")
     in_ros2(node, "services", "/mortal1", there=False)
     node.do("serve", service="/mortal2")
-    services = lambda: hall.robot.ros.tool("rosservice", "list").split()  # noqa: E731 - asked again and again
+
+    def services() -> list[str]:
+        return hall.robot.ros.tool("rosservice", "list").split()
+
     eventually(lambda: "/mortal2" in services(), LONG, what="/mortal2 in ROS 1")
     node.do("unserve", service="/mortal2")
     eventually(lambda: "/mortal2" not in services(), LONG, what="/mortal2 out of ROS 1")
@@ -137,7 +140,7 @@ def test_a_listener_may_be_restarted_again_and_again(hall: Hall, node: OtherEnd)
 
             def told(turn: int = turn) -> bool:
                 node.do("publish", topic="/again2", text=f"turn {turn}", count=1)
-                return bool(listener.events("text"))  # noqa: B023 - called at once
+                return bool(listener.events("text"))
 
             eventually(told, LONG, what=f"a message in turn {turn}", every=0.2)
 

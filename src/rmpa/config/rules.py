@@ -380,6 +380,21 @@ class Ros2Settings:
     """The table ``[gateway.ros2]``."""
 
     enabled: bool = setting(False, BOOL, "Join a ROS 2 graph.", option="--ros2/--no-ros2")
+    domain: int = setting(0, DOMAIN, "ROS_DOMAIN_ID there; by rclpy 0 is the environment's.", option="--ros2-domain")
+    distribution: str = setting(
+        "jazzy",
+        word_of(
+            ("humble", "iron", "jazzy", "kilted", "lyrical"),
+            "a distribution of ROS 2 that rmw_zenoh is made for",
+            "there are humble, iron, jazzy, kilted and lyrical",
+            "NAME",
+        ),
+        "The distribution whose message definitions its nodes have; rclpy tells its own.",
+        option="--ros2-distribution",
+    )
+    mapping: tuple[str, ...] = setting(
+        (), list_of(TEXT), "Files of rules of ros1_bridge (YAML), for types that differ.", option="--ros2-mapping"
+    )
     via: str = setting(
         "auto",
         word_of(
@@ -399,21 +414,6 @@ class Ros2Settings:
         "The Python that has rclpy.",
         option="--ros2-python",
         shown_default="python3 of the sourced environment",
-    )
-    domain: int = setting(0, DOMAIN, "ROS_DOMAIN_ID there; by rclpy 0 is the environment's.", option="--ros2-domain")
-    distribution: str = setting(
-        "jazzy",
-        word_of(
-            ("humble", "iron", "jazzy", "kilted", "lyrical"),
-            "a distribution of ROS 2 that rmw_zenoh is made for",
-            "there are humble, iron, jazzy, kilted and lyrical",
-            "NAME",
-        ),
-        "The distribution whose message definitions its nodes have; rclpy tells its own.",
-        option="--ros2-distribution",
-    )
-    mapping: tuple[str, ...] = setting(
-        (), list_of(TEXT), "Files of rules of ros1_bridge (YAML), for types that differ.", option="--ros2-mapping"
     )
 
 

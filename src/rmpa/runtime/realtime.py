@@ -9,8 +9,8 @@ SCHED_RESET_ON_FORK leaves all other threads and every child process at default 
 
 What the start made is frozen, young garbage collected often. The data path makes no cycles, so in steady state
 nothing needs collecting. Control work makes some: each closed asyncio connection is a cycle. Among 64 modules, at
-1 kHz and beside 200 calls a second, p99.9 of a message is that of a collector that waits for pauses; with Python's own
-settings a full collection makes it 17 to 21 ms.
+1 kHz and beside 200 calls a second, p99.9 of a message is that of a collector that waits for pauses; with Python's
+own settings a full collection makes it 17 to 21 ms.
 """
 
 from __future__ import annotations

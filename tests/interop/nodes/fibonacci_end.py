@@ -1,13 +1,14 @@
 """A server or client of actionlib for ROS 2's action Fibonacci (rospy), of the package beside: no message is built.
 
-``fibonacci_end.py server|client --action NAME``. The server counts to the order, one feedback a step, and aborts below
-0. The client reads lines: ``server SECONDS``; ``send ORDER``; ``cancel``. Events: ``up``; of the server ``goal``; of
-the client ``server``, ``feedback`` with each length, ``done`` with the state and the length of the result.
+``fibonacci_end.py server|client --action NAME``. The server counts to the order, one feedback a step, and aborts
+below 0. The client reads lines: ``server SECONDS``; ``send ORDER``; ``cancel``. Events: ``up``; of the server
+``goal``; of the client ``server``, ``feedback`` with each length, ``done`` with the state and the length of the result.
 """
 
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import actionlib
 import rospy
@@ -19,21 +20,23 @@ from std_msgs.msg import Header
 PACKAGE = Path(__file__).parents[1] / "packages" / "test_msgs" / "msg"
 
 
-def classes() -> dict:
+def classes() -> dict[str, Any]:
     """The message classes of the action, by name."""
     parts = [f"MSG: test_msgs/{file.stem}\n{file.read_text()}" for file in sorted(PACKAGE.glob("Fibonacci*.msg"))]
     known = [f"MSG: {kind._type}\n{kind._full_text.split('=' * 80)[0]}" for kind in (Header, GoalID, GoalStatus)]
     text = f"\n{'=' * 80}\n".join([(PACKAGE / "FibonacciAction.msg").read_text(), *parts, *known])
-    return {name.partition("/")[2]: kind for name, kind in generate_dynamic("test_msgs/FibonacciAction", text).items()}
+    return {
+        name.partition("/")[2]: kind for name, kind in generate_dynamic("test_msgs/FibonacciAction", text).items()
+    }
 
 
-def serve(name: str, made: dict) -> None:
-    def execute(goal) -> None:  # type: ignore[no-untyped-def] # of a class that is made here
+def serve(name: str, made: dict[str, Any]) -> None:
+    def execute(goal: Any) -> None:
         say("goal", goal=goal.order)
         if goal.order < 0:
             server.set_aborted(made["FibonacciResult"]([]))
             return
-        sequence: list = []
+        sequence: list[int] = []
         while len(sequence) < goal.order:
             if server.is_preempt_requested() or rospy.is_shutdown():
                 server.set_preempted(made["FibonacciResult"](sequence))
@@ -47,7 +50,7 @@ def serve(name: str, made: dict) -> None:
     server.start()
 
 
-def ask(name: str, made: dict) -> None:
+def ask(name: str, made: dict[str, Any]) -> None:
     client = actionlib.SimpleActionClient(name, made["FibonacciAction"])
 
     def obey() -> None:

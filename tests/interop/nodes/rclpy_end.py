@@ -20,9 +20,9 @@ import json
 import sys
 import threading
 import time
+from typing import Any
 
 import rclpy
-from node import say
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
@@ -31,6 +31,8 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 from test_msgs.action import Fibonacci
 
+from node import say
+
 STEP = 0.05
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -38,44 +40,44 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 class End:
     """The node, and what was made of it."""
 
-    def __init__(self, name, action):
+    def __init__(self, name: str, action: str) -> None:
         self.node = rclpy.create_node(name)
         self.action = action
-        self.kept = {}
+        self.kept: dict[str, Any] = {}
         self.group = ReentrantCallbackGroup()
-        self.goal = None
-        self.client = None
+        self.goal: Any = None
+        self.client: Any = None
 
-    def publish(self, topic, text, count=1, rate=1000, latched=False):
+    def publish(self, topic: str, text: str, count: int = 1, rate: float = 1000, latched: bool = False) -> None:
         publisher = self.kept.get("publish " + topic)
         if publisher is None:
             publisher = self.kept["publish " + topic] = self.node.create_publisher(
                 String, topic, LATCHED if latched else QoSProfile(depth=1000)
             )
         for number in range(1, count + 1):
-            publisher.publish(String(data="%s %d" % (text, number)))
+            publisher.publish(String(data=f"{text} {number}"))
             time.sleep(1 / rate)
 
-    def unpublish(self, topic):
+    def unpublish(self, topic: str) -> None:
         self.node.destroy_publisher(self.kept.pop("publish " + topic))
 
-    def subscribe(self, topic, latched=False):
-        def take(message):
+    def subscribe(self, topic: str, latched: bool = False) -> None:
+        def take(message: Any) -> None:
             say("heard", topic=topic, data=message.data)
 
         qos = LATCHED if latched else QoSProfile(depth=1000)
         self.kept["subscribe " + topic] = self.node.create_subscription(String, topic, take, qos)
 
-    def sensor(self, topic):
+    def sensor(self, topic: str) -> None:
         qos = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
         publisher = self.node.create_publisher(String, topic, qos)
         self.kept["sensor " + topic] = self.node.create_timer(0.05, lambda: publisher.publish(String(data="seen")))
 
-    def strict(self, topic):
+    def strict(self, topic: str) -> None:
         self.subscribe(topic, latched=True)
 
-    def serve(self, service, delay=0.0):
-        def answer(request, response):
+    def serve(self, service: str, delay: float = 0.0) -> None:
+        def answer(request: Any, response: Any) -> Any:
             say("asked", data=request.data)
             time.sleep(delay)
             response.success, response.message = not request.data, "from ROS 2"
@@ -83,10 +85,10 @@ class End:
 
         self.kept["serve " + service] = self.node.create_service(SetBool, service, answer, callback_group=self.group)
 
-    def unserve(self, service):
+    def unserve(self, service: str) -> None:
         self.node.destroy_service(self.kept.pop("serve " + service))
 
-    def call(self, service, data, within=5.0):
+    def call(self, service: str, data: bool, within: float = 5.0) -> None:
         client = self.node.create_client(SetBool, service)
         try:
             if not client.wait_for_service(within):
@@ -103,7 +105,7 @@ class End:
         finally:
             self.node.destroy_client(client)
 
-    def list(self):
+    def list(self) -> None:
         say(
             "graph",
             topics=[[name, types] for name, types in self.node.get_topic_names_and_types()],
@@ -111,17 +113,17 @@ class End:
             nodes=[space.rstrip("/") + "/" + name for name, space in self.node.get_node_names_and_namespaces()],
         )
 
-    def action_serve(self):
-        def accept(request):
+    def action_serve(self) -> None:
+        def accept(request: Any) -> Any:
             say("goal", goal=request.order)
             return GoalResponse.ACCEPT if request.order >= 0 else GoalResponse.REJECT
 
-        def cancel(_goal):
+        def cancel(_goal: Any) -> Any:
             say("cancel")
             return CancelResponse.ACCEPT
 
-        def execute(goal):
-            sequence = []
+        def execute(goal: Any) -> Any:
+            sequence: list[int] = []
             while len(sequence) < goal.request.order:
                 if goal.is_cancel_requested:
                     goal.canceled()
@@ -142,33 +144,33 @@ class End:
             callback_group=self.group,
         )
 
-    def send(self, goal):
+    def send(self, goal: int) -> None:
         if self.client is None:
             self.client = ActionClient(self.node, Fibonacci, self.action)
         if not self.client.wait_for_server(5.0):
             say("accepted", ok=False)
             return
 
-        def feedback(message):
+        def feedback(message: Any) -> None:
             say("feedback", value=len(message.feedback.sequence))
 
-        def accepted(future):
+        def accepted(future: Any) -> None:
             self.goal = future.result()
             say("accepted", ok=self.goal.accepted)
             if self.goal.accepted:
                 self.goal.get_result_async().add_done_callback(ended)
 
-        def ended(future):
+        def ended(future: Any) -> None:
             answer = future.result()
             say("ended", status=answer.status, result=len(answer.result.sequence))
 
         self.client.send_goal_async(Fibonacci.Goal(order=goal), feedback).add_done_callback(accepted)
 
-    def cancel(self):
+    def cancel(self) -> None:
         self.goal.cancel_goal_async().add_done_callback(lambda f: say("cancelling", code=f.result().return_code))
 
 
-def main():
+def main() -> None:
     rclpy.init()
     end = End(sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "/count")
     executor = MultiThreadedExecutor(4)

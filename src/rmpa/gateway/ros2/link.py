@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -10,6 +10,17 @@ if TYPE_CHECKING:
     from rmpa.bridge.policy import Needs
     from rmpa.gateway.zenoh.threads import ZenohQos, ZenohReply, ZenohSample
     from rmpa.runtime.tls import Buffer
+
+
+# What the ways to ROS 2 can and need, as docs/guides/ros2.md shows it: a row, and what holds by rclpy and by Zenoh.
+WAYS: Final = (
+    ("ROS 2 where the gateway runs", "needed", "not needed"),
+    ("nodes that are reached", "of any RMW of yours", "of rmw_zenoh"),
+    ("a router", "no", "`rmw_zenohd`"),
+    ("types", "installed in ROS 2 there", "learnt from the node"),
+    ("QoS", "ROS 2's own, enforced", "reliability and durability"),
+    ("security", "SROS 2", "TLS of the mesh"),
+)
 
 
 class Declared(Protocol):

@@ -712,7 +712,7 @@ def main() -> int:
         import rclpy.guard_condition
         import rclpy.node
     except ImportError as error:
-        link.say("!", 0, text="%s has no rclpy: %s" % (sys.executable, error))
+        link.say("!", 0, text="it has no rclpy (%s)" % error)
         return 1
     half = Half(link, rclpy, asked["domain"], asked["name"])
     half.start()

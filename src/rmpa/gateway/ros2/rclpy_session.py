@@ -251,7 +251,7 @@ class RclpySession:
             )
         except OSError as error:
             here.close()
-            raise self._no_rclpy(f"cannot be started: {error.strerror}") from error
+            raise self._no_rclpy(f"it cannot be started: {error.strerror}") from error
         finally:
             there.close()
         self._ended.clear()
@@ -264,13 +264,13 @@ class RclpySession:
                 await self._ready
         except TimeoutError:
             await self._kill()
-            raise self._no_rclpy(f"gave no answer for {_START_MAX:g} s") from None
+            raise self._no_rclpy(f"no answer within {_START_MAX:g} s") from None
         self.problem = ""
         for number, endpoint in self._declared.items():
             self._create(number, endpoint)
 
     def _no_rclpy(self, why: str) -> StartError:
-        return StartError("ROS 2's half", f"{self._python} {why}", code="no-ros2")
+        return StartError("ROS 2's half", f"{self._python}: {why}", code="no-ros2")
 
     async def _keep(self) -> None:
         backoff = Backoff(limits.OPEN_RETRY_FIRST, _RESTART_MAX, random.random)
@@ -303,7 +303,7 @@ class RclpySession:
     def _closed(self, _error: Exception | None) -> None:
         self._stream = None
         if self._ready is not None and not self._ready.done():
-            self._ready.set_exception(self._no_rclpy("has ended at once"))
+            self._ready.set_exception(self._no_rclpy("it has ended at once"))
         for gid in list(self._foreign):
             self._remove(gid)
         for name in list(self._nodes):
@@ -595,8 +595,8 @@ def pythons(chosen: str, environ: Mapping[str, str]) -> list[str]:
     if chosen:
         return [chosen]
     folders = [*environ.get("PATH", "").split(os.pathsep), "/usr/bin"]
-    found = (Path(folder, "python3") for folder in folders if folder.startswith("/"))
-    return list(dict.fromkeys(str(each) for each in found if os.access(each, os.X_OK)))
+    found = dict.fromkeys(Path(folder).resolve() / "python3" for folder in folders if folder.startswith("/"))
+    return [str(each) for each in found if os.access(each, os.X_OK)]
 
 
 async def open_rclpy_session(settings: Settings) -> RclpySession:
@@ -621,6 +621,6 @@ async def open_rclpy_session(settings: Settings) -> RclpySession:
             asked.append(str(error.problem))
             continue
         return session
-    problem = "has no rclpy: " + ("; ".join(asked) or "no python3 was found")
+    problem = "; ".join(asked) or "no python3 was found"
     remedy = "source ROS 2 (source /opt/ros/<distribution>/setup.bash), or name its Python with --ros2-python"
     raise StartError("ROS 2", problem, remedy, code="no-ros2")
