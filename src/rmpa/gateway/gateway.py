@@ -227,8 +227,8 @@ class Gateway:
             self.neighbours["ros2"] = make_ros2_neighbour(self.graph, self.ros2 or session, self._settings)
         for neighbour in self.neighbours.values():
             neighbour.start()
-        ways = ", ".join(f"{each.name} session {each.zid}" for each in dict.fromkeys((session, self.ros2)) if each)
-        _log.info("= joined: %s; %s", ", ".join(self.neighbours) or "none", ways)
+        way = "rclpy" if session is self.ros2 else "zenoh"
+        _log.info("= joined: %s; %s session %s", ", ".join(self.neighbours) or "none", way, session.zid)
 
     def _failed(self, error: StartError) -> None:
         if str(error) != self._problem:

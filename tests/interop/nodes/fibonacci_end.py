@@ -2,7 +2,7 @@
 
 ``fibonacci_end.py server|client --action NAME``. The server counts to the order, one feedback a step, and aborts
 below 0. The client reads lines: ``server SECONDS``; ``send ORDER``; ``cancel``. Events: ``up``; of the server
-``goal``; of the client ``server``, ``feedback`` with each length, ``done`` with the state and the length of the result.
+``goal``; of the client ``server``, ``feedback`` with each length, ``done`` with the state and the result's length.
 """
 
 import sys

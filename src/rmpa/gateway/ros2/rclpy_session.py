@@ -199,7 +199,6 @@ class RclpySession:
         self._domain = domain
         self._name = name
         self._environ = dict(os.environ if environ is None else environ)
-        self.name = "rclpy"
         self.stale = False
         self.zid = f"{random.getrandbits(96):024x}"
         self.hash_of: Callable[[str], str] = lambda _: NO_HASH

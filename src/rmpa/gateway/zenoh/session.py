@@ -112,7 +112,6 @@ class OpenSession:
         loop: asyncio.AbstractEventLoop,
         stale: Callable[[], bool] = lambda: False,
     ) -> None:
-        self.name = "zenoh"
         self._zenoh = library
         self._session = session
         self._loop = loop
