@@ -10,7 +10,7 @@ BUILDER := $(if $(wildcard $(STAMP)),$(VENV),$(SMALL))
 .DEFAULT_GOAL := venv
 # One apt at a time: a lock on this folder.
 APT := flock scripts
-.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests test-long test-packages test-packages-short short-package short-chroot style format types imports reference docs fuzz soak soak-services soak-web bench experiment wheel deb bundle release ros chromium clients clean
+.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests test-long test-packages test-packages-short short-package short-chroot style format types imports reference docs fuzz soak soak-services soak-web bench experiment wheel deb bundle release ros ros2 chromium clients clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -41,6 +41,7 @@ packages:
 	$(APT) scripts/install-ros
 	$(APT) scripts/install-chromium
 	$(APT) scripts/install-clients
+	$(APT) scripts/install-ros2
 
 checks: style types imports
 
@@ -55,6 +56,9 @@ clients:  ## install npm and promtool for the tests of rmpa web against other pe
 
 ros:  ## install Debian's ROS 1 for the interop tests (only where apt and root are there; else says so)
 	$(APT) scripts/install-ros
+
+ros2:  ## ROS 2 (rclpy of Jazzy and Kilted) by pip for the interop tests, in a folder that is kept (else says so)
+	$(APT) scripts/install-ros2
 
 tests: $(STAMP)  ## all tests, several files at a time; some of them: make tests ARGS="tests/core -k names"
 	$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),scripts/run-tests $(BIN)/python)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from lab.bed.agents import Agent
@@ -17,7 +19,6 @@ from tests.interop.ros import NODES, Ros
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from lab.bed.namespaces import Host
 
@@ -32,6 +33,22 @@ insecure = true
 [gateway.ros2]
 enabled = true
 """
+RCLPY: Final = """
+[gateway.ros2]
+enabled = true
+python = "{python}"
+"""
+SOURCED: Final = ("env", f"ROS_PACKAGE_PATH={NODES.parent / 'packages'}")
+"""The workspace of ROS 1 at the gateway: it has an action that ROS 2's test_msgs has too."""
+ROS2: Final = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"), "rmpa", "ros2")
+"""Where ``scripts/install-ros2`` keeps a venv for each distribution."""
+ZENOH: Final = "zenoh"
+"""ROS 2 as ``zenoh-ros2-sdk`` speaks it; else ``rclpy`` of the distribution that is named."""
+
+
+def python_of(distribution: str) -> Path:
+    """The Python of a distribution of ROS 2, which may not be there."""
+    return ROS2 / distribution / "bin" / "python"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,33 +79,45 @@ class Hall:
     other: Host
     home: Path
     stack: ExitStack
+    way: str = ZENOH
 
-    def end(self, program: str, *words: str) -> OtherEnd:
+    def node(self, name: str, *words: str) -> OtherEnd:
+        """Start a ROS 2 node on the other host."""
+        if self.way == ZENOH:
+            return self.end("ros2_end", self.robot.host.address)
+        return self.end("rclpy_end", name, *words, python=python_of(self.way))
+
+    def end(self, program: str, *words: str, python: Path = Path(sys.executable)) -> OtherEnd:
         """Start a program of ``nodes/`` on the other host."""
         env = {"PATH": "/usr/bin:/bin", "HOME": str(self.home), "PYTHONPATH": f"{NODES}:{NODES.parents[2]}/lab/nodes"}
-        argv = self.other.command([sys.executable, NODES / f"{program}.py", *words])
+        argv = self.other.command([python, NODES / f"{program}.py", *words])
         process = self.stack.enter_context(Process(argv, env=env, name=program, commands=True))
         process.wait_event("up", LONG)
         return OtherEnd(process)
 
 
 @contextmanager
-def running_hall(home: Path, config: str = "") -> Iterator[Hall]:
+def running_hall(home: Path, config: str = "", *, way: str = ZENOH, gateway_config: str = "") -> Iterator[Hall]:
     """Start the module and its gateway, and join them.
 
     Args:
         home: Existing directory.
         config: Text of the module's ``rmpa.toml``.
+        way: To ROS 2.
+        gateway_config: More text of the gateway's.
     """
+    text = CONFIG if way == ZENOH else RCLPY.format(python=python_of(way))
     with ExitStack() as stack:
         lab = stack.enter_context(Lab())
         robot, other = lab.hosts("robot", "other")
         agent = stack.enter_context(Agent(robot, home, name="robot", config=config))
-        gateway = stack.enter_context(GatewayProcess(robot, home, name="gate", config=CONFIG))
+        gateway = stack.enter_context(
+            GatewayProcess(robot, home, name="gate", config=text + gateway_config, prefix=SOURCED)
+        )
         for one in (agent, gateway):
             one.start()
         for one in (agent, gateway):
             one.wait_ready()
         agent.wait_peer(gateway.name)
         module = Module(robot, agent, stack.enter_context(Ros(robot, home, 11311)))
-        yield Hall(module, gateway, other, home, stack)
+        yield Hall(module, gateway, other, home, stack, way)

@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import json
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
 
 from lab.bed.gateways import ROUTER_PORT
-from lab.bed.processes import Process, eventually
+from lab.bed.processes import Event, Process, eventually
 from rmpa.gateway.ros2.conversion import ActionPair
 from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.messages import MessageType
 from tests.interop.ros import lacks
-from tests.interop.ros2_hall import LONG, Hall, OtherEnd, running_hall
+from tests.interop.ros2_hall import LONG, ZENOH, Hall, OtherEnd, python_of, running_hall
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -26,7 +26,13 @@ if TYPE_CHECKING:
 pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 needs_actionlib = pytest.mark.skipif(bool(lacks("actionlib")), reason=lacks("actionlib"))
-needs_sdk = pytest.mark.skipif(find_spec("zenoh_ros2_sdk") is None, reason="zenoh-ros2-sdk is not installed")
+
+
+class World(NamedTuple):
+    """A hall, and a ROS 2 node in it."""
+
+    hall: Hall
+    node: OtherEnd
 
 
 @pytest.fixture(scope="module")
@@ -36,10 +42,19 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
         yield hall
 
 
-@pytest.fixture(scope="module")
-def ros2(hall: Hall) -> OtherEnd:
-    """A ROS 2 node."""
-    return hall.end("ros2_end", hall.robot.host.address)
+@pytest.fixture(scope="module", params=[ZENOH, "jazzy", "kilted"])
+def ros2(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    """A ROS 2 node, and the hall that it is in: each way to ROS 2 has the same behaviour."""
+    if request.param == ZENOH:
+        if find_spec("zenoh_ros2_sdk") is None:
+            pytest.skip("zenoh-ros2-sdk is not installed")
+        hall = request.getfixturevalue("hall")
+        yield World(hall, hall.node("talker2"))
+        return
+    if not python_of(request.param).exists():
+        pytest.skip(f"ROS 2 {request.param} is not there: scripts/install-ros2")
+    with running_hall(tmp_path_factory.mktemp(request.param), way=request.param) as hall:
+        yield World(hall, hall.node("talker2"))
 
 
 @pytest.fixture(scope="module")
@@ -78,25 +93,25 @@ def hears_all(listener: Process, ros2: OtherEnd, text: str) -> None:
     assert heard == [f"{text} {number}" for number in range(1, 51)]
 
 
-@needs_sdk
-def test_ros2_lists_and_hears_a_rospy_talker(hall: Hall, ros2: OtherEnd) -> None:
+def test_ros2_lists_and_hears_a_rospy_talker(ros2: World) -> None:
+    hall, node = ros2
     with hall.robot.ros.rospy("talker", "__name:=talker", topic="/hello", type="String", rate=50, wait=1):
-        listed(ros2, "topics", "/hello", "std_msgs/msg/String")
-        ros2.do("subscribe", topic="/hello")
-        ros2.process.wait_event("heard", where=lambda e: e["data"] == "message 21")
-        heard = [e["data"] for e in ros2.process.events("heard") if e["topic"] == "/hello"]
+        listed(node, "topics", "/hello", "std_msgs/msg/String")
+        node.do("subscribe", topic="/hello")
+        node.process.wait_event("heard", where=lambda e: e["data"] == "message 21")
+        heard = [e["data"] for e in node.process.events("heard") if e["topic"] == "/hello"]
         assert heard[:21] == [f"message {number}" for number in range(1, 22)]
 
 
-@needs_sdk
-def test_ros1_lists_and_hears_a_ros2_talker(hall: Hall, ros2: OtherEnd) -> None:
-    ros2.do("publish", topic="/from2", text="early", count=1)
+def test_ros1_lists_and_hears_a_ros2_talker(ros2: World) -> None:
+    hall, node = ros2
+    node.do("publish", topic="/from2", text="early", count=1)
     hall.robot.wait_topic("/from2")
     assert "/rmpa/ros2/talker2" in hall.robot.ros.tool("rosnode", "list").split()
     assert "std_msgs/String" in hall.robot.ros.tool("rostopic", "info", "/from2")
     for number in range(2):
         with hall.robot.ros.rospy("listener", topic="/from2", type="String", name=f"l_{number}") as listener:
-            hears_all(listener, ros2, f"turn{number}")
+            hears_all(listener, node, f"turn{number}")
             _, text = hall.robot.agent.rmpa("why", "ros2:/from2")
             assert "std_msgs/msg/String of ROS 2 is std_msgs/String here" in text, text
     code, text = hall.robot.agent.rmpa("site", "info", "ros2")
@@ -104,25 +119,25 @@ def test_ros1_lists_and_hears_a_ros2_talker(hall: Hall, ros2: OtherEnd) -> None:
     assert "/from2" in text
 
 
-@needs_sdk
-def test_latched_is_transient_local_both_ways(hall: Hall, ros2: OtherEnd) -> None:
+def test_latched_is_transient_local_both_ways(ros2: World) -> None:
+    hall, node = ros2
     with hall.robot.ros.rospy("text_teller", topic="/map1", latch=True, commands=True) as teller:
         teller.wait_event("up")
         teller.tell(json.dumps({"data": "kept by ROS 1"}))
-        listed(ros2, "topics", "/map1", "std_msgs/msg/String")
-        ros2.do("subscribe", topic="/map1", latched=True)
-        ros2.process.wait_event("heard", where=lambda e: e["data"] == "kept by ROS 1")
+        listed(node, "topics", "/map1", "std_msgs/msg/String")
+        node.do("subscribe", topic="/map1", latched=True)
+        node.process.wait_event("heard", where=lambda e: e["data"] == "kept by ROS 1")
 
 
-@needs_sdk
-def test_services_are_called_both_ways(hall: Hall, ros2: OtherEnd) -> None:
+def test_services_are_called_both_ways(ros2: World) -> None:
+    hall, node = ros2
     with hall.robot.ros.rospy("switch", service="/lamp") as switch:
         switch.wait_event("up")
-        listed(ros2, "services", "/lamp", "std_srvs/srv/SetBool")
-        answer = ros2.ask("call", "answered", service="/lamp", data=True)
+        listed(node, "services", "/lamp", "std_srvs/srv/SetBool")
+        answer = node.ask("call", "answered", service="/lamp", data=True)
         assert (answer.get("success"), answer.get("message")) == (True, "on"), answer
         assert switch.events("call")[-1]["data"] is True
-    ros2.do("serve", service="/gate2")
+    node.do("serve", service="/gate2")
     eventually(lambda: "/gate2" in hall.robot.ros.tool("rosservice", "list").split(), what="/gate2 in ROS 1")
     assert hall.robot.ros.tool("rosservice", "type", "/gate2").strip() == "std_srvs/SetBool"
     output = hall.robot.ros.tool("rosservice", "call", "/gate2", "false")
@@ -230,3 +245,51 @@ def test_a_client_of_ros2_uses_a_server_of_ros1(hall: Hall, kind: str) -> None:
     since = client.process.mark_events()
     server.kill()
     assert client.process.wait_event("ended", LONG, since=since)["status"] == 6
+
+
+def has_rclpy(world: World) -> Hall:
+    """The hall, for what zenoh-ros2-sdk cannot do."""
+    if world.hall.way == ZENOH:
+        pytest.skip("only rclpy has it")
+    return world.hall
+
+
+def done(client: Process, line: str) -> Event:
+    """What becomes of a goal that a client of ROS 1 sends, or of what it does else."""
+    since = client.mark_events()
+    client.tell(line)
+    return client.wait_event("done", LONG, since=since)
+
+
+@needs_actionlib
+def test_a_client_of_ros1_uses_a_server_of_rclpy(ros2: World) -> None:
+    hall = has_rclpy(ros2)
+    server = hall.node("counter2", "/fibonacci2")
+    server.do("action_serve")
+    client = hall.robot.ros.rospy("fibonacci_end", "client", action="/fibonacci2", commands=True)
+    client.wait_event("up", LONG)
+    client.tell("server 20")
+    assert client.wait_event("server", LONG)["found"]
+    ended = done(client, "send 5")
+    assert (ended["state"], ended["result"]) == ("SUCCEEDED", 5)
+    assert client.events("feedback")[-1]["value"] == 5
+    assert done(client, "send -1")["state"] == "REJECTED"
+    since = client.mark_events()
+    client.tell("send 100000")
+    client.wait_event("feedback", LONG, since=since)
+    assert done(client, "cancel")["state"] == "PREEMPTED"
+
+
+@needs_actionlib
+def test_a_client_of_rclpy_uses_a_server_of_ros1(ros2: World) -> None:
+    hall = has_rclpy(ros2)
+    hall.robot.ros.rospy("fibonacci_end", "server", action="/fibonacci1").wait_event("up", LONG)
+    client = hall.node("client2", "/fibonacci1")
+    eventually(lambda: client.ask("send", "accepted", goal=5)["ok"], LONG, what="a server of actions", every=0.2)
+    ended = client.process.wait_event("ended", LONG)
+    assert (ended["status"], ended["result"]) == (4, 5)
+    since = client.process.mark_events()
+    client.do("send", goal=100000)
+    client.process.wait_event("feedback", LONG, since=since)
+    assert client.ask("cancel", "cancelling")["code"] == 0
+    assert client.process.wait_event("ended", LONG, since=since)["status"] == 5

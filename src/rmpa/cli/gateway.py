@@ -53,7 +53,7 @@ _OF_THE_PROCESS: Final = (
 @config_option
 @click.pass_context
 def gateway(context: click.Context, /, **options: object) -> int:
-    """Join this network's modules with other sites and with ROS 2, over Zenoh.
+    """Join this network's modules with other sites over Zenoh, and with ROS 2.
 
     Topics, services, actions and parameters cross once a node at the other side asks for them.
 
@@ -68,6 +68,7 @@ def gateway(context: click.Context, /, **options: object) -> int:
       rmpa gateway --site warehouse --connect tls/fleet.example:7447     one site of a fleet
       rmpa gateway --router --listen tls/0.0.0.0:7447                    the router that the sites connect to
       rmpa gateway --site b --rank 200 --connect tls/fleet.example:7447  standby for the one with rank 100
+      rmpa gateway --ros2                                                ROS 2 with any RMW, once it is sourced
       rmpa gateway --ros2 --connect tcp/localhost:7447                   ROS 2 nodes beside rmw_zenohd
       rmpa gateway zenoh-config --listen tls/0.0.0.0:7447 > zenohd.json5  a router with zenohd instead
     """

@@ -213,13 +213,15 @@ def check_gateway(settings: Settings) -> None:
     Raises:
         ConfigError: It has not.
     """
-    _check_libraries("rmpa gateway", "zenoh", {"zenoh": "eclipse-zenoh", "xxhash": "xxhash"})
     it = settings.gateway
+    by_zenoh = it.site or it.router or not it.via_rclpy
+    zenoh = {"zenoh": "eclipse-zenoh"} if by_zenoh else {}
+    _check_libraries("rmpa gateway", "zenoh", {**zenoh, "xxhash": "xxhash"})
     if not (it.site or it.ros2.enabled or it.router or find_plugins(NEIGHBOURS)):
         raise ConfigError("rmpa gateway", "there is nothing to join", "say --site NAME for other sites, or --ros2")
     if it.router and not it.listen:
         raise ConfigError("gateway.router", "a router that listens nowhere", "add --listen tls/0.0.0.0:7447")
-    if not (it.connect or it.listen):
+    if not (it.connect or it.listen) and by_zenoh:
         example = "tcp/localhost:7447 for rmw_zenohd here" if it.ros2.enabled else "tls/fleet.example:7447"
         raise ConfigError(
             "rmpa gateway", "there is no connection to other sites", f"add --connect, such as {example}"

@@ -375,8 +375,8 @@ GATEWAY_RULES: Final = rules_of(
 class Ros2Settings:
     """The table ``[gateway.ros2]``."""
 
-    enabled: bool = setting(False, BOOL, "Join a ROS 2 graph whose nodes run rmw_zenoh.", option="--ros2/--no-ros2")
-    domain: int = setting(0, DOMAIN, "ROS_DOMAIN_ID there.", option="--ros2-domain")
+    enabled: bool = setting(False, BOOL, "Join a ROS 2 graph.", option="--ros2/--no-ros2")
+    domain: int = setting(0, DOMAIN, "ROS_DOMAIN_ID there; by rclpy 0 is the environment's.", option="--ros2-domain")
     distribution: str = setting(
         "jazzy",
         word_of(
@@ -385,11 +385,31 @@ class Ros2Settings:
             "there are humble, iron, jazzy, kilted and lyrical",
             "NAME",
         ),
-        "The distribution whose message definitions its nodes have.",
+        "The distribution whose message definitions its nodes have; rclpy tells its own.",
         option="--ros2-distribution",
     )
     mapping: tuple[str, ...] = setting(
         (), list_of(TEXT), "Files of rules of ros1_bridge (YAML), for types that differ.", option="--ros2-mapping"
+    )
+    via: str = setting(
+        "auto",
+        word_of(
+            ("auto", "rclpy", "zenoh"),
+            "a way to ROS 2",
+            "auto: zenoh where connect or listen is set, else rclpy; rclpy: ROS 2's own library, with any RMW; "
+            "zenoh: nodes that run rmw_zenoh, without ROS 2 on this machine",
+            "WAY",
+        ),
+        "How it is joined: by ROS 2's own library in a process of its own (rclpy), or as rmw_zenoh (zenoh). "
+        "auto: zenoh where connect or listen is set.",
+        option="--ros2-via",
+    )
+    python: str = setting(
+        "",
+        TEXT,
+        "The Python that has rclpy.",
+        option="--ros2-python",
+        shown_default="python3 of the sourced environment",
     )
 
 
@@ -443,3 +463,9 @@ class GatewaySettings:
         key="gateway.rule",
         live=True,
     )
+
+    @property
+    def via_rclpy(self) -> bool:
+        """Whether ROS 2 is joined by its own library; a file that joined it by Zenoh before does so as before."""
+        auto = "zenoh" if self.connect or self.listen else "rclpy"
+        return self.ros2.enabled and (auto if self.ros2.via == "auto" else self.ros2.via) == "rclpy"

@@ -7,7 +7,7 @@ import contextlib
 import logging
 import random
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.agent.agent import Agent
 from rmpa.agent.process import run_process, serve
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from rmpa.config.read import Loaded
     from rmpa.config.settings import Settings
+    from rmpa.gateway.ros2.rclpy_session import RclpySession
     from rmpa.gateway.rules import Neighbour
     from rmpa.gateway.zenoh.session import OpenSession
 
@@ -47,7 +48,8 @@ class Gateway:
         make_neighbours: ``(graph, session, settings)``: makes the neighbours by their names; they are not started.
 
     Attributes:
-        session: The session; ``None`` until it is open.
+        session: The session; ``None`` until it is open. Where ROS 2 alone is joined by rclpy it is that one.
+        ros2: The session of rclpy; ``None`` without.
         neighbours: The neighbours by their names; empty until the session is open.
     """
 
@@ -58,7 +60,7 @@ class Gateway:
         load: Callable[[], Loaded] | None = None,
         *,
         open_session: Callable[[Settings], Coroutine[None, None, OpenSession]] = open_trusted_session,
-        make_neighbours: Callable[[AgentGraph, OpenSession, Settings], Mapping[str, Neighbour]] | None = None,
+        make_neighbours: Callable[[AgentGraph, Any, Settings], Mapping[str, Neighbour]] | None = None,
     ) -> None:
         self._settings = replace(settings, relay=True)
         self._open_session = open_session
@@ -71,7 +73,8 @@ class Gateway:
         self.graph.reloaded = self._reloaded
         if self.agent.trust is not None:
             self.agent.trust.membership.on_denied.append(self._denied)
-        self.session: OpenSession | None = None
+        self.session: OpenSession | RclpySession | None = None
+        self.ros2: RclpySession | None = None
         self.neighbours: dict[str, Neighbour] = {}
         self._problem = ""
         # Set where the neighbours have to be made anew.
@@ -88,7 +91,7 @@ class Gateway:
             StartError: The agent or the session cannot start on this machine with these settings.
         """
         # At once: the library is read in another thread while the agent starts.
-        opening = start_task(self._open_session(self._settings), "open the zenoh session", raises=(StartError,))
+        opening = start_task(self._open(), "open the session", raises=(StartError,))
         try:
             await self.agent.start()
         except BaseException:
@@ -115,10 +118,21 @@ class Gateway:
                 self._running.cancel()
             await asyncio.wait([self._running])
         await self._close_neighbours()
-        if self.session is not None:
-            await self.session.close()
+        for session in dict.fromkeys((self.session, self.ros2)):
+            if session is not None:
+                await session.close()
         await self.graph.end()
         await self.agent.close()
+
+    async def _open(self) -> OpenSession | RclpySession:
+        gateway = self._settings.gateway
+        if gateway.via_rclpy and self.ros2 is None:
+            from rmpa.gateway.ros2.rclpy_session import open_rclpy_session  # noqa: PLC0415 - not every gateway needs it
+
+            self.ros2 = await open_rclpy_session(self._settings)
+        if self.ros2 is not None and not (gateway.site or gateway.router):
+            return self.ros2
+        return await self._open_session(self._settings)
 
     async def _close_neighbours(self) -> None:
         for name, neighbour in reversed(list(self.neighbours.items())):
@@ -151,7 +165,7 @@ class Gateway:
                 self._reopen = False  # what it was asked for is read now
                 self._changed.clear()
                 try:
-                    self._try_to_join(await self._open_session(self._settings))
+                    self._try_to_join(await self._open())
                     backoff.reset()
                 except StartError as error:
                     self._failed(error)
@@ -166,7 +180,7 @@ class Gateway:
                 async with self._leaving:
                     await self._leave(self.session)
 
-    async def _leave(self, session: OpenSession) -> None:
+    async def _leave(self, session: OpenSession | RclpySession) -> None:
         self._changed.clear()
         await self._close_neighbours()
         self.graph.unwatch()
@@ -197,21 +211,28 @@ class Gateway:
         }
 
     def _notes(self) -> Iterator[str]:
+        if self.ros2 is not None and self.ros2.problem:
+            yield f"gateway: {self.ros2.problem}"
         if self._problem:
             yield f"gateway: {self._problem}"
         elif self.session is not None and self._settings.gateway.connect and not self.session.endpoints:
             yield f"gateway: no router is connected; it is to be at {', '.join(self._settings.gateway.connect)}"
 
-    def _join(self, session: OpenSession) -> None:
+    def _join(self, session: OpenSession | RclpySession) -> None:
         self.session = session
         self._problem = ""
         self.neighbours = dict(self._make_neighbours(self.graph, session, self._settings))
+        if self._settings.gateway.ros2.enabled and "ros2" not in self.neighbours:
+            from rmpa.gateway.ros2.ros2 import make_ros2_neighbour  # noqa: PLC0415 - it reads all types of ROS
+
+            self.neighbours["ros2"] = make_ros2_neighbour(self.graph, self.ros2 or session, self._settings)
         for neighbour in self.neighbours.values():
             neighbour.start()
         self._join_others(session)
-        _log.info("= joined: %s; zenoh session %s", ", ".join(self.neighbours) or "none", session.zid)
+        way = "rclpy" if session is self.ros2 else "zenoh"
+        _log.info("= joined: %s; %s session %s", ", ".join(self.neighbours) or "none", way, session.zid)
 
-    def _join_others(self, session: OpenSession) -> None:
+    def _join_others(self, session: OpenSession | RclpySession) -> None:
         """Make and start the neighbours of other packages; one that fails is logged, and left out."""
         for entry, make in load_plugins(NEIGHBOURS):
             try:
@@ -227,7 +248,7 @@ class Gateway:
             self._problem = str(error)
             _log.warning("! %s; it is tried again [zenoh-trouble]", error)
 
-    def _try_to_join(self, session: OpenSession) -> None:
+    def _try_to_join(self, session: OpenSession | RclpySession) -> None:
         """Makes the neighbours while the gateway runs: what is wrong with them is told, and ends nothing else."""
         try:
             self._join(session)
@@ -245,13 +266,13 @@ def _rules(settings: Settings) -> tuple[object, ...]:
     return settings.gateway.rules, policy, settings.contracts, (trust.default, trust.groups, trust.rules)
 
 
-async def _discard(opening: asyncio.Future[OpenSession]) -> None:
+async def _discard(opening: asyncio.Future[OpenSession | RclpySession]) -> None:
     """Closes a session that is not needed any more, once it is open."""
     with contextlib.suppress(StartError):
         await (await opening).close()
 
 
-def _make_neighbours(graph: AgentGraph, session: OpenSession, settings: Settings) -> dict[str, Neighbour]:
+def _make_neighbours(graph: AgentGraph, session: Any, settings: Settings) -> dict[str, Neighbour]:
     """Make the neighbours that the settings ask for, by their names; they are not started.
 
     Raises:
@@ -263,10 +284,6 @@ def _make_neighbours(graph: AgentGraph, session: OpenSession, settings: Settings
         from rmpa.gateway.sites.answers import make_site_neighbour  # noqa: PLC0415 - not every gateway needs it
 
         neighbours["sites"] = make_site_neighbour(graph, session, settings)
-    if gateway.ros2.enabled:
-        from rmpa.gateway.ros2.ros2 import make_ros2_neighbour  # noqa: PLC0415 - it reads all types of ROS
-
-        neighbours["ros2"] = make_ros2_neighbour(graph, session, settings)
     return neighbours
 
 

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from rmpa.gateway.own_graph import AgentGraph, TopicTap
+    from rmpa.gateway.ros2.link import Link, Publishing
     from rmpa.gateway.rules import MeshSource
-    from rmpa.gateway.zenoh.session import OpenSession
-    from rmpa.gateway.zenoh.threads import QueuedPublisher, ZenohQos
+    from rmpa.gateway.zenoh.threads import ZenohQos
     from rmpa.ros.wire.tcpros import TopicDescription
 
 # Queries that wait for the header of one publisher; further ones are refused at once.
@@ -137,7 +137,7 @@ class ExportedTopic:
         self,
         source: MeshSource,
         graph: AgentGraph,
-        session: OpenSession,
+        session: Link,
         dialect: ExportDialect,
         rate: float | None = None,
         size: int | None = None,
@@ -155,7 +155,7 @@ class ExportedTopic:
         self._failed = self._was_wanted = self._large = self._latched = self._repeated = False
         self._dropped_before = 0
         self._terms: tuple[str, ZenohQos] | None = None
-        self._publisher: QueuedPublisher | None = None
+        self._publisher: Publishing | None = None
         self._tap: TopicTap | None = None
         self._opening = self._closed = False
         self._linger: asyncio.TimerHandle | None = None

@@ -31,11 +31,9 @@ if TYPE_CHECKING:
     from rmpa.gateway.own_graph import TopicTap
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint
+    from rmpa.gateway.ros2.link import Declared, Publishing, Query
     from rmpa.gateway.ros2.services import Ros2Context
     from rmpa.gateway.rules import MeshSource
-    from rmpa.gateway.zenoh.queries import ArrivedQuery
-    from rmpa.gateway.zenoh.session import Declaration
-    from rmpa.gateway.zenoh.threads import QueuedPublisher
     from rmpa.ros.wire.tcpros import TopicDescription
 
 # Seconds of one goal of an action at a server of ROS 2: a day. A server that dies ends its goals at once.
@@ -89,7 +87,7 @@ class JoinedAction(Goals):
         self._timer = MachineTimer(self.next_timer, self.handle_timer)
         self._topics: dict[str, ProxiedTopic] = {}
         self._taps: dict[MeshSource, TopicTap] = {}
-        self._declared: list[Declaration | OwnEndpoint | QueuedPublisher] = []
+        self._declared: list[Declared | OwnEndpoint | Publishing] = []
         self._sequence = 0
         context.start(self._join(), f"join action {name}")
 
@@ -174,7 +172,7 @@ class OfferedAction(JoinedAction, GoalsToRos1):
         self.server = dict(server)
         self._connected: set[str] = set()
         self._ready = asyncio.Event()
-        self._publishers: dict[str, tuple[QueuedPublisher, bytes]] = {}
+        self._publishers: dict[str, tuple[Publishing, bytes]] = {}
         super().__init__(context, name, name, server["result"].proxy, _NODE)
 
     def close(self) -> None:
@@ -187,7 +185,7 @@ class OfferedAction(JoinedAction, GoalsToRos1):
         publisher, gid = self._publishers[topic]
         publisher.put(message, self._attachment(gid))
 
-    def answer(self, query: ArrivedQuery, response: bytes) -> None:
+    def answer(self, query: Query, response: bytes) -> None:
         """Answer a request; its attachment is repeated, as rmw_zenoh does."""
         try:
             asked = Ros2Attachment.parse(query.attachment)
@@ -240,7 +238,7 @@ class OfferedAction(JoinedAction, GoalsToRos1):
     def _changed(self, _value: object) -> None:
         asyncio.get_running_loop().call_soon(self._judge_ready)
 
-    def _send_goal(self, query: ArrivedQuery) -> None:
+    def _send_goal(self, query: Query) -> None:
         """Listen to the server from the first goal on, and pass the goal on once the server listens too."""
         for part, source in self.server.items():
             if source not in self._taps:
@@ -248,7 +246,7 @@ class OfferedAction(JoinedAction, GoalsToRos1):
         self._judge_ready()
         self._context.start(self._send_when_ready(query), f"goal of {self._name}")
 
-    async def _send_when_ready(self, query: ArrivedQuery) -> None:
+    async def _send_when_ready(self, query: Query) -> None:
         try:
             async with asyncio.timeout(_ROS2_ACTION_READY):
                 await self._ready.wait()
@@ -257,7 +255,7 @@ class OfferedAction(JoinedAction, GoalsToRos1):
             return
         self._request("send_goal", query)
 
-    def _request(self, service: str, query: ArrivedQuery) -> None:
+    def _request(self, service: str, query: Query) -> None:
         if not self._open:
             query.reply_error("the action server of ROS 1 is gone")
             return

@@ -20,7 +20,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from msgspec import UNSET
 
@@ -30,6 +30,8 @@ from rmpa.gateway import limits
 from rmpa.gateway.zenoh.threads import PRIORITIES, ZenohQos
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rmpa.core.contract import Contract, Contracts
     from rmpa.ros.wire.tcpros import Buffer
 
@@ -188,6 +190,32 @@ class Ros2Qos:
             _kind(Ros2Liveliness, liveliness, default.liveliness),
             _duration_nanoseconds(lease),
         )
+
+
+# The fields of a QoS that are words, and those that are times, as rclpy names them (the lease is shorter here).
+_WORDS: Final[tuple[tuple[str, type[IntEnum]], ...]] = (
+    ("reliability", Ros2Reliability),
+    ("durability", Ros2Durability),
+    ("history", Ros2History),
+    ("liveliness", Ros2Liveliness),
+)
+_TIMES: Final = ("deadline", "lifespan", "lease")
+
+
+def qos_fields(qos: Ros2Qos) -> dict[str, str | int]:
+    """The fields of a QoS that are not rmw's defaults, and its depth: what the process of rclpy reads."""
+    usual = Ros2Qos()
+    words = {name: getattr(qos, name).name for name, _ in _WORDS if getattr(qos, name) != getattr(usual, name)}
+    times = {name: getattr(qos, name) for name in _TIMES if getattr(qos, name) != INFINITE}
+    return {"depth": qos.depth, **words, **times}
+
+
+def qos_of_fields(fields: Mapping[str, Any]) -> Ros2Qos:
+    """A QoS as the process of rclpy tells it; words that this version does not know count as the default."""
+    usual = Ros2Qos()
+    words = {name: kind.__members__.get(str(fields.get(name)), getattr(usual, name)) for name, kind in _WORDS}
+    numbers = {name: fields[name] for name in ("depth", *_TIMES) if isinstance(fields.get(name), int)}
+    return Ros2Qos(**words, **numbers)
 
 
 def _duration(nanoseconds: int) -> str:

@@ -25,7 +25,7 @@ from rmpa.gateway.ros2.transcoder import HEAD
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.ros2.link import Query
     from rmpa.ros.wire.tcpros import Buffer
     from rmpa.runtime.loop import SystemClock
 
@@ -297,9 +297,9 @@ class _SentToRos1:
     # When the goal is given up, unless the server shows it before; afterwards, when it is forgotten.
     deadline: float
     # The request ``send_goal`` that is not answered yet.
-    asked: ArrivedQuery | None
+    asked: Query | None
     status: Ros1Status = Ros1Status.PENDING
-    waiting: list[ArrivedQuery] = field(default_factory=list)
+    waiting: list[Query] = field(default_factory=list)
     result: bytes | None = None
     listed: bool = False
 
@@ -321,10 +321,10 @@ class GoalsToRos1(Goals):
         """Publish a message for ROS 2."""
 
     @abstractmethod
-    def answer(self, query: ArrivedQuery, response: bytes) -> None:
+    def answer(self, query: Query, response: bytes) -> None:
         """Answer a request of a client."""
 
-    def send_goal(self, query: ArrivedQuery) -> None:
+    def send_goal(self, query: Query) -> None:
         """A client calls ``send_goal``."""
         uuid, cdr = split_uuid(query.payload)
         body, name, stamp = self.pair.goal.to_ros1(cdr), str(UUID(bytes=uuid)), self._clock.wall_ns()
@@ -335,7 +335,7 @@ class GoalsToRos1(Goals):
         self._goals[name] = _SentToRos1(goal_id, uuid, self._clock.now() + limits.ROS2_ACCEPT_TIMEOUT, query)
         self.tell_ros1("goal", ros1_message(stamp, goal_id.serialize(), body))
 
-    def get_result(self, query: ArrivedQuery) -> None:
+    def get_result(self, query: Query) -> None:
         """A client calls ``get_result``; of a goal that is not known the status is UNKNOWN, as rcl answers."""
         uuid, _ = split_uuid(query.payload)
         goal = self._goals.get(str(UUID(bytes=uuid)))
@@ -348,7 +348,7 @@ class GoalsToRos1(Goals):
             if goal.ended:
                 self._give_result(goal)
 
-    def cancel_goal(self, query: ArrivedQuery) -> None:
+    def cancel_goal(self, query: Query) -> None:
         """A client calls ``cancel_goal``: one goal, all up to a stamp, or all (action_msgs/CancelGoal)."""
         uuid, until = parse_cancel_request(query.payload)
         every = uuid == ALL_GOALS and until == (0, 0)

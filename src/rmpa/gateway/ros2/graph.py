@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rmpa.gateway.ros2.format import Ros2Qos
+    from rmpa.gateway.ros2.link import Declared, Link
     from rmpa.gateway.ros2.types import Ros2Types
-    from rmpa.gateway.zenoh.session import Declaration, OpenSession
 
 # The name of ROS 2 among the sites, in rules and in the names of proxies; it is ``{module}`` too.
 SITE: Final = ROS2
@@ -230,7 +230,7 @@ class OwnEndpoint:
         self.endpoint = endpoint
         self.gid = gid
         self._nodes = nodes
-        self._token: Declaration | None = nodes.session.token(endpoint.token())
+        self._token: Declared | None = nodes.session.token(endpoint.token())
 
     def close(self) -> None:
         """Take its token back, and its node's if it was the last of it."""
@@ -254,14 +254,14 @@ class OwnRos2Nodes:
         gids: The GIDs of all endpoints that are declared: what comes with one of them is this gateway's own.
     """
 
-    def __init__(self, session: OpenSession, domain: int, name: str, gid_bytes: int) -> None:
+    def __init__(self, session: Link, domain: int, name: str, gid_bytes: int) -> None:
         self.session = session
         self.own_name = OWN_NAMESPACE + _NOT_IN_NAMES.sub("_", name)
         self.gids: set[bytes] = set()
         self._domain = domain
         self._gid_bytes = gid_bytes
         self._numbers = itertools.count()
-        self._nodes: dict[str, tuple[Ros2Node, Declaration]] = {}
+        self._nodes: dict[str, tuple[Ros2Node, Declared]] = {}
         self._uses: Counter[str] = Counter()
 
     def declare(
@@ -315,7 +315,7 @@ class Ros2TypeAsker:
         types: The types of ROS 2's distribution.
     """
 
-    def __init__(self, session: OpenSession, nodes: OwnRos2Nodes, ros2: Ros2Graph, types: Ros2Types) -> None:
+    def __init__(self, session: Link, nodes: OwnRos2Nodes, ros2: Ros2Graph, types: Ros2Types) -> None:
         self._session = session
         self._nodes = nodes
         self._ros2 = ros2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -13,8 +14,10 @@ from rmpa.gateway import limits
 from rmpa.gateway.ros2.actions import Ros2Actions
 from rmpa.gateway.ros2.format import Ros2Endpoint, graph_key
 from rmpa.gateway.ros2.graph import SITE
+from rmpa.gateway.ros2.rclpy_session import RclpySession, shown_in_ros2
 from rmpa.gateway.ros2.services import Ros2Context, Ros2Services
 from rmpa.gateway.ros2.topics import Ros2Topics
+from rmpa.gateway.ros2.types import DISTRIBUTIONS
 from rmpa.gateway.rules import CrossingRules, SourceKind
 from rmpa.gateway.topics import flow
 from rmpa.observe.operations import INFO, REPORT, WHY
@@ -28,10 +31,10 @@ if TYPE_CHECKING:
     from rmpa.config.rules import GatewaySettings
     from rmpa.config.settings import Settings
     from rmpa.gateway.own_graph import AgentGraph
+    from rmpa.gateway.ros2.link import Declared, Link
     from rmpa.gateway.ros2.topics import Ros2Dialect, Ros2Import, Ros2Publisher
     from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.topics import ExportedTopic
-    from rmpa.gateway.zenoh.session import Declaration, OpenSession
     from rmpa.observe.operations import SiteAnswerer
     from rmpa.ros.types.messages import MessageType
 
@@ -64,7 +67,7 @@ class Ros2Neighbour:
     def __init__(
         self,
         graph: AgentGraph,
-        session: OpenSession,
+        session: Link,
         settings: GatewaySettings,
         contracts: Contracts | None = None,
         find: Callable[[str], MessageType] | None = None,
@@ -80,7 +83,7 @@ class Ros2Neighbour:
         self._standing_by: dict[str, str] = {}
         self.sites: SiteAnswerer | None = None
         self.permissions = CrossingRules()
-        self._watch: Declaration | None = None
+        self._watch: Declared | None = None
         self._closed = False
 
     def start(self) -> None:
@@ -247,8 +250,8 @@ def _way(stages: tuple[Check, ...], name: str, node: str, peer: str, to: str) ->
 
 def _out_stages(export: ExportedTopic, dialect: Ros2Dialect, problems: Mapping[str, str]) -> Iterator[Check]:
     yield Check("rule", OK, dialect.why)
-    if export.problem:
-        yield Check("type", FAIL, export.problem)
+    if problem := export.problem or problems.get(shown_in_ros2(export.source.here, export.source.proxy)):
+        yield Check("type", FAIL, problem)
     if dialect.endpoint is None:
         text = f"ROS 2 has no {export.source.type}; its publisher is being asked for the definition"
         yield Check("type", WARN, text)
@@ -298,14 +301,18 @@ def _in_stages(imported: Ros2Import, publisher: Ros2Publisher) -> Iterator[Check
     yield flow("arrived", f"{publisher.received} messages have come", publisher.received, losses)
 
 
-def make_ros2_neighbour(graph: AgentGraph, session: OpenSession, settings: Settings) -> Ros2Neighbour:
+def make_ros2_neighbour(graph: AgentGraph, session: Link, settings: Settings) -> Ros2Neighbour:
     """Make the neighbour, after that of the sites if there is one, and have it answer; it is not started.
 
     Raises:
         ConfigError: A setting of it is wrong.
     """
-    agent = graph.agent
-    neighbour = Ros2Neighbour(graph, session, settings.gateway, settings.make_contracts())
+    agent, gateway = graph.agent, settings.gateway
+    if isinstance(session, RclpySession) and session.hello["distribution"] in DISTRIBUTIONS:
+        gateway = replace(gateway, ros2=replace(gateway.ros2, distribution=session.hello["distribution"]))
+    neighbour = Ros2Neighbour(graph, session, gateway, settings.make_contracts())
+    if isinstance(session, RclpySession):
+        session.say, session.hash_of = neighbour.context.say, neighbour.context.types.known_hash
     neighbour.permissions = CrossingRules(gate=agent.bridge.gate)
     neighbour.sites = agent.sites.answerer if settings.gateway.site else None
     agent.sites.serve(neighbour)

@@ -36,9 +36,8 @@ if TYPE_CHECKING:
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint
+    from rmpa.gateway.ros2.link import Declared, Link, Query
     from rmpa.gateway.rules import MeshSource
-    from rmpa.gateway.zenoh.queries import ArrivedQuery
-    from rmpa.gateway.zenoh.session import Declaration, OpenSession
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.wire.tcpros import ServiceDescription
 
@@ -167,9 +166,7 @@ class Ros2Context(OwnedTasks):
 
     # More than twelve fields: each is what a part needs.
 
-    def __init__(
-        self, graph: AgentGraph, session: OpenSession, settings: GatewaySettings, contracts: Contracts
-    ) -> None:
+    def __init__(self, graph: AgentGraph, session: Link, settings: GatewaySettings, contracts: Contracts) -> None:
         super().__init__()
         ros2 = settings.ros2
         self.graph: Final = graph
@@ -260,7 +257,7 @@ class OfferedService:
         self.source = source
         self._context = context
         self._pair: ServicePair | None = None
-        self._declared: tuple[Declaration | OwnEndpoint, ...] = ()
+        self._declared: tuple[Declared | OwnEndpoint, ...] = ()
         self._answering = Answering(f"service {source.here}", "the gateway ends", limits.ROS2_CALLS_MAX)
         self._started = self._closed = False
 
@@ -329,7 +326,7 @@ class OfferedService:
             context.nodes.declare(self.source.proxy, kind_of, name, pair.ros2, pair.type_hash, Ros2Qos()),
         )
 
-    async def _respond(self, query: ArrivedQuery) -> tuple[bytes, bytes]:
+    async def _respond(self, query: Query) -> tuple[bytes, bytes]:
         """Call the server; a call that fails gets Zenoh's error reply, for ROS 2 has no response that says so."""
         assert self._pair is not None  # noqa: S101 - the queryable is declared with it
         try:

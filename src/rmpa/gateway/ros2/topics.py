@@ -11,11 +11,13 @@ from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.conversion import Conversion, ConversionError, NoConversion
 from rmpa.gateway.ros2.format import (
+    DEFAULT_DEPTH,
     GID_BYTES,
     EntityKind,
     Ros2Attachment,
     Ros2Durability,
     Ros2Qos,
+    Ros2Reliability,
     ros2_qos,
     zenoh_qos,
 )
@@ -34,9 +36,9 @@ if TYPE_CHECKING:
     from rmpa.gateway.foreign import ProxiedTopic
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint
+    from rmpa.gateway.ros2.link import Declared
     from rmpa.gateway.ros2.services import Ros2Context
     from rmpa.gateway.rules import CrossingDecision, MeshSource
-    from rmpa.gateway.zenoh.session import Declaration
     from rmpa.gateway.zenoh.threads import ZenohQos, ZenohSample
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import Buffer
@@ -52,6 +54,9 @@ _ROS2_LINGER: Final = 5.0
 _ROS2_EARLY_MESSAGES: Final = 1000
 # Bytes of these; one message always fits.
 _ROS2_EARLY_BYTES: Final = 16 * 1024 * 1024
+
+# Messages that ROS 2 keeps for the gateway, but of images and the like: as many as a topic of ROS 1 may have waiting.
+_DEPTH: Final = 1000
 
 # Its publishers latch, in ROS 1 and ROS 2 (tf2_ros).
 _STATIC_TF: Final = "/tf_static"
@@ -219,8 +224,9 @@ class Ros2Import:
         self._by_gid: dict[bytes, Ros2Publisher] = {}
         self._adopted: dict[bytes, Ros2Publisher] = {}
         self._has_seq = False
-        self._subscribed: tuple[Declaration, OwnEndpoint] | None = None
+        self._subscribed: tuple[Declared, OwnEndpoint] | None = None
         self._history = False
+        self._qos = Ros2Qos()
         self.sequences = Ros2Sequences()
         self.early: BoundedQueue[tuple[bytes, int, bytes]] = BoundedQueue(_ROS2_EARLY_MESSAGES, _ROS2_EARLY_BYTES)
         self.unconverted = 0
@@ -241,8 +247,8 @@ class Ros2Import:
         self._by_gid[gid_of(endpoint.token())] = publisher
         self._describe(publisher)
         self._linger()
-        if publisher.latched and not self._history:
-            self._unsubscribe()  # again, with the history
+        if (publisher.latched and not self._history) or self._terms() != self._qos:
+            self._unsubscribe()  # again, with the history, or by what this publisher offers too
         self._follow_demand()
 
     def remove(self, endpoint: Ros2Endpoint) -> None:
@@ -320,12 +326,23 @@ class Ros2Import:
         elif wanted and self._subscribed is None:
             context, first = self.part.context, self.first
             self._history = any(each.latched for each in self.publishers.values())
-            qos = Ros2Qos(durability=Ros2Durability.TRANSIENT_LOCAL if self._history else Ros2Durability.VOLATILE)
-            kind = EntityKind.SUBSCRIPTION
+            qos, kind = self._terms(), EntityKind.SUBSCRIPTION
+            self._qos = qos
             self._subscribed = (
                 context.session.subscribe(first.key(), self._sample, history=self._history),
                 context.nodes.declare(context.nodes.own_name, kind, first.name, first.type, first.type_hash, qos),
             )
+
+    def _terms(self) -> Ros2Qos:
+        """The QoS that fits all publishers: DDS connects no subscription that asks for more than one offers."""
+        offered = [each.qos for publisher in self.publishers.values() for each in publisher.endpoints]
+        kept = bool(offered) and all(each.latched for each in offered)
+        reliable = all(each.reliability is Ros2Reliability.RELIABLE for each in offered)
+        return Ros2Qos(
+            Ros2Reliability.RELIABLE if reliable else Ros2Reliability.BEST_EFFORT,
+            Ros2Durability.TRANSIENT_LOCAL if kept else Ros2Durability.VOLATILE,
+            depth=DEFAULT_DEPTH if self.ros1_type in _STREAMS else _DEPTH,
+        )
 
     def _unsubscribe(self) -> None:
         for each in self._subscribed or ():

@@ -275,6 +275,10 @@ class Ros2Types:
             self._hashes[name] = self.store.hash_rihs01(name)
         return self._hashes[name]
 
+    def known_hash(self, name: str) -> str:
+        """The hash of a type; that which stands for none if the type is not known."""
+        return self.type_hash(name) if name in self else NO_HASH
+
     def service_hash(self, service: ServiceType, name: str = "") -> str:
         """The hash of a service type, as it stands in keys and tokens; its request and response are learnt.
 

@@ -1,0 +1,144 @@
+"""ROS 2's half without ROS 2: its syntax, its frames, and what it makes of the gateway's words, by a stand-in."""
+
+from __future__ import annotations
+
+import ast
+import asyncio
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.core.errors import StartError
+from rmpa.gateway.ros2 import rclpy_child
+from rmpa.gateway.ros2.format import (
+    EntityKind,
+    Ros2Attachment,
+    Ros2Durability,
+    Ros2Endpoint,
+    Ros2Liveliness,
+    Ros2Node,
+    Ros2Qos,
+    Ros2Reliability,
+    qos_fields,
+    qos_of_fields,
+)
+from rmpa.gateway.ros2.graph import gid_of
+from rmpa.gateway.ros2.rclpy_session import RclpySession, pythons
+from rmpa.gateway.zenoh.threads import ZenohQos
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+STAND_IN = """
+import json, os, socket, struct, sys
+sock = socket.socket(fileno=int(sys.argv[-1]))
+HEAD = struct.Struct("<IBI")
+def say(operation, number, body):
+    sock.sendall(HEAD.pack(len(body) + 5, ord(operation), number) + body)
+def read():
+    size, operation, number = HEAD.unpack(sock.recv(9, socket.MSG_WAITALL))
+    return chr(operation), number, sock.recv(size - 5, socket.MSG_WAITALL) if size > 5 else b""
+assert read()[0] == "H"
+say("H", 0, json.dumps({"protocol": 1, "distribution": "jazzy", "rmw": "stand-in", "prefix": "0" * 24}).encode())
+row = {"gid": "f" * 32, "kind": "MS", "node": "/there", "name": "/x", "type": "std_msgs/msg/String"}
+row |= {"hash": "", "qos": {}}
+say("G", 0, json.dumps({"nodes": ["/there"], "added": [row], "removed": []}).encode())
+while True:
+    operation, number, body = read()
+    if operation == "M":  # what is published comes back as if another node had sent it
+        if body == b"die":
+            os._exit(1)
+        say("M", number, bytes([16]) + b"g" * 16 + struct.pack("<qq", 7, 9) + body)
+    elif operation == "Q":
+        say("A", number, body[:8] + b"\\1" + body[8:].upper())
+"""
+
+
+def test_it_is_of_the_grammar_of_python_3_8_and_imports_nothing_of_ours() -> None:
+    tree = ast.parse(Path(rclpy_child.__file__).read_text("utf-8"), feature_version=(3, 8))
+    named = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    named |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert not {name for name in named if name.startswith(("rmpa", "numpy", "msgspec"))}
+
+
+@pytest.mark.parametrize(
+    "qos",
+    [
+        Ros2Qos(),
+        Ros2Qos(Ros2Reliability.BEST_EFFORT, Ros2Durability.TRANSIENT_LOCAL, depth=3),
+        Ros2Qos(deadline=5, lifespan=6, lease=7, liveliness=Ros2Liveliness.MANUAL_BY_TOPIC),
+    ],
+)
+def test_a_qos_survives_the_pipe(qos: Ros2Qos) -> None:
+    assert qos_of_fields(qos_fields(qos)) == qos
+
+
+def test_a_qos_with_unknown_words_is_the_default() -> None:
+    assert qos_of_fields({"reliability": "PERHAPS", "depth": "many", "history": None}) == Ros2Qos()
+
+
+def test_the_python_is_the_chosen_one_or_each_of_the_path(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+    made = tmp_path / "two" / "python3"
+    made.touch(0o755)
+    path = f"{tmp_path / 'one'}::relative:{tmp_path / 'two'}:{tmp_path / 'two'}"
+    assert pythons("", {"PATH": path})[0] == str(made)
+    assert pythons("", {"PATH": path}).count(str(made)) == 1
+    assert pythons("/opt/python", {"PATH": path}) == ["/opt/python"]
+
+
+@pytest.fixture
+async def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[RclpySession]:
+    (tmp_path / "half.py").write_text(STAND_IN)
+    monkeypatch.setattr("rmpa.gateway.ros2.rclpy_session._CHILD", tmp_path / "half.py")
+    session = RclpySession(sys.executable, 0, "gate", {})
+    await session.start()
+    yield session
+    await session.close()
+
+
+async def until(found: Callable[[], object]) -> None:
+    async with asyncio.timeout(20):
+        while not found():
+            await asyncio.sleep(0.01)
+
+
+def endpoint(session: RclpySession, kind: EntityKind, number: int) -> Ros2Endpoint:
+    node = Ros2Node(0, session.zid, 1, "/rmpa/arm/node")
+    return Ros2Endpoint(node, number, kind, "/x", "std_msgs/msg/String", "RIHS01_1", Ros2Qos())
+
+
+async def test_messages_calls_and_demand_and_all_of_it_again_after_a_death(session: RclpySession) -> None:
+    told: list[tuple[str, bool]] = []
+    session.watch_tokens("", lambda token, alive: told.append((token.split("/")[5], alive)))
+    await until(lambda: ("MS", True) in told)
+    publisher = endpoint(session, EntityKind.PUBLISHER, 2)
+    session.token(publisher.token())
+    wanted: list[bool] = []
+    sender = session.publisher(publisher.key(), ZenohQos(), wanted.append)
+    await until(lambda: wanted == [True])
+    arrived: list[bytes] = []
+    session.subscribe(publisher.key(), lambda sample: arrived.append(sample.payload))
+    attachment = Ros2Attachment(1, 0, gid_of(publisher.token())).serialize()
+    sender.put(b"one", attachment)
+    await until(lambda: arrived == [b"one"])
+    assert (await session.get(publisher.key(), b"ask", attachment))[0].payload == b"ASK"
+
+    sender.put(b"die", attachment)
+    await until(lambda: ("MS", False) in told)
+    assert (await session.get(publisher.key(), b"ask", attachment))[0].ok is False
+    await until(lambda: not session.problem)
+    sender.put(b"two", attachment)
+    await until(lambda: arrived[-1] == b"two")
+
+
+async def test_a_python_without_rclpy_is_told(tmp_path: Path) -> None:
+    session = RclpySession(sys.executable, 0, "gate", {"PATH": str(tmp_path)})
+    with pytest.raises(StartError, match="no rclpy"):
+        await session.start()
+    await session.close()
+    with pytest.raises(StartError, match="cannot be started"):
+        await RclpySession(str(tmp_path / "none"), 0, "gate", {}).start()

@@ -1,0 +1,188 @@
+"""A ROS 2 node of rclpy. Runs with ROS 2's Python: ``rclpy_end.py NAME [ACTION]``. Reads lines of JSON.
+
+* ``{"do": "publish", "topic", "text", "count", "rate", "latched"}``: std_msgs/msg/String, each with its number;
+* ``{"do": "subscribe", "topic", "latched"}``: then ``heard`` with ``data``;
+* ``{"do": "serve", "service", "delay"}``: std_srvs/srv/SetBool; then ``asked`` with ``data``;
+* ``{"do": "call", "service", "data"}``: likewise; then ``answered`` with ``success`` and ``message``, or ``error``;
+* ``{"do": "unpublish", "topic"}``, ``{"do": "unserve", "service"}``: take it back;
+* ``{"do": "list"}``: then ``graph`` with ``topics`` and ``services``, each a list of name and types, and ``nodes``;
+* ``{"do": "action_serve"}``: rclpy's action server of test_msgs/action/Fibonacci, which rejects orders below 0;
+* ``{"do": "send", "goal"}``: by rclpy's action client; then ``accepted`` with ``ok``, ``feedback`` with ``value``,
+  ``ended`` with ``status`` and ``result``;
+* ``{"do": "cancel"}``: the goal that was sent last; then ``cancelling`` with ``code``;
+* ``{"do": "sensor", "topic"}``: publish std_msgs/msg/String with best effort, 20 a second;
+* ``{"do": "strict", "topic"}``: subscribe reliably and transient local.
+
+Events beside: ``up``; ``goal`` and ``cancel`` of the server; ``done`` after each line.
+"""
+
+import json
+import sys
+import threading
+import time
+from typing import Any
+
+import rclpy
+from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
+from std_srvs.srv import SetBool
+from test_msgs.action import Fibonacci
+
+from node import say
+
+STEP = 0.05
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class End:
+    """The node, and what was made of it."""
+
+    def __init__(self, name: str, action: str) -> None:
+        self.node = rclpy.create_node(name)
+        self.action = action
+        self.kept: dict[str, Any] = {}
+        self.group = ReentrantCallbackGroup()
+        self.goal: Any = None
+        self.client: Any = None
+
+    def publish(self, topic: str, text: str, count: int = 1, rate: float = 1000, latched: bool = False) -> None:
+        publisher = self.kept.get("publish " + topic)
+        if publisher is None:
+            publisher = self.kept["publish " + topic] = self.node.create_publisher(
+                String, topic, LATCHED if latched else QoSProfile(depth=1000)
+            )
+        for number in range(1, count + 1):
+            publisher.publish(String(data=f"{text} {number}"))
+            time.sleep(1 / rate)
+
+    def unpublish(self, topic: str) -> None:
+        self.node.destroy_publisher(self.kept.pop("publish " + topic))
+
+    def subscribe(self, topic: str, latched: bool = False) -> None:
+        def take(message: Any) -> None:
+            say("heard", topic=topic, data=message.data)
+
+        qos = LATCHED if latched else QoSProfile(depth=1000)
+        self.kept["subscribe " + topic] = self.node.create_subscription(String, topic, take, qos)
+
+    def sensor(self, topic: str) -> None:
+        qos = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+        publisher = self.node.create_publisher(String, topic, qos)
+        self.kept["sensor " + topic] = self.node.create_timer(0.05, lambda: publisher.publish(String(data="seen")))
+
+    def strict(self, topic: str) -> None:
+        self.subscribe(topic, latched=True)
+
+    def serve(self, service: str, delay: float = 0.0) -> None:
+        def answer(request: Any, response: Any) -> Any:
+            say("asked", data=request.data)
+            time.sleep(delay)
+            response.success, response.message = not request.data, "from ROS 2"
+            return response
+
+        self.kept["serve " + service] = self.node.create_service(SetBool, service, answer, callback_group=self.group)
+
+    def unserve(self, service: str) -> None:
+        self.node.destroy_service(self.kept.pop("serve " + service))
+
+    def call(self, service: str, data: bool, within: float = 5.0) -> None:
+        client = self.node.create_client(SetBool, service)
+        try:
+            if not client.wait_for_service(within):
+                say("answered", error="no server")
+                return
+            future = client.call_async(SetBool.Request(data=data))
+            over = time.monotonic() + within
+            while not future.done() and time.monotonic() < over:
+                time.sleep(0.01)
+            if future.done():
+                say("answered", success=future.result().success, message=future.result().message)
+            else:
+                say("answered", error="no response")
+        finally:
+            self.node.destroy_client(client)
+
+    def list(self) -> None:
+        say(
+            "graph",
+            topics=[[name, types] for name, types in self.node.get_topic_names_and_types()],
+            services=[[name, types] for name, types in self.node.get_service_names_and_types()],
+            nodes=[space.rstrip("/") + "/" + name for name, space in self.node.get_node_names_and_namespaces()],
+        )
+
+    def action_serve(self) -> None:
+        def accept(request: Any) -> Any:
+            say("goal", goal=request.order)
+            return GoalResponse.ACCEPT if request.order >= 0 else GoalResponse.REJECT
+
+        def cancel(_goal: Any) -> Any:
+            say("cancel")
+            return CancelResponse.ACCEPT
+
+        def execute(goal: Any) -> Any:
+            sequence: list[int] = []
+            while len(sequence) < goal.request.order:
+                if goal.is_cancel_requested:
+                    goal.canceled()
+                    return Fibonacci.Result(sequence=sequence)
+                sequence.append(len(sequence))
+                goal.publish_feedback(Fibonacci.Feedback(sequence=sequence))
+                time.sleep(STEP)
+            goal.succeed()
+            return Fibonacci.Result(sequence=sequence)
+
+        self.kept["action"] = ActionServer(
+            self.node,
+            Fibonacci,
+            self.action,
+            execute,
+            goal_callback=accept,
+            cancel_callback=cancel,
+            callback_group=self.group,
+        )
+
+    def send(self, goal: int) -> None:
+        if self.client is None:
+            self.client = ActionClient(self.node, Fibonacci, self.action)
+        if not self.client.wait_for_server(5.0):
+            say("accepted", ok=False)
+            return
+
+        def feedback(message: Any) -> None:
+            say("feedback", value=len(message.feedback.sequence))
+
+        def accepted(future: Any) -> None:
+            self.goal = future.result()
+            say("accepted", ok=self.goal.accepted)
+            if self.goal.accepted:
+                self.goal.get_result_async().add_done_callback(ended)
+
+        def ended(future: Any) -> None:
+            answer = future.result()
+            say("ended", status=answer.status, result=len(answer.result.sequence))
+
+        self.client.send_goal_async(Fibonacci.Goal(order=goal), feedback).add_done_callback(accepted)
+
+    def cancel(self) -> None:
+        self.goal.cancel_goal_async().add_done_callback(lambda f: say("cancelling", code=f.result().return_code))
+
+
+def main() -> None:
+    rclpy.init()
+    end = End(sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "/count")
+    executor = MultiThreadedExecutor(4)
+    executor.add_node(end.node)
+    threading.Thread(target=executor.spin, daemon=True).start()
+    say("up")
+    for line in sys.stdin:
+        told = json.loads(line)
+        do = told.pop("do")
+        getattr(end, do)(**told)
+        say("done", do=do)
+
+
+if __name__ == "__main__":
+    main()
