@@ -155,6 +155,8 @@ SOURCES: tuple[tuple[Any, ...], ...] = (
         "ros2_distribution",
         "kilted",
     ),
+    ("gateway.ros2.via", "gateway.ros2.via", "RMPA_ROS2_VIA", "ros2_via", "rclpy"),
+    ("gateway.ros2.python", "gateway.ros2.python", "RMPA_ROS2_PYTHON", "ros2_python", "/opt/bin/python3"),
     ("gateway.ros2.mapping", "gateway.ros2.mapping", "RMPA_ROS2_MAPPING", "ros2_mapping", ("a.yaml", "b.yaml")),
     ("relay.enabled", "relay", "RMPA_RELAY", "", True),
     ("control.group", "control_group", "RMPA_CONTROL_GROUP", "", "robots"),

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from rmpa.gateway.own_graph import AgentGraph, TopicTap
-    from rmpa.gateway.ros2.link import Link, Publishing
+    from rmpa.gateway.ros2.link import Publishing, Ros2Link
     from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.zenoh.threads import ZenohQos
     from rmpa.ros.wire.tcpros import TopicDescription
@@ -137,7 +137,7 @@ class ExportedTopic:
         self,
         source: MeshSource,
         graph: AgentGraph,
-        session: Link,
+        session: Ros2Link,
         dialect: ExportDialect,
         rate: float | None = None,
         size: int | None = None,

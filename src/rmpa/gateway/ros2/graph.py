@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rmpa.gateway.ros2.format import Ros2Qos
-    from rmpa.gateway.ros2.link import Declared, Link
+    from rmpa.gateway.ros2.link import Declared, Ros2Link
     from rmpa.gateway.ros2.types import Ros2Types
 
 # The name of ROS 2 among the sites, in rules and in the names of proxies; it is ``{module}`` too.
@@ -254,7 +254,7 @@ class OwnRos2Nodes:
         gids: The GIDs of all endpoints that are declared: what comes with one of them is this gateway's own.
     """
 
-    def __init__(self, session: Link, domain: int, name: str, gid_bytes: int) -> None:
+    def __init__(self, session: Ros2Link, domain: int, name: str, gid_bytes: int) -> None:
         self.session = session
         self.own_name = OWN_NAMESPACE + _NOT_IN_NAMES.sub("_", name)
         self.gids: set[bytes] = set()
@@ -315,7 +315,7 @@ class Ros2TypeAsker:
         types: The types of ROS 2's distribution.
     """
 
-    def __init__(self, session: Link, nodes: OwnRos2Nodes, ros2: Ros2Graph, types: Ros2Types) -> None:
+    def __init__(self, session: Ros2Link, nodes: OwnRos2Nodes, ros2: Ros2Graph, types: Ros2Types) -> None:
         self._session = session
         self._nodes = nodes
         self._ros2 = ros2

@@ -63,7 +63,7 @@ class Query(Protocol):
         """Say that no more answers come."""
 
 
-class Link(Protocol):
+class Ros2Link(Protocol):
     """Endpoints, messages and calls by rmw_zenoh's tokens and keys.
 
     Attributes:

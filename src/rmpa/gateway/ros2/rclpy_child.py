@@ -72,7 +72,7 @@ _POLICIES = {
 }
 
 
-class Link:
+class Pipe:
     """The socket to the gateway; frames are written by any thread."""
 
     def __init__(self, sock: socket.socket) -> None:
@@ -275,8 +275,8 @@ def load_type(name: str) -> Any:
         raise LookupError("the package %s of ROS 2 has no %s here: it is older or newer" % (package, name))
 
 
-class Endpoint:
-    """One publisher, subscription, server or client that the gateway has asked for."""
+class Made:
+    """One publisher, subscription, server or client that was made for the gateway."""
 
     def __init__(self, number: int, kind: str, name: str, node: Any, entity: Any, kind_of: Any) -> None:
         self.number = number
@@ -292,7 +292,7 @@ class Endpoint:
 class Half:
     """The endpoints, and the loop that takes what arrives for them."""
 
-    def __init__(self, link: Link, rclpy: Any, domain: int, name: str) -> None:
+    def __init__(self, link: Pipe, rclpy: Any, domain: int, name: str) -> None:
         from rclpy.impl.implementation_singleton import rclpy_implementation
 
         self._link = link
@@ -302,12 +302,12 @@ class Half:
         rclpy.init(args=[], context=self._context, domain_id=domain)
         self._nodes: dict[str, tuple[Any, list[int]]] = {}
         self._own = self._make_node(_OWN + name)
-        self._endpoints: dict[int, Endpoint] = {}
+        self._endpoints: dict[int, Made] = {}
         self._tasks: collections.deque[tuple[str, int, bytes]] = collections.deque()
         self._wake = rclpy.guard_condition.GuardCondition(None, None, context=self._context)
         self._wait_set: Any = None
         self.taker = Taker()
-        self._graph = Graph(self._own, link)
+        self._graph = Watcher(self._own, link)
         self._requests = 0
         # Messages of our own that have not come back yet, by topic and hash.
         self._echoes: collections.Counter[tuple[str, int]] = collections.Counter()
@@ -382,7 +382,7 @@ class Half:
             self._link.say("!", number, text=str(error) or type(error).__name__)
             return
         users.append(number)
-        self._endpoints[number] = Endpoint(number, kind, asked["name"], node, entity, kind_of)
+        self._endpoints[number] = Made(number, kind, asked["name"], node, entity, kind_of)
         self._wait_set = None
         self._link.say("+", number)
 
@@ -459,7 +459,7 @@ class Half:
                 self._do(*self._tasks.popleft())
 
     def _wait(self, timeout: float) -> None:
-        kinds: dict[str, list[Endpoint]] = {"MS": [], "SS": [], "SC": []}
+        kinds: dict[str, list[Made]] = {"MS": [], "SS": [], "SC": []}
         for endpoint in self._endpoints.values():
             if endpoint.kind in kinds:
                 kinds[endpoint.kind].append(endpoint)
@@ -487,7 +487,7 @@ class Half:
                     if endpoint.entity.handle.pointer in ready:
                         take(endpoint)
 
-    def _messages(self, endpoint: Endpoint) -> None:
+    def _messages(self, endpoint: Made) -> None:
         for _ in range(16):  # then the others have their turn
             taken = self.taker.take(endpoint.entity, endpoint.type)
             if taken is None:
@@ -506,7 +506,7 @@ class Half:
         self._echoes[key] -= 1
         return True
 
-    def _responses(self, endpoint: Endpoint) -> None:
+    def _responses(self, endpoint: Made) -> None:
         from rclpy.serialization import serialize_message
 
         header, response = endpoint.entity.handle.take_response(endpoint.type.Response)
@@ -517,7 +517,7 @@ class Half:
         if call is not None:
             self._link.send("A", endpoint.number, call, b"\1", serialize_message(response))
 
-    def _requests_of(self, endpoint: Endpoint) -> None:
+    def _requests_of(self, endpoint: Made) -> None:
         from rclpy.serialization import serialize_message
 
         request, header = endpoint.entity.handle.service_take_request(endpoint.type.Request)
@@ -580,10 +580,10 @@ def _qos(given: dict[str, Any]) -> Any:
     return qos.QoSProfile(**fields)
 
 
-class Graph:
+class Watcher:
     """What ROS 2 has, looked at again and again: rclpy tells of no change."""
 
-    def __init__(self, node: Any, link: Link) -> None:
+    def __init__(self, node: Any, link: Pipe) -> None:
         self._node = node
         self._link = link
         self._names: Any = None
@@ -701,7 +701,7 @@ def _service_hash(name: str) -> str:
 
 def main() -> int:
     """Serve the gateway until it ends."""
-    link = Link(socket.socket(fileno=int(sys.argv[1])))
+    link = Pipe(socket.socket(fileno=int(sys.argv[1])))
     operation, _, body = link.read()
     asked = json.loads(body)
     if operation != "H" or asked.get("protocol") != PROTOCOL:

@@ -269,14 +269,14 @@ class RclpySession:
             self._create(number, endpoint)
 
     def _no_rclpy(self, why: str) -> StartError:
-        return StartError("ROS 2's half", f"{self._python}: {why}", code="no-ros2")
+        return StartError("ROS 2's half", f"{self._python}: {why}", code="no-rclpy")
 
     async def _keep(self) -> None:
         backoff = Backoff(limits.OPEN_RETRY_FIRST, _RESTART_MAX, random.random)
         while True:
             await self._ended.wait()
             self.problem = f"ROS 2's half ({self._python}) has ended; it is started again"
-            _log.warning("! %s [no-ros2]", self.problem)
+            _log.warning("! %s [no-rclpy]", self.problem)
             await asyncio.sleep(backoff.delay())
             try:
                 await self._begin()
@@ -610,7 +610,7 @@ async def open_rclpy_session(settings: Settings) -> RclpySession:
     if secured and not gateway.insecure and environ.get("ROS_SECURITY_ENABLE", "").lower() != "true":
         problem = "is not secured, and this module is in a secured mesh"
         remedy = "set ROS_SECURITY_ENABLE=true and its keystore (SROS 2), or say --insecure"
-        raise StartError("ROS 2", problem, remedy, code="no-ros2")
+        raise StartError("ROS 2", problem, remedy, code="no-rclpy")
     asked: list[str] = []
     for python in pythons(gateway.ros2.python, environ):
         session = RclpySession(python, gateway.ros2.domain, settings.name, environ)
@@ -622,4 +622,4 @@ async def open_rclpy_session(settings: Settings) -> RclpySession:
         return session
     problem = "; ".join(asked) or "no python3 was found"
     remedy = "source ROS 2 (source /opt/ros/<distribution>/setup.bash), or name its Python with --ros2-python"
-    raise StartError("ROS 2", problem, remedy, code="no-ros2")
+    raise StartError("ROS 2", problem, remedy, code="no-rclpy")

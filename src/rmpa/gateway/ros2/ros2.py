@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rmpa.config.rules import GatewaySettings
     from rmpa.config.settings import Settings
     from rmpa.gateway.own_graph import AgentGraph
-    from rmpa.gateway.ros2.link import Declared, Link
+    from rmpa.gateway.ros2.link import Declared, Ros2Link
     from rmpa.gateway.ros2.topics import Ros2Dialect, Ros2Import, Ros2Publisher
     from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.topics import ExportedTopic
@@ -67,7 +67,7 @@ class Ros2Neighbour:
     def __init__(
         self,
         graph: AgentGraph,
-        session: Link,
+        session: Ros2Link,
         settings: GatewaySettings,
         contracts: Contracts | None = None,
         find: Callable[[str], MessageType] | None = None,
@@ -301,7 +301,7 @@ def _in_stages(imported: Ros2Import, publisher: Ros2Publisher) -> Iterator[Check
     yield flow("arrived", f"{publisher.received} messages have come", publisher.received, losses)
 
 
-def make_ros2_neighbour(graph: AgentGraph, session: Link, settings: Settings) -> Ros2Neighbour:
+def make_ros2_neighbour(graph: AgentGraph, session: Ros2Link, settings: Settings) -> Ros2Neighbour:
     """Make the neighbour, after that of the sites if there is one, and have it answer; it is not started.
 
     Raises:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint
-    from rmpa.gateway.ros2.link import Declared, Link, Query
+    from rmpa.gateway.ros2.link import Declared, Query, Ros2Link
     from rmpa.gateway.rules import MeshSource
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.wire.tcpros import ServiceDescription
@@ -166,7 +166,7 @@ class Ros2Context(OwnedTasks):
 
     # More than twelve fields: each is what a part needs.
 
-    def __init__(self, graph: AgentGraph, session: Link, settings: GatewaySettings, contracts: Contracts) -> None:
+    def __init__(self, graph: AgentGraph, session: Ros2Link, settings: GatewaySettings, contracts: Contracts) -> None:
         super().__init__()
         ros2 = settings.ros2
         self.graph: Final = graph
