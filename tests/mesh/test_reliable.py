@@ -16,7 +16,6 @@ from tests.mesh.reliable_pair import MASK, Bounds, Pair, number_of, payload, tak
 
 FIRSTS = (1, 0, MASK, MASK - 5, (1 << 31) - 3)
 """Where the numbering begins: also such that it wraps, or crosses the half, within a test."""
-ROOMY = Bounds(depth=1000, max_bytes=1 << 20, window_messages=64, window_bytes=1 << 16)
 
 
 def sender(depth: int = 100, max_bytes: int = 10_000, window: int = 10, window_bytes: int = 10_000) -> ReliableSender:
