@@ -55,6 +55,87 @@ def test_a_receiver_may_be_ahead_by_another_path_and_an_old_position_changes_not
     assert numbers(machine) == [2, 3, 4][3 - left :], "counted from 0"
 
 
+def test_depth_drops_the_oldest_and_counts_it() -> None:
+    machine = sender(depth=3)
+    machine.suspend()
+    fill(machine, 10)
+    assert (machine.pending, machine.overflowed) == (3, 7)
+    machine.resume(0)
+    assert [m.sequence for m in taken(machine)] == [8, 9, 10]
+
+
+def test_byte_bound_drops_the_oldest() -> None:
+    machine = sender(max_bytes=20)
+    machine.suspend()
+    fill(machine, 5)
+    assert machine.overflowed == 0
+    machine.offer(bytes(12), 0)
+    assert (machine.overflowed, machine.pending_bytes) == (3, 20)
+    machine.offer(bytes(500), 0)
+    assert (machine.overflowed, machine.pending, machine.pending_bytes) == (6, 1, 500)
+    machine.offer(b"", 0)
+    assert (machine.overflowed, machine.pending, machine.pending_bytes) == (7, 1, 0)
+
+
+def test_message_dropped_in_flight_may_have_arrived() -> None:
+    machine = sender(depth=2, window=4)
+    fill(machine, 2)
+    taken(machine)
+    machine.offer(payload(2), 0)
+    machine.offer(payload(3), 0)
+    assert (machine.pending, machine.in_flight, machine.overflowed) == (2, 2, 0)
+    taken(machine)
+    machine.acknowledged(1)
+    machine.suspend()
+    assert not machine.idle
+    machine.resume(1)
+    assert machine.overflowed == 1
+    assert numbers(machine) == [2, 3]
+
+
+def test_message_dropped_without_a_link_may_have_arrived() -> None:
+    machine = sender(depth=4)
+    fill(machine, 4)
+    taken(machine, 3)
+    machine.suspend()
+    for number in range(4, 9):
+        machine.offer(payload(number), 0)
+    assert (machine.pending, machine.overflowed) == (4, 2), "only of two is it certain that they were never sent"
+    machine.resume(2)
+    assert machine.overflowed == 3
+    assert numbers(machine) == [5, 6, 7, 8]
+
+
+@pytest.mark.parametrize(("window", "window_bytes"), [(2, 1000), (100, 10)])
+def test_messages_dropped_in_flight_fill_the_window(window: int, window_bytes: int) -> None:
+    machine = sender(depth=1, window=window, window_bytes=window_bytes)
+    for number in range(10):
+        machine.offer(payload(number, 1), 0)
+        taken(machine)
+    assert machine.in_flight == 2
+    assert machine.pending_bytes == 5
+    machine.acknowledged(2)
+    assert numbers(machine) == [9]
+    assert machine.overflowed == 7
+
+
+def test_lost_lane_is_replayed_from_the_acknowledgement() -> None:
+    machine = sender(depth=4)
+    fill(machine, 4)
+    taken(machine)
+    machine.acknowledged(1)
+    machine.offer(payload(4), 0)
+    machine.offer(payload(5), 0)
+    machine.rewind()
+    assert machine.overflowed == 1
+    assert numbers(machine, 1) == [2]
+    machine.acknowledged(4)  # it was on its way, over the other lane
+    assert numbers(machine) == [4, 5]
+    machine.suspend()
+    machine.rewind()
+    assert taken(machine) == []
+
+
 def cost(waiting: int, *, dropping: bool) -> float:
     """Seconds of this process for 2000 messages, with so many others waiting, half of them in flight."""
     depth = waiting + 10 * (not dropping)
