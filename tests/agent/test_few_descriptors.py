@@ -28,6 +28,7 @@ from rmpa.ros.core import liveness
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.listeners import SharedListener
+from rmpa.ros.node.subscription import PublisherConnection
 from rmpa.ros.wire.tcpros import encode_header, subscriber_header
 from rmpa.ros.wire.xmlrpc import serialize_call
 from rmpa.runtime import accept as descriptors
@@ -61,6 +62,28 @@ def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
     """What is logged of the shortage; that trust is off is said once by each agent, at its start."""
     texts = [r.getMessage() for r in caplog.records if r.levelno > logging.INFO or "descriptors" in r.getMessage()]
     return [text for text in texts if "trust is off" not in text]
+
+
+@pytest.mark.usefixtures("fresh")
+async def test_a_failed_dial_is_logged_and_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rmpa.ros.node.subscription.TCPROS_RETRY_FIRST", 0.01)
+    monkeypatch.setattr("rmpa.ros.node.subscription.TCPROS_RETRY_MAX", 0.02)
+    core = RosCore("127.0.0.1", 0)
+    await core.start()
+    lost: list[str] = []
+    link = PublisherConnection("/t", core.uri, "/s", on_message=lambda _: None, on_lost=lost.append)
+    try:
+        with descriptors_left(0):
+            with pytest.raises(UnreachableError, match="no file descriptor is left for a connection"):
+                await call_api(core.uri, "getPid", "/test")
+            link.start()
+            await until(lambda: len(lost) >= 3)
+            assert all("no file descriptor left" in reason for reason in lost)
+            lost.clear()
+        await until(lambda: any("requestTopic" in reason for reason in lost))  # a core has none: it was asked
+    finally:
+        link.close()
+        await core.close()
 
 
 @pytest.mark.usefixtures("fresh")

@@ -1,4 +1,4 @@
-"""An agent and its network: its core, its address, twins, and peers that cannot be reached."""
+"""An agent and its network: its core, its address, twins (docs/guides/names.md), and peers out of reach."""
 
 from __future__ import annotations
 

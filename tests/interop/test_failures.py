@@ -1,4 +1,4 @@
-"""Agents, nodes, cables and hosts that fail, rest, restart or hang."""
+"""Agents, nodes, cables and hosts that fail, rest, restart or hang, as docs/guides/running.md says."""
 
 from __future__ import annotations
 

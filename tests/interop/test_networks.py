@@ -1,4 +1,4 @@
-"""Networks behind routers, paths that change, and packets that are too large."""
+"""Networks behind routers, paths that change (docs/guides/networks.md), and packets that are too large."""
 
 from __future__ import annotations
 

@@ -400,7 +400,7 @@ OTHER = MessageType("std_msgs/String", parse_definition("std_msgs/String", "int3
 
 
 @pytest.fixture
-def client() -> Client:
+def other_version() -> Client:
     """A client of a hub that has another version of the type, too."""
     client = Client()
     client.hub.types.versions[OTHER.md5sum] = OTHER
@@ -408,7 +408,10 @@ def client() -> Client:
     return client
 
 
-def test_publishers_with_two_versions_of_a_type_are_two_channels_and_all_clients_are_warned(client: Client) -> None:
+def test_publishers_with_two_versions_of_a_type_are_two_channels_and_all_clients_are_warned(
+    other_version: Client,
+) -> None:
+    client = other_version
     beside = Client(beside=client)
     asked = client.subscribe(1)
     for md5sum in (OWN, OTHER.md5sum, OWN, OTHER.md5sum):
@@ -433,7 +436,8 @@ def test_publishers_with_two_versions_of_a_type_are_two_channels_and_all_clients
     assert client.of("removeStatus")[-1]["statusIds"] == [warned["id"]]
 
 
-def test_a_channel_whose_version_no_publisher_has_is_replaced(client: Client) -> None:
+def test_a_channel_whose_version_no_publisher_has_is_replaced(other_version: Client) -> None:
+    client = other_version
     asked = client.subscribe(1)
     asked.message(b"other", md5sum=OTHER.md5sum)
     assert client.of("unadvertise")[-1]["channelIds"] == [1]

@@ -408,7 +408,7 @@ async def test_rest_asks_for_the_token_in_every_path_and_changes_nothing() -> No
             async with server.session.get(f"{server.url}{path}") as response:
                 assert (response.status, response.content_type) == (401, "application/problem+json"), path
             for method in ("POST", "PUT", "PATCH", "DELETE"):
-                async with server.session.request(method, f"{server.url}{path}?token={TOKEN}") as response:
+                async with server.session.request(method, f"{server.url}{path}?token={SECRET}") as response:
                     assert response.status == 405, (method, path)
 
 
@@ -420,7 +420,7 @@ async def test_another_protocol_is_refused_by_name(offered: tuple[str, ...]) -> 
                 pass
         assert refused.value.status == 400
         headers = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Protocol": ", ".join(offered)}
-        async with server.session.get(f"{server.url}/?token={TOKEN}", headers=headers) as response:
+        async with server.session.get(f"{server.url}/?token={SECRET}", headers=headers) as response:
             assert f"'{', '.join(offered)}' is not spoken here" in await response.text()
         async with server.connect("x", SUBPROTOCOLS[-1]) as socket:
             assert socket.protocol == SUBPROTOCOLS[-1]
