@@ -459,7 +459,7 @@ def test_trust_check_says_what_is_enforced(seed: int, tmp_path: Path) -> None:
         elif word == "action_serve":
             asked = [(Access.SUBSCRIBE, "goal cancel"), (Access.PUBLISH, "status feedback result")]
         else:
-            asked = [(Access(word), "")]
+            asked = [(Access[word.upper()], "")]
         each = [(access, f"{name}/{one}" if one else name) for access, ones in asked for one in ones.split(" ")]
         enforced = all(gate.admits(access, module, one) for access, one in each)
         assert json.loads(answer.output)["allowed"] is enforced, (module, word, name, file.read_text())

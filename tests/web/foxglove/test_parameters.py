@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from msgspec import UNSET
 
 from rmpa.core.errors import RmpaError
-from rmpa.web import limits
-from rmpa.web.foxglove import protocol
+from rmpa.web.foxglove import limits, protocol
 from rmpa.web.foxglove.protocol import FoxgloveParameter as Parameter
 from rmpa.web.foxglove.protocol import from_parameter, to_parameter
 
@@ -170,7 +169,7 @@ def test_all_parameters_are_followed_and_some_left_out(client: Client) -> None:
 def test_requests_without_answers_and_followed_names_are_bounded(
     client: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for _ in range(limits.FOXGLOVE_PARAMETER_REQUESTS_MAX + 1):
+    for _ in range(limits.PARAMETER_REQUESTS_MAX + 1):
         client.send({"op": "getParameters"})
     assert len(client.errors) == 1
     assert "try again later" in client.errors[0]
@@ -178,7 +177,7 @@ def test_requests_without_answers_and_followed_names_are_bounded(
     client.all("get_params")[0].done({})
     client.send({"op": "getParameters"})
     assert len(client.errors) == 1
-    monkeypatch.setattr(limits, "FOXGLOVE_PARAMETERS_MAX", 2)
+    monkeypatch.setattr(limits, "PARAMETERS_MAX", 2)
     for name in ("/a", "/b"):
         _follow(client, name)
     _follow(client, "/c")

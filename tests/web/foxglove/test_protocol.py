@@ -12,9 +12,8 @@ import msgspec
 import pytest
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.web import limits
 from rmpa.web.clients.frame_writer import Opcode
-from rmpa.web.foxglove import protocol
+from rmpa.web.foxglove import limits, protocol
 from rmpa.web.foxglove.channels import Channel, FoxgloveService, graph_update
 from rmpa.web.foxglove.session import DECODER, OPS
 
@@ -144,7 +143,7 @@ def test_a_binary_message_that_was_cut_is_refused_at_each_length(whole: bytes) -
         '{"op":"fetchAsset","uri":"' + "x" * 2000 + '","requestId":1}',
         '{"op":"setParameters","parameters":[{"name":"/a","value":' + "[" * 100_000,
         '{"op":"setParameters","parameters":[{"name":"/a","value":1,"type":"float32"}]}',
-        '{"op":"unsubscribe","subscriptionIds":[' + "1," * limits.FOXGLOVE_SUBSCRIPTIONS_MAX + "1]}",
+        '{"op":"unsubscribe","subscriptionIds":[' + "1," * limits.SUBSCRIPTIONS_MAX + "1]}",
     ],
     ids=lambda text: text[:60],
 )
@@ -154,8 +153,8 @@ def test_broken_and_hostile_text_is_refused(text: str) -> None:
 
 
 def test_a_frame_beyond_the_limit_is_refused_before_it_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "FOXGLOVE_TEXT_MAX", 10)
-    monkeypatch.setattr(limits, "FOXGLOVE_BINARY_MAX", 10)
+    monkeypatch.setattr(limits, "TEXT_MAX", 10)
+    monkeypatch.setattr(limits, "BINARY_MAX", 10)
     with pytest.raises(LimitExceeded):
         protocol.parse_text('{"op":"subscribeConnectionGraph"}', DECODER)
     with pytest.raises(LimitExceeded):

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core.errors import LimitExceeded
-from rmpa.web import limits
 from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.protocol import Assembler, OpError, split
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ import cbor2
 import pytest
 
 from rmpa.core.errors import PeerRefused
-from rmpa.web import limits
 from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.protocol import decode_png
 from tests.web.recorder import NOW_NS
 
