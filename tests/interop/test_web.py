@@ -14,7 +14,7 @@ from lab.bed.agents import RMPA, Agent
 from lab.bed.chromium import Chromium
 from lab.bed.http_client import http_client
 from lab.bed.processes import DEADLINE, Process
-from rmpa.web.limits import DRIVE_SPEED
+from rmpa.web.monitor.limits import DRIVE_SPEED
 from tests.interop.modules import Module
 from tests.interop.web import needs_browser
 

@@ -19,7 +19,7 @@ from lab.bed.http_client import http_client
 from lab.bed.processes import DEADLINE
 from rmpa.ros.types.descriptor import Descriptor, ParameterDescriptor, ProfileDescriptor
 from rmpa.web import limits
-from rmpa.web import limits as monitor_limits
+from rmpa.web.monitor import limits as monitor_limits
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from tests.interop.ros import PYTHON
 from tests.interop.web import REFUSED, needs_browser

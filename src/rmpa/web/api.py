@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from rmpa.observe.peer_info import LinkInfo, PeerInfo
     from rmpa.observe.snapshot import RouteInfo, SampleSpread, ServiceInfo, Snapshot
 
-# --- the REST API -------------------------------------------------------------------------------------------------
-
 # Begins each path; a later version that breaks clients has another number.
 PREFIX: Final = "/api/v1"
 # What there is below ``PREFIX``: the snapshot, and members of it.
@@ -128,8 +126,6 @@ def _missing(kind: str, name: str, names: Sequence[str]) -> str:
 def _short(text: str) -> str:
     return ascii(text if len(text) <= 80 else f"{text[:80]}…")
 
-
-# --- the metrics --------------------------------------------------------------------------------------------------
 
 # The values of ``PeerInfo.state``.
 PEER_STATES: Final = ("linked", "linking", "refused", "conflict", "relayed")

@@ -1,9 +1,4 @@
-"""Limits of the web server, the monitor, rosbridge and the conversion of values.
-
-Limits of the web server's clients.
-
-Each has its reason beside it. Seconds and bytes, unless the name says otherwise.
-"""
+"""Bounds and time-outs of the hub, its clients and the HTTP server; in seconds and bytes unless stated otherwise."""
 
 from __future__ import annotations
 
@@ -11,7 +6,6 @@ from typing import Final
 
 from rmpa.core.limits import KIB, MIB
 
-# --- the hub ------------------------------------------------------------------------------------------------------
 # [Web] Bytes that wait for one client
 # At it: the oldest messages are dropped, low priorities first; a client that does not read answers is disconnected
 # Told in: status, log
@@ -89,8 +83,6 @@ SEEN_PUBLISHERS_MAX: Final = 256
 # Time that a message waits at most for its topic to be registered, as while the core is away: an older one is
 # dropped, if it is not latched.
 EARLY_AGE: Final = 3.0
-
-# --- clients ------------------------------------------------------------------------------------------------------
 # Time that the first client waits for the graph and the parameters, before it is told that there are none.
 SETTLE: Final = 2.0
 # Time for a client to confirm the end of its WebSocket.
@@ -109,69 +101,6 @@ MESSAGE_TIMEOUT: Final = 120.0
 WRITE_BUFFER: Final = 64 * KIB
 # Shortest time between two texts to a client on the messages that it misses.
 DROPS_SHOWN: Final = 1.0
-
-# --- Foxglove WebSocket -----------------------------------------------------------------------------------------
-# [Foxglove] Bytes of a JSON message
-# At it: it is refused
-# Told in: status
-# Why: The longest name the parameters that a client wants.
-FOXGLOVE_TEXT_MAX: Final = 1 * MIB
-# [Foxglove] Bytes of a binary message: one that is published, or a call
-# At it: it is refused
-# Told in: status
-# Why: An image or a map that a client publishes.
-FOXGLOVE_BINARY_MAX: Final = 64 * MIB
-# [Foxglove] Subscriptions
-# At it: further ones are refused
-# Told in: status
-# Why: Each has a queue of its own.
-FOXGLOVE_SUBSCRIPTIONS_MAX: Final = 4096
-# [Foxglove] Topics that it publishes
-# At it: further ones are refused
-# Told in: status
-# Why: Each is a publisher in the graph.
-FOXGLOVE_ADVERTISED_MAX: Final = 256
-# [Foxglove] Service calls under way
-# At it: further ones fail
-# Told in: the call's failure
-FOXGLOVE_CALLS_MAX: Final = 256
-# [Foxglove] Parameters that one message names, or that are followed by name
-# At it: the message is refused; all can be asked for at once
-# Told in: status
-FOXGLOVE_PARAMETERS_MAX: Final = 4096
-# [Foxglove] Requests for parameters under way
-# At it: further ones are refused
-# Told in: status
-FOXGLOVE_PARAMETER_REQUESTS_MAX: Final = 64
-# [Foxglove] Lists and maps within each other in a parameter
-# At it: it is refused
-# Told in: status
-# Why: As XML-RPC values are bounded.
-FOXGLOVE_PARAMETER_DEPTH_MAX: Final = 32
-# [Foxglove] Assets that are being fetched
-# At it: further ones are refused
-# Told in: the asset's failure
-FOXGLOVE_ASSETS_MAX: Final = 16
-# [Foxglove] Bytes of an asset
-# At it: it is refused
-# Told in: the asset's failure
-# Why: The mesh of a large robot has some 20 MB.
-FOXGLOVE_ASSET_MAX: Final = 64 * MIB
-# [Foxglove] Characters of a name, type, encoding or asset's URI
-# At it: the message is refused
-# Told in: status
-FOXGLOVE_NAME_MAX: Final = 1024
-# Characters of schemas in one advertise message; further channels go into further messages.
-FOXGLOVE_ADVERTISE_BYTES: Final = 256 * KIB
-# Status messages a second for errors of one client, in the long run.
-FOXGLOVE_STATUS_RATE: Final = 5.0
-# [Foxglove] Errors at once
-# At it: further ones are reported five times a second; a malformed message ends the connection
-# Told in: the close reason
-# Why: Beyond that and the rate, what a client may not do is refused without a status: it does not speak the protocol.
-FOXGLOVE_STATUS_BURST: Final = 100.0
-
-# --- /metrics -----------------------------------------------------------------------------------------------------
 # [Web] Peers in `/metrics`
 # At it: others are left out
 # Told in: `rmpa_metrics_omitted`
@@ -191,15 +120,11 @@ METRIC_SERVICES: Final = 1000
 METRIC_REASONS: Final = 256
 # Characters of a label's value in /metrics, which Prometheus keeps with each time series.
 METRIC_LABEL_CHARACTERS: Final = 256
-
-# --- REST ---------------------------------------------------------------------------------------------------------
 # [Web] Characters of a path of the REST API
 # At it: 404
 # Told in: the response
 # Why: A name of 512 characters, percent-encoded.
 REST_PATH_MAX: Final = 2048
-
-# --- HTTP server --------------------------------------------------------------------------------------------------
 # [Web] Connections of all clients
 # At it: the one without a request for longest is closed
 # Told in: `rmpa_web_refused_total`, log
@@ -259,219 +184,3 @@ WEB_TOKEN_LENGTH_MIN: Final = 16
 WEB_TOKEN_FILE_MAX: Final = 4096
 # Seconds between two looks at the files of the certificate: a renewed one is served long before the old one ends.
 CERTIFICATE_LOOK_PERIOD: Final = 5.0
-
-
-# --- Limits of the monitor's clients --------------------------------------------------------------------------------
-#
-# Each has its reason beside it. Seconds and bytes, unless the name says otherwise.
-
-
-# Between two patches of one client: some 7 a second, which looks live and is read at leisure.
-PATCH_PERIOD: Final = 0.15
-# Shortest time from one snapshot of the agent to the next while pages are open.
-STATE_PERIOD: Final = 0.15
-# The pause between two snapshots is at least so many times as long as a snapshot takes: a fifth of a core.
-STATE_SHARE: Final = 4.0
-# States and patches that a client has not acknowledged yet. A slow browser gets fewer patches, never a queue.
-UNACKNOWLEDGED_MAX: Final = 2
-# [Pages] Bytes of one message of a page: a call, or a parameter
-# At it: its connection is made anew
-# Told in: the line at the top of the page
-REQUEST_MAX: Final = 64 * KIB
-# [Pages] Messages of one page a second, in the long run
-# At it: its connection is made anew
-# Told in: the line at the top of the page
-# Why: A joystick sends 10, acknowledgements 7.
-REQUEST_RATE: Final = 50.0
-# Messages of one client at once: a page that reconnects and asks for all that it shows.
-REQUEST_BURST: Final = 200.0
-# Things whose details one client is shown at one time; a page shows one or two.
-LOOKS_MAX: Final = 4
-# [Pages] Live topics of one page
-# At it: a further one is refused
-# Told in: the page
-WATCHES_MAX: Final = 16
-# [Pages] Values, images and scans of one topic a second
-# At it: the newest is shown
-WATCH_RATE_MAX: Final = 10.0
-# [Pages] Lines of one plot
-# At it: the first one is replaced
-# Told in: the page
-# Why: As many as can be told apart.
-FIELDS_MAX: Final = 8
-# [Pages] Questions of one page under way (*Why?*, calls, parameters)
-# At it: a further one is refused
-# Told in: the page
-ASKS_MAX: Final = 16
-# Samples of a plot in one message. Of more, the least and the greatest of each part are kept.
-POINTS_MAX: Final = 64
-# [Pages] Characters of a text in a live value
-# At it: the rest is cut
-# Told in: the value
-VALUE_CHARACTERS: Final = 512
-# [Pages] Elements of an array in a live value
-# At it: the rest is cut
-# Told in: the value
-VALUE_ITEMS: Final = 64
-# Values in one live value, all levels together.
-VALUE_NODES: Final = 2000
-# [Pages] Ranges of a laser scan
-# At it: of neighbours the nearest is shown
-# Why: Two a degree.
-SCAN_POINTS: Final = 720
-# [Pages] Pixels of a raw image
-# At it: every n-th row and column is shown
-# Told in: the size below the image
-IMAGE_PIXELS: Final = 320 * 240
-# [Pages] Topics
-# At it: further ones are counted; `rmpa topic list` has them
-# Told in: the page of all topics
-TOPICS_SHOWN: Final = 2000
-# [Pages] Services
-# At it: further ones are counted; `rmpa topic list` has them
-# Told in: the page of all services
-SERVICES_SHOWN: Final = 2000
-# Nodes in a state; further ones are counted.
-NODES_SHOWN: Final = 2000
-# [Pages] Modules
-# At it: further ones are counted; `rmpa topic list` has them
-# Told in: the page of the mesh
-# Why: A ring of more could not be read.
-MODULES_SHOWN: Final = 256
-# [Pages] Lines of the log
-# At it: the oldest are forgotten
-LOG_LINES: Final = 500
-# [Pages] Characters of one of them
-# At it: the rest is cut
-LOG_CHARACTERS: Final = 1024
-# Time after the start of this module's agent in which peers that it has not found yet do not count as lost: beacons
-# come every 5 s at the latest, and links take seconds where names or addresses are resolved.
-AGENT_SETTLES: Final = 10.0
-# [Pages] Time for which a module that is gone is shown
-# At it: it leaves the ring
-FORGET_AFTER: Final = 600.0
-# Seconds that an order of a page may be old: less than the page waits for a word before it gives all up.
-ORDER_AGE: Final = 5.0
-# [Pages] Time after a joystick's last command
-# At it: the robot is stopped
-# Why: A joystick sends every 0.1 s.
-DRIVE_TIMEOUT: Final = 0.3
-# How often the server of the page that has the stick tells other servers; a second may lose two of them.
-STICK_RENEW: Final = 0.5
-# [Pages] Time without a word of the server whose page has the stick
-# At it: the stick is free
-# Why: It tells it every 0.5 s.
-STICK_EXPIRY: Final = 2.0
-# Magnitude of a linear speed that a joystick may command, m/s.
-DRIVE_SPEED: Final = 2.0
-# Magnitude of an angular speed that a joystick may command, rad/s.
-DRIVE_TURN: Final = 4.0
-# [Pages] Smart Resources that are followed
-# At it: others are not shown
-# Why: Paths of them; each is up to nine subscriptions.
-RESOURCES_MAX: Final = 256
-# Time for which the details of a Smart Resource are followed after a page has shown it.
-LOOK_KEPT: Final = 10.0
-# Time between two signs of life to a page, which takes its connection for lost after three without any.
-TICK_PERIOD: Final = 2.0
-# Pause before it is looked again whether a page has taken what was sent.
-UNSENT_RETRY: Final = 0.1
-# Questions of all pages together that wait for the agent, each in a thread: `why` takes seconds.
-ANSWERS_AT_ONCE: Final = 4
-# The longest pause between two snapshots.
-STATE_PAUSE_MAX: Final = 0.5
-
-
-# --- Bounds and time-outs of one rosbridge client, in seconds and bytes ---------------------------------------------
-
-
-# [Rosbridge] Bytes of a frame in JSON
-# At it: it is refused
-# Told in: status
-# Why: And so of a message that a client publishes; rosbridge_suite's default.
-FRAME_MAX: Final = 10 * MIB
-# [Rosbridge] Bytes of a frame in CBOR
-# At it: it is refused
-# Told in: status
-# Why: Each byte may be a value, which takes up to 64 bytes.
-BINARY_FRAME_MAX: Final = 2 * MIB
-# [Rosbridge] Objects and lists in a frame in JSON
-# At it: it is refused
-# Told in: status
-# Why: An empty object has two characters and takes 64 bytes.
-CONTAINERS_MAX: Final = 200_000
-# [Rosbridge] Characters of an `id`
-# At it: the frame is refused
-# Told in: status
-# Why: It is sent back and kept.
-ID_MAX: Final = 1 * KIB
-# [Rosbridge] Characters of a topic's, service's or type's name
-# At it: the frame is refused
-# Told in: status
-NAME_MAX: Final = 1 * KIB
-# [Rosbridge] Fragments of a message
-# At it: they are refused
-# Told in: status
-# Why: Sent or received: a fragment of one character would need 100 bytes around it.
-FRAGMENTS_MAX: Final = 10_000
-# [Rosbridge] Bytes of all incomplete messages
-# At it: the oldest one is dropped; a longer one is refused
-# Told in: status
-FRAGMENTED_MAX: Final = 16 * MIB
-# Incomplete messages of a client; the oldest is dropped.
-FRAGMENTED_MESSAGES_MAX: Final = 16
-# [Rosbridge] Time for a topic to appear that is subscribed to without a type
-# At it: the subscription is refused
-# Told in: status
-# Why: It may begin at the same moment.
-TYPE_WAIT: Final = 2.0
-# [Rosbridge] Time for the next fragment
-# At it: the message is forgotten
-# Told in: status
-FRAGMENT_TIMEOUT: Final = 60.0
-# [Rosbridge] Bytes that a `png` unpacks to
-# At it: it is refused
-# Told in: status
-# Why: Its lines may have filters, which are undone in Python.
-PNG_MAX: Final = 4 * MIB
-# [Rosbridge] Subscribed topics
-# At it: further ones are refused
-# Told in: status
-# Why: A page that shows all topics of some large modules stays below.
-SUBSCRIPTIONS_MAX: Final = 1000
-# [Rosbridge] Ids of one topic
-# At it: further ones are refused
-# Told in: status
-# Why: Of one client that subscribe to one topic, or advertise it.
-SUBSCRIBERS_MAX: Final = 100
-# [Rosbridge] `queue_length`
-# At it: a larger one is lowered
-QUEUE_MESSAGES_MAX: Final = 1000
-# [Rosbridge] Advertised topics
-# At it: further ones are refused
-# Told in: status
-ADVERTISED_MAX: Final = 500
-# [Rosbridge] Open calls
-# At it: further ones are refused
-# Told in: status
-# Why: Without an answer yet, questions of rosapi included.
-CALLS_MAX: Final = 1000
-# [Rosbridge] Advertised services
-# At it: further ones are refused
-# Told in: status
-SERVED_MAX: Final = 200
-# [Rosbridge] Open calls to these
-# At it: further ones are refused
-# Told in: status
-REQUESTS_MAX: Final = 1000
-# Messages kept in the form in which they were sent, for further clients of the same topic.
-SHARED_FRAMES: Final = 64
-# Bytes of these; larger messages are converted for each client.
-SHARED_BYTES: Final = 16 * MIB
-# [Rosbridge] Lists and objects within each other in a parameter
-# At it: it is refused
-# Told in: status
-# Why: Beyond, other nodes' XML-RPC libraries give up.
-PARAMETER_DEPTH_MAX: Final = 32
-# Characters of a status message.
-TEXT_MAX: Final = 500

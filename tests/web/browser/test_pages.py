@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.web import limits
 from rmpa.web.hub.node_link import Rights
+from rmpa.web.monitor import limits
 from tests.ros.node.peers import until
 
 if TYPE_CHECKING:

@@ -20,8 +20,9 @@ from rmpa.resource.runtime import describe
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import LENGTH
-from rmpa.web import limits
+from rmpa.web import limits as web_limits
 from rmpa.web.hub.node_link import FULL, READ_ONLY
+from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.server.agent_watch import AgentWatch
 from tests.ros.node.peers import DEADLINE, until
@@ -183,7 +184,7 @@ async def test_a_page_is_told_when_the_agent_is_silent_and_when_it_is_back(page:
 
 
 async def test_a_page_is_greeted_although_the_agent_hangs(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "SETTLE", 0.05)
+    monkeypatch.setattr(web_limits, "SETTLE", 0.05)
     agent = Agent(core.uri)
     agent.released.clear()
     async with page_of(core, agent=agent) as page:

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from msgspec import UNSET
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
-from rmpa.web import limits
 from rmpa.web.clients.frame_writer import Opcode
-from rmpa.web.foxglove import protocol
+from rmpa.web.foxglove import limits, protocol
 from rmpa.web.foxglove.channels import Channel, FoxgloveService, graph_update
 from rmpa.web.foxglove.protocol import FoxgloveParameter as Parameter
 from rmpa.web.foxglove.protocol import from_parameter, to_parameter
@@ -151,7 +150,7 @@ def test_a_binary_message_that_was_cut_is_refused_at_each_length(whole: bytes) -
         '{"op":"fetchAsset","uri":"' + "x" * 2000 + '","requestId":1}',
         '{"op":"setParameters","parameters":[{"name":"/a","value":' + "[" * 100_000,
         '{"op":"setParameters","parameters":[{"name":"/a","value":1,"type":"float32"}]}',
-        '{"op":"unsubscribe","subscriptionIds":[' + "1," * limits.FOXGLOVE_SUBSCRIPTIONS_MAX + "1]}",
+        '{"op":"unsubscribe","subscriptionIds":[' + "1," * limits.SUBSCRIPTIONS_MAX + "1]}",
     ],
     ids=lambda text: text[:60],
 )
@@ -161,8 +160,8 @@ def test_broken_and_hostile_text_is_refused(text: str) -> None:
 
 
 def test_a_frame_beyond_the_limit_is_refused_before_it_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "FOXGLOVE_TEXT_MAX", 10)
-    monkeypatch.setattr(limits, "FOXGLOVE_BINARY_MAX", 10)
+    monkeypatch.setattr(limits, "TEXT_MAX", 10)
+    monkeypatch.setattr(limits, "BINARY_MAX", 10)
     with pytest.raises(LimitExceeded):
         protocol.parse_text('{"op":"subscribeConnectionGraph"}', DECODER)
     with pytest.raises(LimitExceeded):
@@ -326,7 +325,7 @@ def test_all_parameters_are_followed_and_some_left_out(client: Client) -> None:
 def test_requests_without_answers_and_followed_names_are_bounded(
     client: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for _ in range(limits.FOXGLOVE_PARAMETER_REQUESTS_MAX + 1):
+    for _ in range(limits.PARAMETER_REQUESTS_MAX + 1):
         client.send({"op": "getParameters"})
     assert len(client.errors) == 1
     assert "try again later" in client.errors[0]
@@ -334,7 +333,7 @@ def test_requests_without_answers_and_followed_names_are_bounded(
     client.all("get_params")[0].done({})
     client.send({"op": "getParameters"})
     assert len(client.errors) == 1
-    monkeypatch.setattr(limits, "FOXGLOVE_PARAMETERS_MAX", 2)
+    monkeypatch.setattr(limits, "PARAMETERS_MAX", 2)
     for name in ("/a", "/b"):
         _follow(client, name)
     _follow(client, "/c")

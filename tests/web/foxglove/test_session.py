@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rmpa.core.errors import RmpaError
 from rmpa.ros.types.definitions import parse_definition
 from rmpa.ros.types.messages import MessageType
-from rmpa.web import limits
+from rmpa.web.foxglove import limits
 from rmpa.web.hub.graph import GraphService, GraphTopic
 from rmpa.web.hub.node_link import Rights
 from tests.web.foxglove.client import CHATTER, SET_BOOL, Client
@@ -105,7 +105,7 @@ def test_a_type_is_asked_for_once_for_all_topics_and_clients(client: Client) -> 
 
 
 def test_many_channels_come_in_several_messages(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "FOXGLOVE_ADVERTISE_BYTES", 1000)
+    monkeypatch.setattr(limits, "ADVERTISE_BYTES", 1000)
     client = Client()
     client.graph(*(GraphTopic(f"/t{n}", ("nav_msgs/Odometry",), ("/n",)) for n in range(4)))
     assert [len(m["channels"]) for m in client.of("advertise")] == [1, 1, 1, 1]
@@ -147,7 +147,7 @@ def test_wrong_subscriptions_are_refused_and_the_right_ones_kept(client: Client)
 
 
 def test_subscriptions_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "FOXGLOVE_SUBSCRIPTIONS_MAX", 1)
+    monkeypatch.setattr(limits, "SUBSCRIPTIONS_MAX", 1)
     client = Client()
     client.graph(CHATTER, GraphTopic("/b", ("std_msgs/String",), ("/n",)))
     client.subscribe(1, 1)
@@ -210,12 +210,12 @@ def test_a_topic_that_cannot_be_published_is_refused(client: Client) -> None:
 
 
 def test_published_topics_are_bounded_and_numbers_are_used_once(client: Client) -> None:
-    for number in range(limits.FOXGLOVE_ADVERTISED_MAX):
+    for number in range(limits.ADVERTISED_MAX):
         client.send(advertise(number))
     client.send(advertise(0))
     client.send(advertise(9999))
     assert len(client.errors) == 2
-    assert len(client.all("advertise")) == limits.FOXGLOVE_ADVERTISED_MAX
+    assert len(client.all("advertise")) == limits.ADVERTISED_MAX
 
 
 def test_messages_of_a_failed_publisher_are_dropped_without_a_status_each(
@@ -263,10 +263,10 @@ def test_calls_that_fail_say_why(client: Client) -> None:
 
 def test_waiting_calls_are_bounded(client: Client) -> None:
     client.graph(SET_BOOL)
-    for number in range(limits.FOXGLOVE_CALLS_MAX + 1):
+    for number in range(limits.CALLS_MAX + 1):
         client.send(call(1, number))
     (failure,) = client.of("serviceCallFailure")
-    assert failure["callId"] == limits.FOXGLOVE_CALLS_MAX
+    assert failure["callId"] == limits.CALLS_MAX
 
 
 def test_the_type_of_a_service_is_searched_where_the_graph_does_not_say_it(client: Client) -> None:
@@ -346,7 +346,7 @@ def fetch(uri: str, number: int = 5) -> dict[str, Any]:
 
 def test_a_file_of_a_package_is_fetched(client: Client) -> None:
     asked = client.one("fetch_asset", client.send(fetch("package://robot/meshes/base.stl")))
-    assert (asked.uri, asked.most) == ("package://robot/meshes/base.stl", limits.FOXGLOVE_ASSET_MAX)
+    assert (asked.uri, asked.most) == ("package://robot/meshes/base.stl", limits.ASSET_MAX)
     asked.done(b"solid")
     assert client.binary[0] == struct.pack("<BIBI", 4, 5, 0, 0) + b"solid"
     client.one("fetch_asset", client.send(fetch("package://robot/none"))).failed(RmpaError("no such file"))
@@ -354,7 +354,7 @@ def test_a_file_of_a_package_is_fetched(client: Client) -> None:
 
 
 def test_assets_are_bounded(client: Client) -> None:
-    for number in range(limits.FOXGLOVE_ASSETS_MAX + 1):
+    for number in range(limits.ASSETS_MAX + 1):
         client.send(fetch("package://robot/x", number))
     assert len(client.binary) == 1
 
@@ -366,7 +366,7 @@ def test_a_malformed_message_is_told_and_too_many_end_the_session(client: Client
     client.send({"op": "nonsense"})
     assert "nonsense" in client.errors[0]
     assert not client.connection.ended
-    for _ in range(int(limits.FOXGLOVE_STATUS_BURST)):
+    for _ in range(int(limits.STATUS_BURST)):
         client.send(b"")
     assert client.connection.ended == [1008]
 
@@ -376,10 +376,10 @@ def test_what_a_client_may_not_do_is_refused_quietly_after_many_times_but_never_
     for _ in range(1000):
         client.send(struct.pack("<BI", 1, 3))
     assert not client.connection.ended
-    assert len(client.errors) == limits.FOXGLOVE_STATUS_BURST
+    assert len(client.errors) == limits.STATUS_BURST
     client.now = 10.0
     client.send(struct.pack("<BI", 1, 3))
-    assert len(client.errors) == limits.FOXGLOVE_STATUS_BURST + 1
+    assert len(client.errors) == limits.STATUS_BURST + 1
 
 
 def test_a_client_that_has_gone_is_told_no_more(client: Client) -> None:

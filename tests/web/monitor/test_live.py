@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.web import limits
+from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import (
     IMAGE_HEADER,
     SampleBuffer,

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.web import limits
 from rmpa.web.hub.node_link import FULL, Rights
 from rmpa.web.hub.topics import ReceivedMessage
+from rmpa.web.monitor import limits
 from rmpa.web.monitor.session import MonitorSession
 from rmpa.web.monitor.sticks import Sticks
 from tests.web.monitor.patches import apply

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from rmpa.core.limits import KIB
 from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo, UnreachableInfo
 from rmpa.trust.permissions import TrustStatus
-from rmpa.web import limits
-from rmpa.web.monitor import messages, questions, session
+from rmpa.web import limits as web_limits
+from rmpa.web.monitor import limits, messages, questions, session
 from rmpa.web.monitor.messages import Tree, difference
 from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.state import StateBuilder, details, module_state
@@ -334,7 +334,7 @@ def test_the_page_says_the_bounds_of_the_code() -> None:
 
 
 def test_each_state_is_of_a_new_snapshot() -> None:
-    assert limits.WEB_SNAPSHOT_AGE < limits.STATE_PERIOD
+    assert web_limits.WEB_SNAPSHOT_AGE < limits.STATE_PERIOD
 
 
 def test_the_page_has_each_question_and_message() -> None:

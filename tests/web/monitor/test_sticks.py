@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.web import limits
 from rmpa.web.hub.topics import ReceivedMessage
+from rmpa.web.monitor import limits
 from rmpa.web.monitor.sticks import Stick, Sticks
 
 if TYPE_CHECKING:

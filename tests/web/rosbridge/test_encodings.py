@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.messages import MessageType
-from rmpa.web import limits
 from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge import protocol as encodings
 from rmpa.web.rosbridge.protocol import (
     Assembler,

@@ -13,7 +13,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
-from rmpa.web import limits
+from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.protocol import decode_png
 from rmpa.web.rosbridge.rosapi import SERVICES
 from tests.web.recorder import NOW_NS

@@ -19,6 +19,7 @@ from rmpa.core.statistics import Counters
 from rmpa.runtime.tasks import start_task
 from rmpa.web import limits
 from rmpa.web.clients.frame_writer import FrameSocket
+from rmpa.web.foxglove import limits as foxglove_limits
 from rmpa.web.foxglove.channels import ChannelTable
 from rmpa.web.foxglove.protocol import SUBPROTOCOLS
 from rmpa.web.foxglove.session import FoxgloveSession
@@ -151,7 +152,7 @@ class WebSocketClients:
         session = self._protocols[chosen](self._hub, self._rights, self._priority, address)
         # Only a client that sends data has a use for large messages: aiohttp keeps what it has gathered to the end.
         return await self._serve(
-            request, session, session.frame_max if self._rights.control else limits.FOXGLOVE_TEXT_MAX
+            request, session, session.frame_max if self._rights.control else foxglove_limits.TEXT_MAX
         )
 
     def _refuse_protocol(self, address: str, text: str) -> web.Response:

@@ -53,9 +53,6 @@ _Entry: TypeAlias = "Callable[[float], Iterable[OutFrame]]"
 _AGE_PINGS: Final = 4
 
 
-# --- the protocol ----------------------------------------------------------------------------------------------
-
-
 def struct_of(method: Callable[..., None], **config: Any) -> type[msgspec.Struct]:
     """The struct of what a client sends for a method to be called: its fields are the method's keywords.
 
@@ -142,9 +139,6 @@ class ClientStream:
         """The frames of a message; called when the connection can take them."""
 
 
-# --- the age of what arrives -----------------------------------------------------------------------------------
-
-
 class MessageArrival:
     """Finds a message that never ends. A byte too few may be counted for it, and never one too many.
 
@@ -225,9 +219,6 @@ class CommandAge:
         return now - self._younger_than
 
 
-# --- the connection --------------------------------------------------------------------------------------------
-
-
 class ClientConnection:
     """One client of a gateway.
 
@@ -256,8 +247,6 @@ class ClientConnection:
         self._refused: Callable[[str, str], None] = lambda *_: None
         self._drops_shown = 0
         self._drops_at = 0.0
-
-    # --- for the session --------------------------------------------------------------------------------------
 
     def push(self, *frames: OutFrame) -> None:
         """Queue frames that are not dropped."""
@@ -311,8 +300,6 @@ class ClientConnection:
     def unsent(self) -> int:
         """Bytes that wait, here and behind the queue."""
         return self.queue.bytes + self._waiting
-
-    # --- the WebSocket ----------------------------------------------------------------------------------------
 
     async def run(
         self,

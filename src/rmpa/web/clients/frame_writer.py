@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from rmpa.web.hub.node_link import Payload
 
+_log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 _FIN: Final = 0x80
 _MASKED: Final = 0x80
@@ -256,7 +257,6 @@ def _priority(queue: _Queue[Any]) -> int:
     return queue.priority
 
 
-_log = logging.getLogger(__name__)
 # Buffers of one system call.
 _BUFFERS: Final = 64
 # System calls for one frame before others have their turn: a fast reader often makes room at once.

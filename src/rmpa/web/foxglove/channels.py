@@ -13,7 +13,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from rmpa.core.identity import is_type_name
-from rmpa.web import limits
+from rmpa.web import limits as web_limits
+from rmpa.web.foxglove import limits
 from rmpa.web.foxglove.protocol import ENCODING, SCHEMA_ENCODING, WARNING, message, status
 from rmpa.web.hub.hub import HubClient
 from rmpa.web.hub.node_link import READ_ONLY
@@ -150,7 +151,7 @@ class ChannelTable:
         """
         pair = channel.topic, channel.type
         versions = self._versions.setdefault(pair, {})
-        if md5sum in versions or len(versions) >= limits.SEEN_TYPES_MAX:
+        if md5sum in versions or len(versions) >= web_limits.SEEN_TYPES_MAX:
             return
         if not versions and channel.delivered:
             versions[channel.md5sum] = None
@@ -163,8 +164,6 @@ class ChannelTable:
             )
             self._warn(_versions_id(pair), text)
         self._update()
-
-    # --- inside -----------------------------------------------------------------------------------------------
 
     def _update(self) -> None:
         """Offer what the graph has and whose type is known, withdraw all else, and ask for types."""
@@ -319,7 +318,7 @@ def _versions_id(pair: tuple[str, str]) -> str:
 
 
 def _parted(op: str, key: str, items: Iterable[Channel | FoxgloveService]) -> Iterator[OutFrame]:
-    """Messages that list these, each with up to ``limits.FOXGLOVE_ADVERTISE_BYTES`` of schemas, or one of them."""
+    """Messages that list these, each with up to ``limits.ADVERTISE_BYTES`` of schemas, or one of them."""
     part: list[dict[str, object]] = []
     total = 0
     for item in items:
@@ -327,7 +326,7 @@ def _parted(op: str, key: str, items: Iterable[Channel | FoxgloveService]) -> It
             size = len(item.schema)
         else:
             size = len(item.kind.request.definition) + len(item.kind.response.definition)
-        if part and total + size > limits.FOXGLOVE_ADVERTISE_BYTES:
+        if part and total + size > limits.ADVERTISE_BYTES:
             yield message(op, **{key: part})
             part, total = [], 0
         part.append(item.json())

@@ -20,8 +20,8 @@ from msgspec import UNSET, Meta, UnsetType
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name
 from rmpa.core.limits import INT32_MAX, INT32_MIN, UINT32_MAX
-from rmpa.web import limits
 from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.foxglove import limits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -38,9 +38,6 @@ SCHEMA_ENCODING: Final = "ros1msg"
 WARNING: Final = 1
 # Levels of a status.
 ERROR: Final = 2
-
-
-# --- from the server: JSON ---
 
 
 def message(op: str, **fields: object) -> OutFrame:
@@ -68,8 +65,6 @@ def encode_json(message: object) -> bytes:
         text = json.dumps(msgspec.to_builtins(message), ensure_ascii=False)
         return text.encode("utf-8", "surrogatepass").decode("utf-8", "replace").encode()
 
-
-# --- from the server: binary ---
 
 _DATA: Final = struct.Struct("<BIQ")
 _TIME: Final = struct.Struct("<BQ")
@@ -109,12 +104,10 @@ def _binary(header: bytes, payload: Payload = b"") -> OutFrame:
     return Opcode.BINARY, (header, payload)
 
 
-# --- from a client: JSON ---
-
 Id: TypeAlias = Annotated[int, Meta(ge=0, le=UINT32_MAX)]
-Text: TypeAlias = Annotated[str, Meta(max_length=limits.FOXGLOVE_NAME_MAX)]
-Ids: TypeAlias = Annotated[tuple[Id, ...], Meta(max_length=limits.FOXGLOVE_SUBSCRIPTIONS_MAX)]
-Names: TypeAlias = Annotated[tuple[Text, ...], Meta(max_length=limits.FOXGLOVE_PARAMETERS_MAX)]
+Text: TypeAlias = Annotated[str, Meta(max_length=limits.NAME_MAX)]
+Ids: TypeAlias = Annotated[tuple[Id, ...], Meta(max_length=limits.SUBSCRIPTIONS_MAX)]
+Names: TypeAlias = Annotated[tuple[Text, ...], Meta(max_length=limits.PARAMETERS_MAX)]
 _ParameterType: TypeAlias = Literal["byte_array", "float64", "float64_array"]
 
 
@@ -149,31 +142,24 @@ class FoxgloveParameter(msgspec.Struct, frozen=True, kw_only=True, omit_defaults
     value: object = UNSET
 
 
-Subscriptions: TypeAlias = Annotated[
-    tuple[FoxgloveSubscription, ...], Meta(max_length=limits.FOXGLOVE_SUBSCRIPTIONS_MAX)
-]
-ClientChannels: TypeAlias = Annotated[tuple[ClientChannel, ...], Meta(max_length=limits.FOXGLOVE_ADVERTISED_MAX)]
-FoxgloveParameters: TypeAlias = Annotated[
-    tuple[FoxgloveParameter, ...], Meta(max_length=limits.FOXGLOVE_PARAMETERS_MAX)
-]
+Subscriptions: TypeAlias = Annotated[tuple[FoxgloveSubscription, ...], Meta(max_length=limits.SUBSCRIPTIONS_MAX)]
+ClientChannels: TypeAlias = Annotated[tuple[ClientChannel, ...], Meta(max_length=limits.ADVERTISED_MAX)]
+FoxgloveParameters: TypeAlias = Annotated[tuple[FoxgloveParameter, ...], Meta(max_length=limits.PARAMETERS_MAX)]
 
 
 def parse_text(data: bytes | str, decoder: msgspec.json.Decoder[msgspec.Struct]) -> msgspec.Struct:
     """Parse a text frame of a client.
 
     Raises:
-        LimitExceeded: It is longer than ``limits.FOXGLOVE_TEXT_MAX``; nothing of it was read.
+        LimitExceeded: It is longer than ``limits.TEXT_MAX``; nothing of it was read.
         RemoteProtocolError: It is not JSON, or not a message of a client.
     """
-    if len(data) > limits.FOXGLOVE_TEXT_MAX:
-        raise LimitExceeded("JSON message", len(data), limits.FOXGLOVE_TEXT_MAX)
+    if len(data) > limits.TEXT_MAX:
+        raise LimitExceeded("JSON message", len(data), limits.TEXT_MAX)
     try:
         return decoder.decode(data)
     except (msgspec.DecodeError, RecursionError, UnicodeError) as error:
         raise RemoteProtocolError(f"not a message of this protocol: {error}") from None
-
-
-# --- from a client: binary ---
 
 
 def parse_binary(data: Payload) -> tuple[int, memoryview] | tuple[int, int, str, memoryview]:
@@ -184,11 +170,11 @@ def parse_binary(data: Payload) -> tuple[int, memoryview] | tuple[int, int, str,
         the service and the call, the encoding and the payload.
 
     Raises:
-        LimitExceeded: It is longer than ``limits.FOXGLOVE_BINARY_MAX``.
+        LimitExceeded: It is longer than ``limits.BINARY_MAX``.
         RemoteProtocolError: The opcode is unknown, or the frame is too short for it.
     """
-    if len(data) > limits.FOXGLOVE_BINARY_MAX:
-        raise LimitExceeded("binary message", len(data), limits.FOXGLOVE_BINARY_MAX)
+    if len(data) > limits.BINARY_MAX:
+        raise LimitExceeded("binary message", len(data), limits.BINARY_MAX)
     view = memoryview(data)
     opcode = view[0] if view else None
     if opcode == 1:
@@ -208,7 +194,7 @@ def _parse_call(view: memoryview) -> tuple[int, int, str, memoryview]:
         raise RemoteProtocolError(f"a service call of {len(view)} bytes is too short for its header of 13")
     _, service, call, length = _SERVICE.unpack_from(view)
     end = _SERVICE.size + length
-    if length > limits.FOXGLOVE_NAME_MAX or end > len(view):
+    if length > limits.NAME_MAX or end > len(view):
         raise RemoteProtocolError(f"a service call of {len(view)} bytes claims an encoding of {length} bytes")
     try:
         encoding = str(view[_SERVICE.size : end], "utf-8")
@@ -217,7 +203,7 @@ def _parse_call(view: memoryview) -> tuple[int, int, str, memoryview]:
     return service, call, encoding, view[end:]
 
 
-# --- parameters: ROS tells integers from floating-point numbers and has byte strings, which JSON does not ---
+# ROS tells integers from floating-point numbers and has byte strings, which JSON does not.
 
 
 def to_parameter(name: str, value: ParamValue) -> FoxgloveParameter:
@@ -295,8 +281,8 @@ def _float(name: str, value: object) -> float:
 
 
 def _from_json(name: str, value: object, depth: int) -> ParamValue:
-    if depth > limits.FOXGLOVE_PARAMETER_DEPTH_MAX:
-        raise RmpaError(f"{name}: lists and maps are nested deeper than {limits.FOXGLOVE_PARAMETER_DEPTH_MAX}")
+    if depth > limits.PARAMETER_DEPTH_MAX:
+        raise RmpaError(f"{name}: lists and maps are nested deeper than {limits.PARAMETER_DEPTH_MAX}")
     if isinstance(value, int) and not INT32_MIN <= value <= INT32_MAX:
         raise RmpaError(f"{name}: {value} does not fit an integer of 32 bits; give it the type float64")
     if isinstance(value, bool | int | float | str):

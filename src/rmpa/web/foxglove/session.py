@@ -16,9 +16,8 @@ import msgspec
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name, is_type_name
 from rmpa.core.timers import TokenBucket
-from rmpa.web import limits
 from rmpa.web.clients.connection import ClientStream, Session, struct_of
-from rmpa.web.foxglove import protocol
+from rmpa.web.foxglove import limits, protocol
 from rmpa.web.foxglove.protocol import ENCODING, ERROR, WARNING, message, status
 from rmpa.web.hub.params import CLOCK, CLOCK_TYPE, clock_ns
 
@@ -94,7 +93,7 @@ class FoxgloveSession(Session):
     """
 
     kind = "foxglove"
-    frame_max = limits.FOXGLOVE_BINARY_MAX
+    frame_max = limits.BINARY_MAX
 
     # More than 12 fields: what the client has of each kind.
     def __init__(
@@ -112,7 +111,7 @@ class FoxgloveSession(Session):
         # The time by ``/clock``, where that gives it: it stamps the messages.
         self.time_ns: int | None = None
         self._now = 0.0
-        self._errors = TokenBucket(limits.FOXGLOVE_STATUS_RATE, limits.FOXGLOVE_STATUS_BURST)
+        self._errors = TokenBucket(limits.STATUS_RATE, limits.STATUS_BURST)
         self._subscriptions: dict[int, _Subscription] = {}
         self._published: dict[int, ClientPublication | None] = {}
         # Requests of each kind that have no answer yet.
@@ -121,8 +120,6 @@ class FoxgloveSession(Session):
         self._names: set[str] = set()
         self._all = False
         self._follower: Follower | None = None
-
-    # --- the connection ---------------------------------------------------------------------------------------
 
     def opened(self) -> None:
         """Tell what the server is and offers."""
@@ -148,7 +145,7 @@ class FoxgloveSession(Session):
     def received_frame(self, data: Payload | str, now: float) -> None:
         """Handle a frame of the client: text as ``str``, binary as bytes.
 
-        What is wrong with it is told to the client as a status, at most ``limits.FOXGLOVE_STATUS_RATE`` times a
+        What is wrong with it is told to the client as a status, at most ``limits.STATUS_RATE`` times a
         second in the long run; a client that sends malformed messages at a higher rate is disconnected.
         """
         self._now = now
@@ -217,8 +214,6 @@ class FoxgloveSession(Session):
 
         self.run(work, partial(answered, done), partial(answered, failed))
 
-    # --- subscriptions and the graph --------------------------------------------------------------------------
-
     def op_subscribe(self, *, subscriptions: protocol.Subscriptions) -> None:
         """Begin to send the messages of channels."""
         self._each(self._subscribe, subscriptions)
@@ -231,7 +226,7 @@ class FoxgloveSession(Session):
             raise RmpaError(f"subscription {wanted.id} exists; end it first, or choose another number")
         if any(each.channel is channel for each in self._subscriptions.values()):
             raise RmpaError(f"channel {wanted.channel_id} ({channel.topic}) has a subscription of this client")
-        if len(self._subscriptions) >= limits.FOXGLOVE_SUBSCRIPTIONS_MAX:
+        if len(self._subscriptions) >= limits.SUBSCRIPTIONS_MAX:
             raise RmpaError(f"{len(self._subscriptions)} subscriptions are the limit of one client; end some first")
         made = self._subscriptions[wanted.id] = _Subscription(self, wanted.id, channel)
         take = partial(self.connection.push_message, made)
@@ -255,8 +250,6 @@ class FoxgloveSession(Session):
         """Tell no more of the graph."""
         self.table.unfollow_graph(self)
 
-    # --- publishing -------------------------------------------------------------------------------------------
-
     def op_advertise(self, *, channels: protocol.ClientChannels) -> None:
         """Begin to publish topics."""
         self.check_control("publish")
@@ -272,7 +265,7 @@ class FoxgloveSession(Session):
             raise RmpaError(f"{channel.topic!r} is not a topic's name; write it like /cmd_vel")
         if not is_type_name(channel.schema_name):
             raise RmpaError(f"{topic}: {channel.schema_name!r} is not a type; write it like std_msgs/String")
-        if len(self._published) >= limits.FOXGLOVE_ADVERTISED_MAX:
+        if len(self._published) >= limits.ADVERTISED_MAX:
             raise RmpaError(f"{len(self._published)} published topics are the limit of one client")
         # The client may send messages before it reads that this failed: they are dropped.
         self._published[channel.id] = None
@@ -295,8 +288,6 @@ class FoxgloveSession(Session):
         if (publication := self._published[channel]) is not None:
             publication.publish(payload)
 
-    # --- services and assets ----------------------------------------------------------------------------------
-
     def _call(self, service: int, call: int, encoding: str, payload: Payload) -> None:
         def done(response: Payload) -> None:
             self.connection.push(protocol.service_response(service, call, response))
@@ -309,7 +300,7 @@ class FoxgloveSession(Session):
         except RmpaError as error:
             failed(error)
         else:
-            self._await("calls", limits.FOXGLOVE_CALLS_MAX, work, done, failed)
+            self._await("calls", limits.CALLS_MAX, work, done, failed)
 
     def _service_call(self, number: int, encoding: str, payload: Payload) -> Coroutine[Any, Any, Payload]:
         self.check_control("call services")
@@ -329,10 +320,8 @@ class FoxgloveSession(Session):
         def failed(error: RmpaError) -> None:
             self.connection.push(protocol.asset_failure(request_id, str(error)))
 
-        work = self.fetch_asset(uri, limits.FOXGLOVE_ASSET_MAX)
-        self._await("assets", limits.FOXGLOVE_ASSETS_MAX, work, done, failed)
-
-    # --- parameters -------------------------------------------------------------------------------------------
+        work = self.fetch_asset(uri, limits.ASSET_MAX)
+        self._await("assets", limits.ASSETS_MAX, work, done, failed)
 
     def op_get_parameters(self, *, parameter_names: protocol.Names = (), id_: protocol.Text | None = None) -> None:
         """Send parameters; all where no name is given."""
@@ -374,7 +363,7 @@ class FoxgloveSession(Session):
             self._tell(error)
             done({})
 
-        self._await("requests for parameters", limits.FOXGLOVE_PARAMETER_REQUESTS_MAX, work, done, failed)
+        self._await("requests for parameters", limits.PARAMETER_REQUESTS_MAX, work, done, failed)
 
     def op_subscribe_parameter_updates(self, *, parameter_names: protocol.Names = ()) -> None:
         """Send changes of parameters; of all where no name is given."""
@@ -407,9 +396,9 @@ class FoxgloveSession(Session):
             self._follow(self._names.union(names), all_=self._all)
 
     def _follow(self, names: set[str], *, all_: bool) -> None:
-        if len(names) > limits.FOXGLOVE_PARAMETERS_MAX:
+        if len(names) > limits.PARAMETERS_MAX:
             raise RmpaError(
-                f"{len(names)} parameters are more than the {limits.FOXGLOVE_PARAMETERS_MAX} that a client may name;"
+                f"{len(names)} parameters are more than the {limits.PARAMETERS_MAX} that a client may name;"
                 " follow all by an empty list"
             )
         if self._follower is not None:

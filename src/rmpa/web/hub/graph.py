@@ -302,8 +302,6 @@ class TypeLibrary:
         """End all searches."""
         await self._finding.close()
 
-    # --- inside -----------------------------------------------------------------------------------------------
-
     async def _find(self, name: str) -> MessageType:
         async with self._asked:
             try:
@@ -455,8 +453,6 @@ class GraphWatch(GraphTable):
             await asyncio.wait(searches, timeout=limits.FIND_ALL_TIMEOUT)
             await end_tasks(*searches)
             self._found_types()
-
-    # --- inside -----------------------------------------------------------------------------------------------
 
     def _found_types(self) -> None:
         self.found_services()

@@ -159,8 +159,6 @@ class HubClient:
     def show_late(self, text: str) -> None:
         """Tell the client that what it publishes comes too late."""
 
-    # --- topics -----------------------------------------------------------------------------------------------
-
     def subscribe(
         self,
         topic: str,
@@ -194,8 +192,6 @@ class HubClient:
             self.show_late(f"what was published on {topic}: {text}")
         return not text
 
-    # --- services ---------------------------------------------------------------------------------------------
-
     def call(
         self, service: str, type_: str, request: Payload, timeout: float | None = None
     ) -> Coroutine[Any, Any, Payload]:
@@ -222,8 +218,6 @@ class HubClient:
         made = self.hub.served.serve(service, self.hub.types.service(type_), called, failed)
         self._open.add(made)
         return made
-
-    # --- parameters and files ---------------------------------------------------------------------------------
 
     @property
     def param_tree(self) -> Mapping[str, ParamValue]:
@@ -274,8 +268,6 @@ class HubClient:
         self._check_view("fetch assets")
         return await asyncio.to_thread(read_asset, uri, most, self.hub.environ)
 
-    # --- tasks and the end ------------------------------------------------------------------------------------
-
     def run(
         self, work: Coroutine[Any, Any, _T], done: Callable[[_T], None], failed: Callable[[RmpaError], None]
     ) -> None:
@@ -299,8 +291,6 @@ class HubClient:
         self.tasks.cancel()
         for each in [*self._open]:
             each.close()
-
-    # --- rights -----------------------------------------------------------------------------------------------
 
     def _check_view(self, what: str) -> None:
         if not self.rights.view:

@@ -30,11 +30,6 @@ ParamValue: TypeAlias = Union[  # noqa: UP007 - | does not take the forward refe
 Payload: TypeAlias = bytes | bytearray | memoryview
 
 
-# --- What clients may do --------------------------------------------------------------------------------------------
-#
-# Kinds of acts by ``[web]``, and names by the rules of ``[[permission]]``.
-
-
 _WHO: Final = "the web server"
 # The name of ``rmpa web`` for the rules.
 _NODE: Final = "web"

@@ -117,8 +117,6 @@ class ParamMirror:
         """End the reading."""
         await end_tasks(self._loading)
 
-    # --- inside -----------------------------------------------------------------------------------------------
-
     async def _check(self, name: str, after: ParamValue = None) -> None:
         """Check a change as ``NodeRules`` does, once no reading of the core's parameters is under way."""
         if self._link.rules.permissions is None:

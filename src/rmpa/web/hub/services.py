@@ -207,8 +207,6 @@ class ServedServices:
         for served in [*self._served.values()]:
             served.close()
 
-    # --- inside -----------------------------------------------------------------------------------------------
-
     async def _register(self, served: ServedService, node: Node) -> Service:
         handler = functools.partial(self._call, served)
         return await node.advertise_service(served.name, served.kind, handler, timeout=60.0, raw=True)
@@ -311,8 +309,6 @@ class ServiceCalls:
         for key, server in [*self._servers.items()]:
             for connection in [*server.idle]:
                 self._drop(key, connection)
-
-    # --- inside -----------------------------------------------------------------------------------------------
 
     async def _exchange(
         self, server: _Server, key: tuple[str, str], request: Payload

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from rmpa.web.hub.graph import GraphWatch, TypeLibrary
     from rmpa.web.hub.node_link import NodeLink, Payload
 
+_log = logging.getLogger(__name__)
+
 
 class PayloadBuffers:
     """Copies large payloads into buffers that are used again when no view of them is left.
@@ -92,7 +94,6 @@ def _has_views(buffer: bytearray) -> bool:
     return False
 
 
-_log = logging.getLogger(__name__)
 # The source of what clients of this hub publish: the node has no connection to itself.
 OWN: Final = ""
 
@@ -242,8 +243,6 @@ class HubTopics:
         for there in [*self._topics.values()]:
             self._end(there)
         self.publishers.close()
-
-    # --- inside -----------------------------------------------------------------------------------------------
 
     def _registration(self, there: _Topic) -> Registration[Subscriber]:
         register = functools.partial(self._register, there)
@@ -482,8 +481,6 @@ class Publishers:
         """End all."""
         for there in [*self._topics.values()]:
             self._end(there)
-
-    # --- inside -----------------------------------------------------------------------------------------------
 
     def _publish(self, there: _Publisher, payload: Payload) -> None:
         if there.numbers is None:

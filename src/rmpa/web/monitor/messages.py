@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, Union
 import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.web import limits
+from rmpa.web.monitor import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -71,8 +71,6 @@ def without_nulls(value: object) -> Value:
         return None
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
-
-# --- live messages ---------------------------------------------------------------------------------------------
 
 # Kind 1, format, width, height, spare, watch, nanoseconds since the epoch (UTC): in front of an image's bytes.
 IMAGE_HEADER: Final = struct.Struct("<BBHHHIQ")
@@ -236,8 +234,6 @@ def _shades(lines: Iterable[Iterable[float]]) -> bytes:
     scale = 254 / (most - least) if most > least else 254.0
     return bytes(1 + int((value - least) * scale) if 0 < value < math.inf else 0 for value in values)
 
-
-# --- watches ------------------------------------------------------------------------------------------------------
 
 # A moment in seconds since the epoch, and a value for each line; ``None`` where there is none.
 Sample: TypeAlias = tuple[float, list[float | None]]

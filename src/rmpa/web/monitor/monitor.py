@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RmpaError
 from rmpa.runtime.tasks import end_tasks, keep_task
-from rmpa.web import limits
+from rmpa.web import limits as web_limits
+from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import LOG_TOPIC
 from rmpa.web.monitor.questions import Answers
 from rmpa.web.monitor.resources import MessageValues, ResourceWatch
@@ -30,11 +31,6 @@ if TYPE_CHECKING:
     from rmpa.web.hub.topics import ClientSubscription, ReceivedMessage
     from rmpa.web.monitor.messages import Tree
     from rmpa.web.server.agent_watch import AgentWatch, Reading
-
-
-# --- The state of the mesh for all pages ----------------------------------------------------------------------------
-#
-# Snapshots of the agent are read while one is open.
 
 
 _log = logging.getLogger(__name__)
@@ -80,9 +76,9 @@ class MeshFeed:
         self._task = keep_task(self._run, "the state of the mesh for the pages")
 
     async def first(self) -> None:
-        """Ask the agent once, for ``limits.SETTLE`` at most, so that a page is told its name."""
+        """Ask the agent once, for ``web_limits.SETTLE`` at most, so that a page is told its name."""
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(limits.SETTLE):
+            async with asyncio.timeout(web_limits.SETTLE):
                 self._take(await self._watch.reading())
 
     def follow(self, page: object, show: Callable[[Tree], None]) -> None:
@@ -145,11 +141,6 @@ class MeshFeed:
             self._state = self._builder.build(reading.snapshot, facts, standing, self._parameters())
         for show in [*self._pages.values()]:
             show(self._state)
-
-
-# --- The log of this module's nodes, ``/rosout_agg`` ----------------------------------------------------------------
-#
-# Its last lines are kept for pages that open it.
 
 
 _TYPE: Final = "rosgraph_msgs/Log"

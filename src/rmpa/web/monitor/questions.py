@@ -24,7 +24,7 @@ from rmpa.observe.operations import PeerParams, parameters_in
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.descriptor import SERVICE_TYPE
 from rmpa.trust.permissions import InviteReply
-from rmpa.web import limits
+from rmpa.web.monitor import limits
 from rmpa.web.monitor.state import node_key
 
 if TYPE_CHECKING:
@@ -36,14 +36,14 @@ if TYPE_CHECKING:
     from rmpa.web.hub.node_link import ParamValue
     from rmpa.web.monitor.resources import ResourceWatch
 
+_log = logging.getLogger(__name__)
+
 
 def shown_node(own: str) -> str:
     """A node of this module's graph as ``node_key`` has it: a proxy is its node in the peer's module."""
     peer = proxied_node(own)
     return node_key(*peer) if peer is not None else own
 
-
-_log = logging.getLogger(__name__)
 
 Args: TypeAlias = dict[str, Any]  # the edge: each question has its own
 _Answer: TypeAlias = "Callable[[Answers, Args], Awaitable[Any]]"
@@ -98,8 +98,6 @@ class Answers:
     def close(self) -> None:
         """End the threads, once what the agent was asked is answered or has timed out."""
         self._threads.shutdown(wait=False, cancel_futures=True)
-
-    # --- what only looks --------------------------------------------------------------------------------------
 
     @question("why")
     async def _why(self, args: Args) -> Any:
@@ -156,8 +154,6 @@ class Answers:
             "text": f"{kind.request.definition.strip()}\n---\n{kind.response.definition.strip()}".strip(),
             "request": msgspec.json.decode(empty.json(memoryview(example))),
         }
-
-    # --- parameters -------------------------------------------------------------------------------------------
 
     @question("params", needs="view")
     async def _params(self, args: Args) -> Any:
@@ -220,8 +216,6 @@ class Answers:
             await _in_time(self._hub.params.set(name, cast("ParamValue", kept)))
         return await self._params(args)
 
-    # --- modules that knock -----------------------------------------------------------------------------------
-
     @question("invite", needs="control")
     async def _invite(self, args: Args) -> Any:
         """An invitation for a module that is pending; the answer is a secret, for the page that asks alone."""
@@ -235,8 +229,6 @@ class Answers:
         made: InviteReply = await self._in_thread(invite)
         _log.info("= a page has made an invitation for %s", name)
         return {"line": f"rmpa trust join {made.token}", "until": made.expires}
-
-    # --- services and resources -------------------------------------------------------------------------------
 
     @question("call", needs="control")
     async def _call(self, args: Args) -> Any:

@@ -17,7 +17,7 @@ from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.descriptor import CONFIG_TYPE, LEVEL_FOR, Descriptor
 from rmpa.ros.types.descriptor import TOPIC as DESCRIPTOR
-from rmpa.web import limits
+from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import Tree, without_nulls
 
 if TYPE_CHECKING:
@@ -282,8 +282,6 @@ class ResourceWatch:
             for peer, facts in path.heard.items()
             if facts.descriptor and facts.level in ("WARN", "ERROR", "STALE")
         ]
-
-    # --- inside -----------------------------------------------------------------------------------------------
 
     def _graph_changed(self) -> None:
         ending = f"/{DESCRIPTOR}"

@@ -18,9 +18,9 @@ from msgspec import Meta
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name
 from rmpa.core.timers import TokenBucket
-from rmpa.web import limits
 from rmpa.web.clients.connection import Session, struct_of
 from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import VERSION, Tree, WatchState, difference
 from rmpa.web.monitor.questions import QUESTIONS
 
@@ -203,8 +203,6 @@ class MonitorSession(Session):
         self._stick: Stick | None = None
         self._has_stick = False
 
-    # --- the connection ---------------------------------------------------------------------------------------
-
     def opened(self) -> None:
         """Greet the page, and show it the state."""
         fastest = {"linear": limits.DRIVE_SPEED, "angular": limits.DRIVE_TURN}
@@ -297,8 +295,6 @@ class MonitorSession(Session):
     def _refuse(self, id_: int, error: str, remedy: str = "", code: str = "refused", **more: Any) -> None:
         self._send({"op": "failed", "id": id_, "error": error, "remedy": remedy, "code": code, **more})
 
-    # --- states and details -----------------------------------------------------------------------------------
-
     def _update(self, state: Tree) -> None:
         self._patches.update(state)
         self.handle_timer(self._clock())
@@ -312,8 +308,6 @@ class MonitorSession(Session):
     ) -> None:
         """The page shows these things and wants their details; none of others. Each is ``[kind, name]``."""
         self._patches.look(at)
-
-    # --- live messages ----------------------------------------------------------------------------------------
 
     def op_watch(
         self,
@@ -379,8 +373,6 @@ class MonitorSession(Session):
             else:
                 self.connection.push((Opcode.BINARY, (frame,))) if isinstance(frame, bytes) else self._send(frame)
 
-    # --- questions and the log --------------------------------------------------------------------------------
-
     def op_ask(self, now: float, *, id: Id, what: str, args: dict[str, Any] = {}, at: float = 0.0) -> None:  # noqa: A002, B006 - copied by msgspec
         """A question or an order that has one answer; ``at`` is as of ``drive``."""
         if what not in QUESTIONS:
@@ -427,8 +419,6 @@ class MonitorSession(Session):
     def _log(self, lines: list[dict[str, Any]]) -> None:
         if self.connection.unsent == 0:  # left out while the page does not take what was sent
             self._send({"op": "log", "lines": lines})
-
-    # --- driving ----------------------------------------------------------------------------------------------
 
     def op_stick(self, _: float, *, topic: str, want: Literal["look", "take", "over", "leave", "stop"]) -> None:
         """The page shows the joystick of a topic (``""``: none), and wants to know the holder, or to be it or not.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import msgspec
 
-from rmpa.web import limits
+from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import Tree, without_nulls
 from rmpa.web.monitor.resources import resource_detail, resource_entry, resource_flows
 
@@ -171,8 +171,6 @@ class StateBuilder:
         self._entries[section] = now
         return {key: entry for key, (_, entry) in now.items()}
 
-    # --- modules ----------------------------------------------------------------------------------------------
-
     def _modules(self, snapshot: Snapshot) -> Iterable[tuple[str, Tree]]:
         taken, peers = snapshot.taken, snapshot.peers[: limits.MODULES_SHOWN]
         # Modules that have left the roster are kept for a while, as many as can be shown.
@@ -227,8 +225,6 @@ class StateBuilder:
             rates = [old + share * (new - old) for old, new in zip(rates or fresh, fresh, strict=True)]
         self._links[name] = counts, rates
         return rates
-
-    # --- topics -----------------------------------------------------------------------------------------------
 
     def _flows(self, topics: Iterable[TopicInfo]) -> dict[str, Tree]:
         """What flows on the own links, by ``from>to``: messages and bytes a second, and the busiest topics."""
@@ -357,9 +353,6 @@ def _service(service: ServiceInfo) -> Tree:
     })  # fmt: skip
 
 
-# --- nodes --------------------------------------------------------------------------------------------------------
-
-
 def node_key(module: str, node: str) -> str:
     """``module:/name`` for a node of a peer, ``/name`` for one of this module, whose ``module`` is empty."""
     return f"{module}:{node}" if module else node
@@ -413,9 +406,6 @@ def node_detail(snapshot: Snapshot, key: str) -> Tree | None:
     found: Tree = {"publishes": [*publishes], "subscribes": [*subscribes], "services": [*services]}
     problem = next((str(info) for info in snapshot.unreachable if not module and info.node == node), "")
     return {**found, "problem": problem} if problem else found
-
-
-# --- details ------------------------------------------------------------------------------------------------------
 
 
 def details(snapshot: Snapshot, resources: Mapping[str, ResourceFacts], kind: str, name: str) -> Tree | None:

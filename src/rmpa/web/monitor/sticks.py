@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.web import limits
+from rmpa.web.monitor import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable

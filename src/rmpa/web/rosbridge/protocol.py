@@ -23,8 +23,8 @@ import msgspec
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import is_type_name, resolve_name
-from rmpa.web import limits
 from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.rosbridge import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -47,9 +47,6 @@ class OpError(RemoteProtocolError):
     def __str__(self) -> str:
         """The problem and the remedy."""
         return f"{self.problem}; {self.remedy}" if self.remedy else self.problem
-
-
-# --- frames from the client ------------------------------------------------------------------------------------
 
 
 def parse_frame(data: str | Part) -> dict[str, Any]:
@@ -196,9 +193,6 @@ def _cbor(data: Part) -> object:
     return values
 
 
-# --- frames to the client --------------------------------------------------------------------------------------
-
-
 _SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _CHUNK: Final = struct.Struct(">I4s")
 _IHDR: Final = struct.Struct(">IIBBBBB")
@@ -307,9 +301,6 @@ def _cbor_length(major: int, length: int) -> bytes:
     return bytes((major | encoded[0],)) + encoded[1:]
 
 
-# --- PNG -------------------------------------------------------------------------------------------------------
-
-
 def encode_png(text: Part) -> OutFrame:
     """An op ``png``: the bytes of another op as the RGB pixels of a picture that is nearly square.
 
@@ -401,9 +392,6 @@ def _unfilter(lines: bytes, row: int, step: int) -> bytearray:
         out += line
         above = line
     return out
-
-
-# --- fragments of ops in both directions -----------------------------------------------------------------------
 
 
 def split(frame: OutFrame, size: int, mid: Id) -> list[OutFrame]:

@@ -18,9 +18,9 @@ from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import parse_definition
 from rmpa.ros.types.installed import ServiceType
-from rmpa.web import limits
 from rmpa.web.hub.graph import GraphService, GraphTopic
 from rmpa.web.hub.params import MISSING
+from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.protocol import OpError, graph_name, type_name
 
 if TYPE_CHECKING:
@@ -119,8 +119,6 @@ class Rosapi:
         answer: Answer = getattr(self, f"_answer_{service.removeprefix(NAMESPACE)}")(**request)
         return answer
 
-    # --- topics ---------------------------------------------------------------------------------------------------
-
     def _answer_topics(self) -> Values:
         topics = self._graph.topics
         return {"topics": list(topics), "types": [_first_type(each) for each in topics.values()]}
@@ -172,8 +170,6 @@ class Rosapi:
             ]
         }
 
-    # --- services -------------------------------------------------------------------------------------------------
-
     def _answer_services(self) -> Values:
         return {"services": list(self._graph.services)}
 
@@ -224,8 +220,6 @@ class Rosapi:
 
         return answer() if name in self._graph.services else self._with_types(answer)
 
-    # --- types, nodes and time ------------------------------------------------------------------------------------
-
     def _answer_message_details(self, type: str) -> Values:  # noqa: A002 - the field's name
         return _details(self._client.hub.types.message(type_name(type)))
 
@@ -250,8 +244,6 @@ class Rosapi:
     def _answer_get_time(self) -> Values:
         secs, nsecs = divmod(max(0, self._client.hub.time.now_ns()), 1_000_000_000)
         return {"time": {"secs": secs, "nsecs": nsecs}}
-
-    # --- parameters -----------------------------------------------------------------------------------------------
 
     def _is_parameter(self, name: str) -> bool:
         return self._client.read_param(name) is not MISSING

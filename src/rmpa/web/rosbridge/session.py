@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 from rmpa.core.errors import RmpaError
 from rmpa.ros.types.codec import MessageCodec, codec_for
-from rmpa.web import limits
 from rmpa.web.clients.connection import ClientStream, Session, struct_of
+from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.protocol import (
     Assembler,
     Compression,
@@ -169,8 +169,6 @@ class RosbridgeSession(Session):
         self._services: dict[str, _Served] = {}
         self._asked = 0
 
-    # --- the connection ---------------------------------------------------------------------------------------
-
     def opened(self) -> None:
         """Count the client; nothing is sent first."""
         self.hub.counts.add(self, self.address)
@@ -229,8 +227,6 @@ class RosbridgeSession(Session):
         for mid in self._fragments.expire(now):
             self.status("warning", f"no next fragment came for {limits.FRAGMENT_TIMEOUT:g} s", cast("Id", mid))
 
-    # --- status and fragments ---------------------------------------------------------------------------------
-
     def op_set_level(self, *, id_: Id = None, level: str) -> None:  # noqa: ARG002
         """Which status messages the client wants."""
         if level not in LEVELS:
@@ -263,8 +259,6 @@ class RosbridgeSession(Session):
             self._handle(parse_frame(text))
         finally:
             self._depth -= 1
-
-    # --- subscriptions ----------------------------------------------------------------------------------------
 
     def op_subscribe(
         self,
@@ -349,8 +343,6 @@ class RosbridgeSession(Session):
         self.connection.queue.end(topic)
         topic.subscription.close()
 
-    # --- publishers -------------------------------------------------------------------------------------------
-
     def op_advertise(self, *, id_: Id = None, topic: str, type_: str, latch: bool | None = False) -> None:
         """Begin a publisher, or count one more id of it."""
         self.check_control("publish")
@@ -422,8 +414,6 @@ class RosbridgeSession(Session):
         del self._publishers[publisher.topic]
         publisher.publication.close()
 
-    # --- calls ------------------------------------------------------------------------------------------------
-
     def op_call_service(
         self,
         *,
@@ -494,8 +484,6 @@ class RosbridgeSession(Session):
         op = {"op": "service_response", "service": call.service, "values": values, "result": ok}
         frame = encode(op if call.mid is None else op | {"id": call.mid}, call.compression)
         self.connection.push(*self.split(frame, call.fragment_size, call.mid))
-
-    # --- services that the client offers ----------------------------------------------------------------------
 
     def op_advertise_service(self, *, id_: Id = None, service: str, type_: str) -> None:
         """Offer a service; one that the client offers already is offered again."""

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
     from rmpa.core.statistics import Counters
 
+_log = logging.getLogger(__name__)
 TOKEN_PARAMETER: Final = "token"  # noqa: S105 - its name, not its value
 _HOST: Final = re.compile(r"(?:\[(?P<six>[0-9A-Fa-f:.]+)\]|(?P<name>[A-Za-z0-9_.-]+))(?::[0-9]{1,5})?")
 _SHOWN: Final = 80
@@ -218,16 +219,11 @@ def _short(text: str) -> str:
     return ascii(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…")
 
 
-# --- The file of the token that clients need ------------------------------------------------------------------------
-#
-# Made once, readable by its owner alone.
-
-
 _TOKEN: Final = re.compile(r"[A-Za-z0-9._~+/=-]+")  # RFC 6750, section 2.1
 
 
 def token_from(path: Path) -> tuple[str, bool]:
-    """The token of a file, and whether the file was made now.
+    """The token of a file, and whether the file was made now: readable by its owner alone.
 
     Raises:
         StartError: The file cannot be made or read, others may read it, or it holds no token.
@@ -264,9 +260,6 @@ def _read(path: Path) -> str:
         problem = f"holds no token of {limits.WEB_TOKEN_LENGTH_MIN} letters, digits or ._~+/=- and more"
         raise StartError(str(path), problem, "remove the file, and rmpa web makes one", code="directory-unusable")
     return text
-
-
-_log = logging.getLogger(__name__)
 
 
 class ConnectionTable:
@@ -342,8 +335,6 @@ class GuardedConnection(asyncio.Protocol):
         # Bytes of the client so far.
         self.received = 0
 
-    # --- what aiohttp's handlers tell ---
-
     def request_begins(self) -> None:
         """A request has arrived; its response is being made. Other connections are idler now."""
         if self in self._table.open:
@@ -364,8 +355,6 @@ class GuardedConnection(asyncio.Protocol):
         """
         self._on_unmasked = on_unmasked
         self._enter(ConnectionPhase.UPGRADED)
-
-    # --- the transport ---
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Pass the transport on, if there is room."""
@@ -411,8 +400,6 @@ class GuardedConnection(asyncio.Protocol):
         """Forget the connection."""
         self._forget()
         self._inner.connection_lost(exc)
-
-    # --- limits ---
 
     def refuse(self, reason: str, text: str) -> None:
         """Close the connection, counted by its reason."""

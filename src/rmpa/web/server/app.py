@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from rmpa.web.clients.clients import WebSocketClients
     from rmpa.web.server.agent_watch import AgentWatch
 
+_log = logging.getLogger(__name__)
 _TYPES: Final = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -64,7 +65,6 @@ def _pages(folder: Traversable, path: str) -> Iterator[tuple[str, tuple[bytes, s
             yield "/" if each.name == _FIRST else f"{path}{each.name}", (each.read_bytes(), content_type)
 
 
-_log = logging.getLogger(__name__)
 # What aiohttp says of broken requests; they are counted and logged by us, without tracebacks.
 _AIOHTTP: Final = logging.getLogger("rmpa.web.server.aiohttp")
 _AIOHTTP.setLevel(logging.CRITICAL)
@@ -217,8 +217,6 @@ class WebServer:
             self._table.abort_all()
         await self._watch.close()
 
-    # --- what holds for all paths ---
-
     def _middleware(self) -> Middleware:
         @web.middleware
         async def middleware(request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -322,8 +320,6 @@ class WebServer:
         )
         return response
 
-    # --- the paths ---
-
     async def _page(self, request: web.Request) -> web.Response:
         body, content_type = self._pages[request.path]
         return web.Response(body=body, headers={"Content-Type": content_type})
@@ -355,8 +351,6 @@ class WebServer:
         refused = self.counters.as_dict() | (sockets.counters.as_dict() if sockets is not None else {})
         reads, clients = (self._watch.reads, self._watch.seconds), sockets.figures() if sockets is not None else {}
         return api.web_metrics(connections, self._responses.as_dict(), refused, reads, clients)
-
-    # --- what aiohttp answers by itself ---
 
     def _access_logger(self) -> type[AbstractAccessLogger]:
         """The class that is told of every response, also of those to bytes that are no HTTP."""

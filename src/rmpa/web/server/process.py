@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from rmpa.trust.permissions import TrustStatus
     from rmpa.trust.store import TrustStore
 
+_log = logging.getLogger(__name__)
 _DEFAULT_PORT: Final = 8480
 _PRIORITIES: Final = {Priority.HIGH: 1, Priority.NORMAL: 0, Priority.LOW: -1}
 
@@ -75,14 +76,6 @@ def priority_of(hub: Hub, contracts: Contracts) -> Callable[[str], int]:
         return _PRIORITIES[contracts.of(topic, type_).priority]
 
     return priority
-
-
-# --- HTTPS ----------------------------------------------------------------------------------------------------------
-#
-# The server's certificate, from the user's files or the module's own, and its renewal at run time.
-
-
-_log = logging.getLogger(__name__)
 
 
 class CertificateFiles(NamedTuple):
@@ -213,11 +206,6 @@ class ServerCertificate:
 def _no_password() -> str:
     """OpenSSL would ask for one at the terminal."""
     raise ValueError("the key is encrypted")
-
-
-# --- The process ``rmpa web`` ---------------------------------------------------------------------------------------
-#
-# Makes the server of the settings, says where it is, and runs it until a signal.
 
 
 @dataclass(frozen=True, slots=True)

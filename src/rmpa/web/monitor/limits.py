@@ -1,0 +1,122 @@
+"""Bounds and time-outs of the pages of the monitor; in seconds and bytes unless stated otherwise."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rmpa.core.limits import KIB
+
+# Between two patches of one client: some 7 a second, which looks live and is read at leisure.
+PATCH_PERIOD: Final = 0.15
+# Shortest time from one snapshot of the agent to the next while pages are open.
+STATE_PERIOD: Final = 0.15
+# The pause between two snapshots is at least so many times as long as a snapshot takes: a fifth of a core.
+STATE_SHARE: Final = 4.0
+# States and patches that a client has not acknowledged yet. A slow browser gets fewer patches, never a queue.
+UNACKNOWLEDGED_MAX: Final = 2
+# [Pages] Bytes of one message of a page: a call, or a parameter
+# At it: its connection is made anew
+# Told in: the line at the top of the page
+REQUEST_MAX: Final = 64 * KIB
+# [Pages] Messages of one page a second, in the long run
+# At it: its connection is made anew
+# Told in: the line at the top of the page
+# Why: A joystick sends 10, acknowledgements 7.
+REQUEST_RATE: Final = 50.0
+# Messages of one client at once: a page that reconnects and asks for all that it shows.
+REQUEST_BURST: Final = 200.0
+# Things whose details one client is shown at one time; a page shows one or two.
+LOOKS_MAX: Final = 4
+# [Pages] Live topics of one page
+# At it: a further one is refused
+# Told in: the page
+WATCHES_MAX: Final = 16
+# [Pages] Values, images and scans of one topic a second
+# At it: the newest is shown
+WATCH_RATE_MAX: Final = 10.0
+# [Pages] Lines of one plot
+# At it: the first one is replaced
+# Told in: the page
+# Why: As many as can be told apart.
+FIELDS_MAX: Final = 8
+# [Pages] Questions of one page under way (*Why?*, calls, parameters)
+# At it: a further one is refused
+# Told in: the page
+ASKS_MAX: Final = 16
+# Samples of a plot in one message. Of more, the least and the greatest of each part are kept.
+POINTS_MAX: Final = 64
+# [Pages] Characters of a text in a live value
+# At it: the rest is cut
+# Told in: the value
+VALUE_CHARACTERS: Final = 512
+# [Pages] Elements of an array in a live value
+# At it: the rest is cut
+# Told in: the value
+VALUE_ITEMS: Final = 64
+# Values in one live value, all levels together.
+VALUE_NODES: Final = 2000
+# [Pages] Ranges of a laser scan
+# At it: of neighbours the nearest is shown
+# Why: Two a degree.
+SCAN_POINTS: Final = 720
+# [Pages] Pixels of a raw image
+# At it: every n-th row and column is shown
+# Told in: the size below the image
+IMAGE_PIXELS: Final = 320 * 240
+# [Pages] Topics
+# At it: further ones are counted; `rmpa topic list` has them
+# Told in: the page of all topics
+TOPICS_SHOWN: Final = 2000
+# [Pages] Services
+# At it: further ones are counted; `rmpa topic list` has them
+# Told in: the page of all services
+SERVICES_SHOWN: Final = 2000
+# Nodes in a state; further ones are counted.
+NODES_SHOWN: Final = 2000
+# [Pages] Modules
+# At it: further ones are counted; `rmpa topic list` has them
+# Told in: the page of the mesh
+# Why: A ring of more could not be read.
+MODULES_SHOWN: Final = 256
+# [Pages] Lines of the log
+# At it: the oldest are forgotten
+LOG_LINES: Final = 500
+# [Pages] Characters of one of them
+# At it: the rest is cut
+LOG_CHARACTERS: Final = 1024
+# Time after the start of this module's agent in which peers that it has not found yet do not count as lost: beacons
+# come every 5 s at the latest, and links take seconds where names or addresses are resolved.
+AGENT_SETTLES: Final = 10.0
+# [Pages] Time for which a module that is gone is shown
+# At it: it leaves the ring
+FORGET_AFTER: Final = 600.0
+# Seconds that an order of a page may be old: less than the page waits for a word before it gives all up.
+ORDER_AGE: Final = 5.0
+# [Pages] Time after a joystick's last command
+# At it: the robot is stopped
+# Why: A joystick sends every 0.1 s.
+DRIVE_TIMEOUT: Final = 0.3
+# How often the server of the page that has the stick tells other servers; a second may lose two of them.
+STICK_RENEW: Final = 0.5
+# [Pages] Time without a word of the server whose page has the stick
+# At it: the stick is free
+# Why: It tells it every 0.5 s.
+STICK_EXPIRY: Final = 2.0
+# Magnitude of a linear speed that a joystick may command, m/s.
+DRIVE_SPEED: Final = 2.0
+# Magnitude of an angular speed that a joystick may command, rad/s.
+DRIVE_TURN: Final = 4.0
+# [Pages] Smart Resources that are followed
+# At it: others are not shown
+# Why: Paths of them; each is up to nine subscriptions.
+RESOURCES_MAX: Final = 256
+# Time for which the details of a Smart Resource are followed after a page has shown it.
+LOOK_KEPT: Final = 10.0
+# Time between two signs of life to a page, which takes its connection for lost after three without any.
+TICK_PERIOD: Final = 2.0
+# Pause before it is looked again whether a page has taken what was sent.
+UNSENT_RETRY: Final = 0.1
+# Questions of all pages together that wait for the agent, each in a thread: `why` takes seconds.
+ANSWERS_AT_ONCE: Final = 4
+# The longest pause between two snapshots.
+STATE_PAUSE_MAX: Final = 0.5
