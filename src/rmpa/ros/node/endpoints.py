@@ -12,14 +12,13 @@ from collections.abc import Awaitable, Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.config import limits as config_limits
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.publication import Publication, PublicationEvents
-from rmpa.ros.node.service_client import ServiceConnection
+from rmpa.ros.node.service_client import serialize_given
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.types.codec import codec_for
@@ -240,7 +239,7 @@ class Service:
             self._failed(call, error)
 
     def _reply(self, call: ServiceCall, result: Any) -> None:
-        call.reply(True, result if self._raw else _serialize(self.kind.response, result))
+        call.reply(True, result if self._raw else serialize_given(self.kind.response, result))
 
     def _failed(self, call: ServiceCall, error: Exception) -> None:
         text = str(error)
@@ -250,69 +249,6 @@ class Service:
         if not isinstance(error, RmpaError):
             _log.error("! %s: a call of %s failed", self.name, printable(call.caller_id), exc_info=error)
         call.fail(f"{type(error).__name__}: {text}")
-
-
-class ServiceClient:
-    """Calls one service over one connection, one call at a time; made by ``Node.connect_service``.
-
-    Args:
-        connection: To its server.
-        kind: The type.
-    """
-
-    def __init__(self, connection: ServiceConnection, kind: ServiceType) -> None:
-        self.connection = connection
-        self.kind = kind
-
-    @property
-    def closed(self) -> bool:
-        """Whether either side has closed the connection."""
-        return self.connection.closed
-
-    async def call(
-        self,
-        request: object = None,
-        timeout: float | None = config_limits.SERVICE_TIMEOUT,  # noqa: ASYNC109 - the message names it
-    ) -> Any:
-        """Call the service.
-
-        Args:
-            request: As an object, or as plain values (see ``MessageType.make``).
-            timeout: Seconds; ``None`` waits for ever.
-
-        Returns:
-            The response as an object.
-
-        Raises:
-            MessageError: The request does not fit the type, or the response is not one.
-            PeerRefused: The server answers with an error.
-            ServiceFailed: The server disconnected, or did not answer in time.
-        """
-        ok, body = await self.connection.call(_serialize(self.kind.request, request), timeout)
-        if not ok:
-            raise PeerRefused(
-                f"service {self.connection.service}", str(bytes(body), "utf-8", "replace"), code="service-failed"
-            )
-        return self.kind.response.deserialize(body)
-
-    def close(self) -> None:
-        """Close the connection."""
-        self.connection.close()
-
-
-def _serialize(kind: MessageType, value: object) -> Buffer:
-    return kind.serialize(given_values(kind.name, value, None))
-
-
-async def probe(uri: str, service: str, caller_id: str, timeout: float) -> ServiceConnection:  # noqa: ASYNC109
-    """Ask a server for its description; returns the closed connection with ``description`` and ``caller_id``.
-
-    Raises:
-        RmpaError: As ``ServiceConnection.open``.
-    """
-    connection = await ServiceConnection.open(uri, service, caller_id, md5sum=ANY, probe=True, timeout=timeout)
-    connection.close()
-    return connection
 
 
 class Received:

@@ -36,15 +36,13 @@ from rmpa.ros.node.endpoints import (
     Publisher,
     Received,
     Service,
-    ServiceClient,
     Subscriber,
     check_plain,
-    probe,
 )
 from rmpa.ros.node.fetch_type import find_here, find_or_fetch
 from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.node.rosout import RosoutHandler
-from rmpa.ros.node.service_client import ServiceConnection
+from rmpa.ros.node.service_client import ServiceClient, ServiceConnection
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.types.find import find_service_type
 from rmpa.ros.types.messages import MessageType
@@ -345,7 +343,7 @@ class Node(MasterClient):
         while True:
             try:
                 uri = await self.lookup_service(name)
-                await probe(uri, self._resolve(name), self.name, limits.SERVICE_OPEN_TIMEOUT)
+                await ServiceConnection.probe(uri, self._resolve(name), self.name, limits.SERVICE_OPEN_TIMEOUT)
             except RmpaError:
                 if self.stopped.is_set() or (until is not None and loop.time() >= until):
                     raise
@@ -519,7 +517,7 @@ class Node(MasterClient):
     async def _version_of(self, uri: str, service: str, found: ServiceType) -> ServiceType | None:
         """Find the server's version of a service type; ``None`` if it is the same or is not on this machine."""
         try:
-            said = (await probe(uri, service, self.name, limits.SERVICE_OPEN_TIMEOUT)).description
+            said = (await ServiceConnection.probe(uri, service, self.name, limits.SERVICE_OPEN_TIMEOUT)).description
             other = await asyncio.to_thread(find_service_type, found.name, said.md5sum)
         except RmpaError:
             return None
