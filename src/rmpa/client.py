@@ -227,7 +227,7 @@ class AgentClient:
             UnreachableError: No agent answers, or none of that name.
             RmpaError: Several agents run, and none is selected.
         """
-        await self._find()
+        self._path = (await asyncio.to_thread(choose_agent, os.environ, self._name)).path
         return self
 
     async def __aexit__(
@@ -286,9 +286,6 @@ class AgentClient:
         if self._path is None:
             raise RmpaError("the agent is not known: write `async with AgentClient() as agent:`")
         return self._path
-
-    async def _find(self) -> None:
-        self._path = (await asyncio.to_thread(choose_agent, os.environ, self._name)).path
 
 
 async def _snapshots(client: ControlClient, period: float) -> AsyncGenerator[Snapshot, None]:
