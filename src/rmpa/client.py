@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Final, Self, TypeAlias
 import msgspec
 
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
-from rmpa.core.schedule import positive
+from rmpa.core.timers import positive
 from rmpa.observe import limits
 from rmpa.observe.control import GraphRevision
 from rmpa.observe.control_client import ControlClient, choose_agent

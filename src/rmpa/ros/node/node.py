@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from rmpa.config import limits as config_limits
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
-from rmpa.core.schedule import Schedule, positive
+from rmpa.core.timers import Schedule, positive
 from rmpa.ros import limits
 from rmpa.ros.environment import RosEnvironment, host_of, is_loopback
 from rmpa.ros.node import rosout
