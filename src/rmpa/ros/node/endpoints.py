@@ -12,13 +12,13 @@ from collections.abc import Awaitable, Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
+from rmpa.config import limits as config_limits
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.publication import Publication, PublicationEvents
-from rmpa.ros.node.service_client import serialize_given
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.types.codec import codec_for
@@ -30,6 +30,7 @@ from rmpa.runtime.tasks import OwnedTasks
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
 
+    from rmpa.ros.node.service_client import ServiceConnection
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.node.subscription import PublisherConnection
     from rmpa.ros.types.installed import ServiceType
@@ -44,7 +45,6 @@ NODE_UNREGISTER_TIMEOUT: Final = 3.0
 # Concurrent calls to unregister, each on a connection of its own.
 NODE_UNREGISTER_AT_ONCE: Final = 16
 _REMEDY: Final = "start one (rmpa up, or roscore), or set ROS_MASTER_URI to one that runs"
-
 _CLOSED: Final = "{} is not published any more: its publisher is closed"
 
 Handler = Callable[[Any], "Awaitable[Any] | Any"]
@@ -87,9 +87,8 @@ class MasterClient:
         """
         reply = await self._call(method, *params)
         if reply.code != 1:
-            raise PeerRefused(
-                f"the ROS master at {self.master_uri}", f"{method}: {reply.status}", code="core-refuses"
-            )
+            master = f"the ROS master at {self.master_uri}"
+            raise PeerRefused(master, f"{method}: {reply.status}", code="core-refuses")
         return reply.value
 
     async def _call(self, method: str, *params: XmlRpcValue) -> RosReply:
@@ -239,16 +238,64 @@ class Service:
             self._failed(call, error)
 
     def _reply(self, call: ServiceCall, result: Any) -> None:
-        call.reply(True, result if self._raw else serialize_given(self.kind.response, result))
+        call.reply(True, result if self._raw else _serialize(self.kind.response, result))
 
     def _failed(self, call: ServiceCall, error: Exception) -> None:
-        text = str(error)
-        if isinstance(error, RmpaError) and text:
-            call.fail(text)
-            return
-        if not isinstance(error, RmpaError):
+        ours, text = isinstance(error, RmpaError), str(error)
+        if not ours:
             _log.error("! %s: a call of %s failed", self.name, printable(call.caller_id), exc_info=error)
-        call.fail(f"{type(error).__name__}: {text}")
+        call.fail(text if ours and text else f"{type(error).__name__}: {text}")
+
+
+class ServiceClient:
+    """Calls one service over one connection, one call at a time; made by ``Node.connect_service``.
+
+    Args:
+        connection: To its server.
+        kind: The type.
+    """
+
+    def __init__(self, connection: ServiceConnection, kind: ServiceType) -> None:
+        self.connection = connection
+        self.kind = kind
+
+    @property
+    def closed(self) -> bool:
+        """Whether either side has closed the connection."""
+        return self.connection.closed
+
+    async def call(
+        self,
+        request: object = None,
+        timeout: float | None = config_limits.SERVICE_TIMEOUT,  # noqa: ASYNC109 - the message names it
+    ) -> Any:
+        """Call the service.
+
+        Args:
+            request: As an object, or as plain values (see ``MessageType.make``).
+            timeout: Seconds; ``None`` waits for ever.
+
+        Returns:
+            The response as an object.
+
+        Raises:
+            MessageError: The request does not fit the type, or the response is not one.
+            PeerRefused: The server answers with an error.
+            ServiceFailed: The server disconnected, or did not answer in time.
+        """
+        ok, body = await self.connection.call(_serialize(self.kind.request, request), timeout)
+        if not ok:
+            text = str(bytes(body), "utf-8", "replace")
+            raise PeerRefused(f"service {self.connection.service}", text, code="service-failed")
+        return self.kind.response.deserialize(body)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.connection.close()
+
+
+def _serialize(kind: MessageType, value: object) -> Buffer:
+    return kind.serialize(given_values(kind.name, value, None))
 
 
 class Received:
@@ -308,12 +355,7 @@ class Publisher(PublicationEvents):
     kind_name: Final = "Publisher"
 
     def __init__(
-        self,
-        node: MasterClient,
-        topic: str,
-        description: TopicDescription,
-        kind: MessageType | None,
-        queue_messages: int,
+        self, node: MasterClient, topic: str, description: TopicDescription, kind: MessageType | None, queue: int
     ) -> None:
         self._node = node
         self.topic = self.key = topic
@@ -325,9 +367,8 @@ class Publisher(PublicationEvents):
         self.numbers = HeaderNumbers(kind) if kind is not None else None
         self._change = asyncio.Event()
         self._closed = self._ended = False
-        self.publication = Publication(
-            topic, node.name, description, events=self, queue_messages=_at_least_one(queue_messages)
-        )
+        most = _at_least_one(queue)
+        self.publication = Publication(topic, node.name, description, events=self, queue_messages=most)
 
     @property
     def subscribers(self) -> int:
@@ -540,12 +581,6 @@ class Subscriber:
 
     def _refused(self, connection: PublisherConnection, text: str) -> None:
         _refuse(self, "subscription.refused", connection.uri, text)
-
-
-def check_plain(function: object, what: str) -> None:
-    """Refuse what is no function, and a coroutine function, which nothing would await, with TypeError."""
-    if not callable(function) or inspect.iscoroutinefunction(function):
-        raise TypeError(f"{what} is a plain function, not {function!r}")
 
 
 def _at_least_one(queue_messages: int) -> int:

@@ -36,13 +36,13 @@ from rmpa.ros.node.endpoints import (
     Publisher,
     Received,
     Service,
+    ServiceClient,
     Subscriber,
-    check_plain,
 )
 from rmpa.ros.node.fetch_type import find_here, find_or_fetch
 from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.node.rosout import RosoutHandler
-from rmpa.ros.node.service_client import ServiceClient, ServiceConnection
+from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.types.find import find_service_type
 from rmpa.ros.types.messages import MessageType
@@ -69,6 +69,12 @@ __all__ = ["Node", "Publisher", "Received", "Service", "ServiceClient", "Subscri
 _NO_DEFAULT: Final = object()
 # Time between two look-ups of a service that is waited for.
 _SERVICE_CHECK: Final = 0.2
+
+
+def check_plain(function: object, what: str) -> None:
+    """Refuse what is no function, and a coroutine function, which nothing would await, with TypeError."""
+    if not callable(function) or inspect.iscoroutinefunction(function):
+        raise TypeError(f"{what} is a plain function, not {function!r}")
 
 
 class Node(MasterClient):

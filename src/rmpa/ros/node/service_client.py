@@ -8,9 +8,8 @@ import os
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Final, Self
 
-from rmpa.config import limits as config_limits
 from rmpa.core.errors import (
     LocalProtocolError,
     OutOfDescriptors,
@@ -23,17 +22,11 @@ from rmpa.core.outbox import Outbox
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api, connect, keep_alive
 from rmpa.ros.node.service_server import BODIES, INLINE, send_large
-from rmpa.ros.types.messages import given_values
 from rmpa.ros.wire import tcpros
 from rmpa.ros.wire.slave_api import TCPROS
 from rmpa.runtime.accept import OUT_OF_DESCRIPTORS, Use, is_shortage
 from rmpa.runtime.stream import Stream
 from rmpa.runtime.tasks import start_task
-
-if TYPE_CHECKING:
-    from rmpa.ros.types.installed import ServiceType
-    from rmpa.ros.types.messages import MessageType
-    from rmpa.ros.wire.tcpros import Buffer
 
 Done = Callable[["tuple[bool, bytes | bytearray] | ServiceFailed"], None]
 
@@ -300,59 +293,6 @@ def _checked(fields: tcpros.Header | None, service: str, md5sum: str) -> tcpros.
         server = tcpros.printable(fields.get("callerid", "")) or "its server"
         raise PeerRefused(f"service {service}: {server}", problem, code="service-failed")
     return fields
-
-
-class ServiceClient:
-    """Calls one service over one connection, one call at a time; made by ``Node.connect_service``.
-
-    Args:
-        connection: To its server.
-        kind: The type.
-    """
-
-    def __init__(self, connection: ServiceConnection, kind: ServiceType) -> None:
-        self.connection = connection
-        self.kind = kind
-
-    @property
-    def closed(self) -> bool:
-        """Whether either side has closed the connection."""
-        return self.connection.closed
-
-    async def call(
-        self,
-        request: object = None,
-        timeout: float | None = config_limits.SERVICE_TIMEOUT,  # noqa: ASYNC109 - the message names it
-    ) -> Any:
-        """Call the service.
-
-        Args:
-            request: As an object, or as plain values (see ``MessageType.make``).
-            timeout: Seconds; ``None`` waits for ever.
-
-        Returns:
-            The response as an object.
-
-        Raises:
-            MessageError: The request does not fit the type, or the response is not one.
-            PeerRefused: The server answers with an error.
-            ServiceFailed: The server disconnected, or did not answer in time.
-        """
-        ok, body = await self.connection.call(serialize_given(self.kind.request, request), timeout)
-        if not ok:
-            raise PeerRefused(
-                f"service {self.connection.service}", str(bytes(body), "utf-8", "replace"), code="service-failed"
-            )
-        return self.kind.response.deserialize(body)
-
-    def close(self) -> None:
-        """Close the connection."""
-        self.connection.close()
-
-
-def serialize_given(kind: MessageType, value: object) -> Buffer:
-    """The bytes of a message object or of plain values; errors are those of ``MessageType.given``."""
-    return kind.serialize(given_values(kind.name, value, None))
 
 
 # Finds out whether the TCPROS server of a node can be reached, without a trace at that node. rospy reads the header
