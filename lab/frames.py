@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 
     from lab.experiments.model import Value
 
+# By the letter of numpy's kind.
 _KINDS: Final = {"b": "bool", "i": "int", "u": "int", "f": "float"}
-"""By the letter of numpy's kind."""
+# What a column is read as; ``number`` is of runs that were measured before pandas kept them.
 _TYPES: Final = {
     "none": "float64",
     "bool": "bool",
@@ -27,7 +28,6 @@ _TYPES: Final = {
     "number": "float64",
     "str": "str",
 }
-"""What a column is read as; ``number`` is of runs that were measured before pandas kept them."""
 
 
 def frame(columns: Iterable[str], rows: Iterable[tuple[Value, ...]]) -> pd.DataFrame:

@@ -19,8 +19,8 @@ from lab.experiments.code import code_here
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+# Upper bounds of the histogram's classes, in µs.
 _BOUNDS: Final = (20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000)
-"""Upper bounds of the histogram's classes, in µs."""
 
 
 def facts() -> dict[str, object]:

@@ -10,8 +10,8 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+# Ten samples beyond a percentile at the least, else it is one sample's luck and is not given.
 _NEEDED: Final = {50.0: 10, 95.0: 200, 99.0: 1000, 99.9: 10_000}
-"""Ten samples beyond a percentile at the least, else it is one sample's luck and is not given."""
 
 
 @dataclass(frozen=True, slots=True)

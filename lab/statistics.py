@@ -17,12 +17,12 @@ from lab.samples import percentile
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+# Draws of a bootstrap: its bounds are then stable to about a hundredth of their distance.
 _RESAMPLED: Final = 2000
-"""Draws of a bootstrap: its bounds are then stable to about a hundredth of their distance."""
+# Rounds below which nothing is said of the spread between them.
 _ROUNDS_NEEDED: Final = 3
-"""Rounds below which nothing is said of the spread between them."""
+# Points of a distribution function that a picture can show.
 _DRAWN: Final = 2000
-"""Points of a distribution function that a picture can show."""
 
 
 # --- straight lines -------------------------------------------------------------------------------------------------

@@ -15,9 +15,9 @@ import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
-from lab.bed.processes import DEADLINE, BedError, CommandFailed, Deadline, Process, eventually
+from lab.bed.processes import DEADLINE, BedError, Closing, CommandFailed, Deadline, Process, eventually
 from lab.bed.ros import free_port
 from rmpa.observe.control_client import ControlClient, choose_agent
 
@@ -63,7 +63,7 @@ class NotifySocket:
 
 
 @dataclass
-class Agent:
+class Agent(Closing):
     """One ``rmpa up`` and the commands against it.
 
     Args:
@@ -91,8 +91,8 @@ class Agent:
     log_level: str = "debug"
     prefix: Sequence[str] = ()
     process: Process = field(init=False)
+    # Seconds from exec to READY=1.
     ready_after: float = field(init=False, default=0.0)
-    """Seconds from exec to READY=1."""
     _notify: NotifySocket | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
@@ -103,12 +103,6 @@ class Agent:
         if self.runtime_dir is None:
             # Hosts of a lab share the file system but are different machines: each has a directory of its own.
             self.runtime_dir = _short_dir(self.home, self.host)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     @property
     def env(self) -> dict[str, str]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 from lab.bed import namespaces, ros, transport
 from lab.bed.agents import Agent
 from lab.bed.namespaces import MACHINE, Host, Lab
+from lab.bed.processes import Closing
 from lab.bed.ros import Ros, free_port
 
 if TYPE_CHECKING:
@@ -17,23 +18,17 @@ if TYPE_CHECKING:
 
     from lab.bed.plan import Transport
 
+# Nodes of the tests of which some are measured as well.
 TEST_NODES: Final = Path(__file__).parents[2] / "tests" / "interop" / "nodes"
-"""Nodes of the tests of which some are measured as well."""
 
 
-class Bed:
+class Bed(Closing):
     """What measurements start, and what ends with ``close``."""
 
     def __init__(self) -> None:
         self._stack = ExitStack()
         self.home = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="rmpa-bench-")))
         self._lab: Lab | None = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     @property
     def lab(self) -> Lab:

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
     from lab.bed.namespaces import Host
 
+# The program, or ``None``: then the tests of the pages are skipped.
 BINARY = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-"""The program, or ``None``: then the tests of the pages are skipped."""
 FLAGS = (
     "--headless=new",
     "--disable-gpu",

@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
     from lab.bed.namespaces import Host, Lab
 
+# Zenoh's usual port.
 ROUTER_PORT: Final = 7447
-"""Zenoh's usual port."""
+# The mesh port of the router of secured sites, which lets modules of all sites join.
 AUTHORITY_PORT: Final = 40001
-"""The mesh port of the router of secured sites, which lets modules of all sites join."""
+# The third byte of the addresses at every site.
 SUBNET: Final = 1
-"""The third byte of the addresses at every site."""
 
 
 @dataclass

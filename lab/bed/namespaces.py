@@ -28,16 +28,17 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
+from lab.bed.processes import Closing
 from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _PREFIX: Final = "rmpa"
+# Where ``ip`` keeps its namespaces (ip-netns(8)).
 _PLACES: Final = Path("/run/netns")
-"""Where ``ip`` keeps its namespaces (ip-netns(8))."""
 _CLONE_NEWNET: Final = 0x40000000
 _MASQUERADE: Final = """
 table ip nat {{
@@ -216,8 +217,8 @@ class Host:
         _run(["tc", "-n", self.namespace, "qdisc", "del", "dev", self.cables[cable].interface, "root"])
 
 
+# The real machine, for tests without namespaces.
 MACHINE: Final = Host("machine")
-"""The real machine, for tests without namespaces."""
 
 
 @dataclass(slots=True)
@@ -257,19 +258,13 @@ class Network:
         return f"10.77.{self.subnet}.255"
 
 
-class Lab:
+class Lab(Closing):
     """Hosts and networks that vanish at the end, whatever happened in between, with all that still runs in them."""
 
     def __init__(self) -> None:
         self._prefix = f"{_PREFIX}-{os.getpid()}-{next(_labs)}"
         self._namespaces: list[str] = []
         self._networks: dict[int, Network] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def network(self, number: int = 0, subnet: int | None = None) -> Network:
         """Network 10.77.``subnet``.0/24 (default: its number), made when first asked for."""

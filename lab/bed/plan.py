@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+# Which system: one roscore for all hosts, or one agent and core on each host.
 Kind = Literal["classic", "rmpa"]
-"""Which system: one roscore for all hosts, or one agent and core on each host."""
+# How RMPA brings messages from module to module: through both agents, or straight from node to node.
 Transport = Literal["relay", "direct"]
-"""How RMPA brings messages from module to module: through both agents, or straight from node to node."""
 Size = Literal["short", "full"]
+# Whose nodes: the ROS client library.
 Client = Literal["rospy", "roscpp"]
-"""Whose nodes: the ROS client library."""
 
 
 @dataclass(frozen=True, slots=True)

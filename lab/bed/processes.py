@@ -6,6 +6,7 @@ Start processes from the main thread: the kernel then kills them when this proce
 
 from __future__ import annotations
 
+import abc
 import asyncio
 import atexit
 import contextlib
@@ -25,15 +26,29 @@ from rmpa.core.errors import RmpaError
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+# Seconds that a caller waits for a line at the most: generous, because machines are shared.
 DEADLINE: Final = 40.0
-"""Seconds that a caller waits for a line at the most: generous, because machines are shared."""
+# Seconds from SIGTERM to SIGKILL when a process is only to be gone.
 _END_AFTER: Final = 4.0
-"""Seconds from SIGTERM to SIGKILL when a process is only to be gone."""
 
 Event = dict[str, object]
 T = TypeVar("T")
+# What starts a process; tests may put something quicker in its place.
 spawn: Callable[..., subprocess.Popen[str]] = subprocess.Popen
-"""What starts a process; tests may put something quicker in its place."""
+
+
+class Closing(abc.ABC):
+    """Is closed at the end of its ``with``."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """End it, with all that it has started."""
 
 
 class BedError(RmpaError):

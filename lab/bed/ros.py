@@ -27,20 +27,20 @@ import subprocess
 import tempfile
 import xmlrpc.client
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from lab.bed.namespaces import MACHINE, Host
-from lab.bed.processes import DEADLINE, BedError, Process, run
+from lab.bed.processes import DEADLINE, BedError, Closing, Process, run
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+# The interpreter that Debian's rospy is installed for.
 PYTHON: Final = "/usr/bin/python3"
-"""The interpreter that Debian's rospy is installed for."""
 NODES: Final = Path(__file__).parents[1] / "nodes"
 _SYSTEM_PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
+# Programs that end others, which are in sessions of their own.
 _PARENTS: Final = ("roscore", "roslaunch", "launch")
-"""Programs that end others, which are in sessions of their own."""
 _numbers = itertools.count(1)
 
 
@@ -87,7 +87,7 @@ def environment(home: Path, port: int) -> dict[str, str]:
     }
 
 
-class Ros:
+class Ros(Closing):
     """A ROS user's shell on one host; what it started ends with it.
 
     Args:
@@ -96,8 +96,8 @@ class Ros:
         port: The port of the master that its programs talk to; any program may run it.
     """
 
+    # Where its nodes are, and what they share (``*.hpp``, modules) beside what those of ``NODES`` do.
     nodes: ClassVar[Path] = NODES
-    """Where its nodes are, and what they share (``*.hpp``, modules) beside what those of ``NODES`` do."""
 
     def __init__(self, host: Host = MACHINE, home: Path | None = None, port: int = 11311) -> None:
         self.host = host
@@ -106,12 +106,6 @@ class Ros:
         (self.home / "log").mkdir(parents=True)
         self.env = environment(self.home, port)
         self._started: list[Process] = []
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     @property
     def uri(self) -> str:

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from lab.bed.plan import Kind, Plan, Transport
     from lab.bed.system import System
 
+# The nodes of ``nodes/``.
 PROGRAMS = ("source", "velocity", "sink")
-"""The nodes of ``nodes/``."""
 
 
 def why_not() -> str:

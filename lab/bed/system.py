@@ -6,13 +6,13 @@ import abc
 import collections
 import signal
 import time
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 import psutil
 
 from lab.bed import transport
 from lab.bed.agents import Agent, last_link
-from lab.bed.processes import BedError, Deadline
+from lab.bed.processes import BedError, Closing, Deadline
 from lab.bed.ros import NODES, PYTHON, Ros, compiled, words
 from rmpa.core.errors import UnreachableError
 
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot import Snapshot
 
 CORE_PORT: Final = 11311
+# Seconds until a node must have said ``up``.
 _UP: Final = 30.0
-"""Seconds until a node must have said ``up``."""
+# Seconds until all agents must be linked: 32 of them start on one machine.
 _LINKED: Final = 120.0
-"""Seconds until all agents must be linked: 32 of them start on one machine."""
 
 
 class Place:
@@ -83,7 +83,7 @@ class Place:
             host.shape(self._link, bands=self._bands)
 
 
-class System(abc.ABC):
+class System(Closing):
     """Hosts with what makes them one system: masters or agents, cables and nodes.
 
     Args:
@@ -92,8 +92,8 @@ class System(abc.ABC):
         home: An existing directory for files and logs.
     """
 
+    # The transport between its modules; ``None`` where there are none.
     _way: Transport | None = None
-    """The transport between its modules; ``None`` where there are none."""
 
     def __init__(self, place: Place, hosts: Sequence[str], home: Path) -> None:
         self._place = place
@@ -103,12 +103,6 @@ class System(abc.ABC):
         self._nodes: list[Process] = []
         self._off: set[str] = set()
         self._numbers: collections.Counter[tuple[str, str]] = collections.Counter()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     @property
     @abc.abstractmethod

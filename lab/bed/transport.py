@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from lab.bed.plan import Transport
     from lab.bed.processes import Process
 
+    # A publisher, and a subscriber of it in another module.
     Pair = tuple[Process, Process]
-    """A publisher, and a subscriber of it in another module."""
 
 _ESTABLISHED: Final = "01"
+# States in /proc/net/tcp (proc_pid_net(5)).
 _LISTENING: Final = "0A"
-"""States in /proc/net/tcp (proc_pid_net(5))."""
 
 
 def settings(transport: Transport) -> str:

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from lab.bed.plan import Transport
     from lab.bed.processes import Process
 
+# Bytes of the messages that are measured.
 SIZES: Final = (64, 64 * 1024, 1024 * 1024)
-"""Bytes of the messages that are measured."""
 RELAY: Final = Path("/usr/lib/topic_tools/relay")
 _ROUND_DEADLINE: Final = 120.0
 
@@ -200,6 +200,7 @@ class Entry:
 
 _ROS: Final = (why_no_ros,)
 _HOSTS: Final = (why_no_ros, why_no_hosts)
+# All paths of ROS and RMPA, each at its best.
 ENTRIES: Final[dict[str, Entry]] = {
     "floor_c": Entry(floor_c, needs=_ROS),  # compiled with the nodes' flags
     "floor_python": Entry(floor_python),
@@ -218,4 +219,3 @@ ENTRIES: Final[dict[str, Entry]] = {
         through("direct_one_host", "roscpp, RMPA direct, one host", "direct", flags=("--domain", "1")), needs=_ROS
     ),
 }
-"""All paths of ROS and RMPA, each at its best."""

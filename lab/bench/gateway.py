@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 
     from lab.bed.processes import Process
 
+# What ``--only`` can choose.
 PARTS: Final = ("latency", "throughput", "faults", "idle", "conversion")
-"""What ``--only`` can choose."""
 _MB: Final = 1024 * 1024
 _MODULES: Final = {"warehouse": "arm", "yard": "base"}
 _BARE_PORT: Final = 7448

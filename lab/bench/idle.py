@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+# Seconds after the last link: the burst of beacons and the first exchange are over.
 _SETTLE: Final = 4.0
-"""Seconds after the last link: the burst of beacons and the first exchange are over."""
 
 
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 _SIZE, _RATE = 64, 100.0
 _HOGS: Final = max(2, os.cpu_count() or 2)
+# µs.
 _DEADLINE: Final = 1000.0
-"""µs."""
 _CONDITIONS: Final = ("idle", "hogs")
 
 

@@ -31,18 +31,18 @@ if TYPE_CHECKING:
 
 _SIZE: Final = 64
 _RATE: Final = 50.0
+# µs within which a command is in time.
 _DEADLINE: Final = 50_000.0
-"""µs within which a command is in time."""
+# Seconds without an arrival that end a round: the pauses of TCP's repetitions are part of the figures.
 _SETTLE: Final = 2.0
-"""Seconds without an arrival that end a round: the pauses of TCP's repetitions are part of the figures."""
 _QUEUE_RATE: Final = "20mbit"
 _QUEUE: Final = "100ms"
 _IMAGE: Final = 100_000
+# Hz; 24 Mbit/s, more than the link carries.
 _IMAGE_RATE: Final = 30.0
-"""Hz; 24 Mbit/s, more than the link carries."""
 _IMAGE_QUEUE: Final = 2
+# Seconds of images before the first command that counts: the queue is full then.
 _AHEAD: Final = 2.0
-"""Seconds of images before the first command that counts: the queue is full then."""
 _CUT: Final = 2.0
 _CUT_AFTER: Final = 1.5
 _CUT_ROUND: Final = 9.0
@@ -54,8 +54,8 @@ depth = 1
 lifespan = "100 ms"
 """
 _RELAYED: Final = schedule.AgentPair("agents", "RMPA relayed", "relay", _COMMAND)
+# Percent of the packets, by part.
 _LOSS: Final = {"loss_1": 1, "loss_5": 5, "loss_20": 20}
-"""Percent of the packets, by part."""
 PARTS: Final = ("quiet", *_LOSS, "queue", "cut")
 
 FULL: Final = schedule.Rounds(20.0, 5)
@@ -67,10 +67,10 @@ class RadioScore:
     """The commands of one way in one part, the images beside them, and its interruptions."""
 
     commands: schedule.LatencyScore = field(default_factory=schedule.LatencyScore)
+    # A second, of each round.
     images: list[float] = field(default_factory=list)
-    """A second, of each round."""
+    # Of each cut: ms from its end to the first command that came in time.
     back: list[float] = field(default_factory=list)
-    """Of each cut: ms from its end to the first command that came in time."""
 
     def row(self) -> dict[str, object]:
         """For the result."""

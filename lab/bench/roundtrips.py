@@ -29,20 +29,20 @@ if TYPE_CHECKING:
 
     from lab.bench.contenders import RoundTripPath
 
+# Round trips of each turn that are thrown away: caches and the processor's clock come up.
 _WARM_UP: Final = 20
-"""Round trips of each turn that are thrown away: caches and the processor's clock come up."""
 _BASE: Final = "roscpp_nodelay"
 _RELAYS: Final = "relays"
+# Roscpp over the same kind of cable as the agents'.
 _CABLE: Final = "roscpp_hosts"
-"""Roscpp over the same kind of cable as the agents'."""
 _OURS: Final = "agents_hosts"
 _DIRECT: Final = "direct_hosts"
 _DIRECT_LIMITS: Final = {"p50": 1.05, "p99": 1.15}
 _RELAYED_LIMIT: Final = 2.0
+# Percent of a core: what two looks at an idle agent differ by.
 _IDLE_LIMIT: Final = 0.5
-"""Percent of a core: what two looks at an idle agent differ by."""
+# A whole period of what agents do while nothing happens: the heartbeat's.
 _IDLE_SECONDS: Final = 5.0
-"""A whole period of what agents do while nothing happens: the heartbeat's."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,17 +37,17 @@ if TYPE_CHECKING:
     from lab.bed.processes import Process
     from lab.bed.ros import Ros
 
+# Seconds of each round whose messages are thrown away: caches and the processor's clock come up.
 LEAD_IN: Final = 0.2
-"""Seconds of each round whose messages are thrown away: caches and the processor's clock come up."""
+# Seconds from the command to the first message.
 _START: Final = 0.02
-"""Seconds from the command to the first message."""
+# Seconds without an arrival after which a round is over.
 SETTLE: Final = 0.3
-"""Seconds without an arrival after which a round is over."""
 _FLOWING_DEADLINE: Final = 30.0
+# Seconds of sleeps, before and after, that tell how late the machine itself wakes.
 _HOST_LATENESS: Final = 2.0
-"""Seconds of sleeps, before and after, that tell how late the machine itself wakes."""
+# Of measuring nodes under SCHED_FIFO: below the agents', as a user's nodes would be.
 NODE_PRIORITY: Final = 40
-"""Of measuring nodes under SCHED_FIFO: below the agents', as a user's nodes would be."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 _SIZES: Final = (64, 64 * 1024, 1024 * 1024)
 _HOWS: Final = ("once", "persistent")
 _TARGET: Final = 2.0
+# Of persistent calls: what one of its own connection asks of the core costs the same by either transport.
 _DIRECT_TARGET: Final = 1.1
-"""Of persistent calls: what one of its own connection asks of the core costs the same by either transport."""
+# Seconds until calls go straight to the server.
 _DIRECT_WITHIN: Final = 20.0
-"""Seconds until calls go straight to the server."""
+# Calls of each turn that are thrown away.
 _WARM_UP: Final = 20
-"""Calls of each turn that are thrown away."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from lab.bed.plan import Transport
 
 _TARGET: Final = 0.5
+# Seconds that the first message may come later where the route is direct.
 _LATER: Final = 0.010
-"""Seconds that the first message may come later where the route is direct."""
 _TRANSPORTS: Final[dict[Transport, str]] = {"relay": "", "direct": ", RMPA direct"}
+# Seconds that the waiting nodes get to come up before the second agent starts.
 _SETTLE: Final = 1.5
-"""Seconds that the waiting nodes get to come up before the second agent starts."""
 
 
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:

@@ -36,19 +36,19 @@ if TYPE_CHECKING:
     from lab.bed.ros import Ros
 
 _MB: Final = 1024 * 1024
+# Messages in the queues of publisher and subscriber: about 2 and 50 MB.
 _QUEUE: Final = {64: 10_000, _MB: 50}
-"""Messages in the queues of publisher and subscriber: about 2 and 50 MB."""
+# What is to be reached of direct roscpp.
 _LIMITS: Final = {64: 0.6, _MB: 0.4}
-"""What is to be reached of direct roscpp."""
+# What the direct transport is to reach of roscpp over the same cable.
 _DIRECT_LIMIT: Final = 0.95
-"""What the direct transport is to reach of roscpp over the same cable."""
 _TOPIC: Final = "/flood"
 _CORES: Final = 2
+# Seconds from the first message to the begin of a window, usually: queues are as full as they get.
 _SETTLE: Final = 1.0
-"""Seconds from the first message to the begin of a window, usually: queues are as full as they get."""
 _FIRST_DEADLINE: Final = 30.0
+# Percent of a core that the rest of the machine may use, soft interrupts included, which count for no process.
 _QUIET: Final = 20.0
-"""Percent of a core that the rest of the machine may use, soft interrupts included, which count for no process."""
 
 
 @dataclass(frozen=True, slots=True)

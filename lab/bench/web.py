@@ -26,19 +26,19 @@ if TYPE_CHECKING:
 
     from lab.web.servers import WebServer
 
+# What ``--only`` can choose.
 PARTS: Final = ("messages", "slow", "page")
-"""What ``--only`` can choose."""
 _MIB: Final = 1 << 20
 _CLIENTS: Final = 4
 _SDK_TARGET: Final = 1.5
+# Megabytes of 2^20 bytes.
 _SLOW_TARGET: Final = 16.0
-"""Megabytes of 2^20 bytes."""
+# Percent of a core.
 _PAGE_TARGET: Final = 5.0
-"""Percent of a core."""
 _FRAMES_TARGET: Final = 30.0
 _PAINT_TARGET: Final = 1000.0
+# KB of 1,000 bytes.
 _BYTES_TARGET: Final = 250.0
-"""KB of 1,000 bytes."""
 _MODULES: Final = 16
 _SLOW_WAYS: Final = ("rmpa cbor-raw", "rmpa foxglove", "sdk foxglove")
 

@@ -11,10 +11,10 @@ import msgspec
 
 import rmpa
 
+# What measures, and what is measured.
 _PACKAGES: Final = (Path(__file__).parents[1], Path(rmpa.__file__).parent)
-"""What measures, and what is measured."""
+# Folders that may change while a run is made: they show what was measured, or are that.
 _MEASURE_NOTHING: Final = ("cli/", "experiments/report/", "results/")
-"""Folders that may change while a run is made: they show what was measured, or are that."""
 
 
 class Code(msgspec.Struct, frozen=True, kw_only=True):

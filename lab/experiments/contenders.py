@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from lab.experiments.model import Cell, Measured, Results, Value
 
 
+# The transport of RMPA's topics; ``mixed``: some of them are direct.
 Way = Literal["relay", "direct", "mixed"]
-"""The transport of RMPA's topics; ``mixed``: some of them are direct."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,20 +63,20 @@ class Contender:
                 yield cell, measured
 
 
+# With tcp_nodelay: its best setting, and what RMPA is held against.
 CLASSIC: Final = Contender("classic", "classic")
-"""With tcp_nodelay: its best setting, and what RMPA is held against."""
+# As it comes.
 DEFAULTS: Final = Contender("classic, nodelay off", "classic", nodelay=False)
-"""As it comes."""
+# With as many processes between as RMPA has: a relay in C++ on either host, also with tcp_nodelay.
 RELAYS: Final = Contender("classic, two relays", "classic", relays=2)
-"""With as many processes between as RMPA has: a relay in C++ on either host, also with tcp_nodelay."""
+# Relayed: each message passes both agents.
 RMPA: Final = Contender("RMPA", "rmpa")
-"""Relayed: each message passes both agents."""
+# From node to node; the agents have only made it so.
 DIRECT: Final = Contender("RMPA direct", "rmpa", way="direct")
-"""From node to node; the agents have only made it so."""
+# Images from node to node, commands through the agents.
 MIXED: Final = Contender("RMPA, images direct", "rmpa", way="mixed")
-"""Images from node to node, commands through the agents."""
+# Those that take turns in every experiment.
 COMPARED: Final = (CLASSIC, RMPA, DIRECT)
-"""Those that take turns in every experiment."""
 
 
 def turn(order: Sequence[Contender], number: int) -> list[Contender]:

@@ -41,39 +41,39 @@ if TYPE_CHECKING:
     from lab.experiments.contenders import Contender
     from lab.experiments.model import Results, Value
 
+# Hz, of commands and of the polling velocity node; the paper's.
 RATE: Final = 10.0
-"""Hz, of commands and of the polling velocity node; the paper's."""
 HOSTS: Final = ("joystick", "velocity", "base", "pc")
 CMD: Final = "/cmd"
 VEL: Final = "/vel"
+# For each topic the publishing host, and the subscribing ones.
 _FLOWS: Final = {CMD: ("joystick", "velocity", "pc"), VEL: ("velocity", "base", "pc")}
-"""For each topic the publishing host, and the subscribing ones."""
+# The paper's velocity node, which looks for a command at 10 Hz, and one that takes each as it comes.
 MODES: Final = ("polled", "event")
-"""The paper's velocity node, which looks for a command at 10 Hz, and one that takes each as it comes."""
 _NODES: Final = {"polled": "polled velocity node", "event": "event-driven velocity node"}
+# Bytes of a message: about a Joy's or a Twist's.
 _SIZE: Final = 64
-"""Bytes of a message: about a Joy's or a Twist's."""
+# Messages at the beginning of a round that are not counted.
 _LEAD: Final = 2
-"""Messages at the beginning of a round that are not counted."""
 _MESSAGES: Final = {"short": 10, "full": 100}
 _ROUNDS: Final = {"short": 1, "full": 4}
+# Of classic ROS without tcp_nodelay: a figure beside the others, on which no claim rests.
 _DEFAULTS_ROUNDS: Final = 1
-"""Of classic ROS without tcp_nodelay: a figure beside the others, on which no claim rests."""
 _RELAYS_ROUNDS: Final = 3
+# Seconds until a system of four hosts and its nodes are up, about.
 _SETUP: Final = 4.5
-"""Seconds until a system of four hosts and its nodes are up, about."""
+# From both ends of a period no phase is taken: there, chance would add a whole period to one of two equal delays.
 _MARGIN_MS: Final = 10.0
-"""From both ends of a period no phase is taken: there, chance would add a whole period to one of two equal delays."""
+# Below that, one bad moment of the machine decides a ratio.
 _ROUNDS_NEEDED: Final = 3
-"""Below that, one bad moment of the machine decides a ratio."""
 _JITTER_LIMIT: Final = 1.1
 _DELAY_LIMITS_MS: Final = {RMPA: 0.2, DIRECT: 0.05}
+# As many processes on the way, each at its best.
 _RELAYS_LIMIT: Final = 1.0
-"""As many processes on the way, each at its best."""
+# No worse: within a hundredth, which is half a ms of the mean of 50.
 _POLLED_LIMIT: Final = 1.01
-"""No worse: within a hundredth, which is half a ms of the mean of 50."""
+# Of means and deviations: as many as the paper has.
 _DIGITS: Final = 4
-"""Of means and deviations: as many as the paper has."""
 
 _QUANTITIES: Final = {"cmd": "Command Order", "vel": "Velocity Order", "delay": "Control Computation Delay"}
 _PAPER: Final = {

@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 
 HOSTS: Final = ("joystick", "velocity", "base", "pc")
 _SIZE: Final = 64
+# Seconds of the sources' one round: longer than any observation.
 _FOR: Final = 180.0
-"""Seconds of the sources' one round: longer than any observation."""
+# Seconds that a node has to say ``up`` after its host is on again; one that cannot reach its master says nothing.
 _UP_WITHIN: Final = 5.0
-"""Seconds that a node has to say ``up`` after its host is on again; one that cannot reach its master says nothing."""
 _FLOWING_WITHIN: Final = 30.0
 _BY_HAND_WITHIN: Final = 10.0
 
@@ -71,15 +71,15 @@ NODES: Final = (
 )
 _BY_NAME: Final = {node.name: node for node in NODES}
 _KEYS: Final = {one.key for one in FLOWS}
+# Nodes that publish, and those of other hosts that subscribe.
 _PAIRS: Final = (
     *(("stick", sink) for sink in ("log", "controller", "display")),
     ("controller", "display"),
     ("controller", "wheels"),
     ("battery", "lamp"),
 )
-"""Nodes that publish, and those of other hosts that subscribe."""
+# Sources, and the sinks at which all topics come if they send.
 _LEADS: Final = (("stick", "log"), ("stick", "display"), ("stick", "wheels"), ("battery", "lamp"))
-"""Sources, and the sinks at which all topics come if they send."""
 
 
 @dataclass(frozen=True, slots=True)

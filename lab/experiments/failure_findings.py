@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from lab.experiments.contenders import Contender
     from lab.experiments.model import Cell, Measured, Results
 
+# Messages a second of each source.
 RATE: Final = 50.0
-"""Messages a second of each source."""
+# Seconds without a message that are an outage: ten messages.
 _STILL: Final = 0.2
-"""Seconds without a message that are an outage: ten messages."""
+# Seconds before the end in which messages that are not there yet are not counted as lost.
 _ON_THE_WAY: Final = 0.3
-"""Seconds before the end in which messages that are not there yet are not counted as lost."""
+# Seconds from due to there beyond which a message that came is late.
 _LATE: Final = 0.1
-"""Seconds from due to there beyond which a message that came is late."""
 _AGAIN_WITHIN: Final = 1.0
 
 

@@ -30,16 +30,16 @@ if TYPE_CHECKING:
 
     from lab.bed.processes import Process
 
+# Bytes at the least of a measured message.
 HEAD: Final = 16
-"""Bytes at the least of a measured message."""
+# Seconds without an arrival after which a round is over, unless the caller says otherwise.
 SETTLE: Final = 0.3
-"""Seconds without an arrival after which a round is over, unless the caller says otherwise."""
 _NOTES: Final = ("topic", "sequence", "due_ns", "came_ns")
 _NOTED: Final = 30.0
+# Seconds beyond its plan that a source may take until it said ``sent``.
 _SLACK: Final = 30.0
-"""Seconds beyond its plan that a source may take until it said ``sent``."""
+# Rate and count of the rounds that only show that messages flow.
 _PROBE: Final = (100.0, 10)
-"""Rate and count of the rounds that only show that messages flow."""
 _rounds = itertools.count(1)
 _files = itertools.count(1)
 

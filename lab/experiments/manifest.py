@@ -10,8 +10,8 @@ from lab.bed.plan import Plan  # noqa: TC001 - msgspec reads these types when it
 from lab.experiments.code import Code  # noqa: TC001 - likewise
 from lab.experiments.model import Value  # noqa: TC001 - likewise
 
+# Of ``manifest.json``; another number is another layout.
 FORMAT = 1
-"""Of ``manifest.json``; another number is another layout."""
 
 
 class CellRecord(msgspec.Struct, frozen=True, kw_only=True):

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from lab.bed.stage import Stage
     from lab.findings import Findings
 
+# What a setting or a cell of a table may be.
 Value = str | int | float | bool | None
-"""What a setting or a cell of a table may be."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,29 +27,29 @@ if TYPE_CHECKING:
     from lab.experiments.model import Measured, Results
 
 _KB: Final = 1024
+# Bytes: 1 KB to 1 MB, doubling; a few of them to see that it works.
 SIZES: Final = {
     "short": tuple(_KB * kb for kb in (1, 16, 128, 512)),
     "full": tuple(_KB << power for power in range(11)),
 }
-"""Bytes: 1 KB to 1 MB, doubling; a few of them to see that it works."""
 BATCHES: Final = {"short": (5,), "full": (100, 1000)}
+# How a cell says that no link is shaped.
 UNSHAPED: Final = "none"
-"""How a cell says that no link is shaped."""
+# Hz at the most: the next message is due long after the last one came.
 _FASTEST: Final = 400.0
-"""Hz at the most: the next message is due long after the last one came."""
+# Of the link, at the most, so that no message waits behind the one before.
 _FILLED: Final = 0.7
-"""Of the link, at the most, so that no message waits behind the one before."""
+# Bits on the wire for one of payload: headers of Ethernet, IP and TCP, and a little for acknowledgements.
 _OVERHEAD: Final = 1.06
-"""Bits on the wire for one of payload: headers of Ethernet, IP and TCP, and a little for acknowledgements."""
+# Taken as carried where no link is shaped: what a process must copy several times on two cores.
 _UNSHAPED_BITS: Final = 400e6
-"""Taken as carried where no link is shaped: what a process must copy several times on two cores."""
+# Seconds for the batch of one size; beyond that it is cut short, to the smallest batch at the least.
 _LONGEST: Final = {"short": 1.0, "full": 5.0}
-"""Seconds for the batch of one size; beyond that it is cut short, to the smallest batch at the least."""
 _SETUP: Final = 5.0
 _R2_LIMIT: Final = 0.99
 _SIZES_NEEDED: Final = 3
+# Of the direct transport's p50 by classic ROS's, on a cable that is not shaped: the wire hides nothing there.
 _DIRECT_LIMIT: Final = 1.05
-"""Of the direct transport's p50 by classic ROS's, on a cable that is not shaped: the wire hides nothing there."""
 _DIRECT_SIZES: Final = (64 * _KB, _KB * _KB)
 _UNITS: Final = {"": 1.0, "k": 1e3, "m": 1e6, "g": 1e9}
 
@@ -189,8 +189,8 @@ class Kind:
 
 
 Found = dict[Kind, dict["Contender", Ladder]]
+# Of tables.
 _ORDER: Final = (RMPA, DIRECT, CLASSIC)
-"""Of tables."""
 
 
 def _measured(results: Results) -> Found:

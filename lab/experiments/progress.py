@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
     from lab.experiments.model import Cell
 
+# Times a second that the bar is drawn anew: seldom, for the machine is being measured.
 _REFRESH: Final = 1.0
-"""Times a second that the bar is drawn anew: seldom, for the machine is being measured."""
 
 
 class Progress:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from lab.experiments.model import Experiment
 
+# By name, in the report's order: the module, whose ``EXPERIMENT`` it is, and what it finds out in a few words.
 EXPERIMENTS: Final[Mapping[str, tuple[str, str]]] = {
     "control": ("lab.experiments.control", "rates and control delay at 10 Hz (Figs. 8 and 9, Table 1)"),
     "rates": ("lab.experiments.rates", "latency against rate (Fig. 10)"),
@@ -21,7 +22,6 @@ EXPERIMENTS: Final[Mapping[str, tuple[str, str]]] = {
     "scaling": ("lab.experiments.scaling", "what 2 to 32 modules cost"),
     "images": ("lab.experiments.images", "commands beside images on one cable"),
 }
-"""By name, in the report's order: the module, whose ``EXPERIMENT`` it is, and what it finds out in a few words."""
 
 
 def find_experiment(name: str) -> Experiment:

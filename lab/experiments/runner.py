@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from lab.experiments.progress import Progress
     from lab.experiments.store import Store
 
+# Each cell's table of how late the machine's own wake-ups came: ``when`` (before, after the cell), ``late_us``.
 LATENESS: Final = "lateness"
-"""Each cell's table of how late the machine's own wake-ups came: ``when`` (before, after the cell), ``late_us``."""
+# Of sleeps before and after each cell.
 LATENESS_SECONDS: Final = 0.3
-"""Of sleeps before and after each cell."""
+# How often a cell is tried.
 ATTEMPTS: Final = 2
-"""How often a cell is tried."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +46,8 @@ class Outcome:
     failed: tuple[tuple[str, str, str], ...]
 
 
+# An experiment, and which of its cells are wanted.
 Job = tuple["Experiment", "Sequence[Cell]"]
-"""An experiment, and which of its cells are wanted."""
 
 
 def to_measure(jobs: Sequence[Job], store: Store) -> list[tuple[Experiment, Cell]]:

@@ -29,23 +29,23 @@ if TYPE_CHECKING:
     from lab.experiments.contenders import Contender
     from lab.experiments.model import Value
 
+# The module that sends; with classic ROS it has the master.
 FIRST: Final = "pc"
-"""The module that sends; with classic ROS it has the master."""
 _HELLO, _PROBE = "/hello", "/probe"
 _SIZE: Final = 64
+# Hz: the time of the first message is known to 20 ms.
 _HELLO_RATE: Final = 50.0
-"""Hz: the time of the first message is known to 20 ms."""
 _PROBE_RATE: Final = 100.0
+# Seconds of the probe flow that are thrown away.
 _LEAD_IN: Final = 0.5
-"""Seconds of the probe flow that are thrown away."""
 _UP_WITHIN: Final = 60.0
 _JOINED_WITHIN: Final = 30.0
 _LATENCY_LIMIT: Final = 1.1
 _MESH_LIMIT: Final = 2.0
+# Messages below which nothing is said of a latency.
 _ENOUGH: Final = 500
-"""Messages below which nothing is said of a latency."""
+# Percent of a core: where all agents of the test machine take more of it, the report says so.
 _BUSY: Final = 50.0
-"""Percent of a core: where all agents of the test machine take more of it, the report says so."""
 _TRAFFIC: Final = ("tx_bytes", "rx_bytes", "tx_packets", "rx_packets")
 
 

@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
 _MANIFEST: Final = "manifest.json"
 _LOCK: Final = ".lock"
+# Facts of the machine that must not change within a run.
 _SAME_MACHINE: Final = ("cpu", "cores", "kernel", "python", "roscpp", "rospy")
-"""Facts of the machine that must not change within a run."""
+# Characters of a directory's name; file systems take 255 bytes.
 _LONGEST_NAME: Final = 200
-"""Characters of a directory's name; file systems take 255 bytes."""
 
 
 class Store:

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 HOSTS: Final = ("joystick", "pc")
 TOPIC: Final = "/cmd"
+# Seconds at the beginning of each step whose messages are not counted: caches and the processor's clock come up.
 LEAD: Final = 0.1
-"""Seconds at the beginning of each step whose messages are not counted: caches and the processor's clock come up."""
+# Seconds without an arrival after which a step is over: beyond the delayed acknowledgement's 40 ms, on any link.
 SETTLE: Final = 0.2
-"""Seconds without an arrival after which a step is over: beyond the delayed acknowledgement's 40 ms, on any link."""
 QUEUE: Final = 1000
 
 

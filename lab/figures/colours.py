@@ -15,8 +15,8 @@ _OTHERS: Final = ("#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 _LINES: Final = ("solid", "dashed", "dotted", "dashdot")
 _MARKERS: Final = {"classic": "o^vD", "rmpa": "sPXd", "direct": "*<>h", "mixed": "p8H+"}
 _OTHER_MARKERS: Final = "*<>h"
+# How far a further series of one system goes towards white, or (below 0) black.
 _SHADES: Final = (0.0, 0.4, -0.35, 0.6)
-"""How far a further series of one system goes towards white, or (below 0) black."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from lab.figures.panels import Drawn
     from lab.findings import Figure, Panel
 
+# Inches; shown 830 pixels wide, as on a project's page, a letter of 9 points is 11 pixels high.
 _WIDTH: Final = 9.6
-"""Inches; shown 830 pixels wide, as on a project's page, a letter of 9 points is 11 pixels high."""
+# Letters of a title in one line.
 _LINE: Final = 105
-"""Letters of a title in one line."""
+# Labels that the legend of a whole figure holds where its panels differ in them.
 _LEGEND: Final = 4
-"""Labels that the legend of a whole figure holds where its panels differ in them."""
+# How many times as large the values of one panel may be that shares its axis with another.
 _FOOT: Final = 8.0
-"""How many times as large the values of one panel may be that shares its axis with another."""
 _STYLE: Final[dict[Any, Any]] = {  # keys of matplotlib's own type, which differs between its versions
     "font.family": "DejaVu Sans",  # matplotlib brings it along
     "font.size": 9.0,

@@ -21,22 +21,22 @@ if TYPE_CHECKING:
     from lab.figures.colours import Look
     from lab.findings import Panel, Series
 
+# Characters of all groups' names that have room beside each other in a panel.
 _WORDS_LEVEL: Final = 20
-"""Characters of all groups' names that have room beside each other in a panel."""
+# Points of a series that are drawn; of more, evenly chosen ones and the outermost.
 _MOST: Final = 3000
-"""Points of a series that are drawn; of more, evenly chosen ones and the outermost."""
+# Points up to which a line shows each.
 _FEW: Final = 40
-"""Points up to which a line shows each."""
 _BARS_WITH_NUMBERS: Final = 14
+# Points from which an SVG holds them as an image.
 _RASTER: Final = 300
-"""Points from which an SVG holds them as an image."""
 _FRACTIONS: Final = ("axes fraction", "axes fraction")
+# Of the distribution beside a panel.
 _CLASSES: Final = 32
-"""Of the distribution beside a panel."""
+# How many times the distance of p2 and p98 an axis goes beyond them at the most.
 _ROOM: Final = 0.8
-"""How many times the distance of p2 and p98 an axis goes beyond them at the most."""
+# Multiples of it scatter evenly, and the same each time.
 _GOLDEN: Final = 0.6180339887498949
-"""Multiples of it scatter evenly, and the same each time."""
 QUIET: Final = "#444444"
 DASHES: Final = (0, (4, 3))
 

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 T = TypeVar("T")
+# The first bytes of a measured message: round, sequence from 0, and the ns at which it was due at its source.
 HEAD: Final = struct.Struct("=IIQ")
-"""The first bytes of a measured message: round, sequence from 0, and the ns at which it was due at its source."""
+# Nanoseconds from the command to the first message of a round.
 LEAD: Final = 20_000_000
-"""Nanoseconds from the command to the first message of a round."""
+# Nanoseconds without a message after which the next one comes ``again``.
 _PAUSE: Final = 500_000_000
-"""Nanoseconds without a message after which the next one comes ``again``."""
+# Seconds of waiting for silence at the most.
 _PATIENCE: Final = 10.0
-"""Seconds of waiting for silence at the most."""
 _LOOK: Final = 0.02
 _PHASE: Final = "ms from a whole multiple of the period on CLOCK_MONOTONIC to each due moment; default: any"
 _PR_SET_TIMERSLACK: Final = 29

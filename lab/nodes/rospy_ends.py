@@ -8,8 +8,8 @@ from std_msgs.msg import UInt8MultiArray
 
 from node import Subscribers
 
+# Bytes: rospy's own 64 KiB make it slow with large messages.
 _READ_AT_ONCE = 1 << 21
-"""Bytes: rospy's own 64 KiB make it slow with large messages."""
 
 
 class Counted(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no types

@@ -13,8 +13,8 @@ from node import say
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+# Seconds after which a round trip is lost.
 TIMEOUT = 1.0
-"""Seconds after which a round trip is lost."""
 
 
 def measure(trips_of: Callable[[int], Callable[[], bool]], first: int = 64) -> None:

@@ -29,16 +29,16 @@ if TYPE_CHECKING:
 
 TOPICS_EACH: Final = 20
 SERVICES_EACH: Final = 4
+# One topic in so many flows; the others are offered, and this module does not subscribe to them.
 _ACTIVE: Final = 3
-"""One topic in so many flows; the others are offered, and this module does not subscribe to them."""
+# Seconds.
 _SNAPSHOT_EVERY: Final = 0.1
-"""Seconds."""
+# Of a message: a nav_msgs/Odometry.
 _BYTES: Final = 712
-"""Of a message: a nav_msgs/Odometry."""
+# With churn one module in so many is away, each time another one.
 _ABSENT: Final = 8
-"""With churn one module in so many is away, each time another one."""
+# With churn a module with a new name stays for so many changes.
 _VISIT: Final = 30
-"""With churn a module with a new name stays for so many changes."""
 
 
 class Mesh:
@@ -54,8 +54,8 @@ class Mesh:
         self._name = name
         self._modules = modules
         self._churn = churn
+        # Seconds since the epoch; the figures move from there on.
         self.began = time.time()
-        """Seconds since the epoch; the figures move from there on."""
 
     def add(self, real: Snapshot) -> Snapshot:
         """A real agent's snapshot with the modules, which it would say if they were there."""
@@ -188,8 +188,8 @@ class ControlProxy(socketserver.ThreadingUnixStreamServer):
 
     def __init__(self, path: Path, agent: Path, mesh: Mesh) -> None:
         self.agent = agent
+        # The newest reply, made beforehand: a real agent needs a millisecond for it, this program ten.
         self.snapshot = b""
-        """The newest reply, made beforehand: a real agent needs a millisecond for it, this program ten."""
         self._mesh = mesh
         self._make()
         threading.Thread(target=self._keep_fresh, name="snapshots", daemon=True).start()

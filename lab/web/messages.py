@@ -23,17 +23,17 @@ if TYPE_CHECKING:
     from lab.web.servers import WebServer
     from lab.web.subscriptions import How
 
+# Seconds without a message after which a round is over.
 _SETTLE: Final = 0.5
-"""Seconds without a message after which a round is over."""
+# Messages before a turn, until each client has had one.
 _WARM_UP: Final = 5
-"""Messages before a turn, until each client has had one."""
 _WARM_TURNS: Final = 20
+# The same beside a client that does not read.
 _STALLED_TURNS: Final = 3
-"""The same beside a client that does not read."""
+# Seconds behind the last message in which the slowest server has sent what it sends.
 _WITHIN: Final = 60.0
-"""Seconds behind the last message in which the slowest server has sent what it sends."""
+# Seconds between looks at a server's memory.
 _SAMPLE: Final = 0.02
-"""Seconds between looks at a server's memory."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from lab.bed.processes import Process
 
 MODULE: Final = "pc"
+# Seconds after the first state: the hub has read the graph, and rates are smooth.
 _SETTLE: Final = 3.0
-"""Seconds after the first state: the hub has read the graph, and rates are smooth."""
 _FRAMES: Final = """
 new Promise((done) => {
   const times = [];

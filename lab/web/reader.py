@@ -22,10 +22,10 @@ from lab.web.websocket import WebSocket
 if TYPE_CHECKING:
     from lab.web.subscriptions import How
 
+# Seconds between looks whether nothing comes any more.
 _LOOK: Final = 0.05
-"""Seconds between looks whether nothing comes any more."""
+# Characters of a text that a server sends in place of a message; it is shown.
 _FIRST_TEXT: Final = 300
-"""Characters of a text that a server sends in place of a message; it is shown."""
 
 
 class Client:

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from lab.web.subscriptions import How
 
 _ROOT: Final = Path(__file__).parents[2]
+# Of the publisher, messages for each subscriber.
 _QUEUE: Final = 8
-"""Of the publisher, messages for each subscriber."""
 _URL_WITHIN: Final = 30.0
 
 

@@ -12,21 +12,21 @@ from lab.nodes.node import HEAD
 if TYPE_CHECKING:
     from lab.web.websocket import WebSocket
 
+# Foxglove's protocol, or an encoding of rosbridge's.
 How = Literal["foxglove", "cbor-raw", "cbor", "json"]
-"""Foxglove's protocol, or an encoding of rosbridge's."""
 HOWS: Final[tuple[How, ...]] = ("foxglove", "cbor-raw", "cbor", "json")
+# Of the measured messages.
 TYPE: Final = "std_msgs/UInt8MultiArray"
-"""Of the measured messages."""
+# The only subprotocol that foxglove-sdk's server accepts.
 FOXGLOVE: Final = "foxglove.sdk.v1"
-"""The only subprotocol that foxglove-sdk's server accepts."""
+# Bytes of a ROS 1 message of ``TYPE`` before its data: no dimensions, the offset, and the data's length.
 _LAYOUT: Final = 12
-"""Bytes of a ROS 1 message of ``TYPE`` before its data: no dimensions, the offset, and the data's length."""
 _DATA_OPCODE: Final = 1
+# Of a Foxglove message: opcode, subscription (4 bytes), time (8).
 _DATA_HEADER: Final = 13
-"""Of a Foxglove message: opcode, subscription (4 bytes), time (8)."""
 _JSON: Final = re.compile(r'"data":\s*"([A-Za-z0-9+/=]{24})')
+# The key before the byte string that matters, with its CBOR head: text of 5 and of 4 bytes.
 _CBOR: Final = {"cbor-raw": b"ebytes", "cbor": b"ddata"}
-"""The key before the byte string that matters, with its CBOR head: text of 5 and of 4 bytes."""
 
 
 def protocol_of(how: How) -> str:

@@ -10,8 +10,8 @@ from websockets.typing import Subprotocol
 
 from lab.bed.processes import BedError, Deadline
 
+# Seconds for the handshake, and for a message that a caller waits for.
 _TIMEOUT: Final = 30.0
-"""Seconds for the handshake, and for a message that a caller waits for."""
 
 
 class WebSocket:

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Final, Self, TypeAlias
 import msgspec
 
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
-from rmpa.core.schedule import positive
+from rmpa.core.timers import positive
 from rmpa.observe import limits
 from rmpa.observe.control import GraphRevision
 from rmpa.observe.control_client import ControlClient, choose_agent
@@ -227,7 +227,7 @@ class AgentClient:
             UnreachableError: No agent answers, or none of that name.
             RmpaError: Several agents run, and none is selected.
         """
-        await self._find()
+        self._path = (await asyncio.to_thread(choose_agent, os.environ, self._name)).path
         return self
 
     async def __aexit__(
@@ -286,9 +286,6 @@ class AgentClient:
         if self._path is None:
             raise RmpaError("the agent is not known: write `async with AgentClient() as agent:`")
         return self._path
-
-    async def _find(self) -> None:
-        self._path = (await asyncio.to_thread(choose_agent, os.environ, self._name)).path
 
 
 async def _snapshots(client: ControlClient, period: float) -> AsyncGenerator[Snapshot, None]:

@@ -25,10 +25,9 @@ from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
 from rmpa.config.limits import SERVICE_TIMEOUT
 from rmpa.core.errors import RmpaError
-from rmpa.core.schedule import positive
+from rmpa.core.timers import positive
 from rmpa.ros import limits
-from rmpa.ros.node.endpoints import check_plain
-from rmpa.ros.node.node import Node
+from rmpa.ros.node.node import Node, check_plain
 from rmpa.runtime.tasks import end_tasks
 
 if TYPE_CHECKING:

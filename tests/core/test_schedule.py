@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core.schedule import Schedule
+from rmpa.core.timers import Schedule
 
 
 def test_times_are_absolute_whatever_the_work_takes() -> None:

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from lab.experiments.model import Experiment
     from lab.findings import Claim
 
+# Facts that differ from one minute to the next, or are said with the code.
 _NOT_OF_THE_MACHINE: Final = {"load", "commit", "rmpa"}
-"""Facts that differ from one minute to the next, or are said with the code."""
 
 
 @dataclass(frozen=True, slots=True)

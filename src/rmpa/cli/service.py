@@ -85,14 +85,15 @@ def probe(master: Master, names: Iterable[str]) -> dict[str, Probed]:
     Raises:
         UnreachableError: The master does not answer.
     """
-    from rmpa.ros.node.endpoints import probe as ask
+    from rmpa.ros.node.service_client import ServiceConnection
 
     async def one(name: str) -> Probed:
         uri = ""
         async with turns:
             try:
                 uri = await _lookup(master, name)
-                return Probed(uri, (await ask(uri, name, _CALLER_ID, limits.SERVICE_OPEN_TIMEOUT)).description)
+                found = await ServiceConnection.probe(uri, name, _CALLER_ID, limits.SERVICE_OPEN_TIMEOUT)
+                return Probed(uri, found.description)
             except RmpaError as error:
                 return Probed(uri, None, str(error))
 

@@ -1,4 +1,4 @@
-"""Time in protocol machines: many timers in a heap, back-off, token buckets, and yielding to pending data.
+"""Time in protocol machines: many timers in a heap, periods, back-off, token buckets, and yielding to pending data.
 
 Machines get ``now`` and never read a clock: seconds (float) of a monotonic clock with an arbitrary zero. Stamps on
 the wire are nanoseconds (int) of the sender's wall clock.
@@ -6,6 +6,7 @@ the wire are nanoseconds (int) of the sender's wall clock.
 
 from __future__ import annotations
 
+import math
 from heapq import heapify, heappop, heappush
 from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
 
@@ -163,3 +164,33 @@ class Yielder(Protocol):
     def __call__(self, items: Iterable[_T], /) -> Iterable[_T]:
         """The same items."""
         ...
+
+
+def positive(value: float, what: str) -> float:
+    """The value, if it is above 0 and finite; else ValueError."""
+    if not 0 < value < math.inf:
+        raise ValueError(f"{what} is above 0 and finite, not {value:g}")
+    return value
+
+
+class Schedule:
+    """The due times of a periodic task: start, start + period, start + 2 periods and so on.
+
+    The times are absolute, so that lateness does not add up. A due time that is a whole period past is skipped.
+
+    Args:
+        period: The period in seconds, above 0.
+        start: The first due time, in monotonic seconds.
+    """
+
+    def __init__(self, period: float, start: float) -> None:
+        self.period = period
+        self._start = start
+        self._tick = -1
+
+    def next_due(self, now: float) -> tuple[float, int]:
+        """Advance to the next due time; returns it in monotonic seconds like ``now``, and how many were skipped."""
+        self._tick += 1
+        late = max(0, math.floor((now - self._start) / self.period + _ROUNDING) - self._tick)
+        self._tick += late
+        return self._start + self._tick * self.period, late

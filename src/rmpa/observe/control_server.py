@@ -188,7 +188,7 @@ class ControlServer:
                 # its place among the clients for so long.
                 async with asyncio.timeout(1.0):
                     await reader.read(limits.CONTROL_REQUEST_MAX)
-        except (OSError, TimeoutError, asyncio.IncompleteReadError):
+        except (OSError, asyncio.IncompleteReadError):
             pass  # gone, idle, or closed half-way: none is an error
         finally:
             writer.close()

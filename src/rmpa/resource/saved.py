@@ -24,7 +24,7 @@ from rmpa.resource.adaptation import CoolDown
 from rmpa.resource.quality import parse_requirement
 from rmpa.resource.runtime import RuntimePart
 from rmpa.runtime.accept import in_thread
-from rmpa.runtime.files import set_aside
+from rmpa.runtime.files import replace_file, set_aside
 from rmpa.runtime.tasks import start_task
 
 if TYPE_CHECKING:
@@ -417,18 +417,8 @@ class Persistence(RuntimePart):
         return SavedState()
 
     def _replace(self, content: bytes) -> None:
-        """Replace the file, so that a crash at any moment leaves the old one or the new one.
-
-        Raises:
-            OSError: It cannot be written, or another process uses it.
-        """
         self._take_lock()
-        new = self._path.with_name(f"{self._path.name}.new")
-        with new.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        new.replace(self._path)
+        replace_file(self._path, content)
 
     def _take_lock(self) -> None:
         """Lock the file against a second process: another module of the same name may run the same resource here.

@@ -17,7 +17,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.schedule import Schedule
+from rmpa.core.timers import Schedule
 from rmpa.resource import limits
 from rmpa.resource.declare import OnFailure
 from rmpa.resource.runtime import RuntimePart

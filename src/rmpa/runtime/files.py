@@ -1,13 +1,28 @@
-"""Files that this release cannot read."""
+"""Files that programs keep: replaced as a whole, and set aside where this release cannot read them."""
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 _KEPT: Final = 9
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Replace a file, so that a crash at any moment leaves the old one or the new one; readable by its owner alone.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    new = path.with_name(f"{path.name}.new")
+    with open(new, "wb", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    new.replace(path)
 
 
 def set_aside(path: Path, what: str) -> Path:

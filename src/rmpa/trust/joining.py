@@ -213,7 +213,7 @@ async def _ask(
             text = f"the program at {where} is not an agent of a secured mesh"
             raise RemoteProtocolError(f"{text}; if it is the authority's agent, start it again there") from None
         raise RemoteProtocolError(f"no TLS connection with the authority: {error.reason or error}") from None
-    except (OSError, TimeoutError):
+    except OSError:
         remedy = "does rmpa up run there, and does its TCP port get through the firewall?"
         raise UnreachableError("authority", where, remedy) from None
     try:
@@ -225,7 +225,7 @@ async def _ask(
             writer.write(tokens.encode_message(question(server)))
             size = tokens.message_length(await reader.readexactly(tokens.LENGTH.size), limits.JOIN_ANSWER_MAX)
             answer = tokens.decode_message(await reader.readexactly(size))
-    except (OSError, TimeoutError, asyncio.IncompleteReadError):
+    except (OSError, asyncio.IncompleteReadError):
         raise UnreachableError("authority", where, "it did not answer; its log may say why") from None
     finally:
         writer.close()

@@ -427,7 +427,7 @@ def member_context(certificate: Path, key: Path, ca: bytes, *alpn: str, server_s
     try:
         context.load_cert_chain(certificate, key)
         context.load_verify_locations(cadata=ca)
-    except (ssl.SSLError, OSError) as error:
+    except OSError as error:
         remedy = "join again: rmpa trust invite at the authority, rmpa trust join TOKEN here"
         raise unusable(certificate, f"does not fit {key.name}, or is broken: {error!s:.100}", remedy) from None
     return context

@@ -259,15 +259,9 @@ def _unpack(form: str, raw: Buffer, what: str) -> tuple[Any, ...]:
 
 
 class Goals(ABC):
-    """The goals of one action, in one direction, without I/O: what a goal causes, the join of the action carries out.
+    """The goals of one action, in one direction, without I/O; what a goal causes, the join of the action does."""
 
-    Args:
-        clock: Both clocks.
-
-    Attributes:
-        pair: The action's types, once they are found; no goal comes before.
-    """
-
+    # The action's types, once they are found; no goal comes before.
     pair: ActionPair
 
     def __init__(self, clock: SystemClock) -> None:

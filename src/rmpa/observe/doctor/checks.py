@@ -243,7 +243,7 @@ def exposed_nodes(core_uri: str, agent_pid: int) -> dict[str, tuple[int, ...]] |
             for at in psutil.net_connections("tcp")
             if at.laddr and at.status == psutil.CONN_LISTEN
         ]
-    except (RmpaError, OSError, ValueError, TimeoutError, psutil.Error):
+    except (RmpaError, OSError, ValueError, psutil.Error):
         return None
     found = {}
     for node, port in nodes.items():

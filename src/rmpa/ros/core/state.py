@@ -11,7 +11,6 @@ import contextlib
 import errno
 import logging
 import math
-import os
 import time
 from collections import defaultdict
 from datetime import datetime
@@ -28,7 +27,7 @@ from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import Name, NodeRecord  # noqa: TC001 - msgspec reads the annotations
 from rmpa.ros.wire.xmlrpc import RosFault, serialize_response
 from rmpa.runtime.accept import in_thread
-from rmpa.runtime.files import set_aside
+from rmpa.runtime.files import replace_file, set_aside
 from rmpa.runtime.loop import yielding_to_data
 from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 
@@ -382,12 +381,7 @@ class CoreState:
             with contextlib.suppress(FileNotFoundError):
                 _log.warning("! %s is kept as %s [state-lost]", self.path, set_aside(self.path, "before").name)
             self._unread = False
-        new = self.path.with_name(f"{self.path.name}.new")
-        with open(new, "wb", opener=lambda path, flags: os.open(path, flags, 0o600)) as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        new.replace(self.path)
+        replace_file(self.path, data)
         self._digest = hash(data)
 
     def _reason(self, error: Exception) -> str:

@@ -19,7 +19,6 @@ from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.publication import Publication, PublicationEvents
-from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.types.codec import codec_for
@@ -31,6 +30,7 @@ from rmpa.runtime.tasks import OwnedTasks
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
 
+    from rmpa.ros.node.service_client import ServiceConnection
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.node.subscription import PublisherConnection
     from rmpa.ros.types.installed import ServiceType
@@ -45,7 +45,6 @@ NODE_UNREGISTER_TIMEOUT: Final = 3.0
 # Concurrent calls to unregister, each on a connection of its own.
 NODE_UNREGISTER_AT_ONCE: Final = 16
 _REMEDY: Final = "start one (rmpa up, or roscore), or set ROS_MASTER_URI to one that runs"
-
 _CLOSED: Final = "{} is not published any more: its publisher is closed"
 
 Handler = Callable[[Any], "Awaitable[Any] | Any"]
@@ -88,9 +87,8 @@ class MasterClient:
         """
         reply = await self._call(method, *params)
         if reply.code != 1:
-            raise PeerRefused(
-                f"the ROS master at {self.master_uri}", f"{method}: {reply.status}", code="core-refuses"
-            )
+            master = f"the ROS master at {self.master_uri}"
+            raise PeerRefused(master, f"{method}: {reply.status}", code="core-refuses")
         return reply.value
 
     async def _call(self, method: str, *params: XmlRpcValue) -> RosReply:
@@ -243,13 +241,10 @@ class Service:
         call.reply(True, result if self._raw else _serialize(self.kind.response, result))
 
     def _failed(self, call: ServiceCall, error: Exception) -> None:
-        text = str(error)
-        if isinstance(error, RmpaError) and text:
-            call.fail(text)
-            return
-        if not isinstance(error, RmpaError):
+        ours, text = isinstance(error, RmpaError), str(error)
+        if not ours:
             _log.error("! %s: a call of %s failed", self.name, printable(call.caller_id), exc_info=error)
-        call.fail(f"{type(error).__name__}: {text}")
+        call.fail(text if ours and text else f"{type(error).__name__}: {text}")
 
 
 class ServiceClient:
@@ -290,9 +285,8 @@ class ServiceClient:
         """
         ok, body = await self.connection.call(_serialize(self.kind.request, request), timeout)
         if not ok:
-            raise PeerRefused(
-                f"service {self.connection.service}", str(bytes(body), "utf-8", "replace"), code="service-failed"
-            )
+            text = str(bytes(body), "utf-8", "replace")
+            raise PeerRefused(f"service {self.connection.service}", text, code="service-failed")
         return self.kind.response.deserialize(body)
 
     def close(self) -> None:
@@ -302,17 +296,6 @@ class ServiceClient:
 
 def _serialize(kind: MessageType, value: object) -> Buffer:
     return kind.serialize(given_values(kind.name, value, None))
-
-
-async def probe(uri: str, service: str, caller_id: str, timeout: float) -> ServiceConnection:  # noqa: ASYNC109
-    """Ask a server for its description; returns the closed connection with ``description`` and ``caller_id``.
-
-    Raises:
-        RmpaError: As ``ServiceConnection.open``.
-    """
-    connection = await ServiceConnection.open(uri, service, caller_id, md5sum=ANY, probe=True, timeout=timeout)
-    connection.close()
-    return connection
 
 
 class Received:
@@ -372,12 +355,7 @@ class Publisher(PublicationEvents):
     kind_name: Final = "Publisher"
 
     def __init__(
-        self,
-        node: MasterClient,
-        topic: str,
-        description: TopicDescription,
-        kind: MessageType | None,
-        queue_messages: int,
+        self, node: MasterClient, topic: str, description: TopicDescription, kind: MessageType | None, queue: int
     ) -> None:
         self._node = node
         self.topic = self.key = topic
@@ -389,9 +367,8 @@ class Publisher(PublicationEvents):
         self.numbers = HeaderNumbers(kind) if kind is not None else None
         self._change = asyncio.Event()
         self._closed = self._ended = False
-        self.publication = Publication(
-            topic, node.name, description, events=self, queue_messages=_at_least_one(queue_messages)
-        )
+        most = _at_least_one(queue)
+        self.publication = Publication(topic, node.name, description, events=self, queue_messages=most)
 
     @property
     def subscribers(self) -> int:
@@ -604,12 +581,6 @@ class Subscriber:
 
     def _refused(self, connection: PublisherConnection, text: str) -> None:
         _refuse(self, "subscription.refused", connection.uri, text)
-
-
-def check_plain(function: object, what: str) -> None:
-    """Refuse what is no function, and a coroutine function, which nothing would await, with TypeError."""
-    if not callable(function) or inspect.iscoroutinefunction(function):
-        raise TypeError(f"{what} is a plain function, not {function!r}")
 
 
 def _at_least_one(queue_messages: int) -> int:

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from rmpa.config import limits as config_limits
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
-from rmpa.core.schedule import Schedule, positive
+from rmpa.core.timers import Schedule, positive
 from rmpa.ros import limits
 from rmpa.ros.environment import RosEnvironment, host_of, is_loopback
 from rmpa.ros.node import rosout
@@ -38,8 +38,6 @@ from rmpa.ros.node.endpoints import (
     Service,
     ServiceClient,
     Subscriber,
-    check_plain,
-    probe,
 )
 from rmpa.ros.node.fetch_type import find_here, find_or_fetch
 from rmpa.ros.node.listeners import local_addresses
@@ -71,6 +69,12 @@ __all__ = ["Node", "Publisher", "Received", "Service", "ServiceClient", "Subscri
 _NO_DEFAULT: Final = object()
 # Time between two look-ups of a service that is waited for.
 _SERVICE_CHECK: Final = 0.2
+
+
+def check_plain(function: object, what: str) -> None:
+    """Refuse what is no function, and a coroutine function, which nothing would await, with TypeError."""
+    if not callable(function) or inspect.iscoroutinefunction(function):
+        raise TypeError(f"{what} is a plain function, not {function!r}")
 
 
 class Node(MasterClient):
@@ -345,7 +349,7 @@ class Node(MasterClient):
         while True:
             try:
                 uri = await self.lookup_service(name)
-                await probe(uri, self._resolve(name), self.name, limits.SERVICE_OPEN_TIMEOUT)
+                await ServiceConnection.probe(uri, self._resolve(name), self.name, limits.SERVICE_OPEN_TIMEOUT)
             except RmpaError:
                 if self.stopped.is_set() or (until is not None and loop.time() >= until):
                     raise
@@ -519,7 +523,7 @@ class Node(MasterClient):
     async def _version_of(self, uri: str, service: str, found: ServiceType) -> ServiceType | None:
         """Find the server's version of a service type; ``None`` if it is the same or is not on this machine."""
         try:
-            said = (await probe(uri, service, self.name, limits.SERVICE_OPEN_TIMEOUT)).description
+            said = (await ServiceConnection.probe(uri, service, self.name, limits.SERVICE_OPEN_TIMEOUT)).description
             other = await asyncio.to_thread(find_service_type, found.name, said.md5sum)
         except RmpaError:
             return None

