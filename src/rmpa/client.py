@@ -23,13 +23,13 @@ from typing import TYPE_CHECKING, Final, Self, TypeAlias
 import msgspec
 
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.core.facts import LinkInfo, RouteInfo, ServiceInfo, TopicInfo
 from rmpa.core.schedule import positive
 from rmpa.observe import limits
-from rmpa.observe.control import GraphRevision
 from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.observe.control_stream import ControlStream
-from rmpa.observe.peer_info import LinkInfo, PeerInfo
-from rmpa.observe.snapshot import AgentInfo, RouteInfo, ServiceInfo, Snapshot, TopicInfo
+from rmpa.observe.graph import GraphRevision
+from rmpa.observe.snapshot import AgentInfo, PeerInfo, Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Iterator

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rmpa.agent.agent import Agent
     from rmpa.bridge.topics.imports import RemoteTopic
     from rmpa.config.settings import Settings
-    from rmpa.observe.snapshot import TopicInfo
+    from rmpa.core.facts import TopicInfo
 
 PREFIX = (PeerRule("robot", "/{peer}"),)
 

@@ -49,7 +49,7 @@ def test_the_agent_tells_the_latency_of_what_has_no_header() -> None:
     for whole in (False, True):
         latency = watch.view(103.0, whole=whole).topics[ORDER].latency
         assert latency is not None
-        assert (latency.count, latency.maximum) == (1, 0.0004)
+        assert (latency.count, latency.max) == (1, 0.0004)
 
 
 def test_a_silent_topic_keeps_its_figures_without_a_rate() -> None:
@@ -67,7 +67,7 @@ def test_a_lost_order_is_counted() -> None:
     watch.message(ORDER, 103.102)
     view = watch.view(103.2)
     assert view.unanswered == 1
-    assert view.command_to_velocity.maximum == pytest.approx(0.002)
+    assert view.command_to_velocity.max == pytest.approx(0.002)
 
 
 def test_an_order_before_its_command_shifts_nothing() -> None:
@@ -76,7 +76,7 @@ def test_an_order_before_its_command_shifts_nothing() -> None:
     watch.message(ORDER, 102.9995)
     watch.message(COMMAND, 103.0)
     drive(watch, 103.1, 1.0)
-    assert watch.view(104.2).command_to_velocity.maximum == pytest.approx(0.002)
+    assert watch.view(104.2).command_to_velocity.max == pytest.approx(0.002)
 
 
 def test_an_outage_of_a_module_is_no_period() -> None:
@@ -114,7 +114,7 @@ def test_an_outage_of_a_module_is_no_period() -> None:
     watch.peers({**everyone, "joystick": "linking"}, 109.8)
     assert watch.view(109.8).modules["joystick"].profile == "", "it may be another when it comes back"
     view = watch.view(109.8, whole=True)
-    assert view.topics[ODOM].period.maximum == pytest.approx(0.02)
+    assert view.topics[ODOM].period.max == pytest.approx(0.02)
 
 
 def test_a_module_that_was_never_seen_is_waited_for_not_gone() -> None:

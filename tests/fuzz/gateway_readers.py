@@ -27,7 +27,7 @@ from rmpa.gateway.sites.params import (
     to_json,
 )
 from rmpa.gateway.sites.services import asked_type, read_description
-from rmpa.observe.peer_info import OK, Check
+from rmpa.observe.check import OK, Check
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.wire.tcpros import ServiceDescription
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response

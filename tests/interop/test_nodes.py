@@ -12,7 +12,7 @@ from rmpa.observe.control_client import ControlClient
 
 if TYPE_CHECKING:
     from lab.bed.namespaces import Lab
-    from rmpa.observe.peer_info import PeerInfo
+    from rmpa.observe.snapshot import PeerInfo
     from tests.interop.conftest import AgentFactory, ModuleFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]

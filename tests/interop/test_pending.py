@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from lab.bed.agents import Agent
     from lab.bed.namespaces import Lab
-    from rmpa.observe.peer_info import PeerInfo
+    from rmpa.observe.snapshot import PeerInfo
     from tests.interop.conftest import AgentFactory
 
 pytestmark = [pytest.mark.netns, pytest.mark.timeout(150)]

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa.core import facts
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
-from rmpa.observe import limits, peer_info
+from rmpa.observe import limits
 from rmpa.observe import snapshot as s
 from rmpa.observe.control import ControlReply, ControlRequest, json_pieces
 from rmpa.observe.snapshot import Snapshot
@@ -179,7 +180,7 @@ def test_a_topics_peers_are_those_it_comes_from() -> None:
 
 
 def test_every_field_is_explained() -> None:
-    for struct in (*vars(peer_info).values(), *vars(s).values()):
+    for struct in (*vars(facts).values(), *vars(s).values()):
         if not isinstance(struct, type) or not issubclass(struct, msgspec.Struct):
             continue
         for name in struct.__struct_fields__:

@@ -15,19 +15,21 @@ from rmpa.cli.options import Options, Selection, agent_verb, argument, flag, lim
 from rmpa.cli.output import Table, duration, printable, size, warn
 from rmpa.cli.topic import shown_state
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
-from rmpa.core.statistics import SampleSummary
+from rmpa.core.statistics import SampleSpread
 from rmpa.observe import limits
 from rmpa.observe.control import GATEWAY_REPORT
-from rmpa.observe.peer_info import PENDING, SitesReport
+from rmpa.observe.peers import PENDING
+from rmpa.observe.sites import SitesReport
 from rmpa.observe.snapshot import PingReply
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rmpa.cli.output import Text
+    from rmpa.core.facts import RouteInfo, TopicInfo
     from rmpa.observe.control_client import ControlClient
-    from rmpa.observe.peer_info import PeerInfo, SiteInfo
-    from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo
+    from rmpa.observe.sites import SiteInfo
+    from rmpa.observe.snapshot import PeerInfo, Snapshot
 
 _T = TypeVar("_T")
 # By the state of a peer or site.
@@ -254,8 +256,8 @@ def peer_ping(name: str, count: int | None, interval: float, options: Options) -
                     time.sleep(interval)
                 sent += 1
                 _ping_once(client, found, sent, times, options)
-    of = SampleSummary.of(times)
-    figures = {"min": of.minimum, "avg": of.mean, "max": of.maximum, "sd": of.sd}
+    of = SampleSpread.of(times)
+    figures = {"min": of.min, "avg": of.mean, "max": of.max, "sd": of.sd}
     lost = 100 * (sent - len(times)) / sent if sent else 0
     lines = [f"--- {found.name} ping statistics ---", f"{sent} sent, {len(times)} received, {lost:.0f} % lost"]
     if times:
@@ -313,7 +315,7 @@ def site_list(name: str | None, options: Options) -> int:
       rmpa site list --name store-gateway
       rmpa site list --json | jq -r '.[].sites[].name'
     """
-    from rmpa.observe.operations import REPORT
+    from rmpa.observe.sites import REPORT
 
     with _connect(options, name) as client:
         reports = _ask(client, REPORT, tuple[SitesReport, ...])
@@ -368,10 +370,10 @@ def site_info(site: str, name: str | None, options: Options) -> int:
       rmpa site info warehouse
       rmpa site info hall --json | jq '.sites[0].sources[] | select(.here=="")'
     """
-    from rmpa.observe.operations import INFO
+    from rmpa.observe.sites import SITE_INFO
 
     with _connect(options, name) as client:
-        report = _ask(client, INFO, SitesReport, site=site)
+        report = _ask(client, SITE_INFO, SitesReport, site=site)
     found = next((each for each in report.sites if each.name == site), None)
     if found is None:
         known = [each.name for each in report.sites]

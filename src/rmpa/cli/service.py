@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from rmpa.cli.graph import Graph, GraphName, Master
     from rmpa.cli.output import Text
-    from rmpa.observe.snapshot import ServiceInfo
+    from rmpa.core.facts import ServiceInfo
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import ServiceDescription
 

@@ -11,7 +11,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 from rmpa.observe import limits
-from rmpa.observe.peer_info import FAIL, OK, STALE, WARN, Check
+from rmpa.observe.check import FAIL, OK, STALE, WARN, Check
 from rmpa.observe.why.diagnosis import BY_RULE, connected_directly, misplaced, subscriber_text
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array, known_description
@@ -23,8 +23,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.observe.peer_info import CheckLevel, PeerInfo
-    from rmpa.observe.snapshot import RouteInfo, SampleSpread, ServiceInfo, Snapshot, TopicInfo
+    from rmpa.bridge.facts import BridgeFacts
+    from rmpa.core.facts import RouteInfo, ServiceInfo, TopicInfo
+    from rmpa.core.statistics import SampleSpread
+    from rmpa.observe.check import CheckLevel
+    from rmpa.observe.snapshot import PeerInfo, Snapshot
     from rmpa.observe.snapshot_builder import SnapshotBuilder
     from rmpa.ros.core.external import Core
 
@@ -403,12 +406,14 @@ class Diagnostics(PublicationEvents):
     Args:
         core: The local core.
         bridge: Has the node that publishes; started before.
+        facts: What the bridge tells.
         snapshots: Builds what is judged.
     """
 
-    def __init__(self, core: Core, bridge: Bridge, snapshots: SnapshotBuilder) -> None:
+    def __init__(self, core: Core, bridge: Bridge, facts: BridgeFacts, snapshots: SnapshotBuilder) -> None:
         self._core = core
         self._bridge = bridge
+        self._facts = facts
         self._snapshots = snapshots
         self._clock = SystemClock()
         self._health = Health()
@@ -447,7 +452,7 @@ class Diagnostics(PublicationEvents):
 
     def _look(self) -> None:
         self._again()
-        self._snapshots.topics.follow_clocks()
+        self._facts.topics.follow_clocks()
         if self._publication.subscribers:
             self._publish()
 

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rmpa.core.errors import OutOfDescriptors, StartError
+from rmpa.core.facts import FilesInfo
 from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.runtime import limits
@@ -158,6 +159,19 @@ class Descriptors:
     def problem(self) -> str:
         """What was refused in the last seconds and what to do, as a text for the user; empty for nothing."""
         return self._problem if time.monotonic() - self._refused_at < limits.DESCRIPTORS_TOLD else ""
+
+    def info(self) -> FilesInfo:
+        """Its piece of the snapshot."""
+        used, limit, reserved = self.open, self.limit, self.reserve
+        return FilesInfo(
+            open=used,
+            limit=limit,
+            hard=self.hard_limit,
+            reserved=reserved,
+            near=used >= limits.DESCRIPTORS_NEAR * (limit - reserved),
+            refused=sum(count for name, count in self.counters.as_dict().items() if ".refused." in name),
+            problem=self.problem,
+        )
 
     def open_socket(
         self,

@@ -13,7 +13,7 @@ from rmpa.bridge.data.quality import PeerClockHistory, QosEvent, QosEventKind, Q
 from rmpa.bridge.data.route import Downsampler
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, Liveliness
-from rmpa.core.statistics import SampleSummary
+from rmpa.core.statistics import SampleSpread
 from rmpa.mesh import limits as mesh_limits
 
 # Periods, latencies and rates of one remote source.
@@ -75,7 +75,7 @@ def test_a_clock_that_is_ahead_is_taken_off() -> None:
     feed(quality, [1.0, 1.1], latency=0.003, ahead=-7200.0)
     s = quality.summary(clock(-7200.0, 0.0002, 1.1), 1.1)
     assert s.latency is not None
-    assert s.latency.maximum == pytest.approx(0.003, abs=1e-6)
+    assert s.latency.max == pytest.approx(0.003, abs=1e-6)
     assert s.latency_error == pytest.approx(0.0002 + 0.1 * mesh_limits.CLOCK_DRIFT)
 
 
@@ -99,7 +99,7 @@ def test_messages_of_long_ago_do_not_count() -> None:
     assert s.period.count == 2
     assert s.rate == pytest.approx(2 / 2.0)
     assert s.latency is not None
-    assert s.latency.maximum == pytest.approx(0.001)
+    assert s.latency.max == pytest.approx(0.001)
     late = quality.summary(clock(), 1000.0)
     assert late.period.count == 0
     assert late.age == pytest.approx(899.0)
@@ -123,8 +123,8 @@ def test_latency_is_corrected_by_the_clock_of_its_time() -> None:
     s = quality.summary(known, 51.0)
     assert s.latency is not None
     assert s.latency.count == 51
-    assert s.latency.minimum == pytest.approx(0.001, abs=2e-5)
-    assert s.latency.maximum == pytest.approx(0.001, abs=2e-5)
+    assert s.latency.min == pytest.approx(0.001, abs=2e-5)
+    assert s.latency.max == pytest.approx(0.001, abs=2e-5)
     assert s.latency_error == pytest.approx(0.0001 + 0.5 * mesh_limits.CLOCK_DRIFT)
 
 
@@ -167,9 +167,9 @@ def test_it_agrees_with_a_list_of_everything(messages: list[tuple[float, float, 
     assert s.latency is not None
     assert s.latency.count == len(kept)
     assert s.latency.mean == pytest.approx(sum(latency for _, latency, _ in kept) / len(kept), abs=1e-6)
-    periods = SampleSummary.of(after[0] - before[0] for before, after in pairwise(kept))
+    periods = SampleSpread.of(after[0] - before[0] for before, after in pairwise(kept))
     assert s.period.count == periods.count
-    assert s.period.maximum == pytest.approx(periods.maximum, nan_ok=True)
+    assert s.period.max == pytest.approx(periods.max, nan_ok=True)
     if len(kept) > 1:
         # A ring that holds less than a second is helped out by marks: from one of the messages of two seconds on.
         starts = [

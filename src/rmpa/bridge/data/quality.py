@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from rmpa.bridge import limits
 from rmpa.core.contract import Liveliness
-from rmpa.core.statistics import SampleSummary
+from rmpa.core.statistics import SampleSpread
 from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
@@ -253,10 +253,10 @@ class QualitySummary(NamedTuple):
         bytes: Since the route was opened.
     """
 
-    latency: SampleSummary | None
+    latency: SampleSpread | None
     latency_last: float | None
     latency_error: float | None
-    period: SampleSummary
+    period: SampleSpread
     jitter: float
     rate: float
     bandwidth: float
@@ -344,14 +344,14 @@ class Quality:
         times = self._latest(self._times, self.messages)
         times = times[bisect_left(times, now - limits.QUALITY_SPAN, 0, max(len(times) - 1, 0)) :]  # at least the last
         periods = list(map(sub, times[1:], times))
-        period = SampleSummary.of(periods)
+        period = SampleSpread.of(periods)
         silence = now - times[-1] if times else 0.0
         count, size, elapsed = self._counted(times, now)
-        if periods and silence > max(period.maximum, limits.QUALITY_SILENCE):
+        if periods and silence > max(period.max, limits.QUALITY_SILENCE):
             elapsed += silence
         latencies, error = self._latencies(times, clock, latching=latching) if clock is not None else ([], 0.0)
         return QualitySummary(
-            latency=SampleSummary.of(latencies) if latencies else None,
+            latency=SampleSpread.of(latencies) if latencies else None,
             latency_last=latencies[-1] if latencies else None,
             latency_error=error if latencies else None,
             period=period,

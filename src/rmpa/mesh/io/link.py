@@ -9,6 +9,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, cast
 
+from rmpa.core.facts import LinkInfo
 from rmpa.core.identity import SERIAL_MASK
 from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import URGENT, Outbox
@@ -486,6 +487,26 @@ class PeerLink:
     def rests(self) -> bool:
         """Whether the link is at rest: keepalives are rare, and silence is noticed late."""
         return self.connection.rests
+
+    def info(self) -> LinkInfo:
+        """Its piece of the snapshot."""
+        now, (host, port) = self._mesh.clock.now(), self.remote_endpoint
+        return LinkInfo(
+            remote=f"{host}:{port}",
+            dialled=self.dialled,
+            up_ago=now - (self.since or now),
+            rtt=self.connection.clock.rtt,
+            clock_offset=self.clock_offset,
+            clock_error=self.clock_error,
+            bytes_in=self.bytes_in,
+            bytes_out=self.bytes_out,
+            queued=self.queue_bytes,
+            dropped=self.dropped,
+            heard_ago=now - self.heard_at,
+            rests=self.rests,
+            lease=self.connection.keepalive.remote_lease,
+            lanes=(self.express.info(), self.bulk.info(unneeded=not self.bulk_wanted)),
+        )
 
     def send_control(self, payload: bytes) -> None:
         """Send one control frame, before all data that waits; never dropped; see ``Connection``."""

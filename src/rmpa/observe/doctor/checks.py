@@ -19,8 +19,8 @@ import rmpa
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
 from rmpa.observe import limits
+from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.doctor import machine, network, repairs
-from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.why.diagnosis import misplaced, remedy_for, subscriber_text
 from rmpa.ros.http.rpc import call_api
 from rmpa.runtime.accept import open_files_advice
@@ -28,9 +28,9 @@ from rmpa.runtime.accept import open_files_advice
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
+    from rmpa.core.facts import UnreachableInfo
     from rmpa.observe.doctor.machine import DoctorInput
-    from rmpa.observe.peer_info import PeerInfo
-    from rmpa.observe.snapshot import AgentInfo, Snapshot, UnreachableInfo
+    from rmpa.observe.snapshot import AgentInfo, PeerInfo, Snapshot
     from rmpa.trust.permissions import TrustStatus
 
 # The counters of what ``[[permission]]`` refused begin so.

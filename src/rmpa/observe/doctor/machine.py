@@ -28,8 +28,8 @@ from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.limits import KIB, MIB
 from rmpa.discovery.network import choose, list_interfaces
 from rmpa.observe import limits
+from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check, CheckLevel
 from rmpa.observe.control_client import ControlClient, find_agents
-from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check, CheckLevel
 from rmpa.observe.snapshot import Snapshot
 from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback, shown_uri
 from rmpa.ros.http.rpc import call_api

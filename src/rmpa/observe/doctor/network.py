@@ -29,8 +29,8 @@ from rmpa.discovery.beacon import MAGIC, VERSION, BeaconKind
 from rmpa.discovery.network import choose, join_group, list_interfaces, open_receiver, receive
 from rmpa.mesh.io.dial import may_use_bbr, repeats_quickly
 from rmpa.observe import limits
+from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.doctor.machine import ask_program, resolve
-from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.runtime.kernel_tcp import program_at
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
 import msgspec
 
-from rmpa.bridge.nodes import INFO
+from rmpa.bridge.nodes import NODE_INFO
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.identity import is_global_name, is_own, proxied_node, proxied_peer
 from rmpa.observe import limits as observe_limits
@@ -125,7 +125,7 @@ class Answers:
         name, peer = _name(args, "name"), _text(args, "peer")
         if not peer and is_own(name):
             raise RmpaError(f"{name} belongs to the agent of this module; nothing is asked of it")
-        about = await self._control_call("node", what=INFO, node=name, **({"peer": peer} if peer else {}))
+        about = await self._control_call("node", what=NODE_INFO, node=name, **({"peer": peer} if peer else {}))
         for each in about.get("connections") or ():
             other = str(each["other"])
             each["other"] = shown_node(other) if not peer or is_own(other) else node_key(peer, other)

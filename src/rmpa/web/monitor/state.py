@@ -21,8 +21,8 @@ from rmpa.web.monitor.resources import resource_detail, resource_entry, resource
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from rmpa.observe.peer_info import LinkInfo, PeerInfo
-    from rmpa.observe.snapshot import AgentInfo, ServiceInfo, Snapshot, TopicInfo
+    from rmpa.core.facts import LinkInfo, ServiceInfo, TopicInfo
+    from rmpa.observe.snapshot import AgentInfo, PeerInfo, Snapshot
     from rmpa.web.monitor.resources import ResourceFacts
 
 _T = TypeVar("_T")

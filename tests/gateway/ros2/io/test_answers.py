@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import UnreachableError
-from rmpa.observe.operations import INFO, PARAM, REPORT, WHY
-from rmpa.observe.peer_info import SiteInfo, SitesReport
+from rmpa.observe.sites import PARAM, REPORT, SITE_INFO, WHY, SiteInfo, SitesReport
 from tests.gateway.memory_zenoh import eventually
 from tests.gateway.ros2.io.ros2_bed import NO_TYPE, STRING, Ros2Bed
 
@@ -29,7 +28,7 @@ async def test_ros2_is_listed_with_its_topics_and_what_is_wrong_with_them(bed: R
     answer = bed.neighbour.answer
     report: SitesReport = await answer(REPORT, {})
     assert [(site.name, site.state) for site in report.sites] == [("ros2", "joined")]
-    (info,) = (await answer(INFO, {"site": "ros2"})).sites
+    (info,) = (await answer(SITE_INFO, {"site": "ros2"})).sites
     rows = {(row.name, row.node): row for row in info.sources}
     assert rows["/chatter", "/bot"].type == "std_msgs/String"
     assert "definitions differ" in rows["/mine", "/older"].problem
