@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -107,7 +108,7 @@ async def test_a_node_tells_its_connections_here_and_at_a_peer(settings: Callabl
 async def test_a_peer_tells_of_itself_and_a_module_is_diagnosed(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, b):
         told = msgspec.convert(await a.operations.agent({"peer": "b"}), ModuleFacts)
-        assert (told.version, told.core_uri) == (rmpa.__version__, b.core.uri)
+        assert (told.version, told.core_uri, told.host) == (rmpa.__version__, b.core.uri, os.uname().nodename)
         assert told.rss
         answer = await a.operations.ping({"peer": "b", "count": 2})
         assert len(answer.times) == 2

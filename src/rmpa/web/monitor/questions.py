@@ -21,11 +21,12 @@ from rmpa.core.identity import is_global_name, is_own, proxied_node, proxied_pee
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.observe.operations import PeerParams, parameters_in
+from rmpa.observe.snapshot import ModuleFacts
 from rmpa.resource.reconfigure import SERVICE_TYPE
 from rmpa.ros.types.codec import codec_for
 from rmpa.trust.permissions import InviteReply
 from rmpa.web import limits
-from rmpa.web.monitor.state import node_key
+from rmpa.web.monitor.state import module_facts, node_key
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -113,7 +114,8 @@ class Answers:
 
     @question("agent")
     async def _agent(self, args: Args) -> Any:
-        return await self._control_call("agent", peer=_text(args, "peer"))
+        answer = await self._control_call("agent", peer=_text(args, "peer"))
+        return module_facts(msgspec.convert(answer, ModuleFacts))
 
     @question("contract")
     async def _contract(self, args: Args) -> Any:
