@@ -253,8 +253,8 @@ class AgentClient:
     async def events(self, *, since: Snapshot | None = None, period: float = 1.0) -> AsyncGenerator[AgentEvent, None]:
         """The changes from a snapshot on, without end.
 
-        A change of the local graph, which peers' topics are part of, is told at once; other changes at the end of a
-        period. What appears and is gone again in between is not told. An agent that ends is waited for.
+        A change of the local graph, which peers' topics are part of, is an event at once; other changes at the end of
+        a period. What appears and is gone again in between is no event. An agent that ends is waited for.
 
         Args:
             since: The snapshot that the caller knows; ``None``: what is there now comes first, as if it had appeared.

@@ -291,12 +291,12 @@ def _ping_once(client: ControlClient, peer: PeerInfo, number: int, times: list[f
     except PeerRefused as error:
         problem = error.reason
     elapsed = reply.times[0] if reply.times else None
-    told = {"peer": peer.name, "seq": number, "time": elapsed, "remote": reply.remote}
+    shown = {"peer": peer.name, "seq": number, "time": elapsed, "remote": reply.remote}
     if elapsed is None:
-        options.show(told | {"error": problem}, f"{peer.name}: seq={number} {problem}")
+        options.show(shown | {"error": problem}, f"{peer.name}: seq={number} {problem}")
     else:
         times.append(elapsed)
-        options.show(told, f"{peer.name} ({reply.remote}): seq={number} time={elapsed * 1e3:.3f} ms")
+        options.show(shown, f"{peer.name} ({reply.remote}): seq={number} time={elapsed * 1e3:.3f} ms")
 
 
 name_option = click.option("--name", metavar="GATEWAY", help="Ask this gateway of this machine, not --agent's.")

@@ -49,7 +49,7 @@ class Probed:
     description: ServiceDescription | None = None
     problem: str = ""
 
-    def told(self, name: str) -> ServiceDescription:
+    def says(self, name: str) -> ServiceDescription:
         """What the server says.
 
         Raises:
@@ -218,7 +218,7 @@ def service_list(namespace: str, verbose: bool, selection: Selection, options: O
 
 
 def _find(text: str, options: Options) -> tuple[GraphName, Master, Graph]:
-    """The service that a user names, the master, and its graph; where another module serves it, that is told."""
+    """The service that a user names, the master, and its graph; where another module serves it, a line says so."""
     wanted = read_name(text, "service")
     master, graph = options.graph()
     if wanted.name not in graph.services:
@@ -272,7 +272,7 @@ def service_info(service: str, options: Options) -> None:
                 yield from (f"  {field} {field.name}" for field in half.fields)
         if mesh:
             yield from ("", "Mesh:", *_crossing(mesh))
-        found.told(wanted.name)
+        found.says(wanted.name)
 
     options.show(_json(graph, wanted.name, found) | names | {"mesh": mesh}, text())
 
@@ -288,7 +288,7 @@ def service_type(service: str, options: Options) -> None:
     """
     wanted, master, graph = _find(service, options)
     graph.require_service(wanted)
-    said = probe(master, (wanted.name,))[wanted.name].told(wanted.name)
+    said = probe(master, (wanted.name,))[wanted.name].says(wanted.name)
     options.show({"name": wanted.name, "type": said.type, "md5": said.md5sum}, said.type)
 
 

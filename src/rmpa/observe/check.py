@@ -70,8 +70,8 @@ class Check(msgspec.Struct, frozen=True, omit_defaults=True):
     @classmethod
     def from_message(cls, name: str, level: CheckLevel, message: str, remedy: str = "", where: str = "") -> Self:
         """Split a message as ``message`` joins it: text after the first "; " replaces the given remedy."""
-        text, _, told = message.partition("; ")
-        return cls(name, level, text, told or remedy, where)
+        text, _, own = message.partition("; ")
+        return cls(name, level, text, own or remedy, where)
 
     @property
     def message(self) -> str:

@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from rmpa.core.timers import Yielder
 
 
-# --- The value of the control socket's operation ``reload`` ---------------------------------------------------------
-
-
 class ReloadReply(msgspec.Struct, kw_only=True, frozen=True):
     """The settings as read again, against those that the agent runs with.
 
@@ -49,9 +46,6 @@ class ReloadReply(msgspec.Struct, kw_only=True, frozen=True):
     notes: tuple[str, ...] = ()
     problem: str = ""
     code: str = ""
-
-
-# --- Encodes large JSON values in pieces, between which other work can be done --------------------------------------
 
 
 # Elements of a list in one piece: some 50 microseconds where they are topics.

@@ -32,9 +32,13 @@ if TYPE_CHECKING:
     from rmpa.ros.core.external import Core
 
 
-# --- the evidence of each status: figures as text, their units in the keys, so that rqt can plot them ---------------
+_log = logging.getLogger(__name__)
 
-# Figures by their name; what is empty or ``None`` is left out.
+# The topic of REP 107.
+TOPIC: Final = "/diagnostics"
+_ARRAY: Final = known_description(ARRAY_TYPE)
+# The figures of a status by their name, with their unit, so that rqt can plot them; what is empty or ``None`` is left
+# out.
 Values = dict[str, str | float | None]
 
 
@@ -150,8 +154,6 @@ def route_values(route: RouteInfo) -> dict[str, str]:
     contract: Values = {f"contract {key}": str(value) for key, value in route.contract.items()}
     return _texts(known, contract, {f"events {kind}": count for kind, count in route.events.items()})
 
-
-# --- the judgement --------------------------------------------------------------------------------------------------
 
 # The name of the agent's own status.
 HERE: Final = "rmpa: this module"
@@ -388,20 +390,10 @@ def _relayed(route: RouteInfo) -> str:
     return f"{route.rate:.1f} Hz{latency}"
 
 
-# --- Publishes the agent's health on ``/diagnostics`` once a second (REP 107) ---------------------------------------
-#
-# The agent's own node publishes it, so it does not cross to other modules. Without a subscriber nothing is built.
-
-
-_log = logging.getLogger(__name__)
-
-TOPIC: Final = "/diagnostics"
-# The topic of REP 107.
-_ARRAY: Final = known_description(ARRAY_TYPE)
-
-
 class Diagnostics(PublicationEvents):
     """Publishes judged snapshots; follows the peers' clocks as often, and seldom while no link is in use.
+
+    The agent's own node publishes them, so they do not cross to other modules. Without a subscriber nothing is built.
 
     Args:
         core: The local core.

@@ -186,10 +186,10 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     code: str = ""
 
     def __post_init__(self) -> None:
-        """Take the code from the state, where there is something to tell."""
-        told = self.last_error or self.conflicts or self.state not in ("linked", "linking", "relayed")
+        """Take the code from the state, where something is wrong."""
+        wrong = self.last_error or self.conflicts or self.state not in ("linked", "linking", "relayed")
         code = codes.PEER_STATES.get(self.state, "name-conflict" if self.conflicts else "")
-        if told and code and not self.code:
+        if wrong and code and not self.code:
             msgspec.structs.force_setattr(self, "code", code)
 
 

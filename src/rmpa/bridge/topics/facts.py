@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from itertools import chain
 from typing import TYPE_CHECKING, Any, cast
-
-import msgspec
 
 from rmpa.bridge.data.quality import PeerClockHistory, QosEventKind, shown_seconds
 from rmpa.bridge.data.route_sender import ReliableRouteSender
@@ -21,7 +18,6 @@ from rmpa.core.facts import (
     Arrival,
     ContractTerm,
     EventInfo,
-    LatencyInfo,
     PublisherReport,
     RouteInfo,
     SubscriberTransport,
@@ -432,26 +428,12 @@ def _transport_name(*, direct: bool, relayed: bool) -> str:
     return "relay" if relayed else ""
 
 
-def _known(figure: float) -> float | None:
-    return None if math.isnan(figure) else figure
-
-
 def _quality(quality: QualitySummary) -> dict[str, Any]:
-    """The fields of a route that its quality gives."""
-    latency = None
-    if quality.latency is not None and quality.latency_last is not None and quality.latency_error is not None:
-        same = msgspec.structs.asdict(quality.latency)
-        latency = LatencyInfo(**same, last=quality.latency_last, error=quality.latency_error)
-    return {
-        "messages": quality.messages,
-        "bytes": quality.bytes - LENGTH.size * quality.messages,
-        "age": quality.age,
-        "rate": _known(quality.rate),
-        "bandwidth": _known(quality.bandwidth - LENGTH.size * quality.rate),
-        "period": quality.period if quality.period.count else None,
-        "jitter": _known(quality.jitter),
-        "latency": latency,
-    }
+    """The fields of a route that its quality gives; bytes without TCPROS's length fields."""
+    known = quality._asdict() | {"bytes": quality.bytes - LENGTH.size * quality.messages}
+    if quality.bandwidth is not None and quality.rate is not None:
+        known["bandwidth"] = quality.bandwidth - LENGTH.size * quality.rate
+    return known | {"period": quality.period if quality.period.count else None}
 
 
 def _events(watch: QosWatch | None, now: float) -> dict[str, Any]:

@@ -171,8 +171,6 @@ def _peer(agent: str, peer: PeerInfo) -> Iterator[Check]:
             yield machine.judge_peer_clock(agent, peer.name, link.clock_offset, link.clock_error)
 
 
-# --- which nodes of a secured module listen beyond this machine: what ROS 1 leaves open (docs/reference/security.md)
-
 _LISTED: Final = 5
 _AGENTS_OWN: Final = ("/rmpa", "/rosout")
 

@@ -39,7 +39,6 @@ from rmpa.runtime.realtime import REMEDY
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-# --- what several checks need ---------------------------------------------------------------------------------------
 
 # The name under which a core is asked.
 CALLER: Final = "/rmpa_doctor"
@@ -175,8 +174,6 @@ def resolve(names: Iterable[str]) -> dict[str, tuple[str, ...]]:
     return dict(found)
 
 
-# --- clocks ---------------------------------------------------------------------------------------------------------
-
 # STA_UNSYNC of adjtimex(2).
 _UNSYNCHRONISED: Final = 0x40
 
@@ -277,9 +274,6 @@ def judge_peer_clock(agent: str, peer: str, offset: float, error: float | None) 
     return Check("clock", WARN, text, remedy, where=f"{agent}-{peer}")
 
 
-# --- the start with the machine -------------------------------------------------------------------------------------
-
-
 # The agent's unit, as ``rmpa service install`` and the Debian package name it.
 UNIT: Final = "rmpa.service"
 # How one is started that does not start with the machine; and one that has no name and keys.
@@ -295,8 +289,8 @@ def at_boot(_: DoctorInput) -> Iterable[Check]:
 def read_unit() -> dict[str, str]:
     """What ``systemctl show`` says of the agent's unit; empty where there is no systemd."""
     properties = "--property=LoadState,ActiveState,UnitFileState,Result,FragmentPath"
-    told = ask_program("systemctl", "show", UNIT, properties) or ""
-    return dict(line.partition("=")[::2] for line in told.splitlines())
+    shown = ask_program("systemctl", "show", UNIT, properties) or ""
+    return dict(line.partition("=")[::2] for line in shown.splitlines())
 
 
 def is_set_up(unit: Mapping[str, str]) -> bool:
@@ -322,9 +316,6 @@ def judge_unit(unit: Mapping[str, str]) -> Check:
             "boot", WARN, "rmpa.service starts with the machine, and was stopped", "sudo systemctl start rmpa"
         )
     return Check("boot", OK, f"rmpa.service is {unit['ActiveState']}, and starts with the machine")
-
-
-# --- rights for real time, and the limit of open files --------------------------------------------------------------
 
 
 def rights(given: DoctorInput) -> Iterable[Check]:
@@ -384,9 +375,6 @@ def judge_rights(fifo: str, memlock: int | None, files: int | None, *, wanted: b
         yield Check("files", WARN, text, remedy)
     elif files is not None:
         yield Check("files", OK, f"an agent started here may have {files} open")
-
-
-# --- the ROS_* variables of a shell: whether nodes started in it find the module's core, and can be reached ---------
 
 
 @dataclass(frozen=True, slots=True)
@@ -551,19 +539,19 @@ def _own_name(shell: RosShell) -> Iterator[Check]:
 def _host_name(shell: RosShell, remedy: str) -> tuple[Any, ...]:
     """Without those variables nodes are to be reached under the host's name."""
     name, addresses = shell.host_name, shell.resolved.get(shell.host_name, ())
-    told = f"nodes register with the host name {name}"
+    begin = f"nodes register with the host name {name}"
     if name == "localhost":
         return OK, "nodes are reached by this machine's address"
     if not addresses:
         return (
             FAIL,
-            f"{told}, and that name cannot be resolved",
+            f"{begin}, and that name cannot be resolved",
             f"put '127.0.1.1 {name}' into /etc/hosts, or {remedy}",
         )
     if not shell.is_here(name):
         return (
             FAIL,
-            f"{told}, which resolves to {addresses[0]}: not this machine",
+            f"{begin}, which resolves to {addresses[0]}: not this machine",
             f"correct /etc/hosts, or {remedy}",
         )
     return OK, f"{name} is this machine ({addresses[0]})"

@@ -97,8 +97,8 @@ def without_rules(found: Diagnosis) -> Diagnosis:
     denied = permission_there(found.to, found.peer, Access.PUBLISH, found.name)
     allowed = Check(PERMISSION_HERE, OK, f"{found.to} lets {found.peer} publish it")
     ruled = ((stage, stage.name == PERMISSION_HERE) for stage in found.stages)
-    told = (stage if not by_rule else denied if stage.level is FAIL else allowed for stage, by_rule in ruled)
-    return msgspec.structs.replace(found, stages=tuple(told))
+    shown = (stage if not by_rule else denied if stage.level is FAIL else allowed for stage, by_rule in ruled)
+    return msgspec.structs.replace(found, stages=tuple(shown))
 
 
 def until_failure(stages: Iterable[Check]) -> tuple[Check, ...]:

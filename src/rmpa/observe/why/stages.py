@@ -260,9 +260,6 @@ def _published(ends: Ends, peer: str) -> Check:
     return Check("publisher", FAIL, text, f"did you mean {there.similar}?" if there.similar else remedy)
 
 
-# --- the stages of one publisher ------------------------------------------------------------------------------------
-
-
 def _policy_there(way: Way) -> Check:
     if way.told is None:
         return Check("policy there", UNKNOWN, f"{way.peer} did not tell")

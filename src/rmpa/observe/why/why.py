@@ -177,8 +177,6 @@ class WhyService:
         wires = names.wires_of(name)
         return (name, wires[0]) if wires else (names.local_name(name), name)
 
-    # --- topics of peers --------------------------------------------------------------------------------------
-
     def _own(self, topic: str) -> list[str]:
         """The module's own publishers of a topic."""
         return [node for node in self._core.publishers(topic) if not is_own(node)]
@@ -259,8 +257,6 @@ class WhyService:
         session = self._session(peer)
         return dict(self._facts.topics.arrivals(session, peer.instance, topic)) if session is not None else {}
 
-    # --- topics of this module -------------------------------------------------------------------------------
-
     async def _leaves(self, topic: str, name: str) -> tuple[Diagnosis, ...]:
         """Have a peer judge the paths from here to it."""
         snapshot = self._snapshot()
@@ -328,8 +324,6 @@ class WhyService:
         offered = self._bridge.topics.exports.offered
         relayed = ((node, offered.get(Source(topic, node))) for node in self._core.publishers(topic))
         return [node for node, local in relayed if local and local.origin and local.origin.instance == instance]
-
-    # --- services ---------------------------------------------------------------------------------------------
 
     async def _service(self, service: str, name: str | None) -> tuple[Diagnosis, ...]:
         """Judge the path of a service from one peer, or from each, to here."""
