@@ -448,7 +448,6 @@ class Agent:
         self._facts = facts = BridgeFacts(self.bridge, self.services, twins)
         parts = AgentParts(
             core=self.core,
-            bridge=self.bridge,
             facts=facts,
             endpoint=lambda: (at.identity, at.mesh, at.discovery) if (at := self.network.endpoint) else None,
             counters=counters,
@@ -461,10 +460,8 @@ class Agent:
         needs = Needs((), "the agent and its machine, nothing of the module's graph")
         self.bridge.rpc.on_request(INFO, lambda _asker, _args: self.snapshots.agent().for_peers(), needs)
         self.sites = SiteRequests(self.bridge)
-        self.why = WhyService(settings.name, parts, self.services, self.snapshots, self.sites)
-        self.operations = ControlOperations(
-            settings.name, self.bridge, facts, self.params, self.snapshots, nodes, self.sites
-        )
+        self.why = WhyService(settings.name, facts, self.snapshots, self.sites)
+        self.operations = ControlOperations(settings.name, facts, self.params, self.snapshots, nodes, self.sites)
         self.trust_commands = TrustCommands(settings, self.trust)
         handlers: dict[str, Handler] = {
             **self.operations.handlers(),
@@ -497,7 +494,7 @@ class Agent:
             undo.push_async_callback(self.core.close)
             await self.bridge.start()
             undo.push_async_callback(self.bridge.close)
-            diagnostics = Diagnostics(self.core, self.bridge, self._facts, self.snapshots)
+            diagnostics = Diagnostics(self._facts, self.snapshots)
             diagnostics.start()
             undo.callback(diagnostics.close)
             loggers = LoggerServices(self.bridge.node, self.core.call, _LOGGERS)

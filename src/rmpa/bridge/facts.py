@@ -30,7 +30,7 @@ class ServiceFacts:
     """
 
     def __init__(self, services: Services) -> None:
-        self._services = services
+        self.part = services
 
     def used(self, most: int) -> tuple[Collection[str] | None, int]:
         """The names to show where at most so many services can be shown, and the number of the other services.
@@ -38,7 +38,7 @@ class ServiceFacts:
         First the services of this module and those that are or were called, all of them; then the others that are
         shown, then the hidden ones. A name stands for all services of that name.
         """
-        services = self._services
+        services = self.part
         first, shown, hidden = set(services.exports.seen), Counter[str](), Counter[str]()
         for _, remote in yielding_to_data(list(services.imports)):
             known = services.shown(remote)
@@ -52,18 +52,18 @@ class ServiceFacts:
         if wanted is not None and not wanted:
             return ()
         found = []
-        for service, server in list(self._services.exports.seen.items()):
+        for service, server in list(self.part.exports.seen.items()):
             if wanted is None or service in wanted:
                 yield_to_data()
                 found.append(self._own_service(service, server))
-        for peer, remote in yielding_to_data(list(self._services.imports)):
+        for peer, remote in yielding_to_data(list(self.part.imports)):
             if wanted is None or remote.name in wanted:
                 yield_to_data()
                 found.append(self.of_peer(peer, remote))
         return tuple(sorted(found, key=lambda info: (info.name, info.direction == "in", info.peer)))
 
     def _own_service(self, service: str, server: LocalService) -> ServiceInfo:
-        services = self._services
+        services = self.part
         exports, peer_name = services.exports, services.imports.peer_name
         about, decision = exports.about.get(service), exports.judge(service, server)
         callers = tuple(sorted(map(peer_name, exports.callers(service))))
@@ -76,7 +76,7 @@ class ServiceFacts:
             type=about.type if about else "",
             md5=about.md5sum if about else "",
             callers=callers,
-            wanted=self._services.context.services.transport(service).value,
+            wanted=self.part.context.services.transport(service).value,
             direct_callers=tuple(sorted(peer_name(peer) for peer, _, _ in direct)),
             crosses=decision.allowed,
             policy=decision.rule,
@@ -85,7 +85,7 @@ class ServiceFacts:
 
     def of_peer(self, peer: int, remote: RemoteService) -> ServiceInfo:
         """A service of a peer, by the number of its session."""
-        services, rules = self._services, self._services.context.services
+        services, rules = self.part, self.part.context.services
         shown, decision = services.shown(remote), rules.judge(remote.name, remote.node)
         figures = _figures(shown.stats if shown else None)
         figures["problem"] = (shown.mismatch if shown else "") or figures.get("problem") or remote.problem
@@ -133,18 +133,19 @@ class BridgeFacts:
     """
 
     def __init__(self, bridge: Bridge, services: Services, twins: TwinWatch) -> None:
+        self.bridge = bridge
         self.topics = TopicFacts(bridge)
         self.services = ServiceFacts(services)
-        self._bridge, self._services, self._twins = bridge, services, twins
+        self._services, self._twins = services, twins
 
     def proxies(self) -> dict[str, Any]:
         """The fields of ``AgentInfo`` about the nodes that stand for those of peers."""
-        nodes, count = self._bridge.proxy_nodes, self._bridge.sessions.proxy_count
+        nodes, count = self.bridge.proxy_nodes, self.bridge.sessions.proxy_count
         return {"proxies": count, "proxy_sockets": nodes.sockets(count), "proxy_listening": nodes.listening}
 
     def peer(self, session: PeerSession) -> dict[str, Any]:
         """The fields of ``PeerInfo`` about what crosses; ``conflicts`` has those of names alone."""
-        topics, peer = self._bridge.topics, session.peer
+        topics, peer = self.bridge.topics, session.peer
         offered = len(topics.imports.offered_by(peer)), topics.exports.topics_for(peer)
         yield_to_data()
         twins = self._twins.problem(session)
@@ -160,8 +161,8 @@ class BridgeFacts:
 
     def _beyond(self, session: PeerSession) -> Iterator[BoundInfo]:
         """What of a peer this module refuses because of its limits."""
-        topics, services = self._bridge.topics.imports, self._services.imports
-        most, peer, name = self._bridge.context.settings.limits, session.peer, session.link.name
+        topics, services = self.bridge.topics.imports, self._services.imports
+        most, peer, name = self.bridge.context.settings.limits, session.peer, session.link.name
         nodes = {"topics": topics.refused_nodes(peer), "services": services.refused_nodes(peer)}
         further = [f"{count} {kind}" for kind, of in nodes.items() if (count := sum(map(len, of.values())))]
         for hidden, kind, limit in (
@@ -176,7 +177,7 @@ class BridgeFacts:
 
     def relayed(self) -> Iterator[tuple[Origin, str, int]]:
         """Each module without a link: one of its origins, the peer that relays it, and how many topics are shown."""
-        imports = self._bridge.topics.imports
+        imports = self.bridge.topics.imports
         shown = {
             (entry.origin.instance, entry.name)
             for _, _, entry in yielding_to_data(list(imports))
@@ -187,14 +188,14 @@ class BridgeFacts:
 
     def lost(self) -> dict[str, str]:
         """The relay that brought a module last, of each that no relay brings any more."""
-        return dict(self._bridge.topics.imports.ways.lost)
+        return dict(self.bridge.topics.imports.ways.lost)
 
     def notes(self) -> Iterator[str]:
         """What of this module no peer is offered because of its limits."""
-        for part, kind in ((self._bridge.topics, "topics"), (self._services, "services")):
+        for part, kind in ((self.bridge.topics, "topics"), (self._services, "services")):
             if beyond := part.exports.beyond:
                 which = f"{_count(len(beyond), kind)} of this module are offered to no peer"
-                limit = getattr(self._bridge.context.settings.limits, kind)
+                limit = getattr(self.bridge.context.settings.limits, kind)
                 yield f"{which}: more than limits.{kind} = {limit}; {_raise_limit(kind)}"
 
 

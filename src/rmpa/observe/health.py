@@ -22,14 +22,12 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.facts import BridgeFacts
     from rmpa.core.facts import RouteInfo, ServiceInfo, TopicInfo
     from rmpa.core.statistics import SampleSpread
     from rmpa.observe.check import CheckLevel
     from rmpa.observe.snapshot import PeerInfo, Snapshot
     from rmpa.observe.snapshot_builder import SnapshotBuilder
-    from rmpa.ros.core.external import Core
 
 
 _log = logging.getLogger(__name__)
@@ -396,22 +394,19 @@ class Diagnostics(PublicationEvents):
     The agent's own node publishes them, so they do not cross to other modules. Without a subscriber nothing is built.
 
     Args:
-        core: The local core.
-        bridge: Has the node that publishes; started before.
-        facts: What the bridge tells.
+        facts: What the bridge tells; its node publishes, and has been started.
         snapshots: Builds what is judged.
     """
 
-    def __init__(self, core: Core, bridge: Bridge, facts: BridgeFacts, snapshots: SnapshotBuilder) -> None:
-        self._core = core
-        self._bridge = bridge
+    def __init__(self, facts: BridgeFacts, snapshots: SnapshotBuilder) -> None:
         self._facts = facts
+        self._bridge, self._core = facts.bridge, facts.bridge.core
         self._snapshots = snapshots
         self._clock = SystemClock()
         self._health = Health()
         self._sequence = 0
         # The queue is short: a newer message repeats all of an older one.
-        self._publication = Publication(TOPIC, bridge.node.name, _ARRAY, queue_messages=10, events=self)
+        self._publication = Publication(TOPIC, facts.bridge.node.name, _ARRAY, queue_messages=10, events=self)
         self._timer: asyncio.TimerHandle | None = None
 
     def start(self) -> None:

@@ -14,7 +14,7 @@ from rmpa.bridge.params import rules as transfer
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.facts import ContractTerm, FollowedInfo
-from rmpa.core.identity import OWN_NODE, is_global_name
+from rmpa.core.identity import OWN_NODE, is_global_name, is_meant
 from rmpa.observe import limits
 from rmpa.observe.control import ReloadReply
 from rmpa.observe.graph import GraphRevision
@@ -28,7 +28,6 @@ from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.facts import BridgeFacts
     from rmpa.bridge.nodes import Nodes
     from rmpa.bridge.params.follower import Params
@@ -48,8 +47,7 @@ class ControlOperations:
 
     Args:
         name: The agent's name.
-        bridge: Its bridge.
-        facts: What that tells.
+        facts: What its bridge tells.
         params: The bridge's part for parameters.
         snapshots: Builds its snapshots.
         nodes: Knows the nodes of this module.
@@ -57,7 +55,6 @@ class ControlOperations:
     """
 
     name: str
-    bridge: Bridge
     facts: BridgeFacts
     params: Params
     snapshots: SnapshotBuilder
@@ -105,7 +102,7 @@ class ControlOperations:
         if "/" in peer:
             site, module = read_site_module(peer)
             return await self.sites.one(PARAM, {"site": site, "module": module, "what": what, **inner})
-        return await self.bridge.rpc.request(self._session(peer), what, inner, bridge_limits.PARAM_ASK_TIMEOUT)
+        return await self.facts.bridge.rpc.request(self._session(peer), what, inner, bridge_limits.PARAM_ASK_TIMEOUT)
 
     def followed(self, _args: Args) -> tuple[FollowedInfo, ...]:
         """The parameters of other modules that this one follows."""
@@ -130,18 +127,18 @@ class ControlOperations:
         if peer is None and what == node_requests.NODE_INFO:
             return await self.nodes.info(args)
         if peer is None:
-            return await asyncio.gather(*map(self._nodes_of, self.bridge.sessions.linked()))
+            return await asyncio.gather(*map(self._nodes_of, self.facts.bridge.sessions.linked()))
         session = self._session(peer)
         if what == node_requests.LIST:
             return [await self._nodes_of(session)]
         request = {"node": str(args.get("node", "")), "by": OWN_NODE, "reason": "user request"}
-        return await self.bridge.rpc.request(session, what, request, bridge_limits.NODE_KILL_TIMEOUT)
+        return await self.facts.bridge.rpc.request(session, what, request, bridge_limits.NODE_KILL_TIMEOUT)
 
     async def _nodes_of(self, session: PeerSession) -> PeerNodes:
         """The nodes of a peer; where it does not answer, those of which this module has proxies."""
         peer = session.link.name
         try:
-            value = await self.bridge.rpc.request(session, node_requests.LIST, {})
+            value = await self.facts.bridge.rpc.request(session, node_requests.LIST, {})
             return PeerNodes(peer=peer, nodes=msgspec.convert(value, tuple[NodeLine, ...]))
         except (RmpaError, msgspec.ValidationError) as error:
             nodes = tuple(NodeLine(name=node) for node, _ in session.proxies)
@@ -149,7 +146,7 @@ class ControlOperations:
 
     async def agent(self, args: Args) -> Any:
         """The facts of a peer's module: ``peer``, its name or GUID."""
-        return await self.bridge.rpc.request(self._session(args.get("peer", "")), INFO, {})
+        return await self.facts.bridge.rpc.request(self._session(args.get("peer", "")), INFO, {})
 
     def contract(self, args: Args) -> dict[str, ContractTerm]:
         """The terms that this module's settings give a ``topic`` of a ``type_name``, by key; it need not exist."""
@@ -166,8 +163,8 @@ class ControlOperations:
             UnreachableError: No such peer has it.
         """
         peer = str(name)
-        sessions = list(self.bridge.sessions.linked())
-        fitting = [s for s in sessions if peer in {s.link.name, str(s.link.guid), str(s.link.guid).partition("#")[0]}]
+        sessions = list(self.facts.bridge.sessions.linked())
+        fitting = [session for session in sessions if is_meant(peer, session.link.name, str(session.link.guid))]
         if len(fitting) == 1:
             return fitting[0]
         if fitting:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from rmpa.bridge.facts import BridgeFacts
-    from rmpa.bridge.sessions import PeerSession, PeerSessions
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.core.identity import Identity
     from rmpa.core.timers import Yielder
     from rmpa.discovery.discovery import Discovery
@@ -107,8 +107,7 @@ class Peers:
     Args:
         name: This module's.
         endpoint: As of ``AgentParts``.
-        sessions: The bridge's sessions.
-        facts: What the bridge and its parts tell.
+        facts: What the bridge tells.
         restart: As of ``AgentParts``.
     """
 
@@ -116,13 +115,11 @@ class Peers:
         self,
         name: str,
         endpoint: Callable[[], tuple[Identity, Mesh, Discovery] | None],
-        sessions: PeerSessions,
         facts: BridgeFacts,
         restart: Callable[[], str],
     ) -> None:
         self._name = name
         self._endpoint = endpoint
-        self._sessions = sessions
         self._facts = facts
         self._restart = restart
 
@@ -131,7 +128,7 @@ class Peers:
         if (endpoint := self._endpoint()) is None:
             return (), ()
         (identity, mesh, discovery), now = endpoint, time.monotonic()
-        links = {session.link.guid: session for session in self._sessions.linked()}
+        links = {session.link.guid: session for session in self._facts.bridge.sessions.linked()}
         roster = {view.run.identity.guid: view for view in discovery.peers(yielding_to_data)}
         yield_to_data()
         statuses = {status.identity.guid: status for status in mesh.peers()}

@@ -20,7 +20,6 @@ from rmpa.runtime.loop import yield_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
 
-    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.facts import BridgeFacts
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Identity
@@ -37,8 +36,7 @@ class AgentParts:
 
     Args:
         core: The agent's ROS core.
-        bridge: Its bridge.
-        facts: What the bridge and its parts tell.
+        facts: What its bridge tells.
         endpoint: Its identity, mesh and discovery now; ``None`` while it has no place in the network.
         counters: The counters of parts that are not named here.
         notes: What else the user should know, each ready to read.
@@ -48,7 +46,6 @@ class AgentParts:
     """
 
     core: Core
-    bridge: Bridge
     facts: BridgeFacts
     endpoint: Callable[[], tuple[Identity, Mesh, Discovery] | None]
     counters: Counters
@@ -74,7 +71,7 @@ class SnapshotBuilder:
         self._cpu: float | None = None
         self._cpu_known = self._began = time.monotonic()
         self._started = time.time()
-        self._peers = Peers(settings.name, parts.endpoint, parts.bridge.sessions, parts.facts, parts.restart)
+        self._peers = Peers(settings.name, parts.endpoint, parts.facts, parts.restart)
 
     def reload(self, settings: Settings) -> None:
         """Use other settings from now on."""
@@ -99,7 +96,7 @@ class SnapshotBuilder:
         """
         parts, endpoint = self._parts, self._parts.endpoint()
         counters: Counter[str] = Counter()
-        several = [parts.bridge.counters, parts.core.counters, DESCRIPTORS.counters, parts.counters]
+        several = [parts.facts.bridge.counters, parts.core.counters, DESCRIPTORS.counters, parts.counters]
         notes: list[str] = []
         if endpoint is not None:
             _, mesh, discovery = endpoint

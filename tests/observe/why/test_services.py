@@ -98,8 +98,6 @@ def test_without_a_link_nothing_else_is_judged() -> None:
     assert walk(begin=begin).stages == begin
 
 
-# --- modules --------------------------------------------------------------------------------------------------------
-
 LANES = (LaneInfo(name="express", connected=True), LaneInfo(name="bulk", connected=True))
 UNNEEDED = (LANES[0], LaneInfo(name="bulk", connected=False, unneeded=True))
 CUT = (LANES[0], LaneInfo(name="bulk", connected=False, queued=9))

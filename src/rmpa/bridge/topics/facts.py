@@ -250,17 +250,13 @@ class TopicFacts:
                 continue
             yield_to_data()
             yield source.topic, None, list(self._bridge.topics.mismatches(source))
-            flowing = list(exports.flowing(source))
-            for peer in flowing:
-                route = self._route_to(
-                    peer, names.get(peer, ""), source, local, "open", exports.contract(source, peer)
-                )
-                yield source.topic, route, []
+            flowing = dict.fromkeys(exports.flowing(source), "open")
             grants = self._bridge.topics.direct_exports.of(source.topic, source.node)
-            for peer in dict.fromkeys(peer for peer, _, _ in grants):
-                session = sessions.get(peer)
-                if peer not in flowing and session is not None:
-                    yield source.topic, self._route_to(peer, session.link.name, source, local, "idle"), []
+            idle = {peer: "idle" for peer, _, _ in grants if peer not in flowing}
+            for peer, state in (flowing | idle).items():
+                if (session := sessions.get(peer)) is not None:
+                    contract = exports.contract(source, peer)
+                    yield source.topic, self._route_to(peer, session.link.name, source, local, state, contract), []
             for peer, contract in exports.absent(source).items():
                 if peer not in names or exports.contract(source, peer) is None:
                     name, seconds = self._bridge.topics.losses.away(peer)

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
 from rmpa.config.peer_rules import Access
+from rmpa.core.identity import is_meant
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
 from rmpa.observe.doctor.machine import judge_peer_clock
 from rmpa.observe.snapshot import ModuleFacts
@@ -175,7 +176,7 @@ def diagnose_module(snapshot: Snapshot, name: str, told: ModuleFacts | None = No
     """
     own, peer = snapshot.agent, find_peer(snapshot, name)
     shown, stages = peer.name if peer is not None else name, peer_stages(snapshot, name)
-    if name in (own.name, own.guid, own.guid.partition("#")[0]):
+    if is_meant(name, own.name, own.guid):
         shown, stages = (
             own.name,
             (Check("peer", OK, f"{own.name} is this module ({own.guid}); its agent has answered"),),

@@ -23,6 +23,7 @@ from rmpa.config.rules import CLOCK
 from rmpa.config.values import did_you_mean
 from rmpa.core import limits as core_limits
 from rmpa.core.facts import Arrival, PublisherReport, RouteInfo
+from rmpa.core.identity import is_meant
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check, CheckLevel
 from rmpa.observe.why.diagnosis import (
@@ -109,7 +110,7 @@ def find_peer(snapshot: Snapshot, name: str) -> PeerInfo | None:
 
 
 def _fitting(peers: Iterable[PeerInfo], name: str) -> list[PeerInfo]:
-    return [p for p in peers if name in (p.name, p.guid, p.guid.partition("#")[0])]
+    return [peer for peer in peers if is_meant(name, peer.name, peer.guid)]
 
 
 def peer_stages(snapshot: Snapshot, name: str) -> tuple[Check, ...]:

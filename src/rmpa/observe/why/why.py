@@ -37,12 +37,12 @@ from rmpa.runtime.loop import yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rmpa.bridge.services.part import Services
+    from rmpa.bridge.facts import BridgeFacts
     from rmpa.bridge.sessions import PeerSession
     from rmpa.core.facts import Arrival, PublisherReport
     from rmpa.observe.sites import SiteRequests
     from rmpa.observe.snapshot import PeerInfo, Snapshot
-    from rmpa.observe.snapshot_builder import AgentParts, SnapshotBuilder
+    from rmpa.observe.snapshot_builder import SnapshotBuilder
 
 _T = TypeVar("_T")
 # The request to a publisher's agent: what it knows of a topic. Replied by ``TopicAtPublisher``.
@@ -63,20 +63,18 @@ class WhyService:
 
     Args:
         name: The module's.
-        parts: The parts of its agent.
-        services: The bridge's part for services.
+        facts: What its bridge tells.
         snapshots: Its snapshots.
         sites: Asks gateways for the ways through them.
     """
 
-    def __init__(
-        self, name: str, parts: AgentParts, services: Services, snapshots: SnapshotBuilder, sites: SiteRequests
-    ) -> None:
+    def __init__(self, name: str, facts: BridgeFacts, snapshots: SnapshotBuilder, sites: SiteRequests) -> None:
         self._name = name
-        self._core, self._bridge, self._facts, self._services = parts.core, parts.bridge, parts.facts, services
+        self._facts, self._services = facts, facts.services.part
+        self._bridge, self._core = facts.bridge, facts.bridge.core
         self._snapshots = snapshots
         self._sites = sites
-        rpc = parts.bridge.rpc
+        rpc = self._bridge.rpc
         rpc.on_request(TOPIC, self._answer_topic, Needs((Access.SUBSCRIBE,), "the topic, and those like it"))
         rpc.on_request(SERVICE, self._answer_service, Needs((Access.CALL,), "the service, and those like it"))
         rpc.on_request(HERE, self._answer_here, Needs((Access.PUBLISH,), "the topic, which the peer publishes"))
