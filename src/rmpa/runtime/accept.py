@@ -132,11 +132,6 @@ class Descriptors:
         return _file_limits()[0]
 
     @property
-    def hard_limit(self) -> int:
-        """The highest soft limit that needs no privileges."""
-        return _file_limits()[1]
-
-    @property
     def reserve(self) -> int:
         """The number of descriptors that are kept for the core and the links."""
         return min(limits.DESCRIPTORS_RESERVED, self.limit // limits.DESCRIPTORS_RESERVED_PART)
@@ -166,7 +161,7 @@ class Descriptors:
         return FilesInfo(
             open=used,
             limit=limit,
-            hard=self.hard_limit,
+            hard=_file_limits()[1],
             reserved=reserved,
             near=used >= limits.DESCRIPTORS_NEAR * (limit - reserved),
             refused=sum(count for name, count in self.counters.as_dict().items() if ".refused." in name),

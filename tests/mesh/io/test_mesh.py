@@ -188,7 +188,7 @@ async def test_messages_arrive_in_order_and_byte_exact() -> None:
         for route in (1, 2):
             assert [m for m in other.data if m[0] == route] == [m for m in sent if m[0] == route]
         assert other.controls == [b'{"op":"end"}']
-        assert not link.dropped
+        assert not link.info().dropped
 
 
 async def test_killed_peer_comes_back_as_a_new_instance() -> None:
@@ -287,7 +287,7 @@ async def test_stopped_peer_is_down_after_its_lease(
         for i in range(64):
             link.express.send(5, i, i, block)
             assert link.queue_bytes <= 6 * MIB
-        assert link.dropped >= 50
+        assert link.info().dropped >= 50
         assert link.close_route(5) <= 4
         await until(lambda: bool(one.downs), "the lease is over")
         assert asyncio.get_running_loop().time() - began >= 0.4

@@ -279,7 +279,7 @@ class TopicFacts:
         flow = topics.outbound.flows.get(source)
         route = flow.by_peer.get(peer) if flow is not None else None
         kept = route.sender if isinstance(route, ReliableRouteSender) else None
-        subscribers = self._granted(peer, source) if state != "away" else ()
+        subscribers = self._granted(peer, name, source) if state != "away" else ()
         figures = {}
         if flow is not None:
             figures = {name: getattr(flow, name) for name in ("messages", "dropped", "oversized", "oversized_bytes")}
@@ -303,18 +303,18 @@ class TopicFacts:
             **figures,
         )
 
-    def _granted(self, peer: int, source: Source) -> tuple[SubscriberTransport, ...]:
+    def _granted(self, peer: int, link: str, source: Source) -> tuple[SubscriberTransport, ...]:
         """A peer's subscribers that may connect to a local source directly, by name."""
-        exports, session = self._bridge.topics.direct_exports, self._bridge.sessions.get(peer)
-        known = exports.interruptions if session is not None else {}
-        link = session.link.name if session is not None else ""
+        exports = self._bridge.topics.direct_exports
         return tuple(
             SubscriberTransport(
                 node=name,
                 transport="direct",
                 state="granted",
                 endpoint=str(grant.port),
-                **_interruptions(known.get((link, Want(source.topic, source.node, name))), self._clock.now()),
+                **_interruptions(
+                    exports.interruptions.get((link, Want(source.topic, source.node, name))), self._clock.now()
+                ),
             )
             for owner, name, grant in exports.of(source.topic, source.node)
             if owner == peer

@@ -49,12 +49,9 @@ class LaneSender:
 
     def info(self, *, unneeded: bool = False) -> LaneInfo:
         """Its piece of the snapshot; ``unneeded``: no message has wanted it yet."""
-        stream, dropped = self._stream, self.outbox.dropped.total()
-        if stream is None:
-            return LaneInfo(self.name, False, unneeded, queued=self.outbox.pending_bytes, dropped=dropped)
-        return LaneInfo(
-            self.name, True, unneeded, stream.bytes_in, stream.bytes_out, stream.pending_bytes, dropped=dropped
-        )
+        it, dropped = self._stream, self.outbox.dropped.total()
+        counts = (0, 0, self.outbox.pending_bytes) if it is None else (it.bytes_in, it.bytes_out, it.pending_bytes)
+        return LaneInfo(self.name, it is not None, unneeded, *counts, dropped)
 
     def connect(self, stream: Stream) -> None:
         """Use a connection from now on; waiting messages are sent first."""

@@ -474,11 +474,6 @@ class PeerLink:
         return stream.pending_bytes > 0 or stream.unacknowledged > _TELL_BACKLOG
 
     @property
-    def dropped(self) -> int:
-        """Messages dropped so far because the peer took them too slowly."""
-        return self.express.outbox.dropped.total() + self.bulk.outbox.dropped.total()
-
-    @property
     def heard_at(self) -> float:
         """Monotonic seconds at which bytes were last received on the express lane."""
         return max(self.connection.keepalive.heard, self.connection.stream.last_in)
@@ -491,6 +486,7 @@ class PeerLink:
     def info(self) -> LinkInfo:
         """Its piece of the snapshot."""
         now, (host, port) = self._mesh.clock.now(), self.remote_endpoint
+        lanes = self.express.info(), self.bulk.info(unneeded=not self.bulk_wanted)
         return LinkInfo(
             remote=f"{host}:{port}",
             dialled=self.dialled,
@@ -501,11 +497,11 @@ class PeerLink:
             bytes_in=self.bytes_in,
             bytes_out=self.bytes_out,
             queued=self.queue_bytes,
-            dropped=self.dropped,
+            dropped=sum(lane.dropped for lane in lanes),
             heard_ago=now - self.heard_at,
             rests=self.rests,
             lease=self.connection.keepalive.remote_lease,
-            lanes=(self.express.info(), self.bulk.info(unneeded=not self.bulk_wanted)),
+            lanes=lanes,
         )
 
     def send_control(self, payload: bytes) -> None:

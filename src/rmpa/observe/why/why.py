@@ -148,9 +148,6 @@ class WhyService:
         """Of the agent and its peers."""
         return self._snapshots.build(())
 
-    def _reachable_peers(self) -> list[PeerInfo]:
-        return [peer for peer in self._snapshot().peers if peer.state in _REACHED]
-
     def _is_service(self, name: str) -> bool:
         state = self._core.state()
         if name in state.publishers or name in state.subscribers or any(self._bridge.topics.imports.at(name)):
@@ -327,7 +324,7 @@ class WhyService:
         """Judge the path of a service from one peer, or from each, to here."""
         if name is not None:
             return (await self._calls(name, service),)
-        peers = self._reachable_peers()
+        peers = [peer for peer in self._snapshot().peers if peer.state in _REACHED]
         offering = [peer.guid for peer in peers if self._offers(peer, service)]
         found = await asyncio.gather(*(self._calls(guid, service) for guid in offering or [p.guid for p in peers]))
         served = tuple(diagnosis for diagnosis in found if diagnosis.node) or tuple(filter(_is_denied, found))
