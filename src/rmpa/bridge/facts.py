@@ -27,6 +27,9 @@ class ServiceFacts:
 
     Args:
         services: The part.
+
+    Attributes:
+        part: The part.
     """
 
     def __init__(self, services: Services) -> None:
@@ -130,6 +133,10 @@ class BridgeFacts:
         bridge: The bridge.
         services: Its part for services.
         twins: Its part for peers of this module's kind.
+
+    Attributes:
+        topics: The facts of topics.
+        services: The facts of services.
     """
 
     def __init__(self, bridge: Bridge, services: Services, twins: TwinWatch) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 import os
-from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import msgspec
 
@@ -84,13 +84,13 @@ class ModuleFacts(msgspec.Struct, kw_only=True, frozen=True):
 
 def read_facts(kind: type[ModuleFacts]) -> dict[str, Any]:
     """The facts that have a ``reading``, by name, as they are now on this machine."""
-    marks = ((name, getattr(hint, "__metadata__", ())) for name, hint in _hints(kind).items())
-    return {name: mark.extra["reading"]() for name, found in marks for mark in found if mark.extra}
+    return {name: how() for name, how in _readings(kind).items()}
 
 
 @functools.cache
-def _hints(kind: type[ModuleFacts]) -> dict[str, Any]:
-    return get_type_hints(kind, include_extras=True)
+def _readings(kind: type[ModuleFacts]) -> dict[str, Callable[[], object]]:
+    marks = ((field.name, getattr(field.type, "__metadata__", ())) for field in msgspec.structs.fields(kind))
+    return {name: mark.extra["reading"] for name, found in marks for mark in found}
 
 
 class AgentInfo(ModuleFacts, kw_only=True, frozen=True):
