@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from rmpa.core.statistics import SampleSummary
+    from rmpa.core.statistics import SampleSpread
 
 WIDTH, HEIGHT = 32, 11
 """The trail's drawing, in characters."""
@@ -72,7 +72,7 @@ def _topics(view: View) -> Table:
     for name, topic in view.topics.items():
         period, latency = topic.period, topic.latency
         rate = Text(f"{topic.rate:.1f}", style="" if topic.rate else "bold red")
-        times = [period.mean, period.sd, *([latency.p50, latency.p99, latency.maximum] if latency else [None] * 3)]
+        times = [period.mean, period.sd, *([latency.p50, latency.p99, latency.max] if latency else [None] * 3)]
         table.add_row(name, str(topic.messages), rate, *(_number(seconds) for seconds in times))
     return table
 
@@ -85,7 +85,7 @@ def _delay(view: View) -> Text:
     return Text(f"CMD→VEL at the pc: {_spread(view.command_to_velocity)}, {view.unanswered} unanswered")
 
 
-def _spread(summary: SampleSummary) -> str:
+def _spread(summary: SampleSpread) -> str:
     mean, sd, p99 = ms(summary.mean), ms(summary.sd), ms(summary.p99)
     return f"mean {mean}, sd {sd}, p99 {p99}" if summary.count else "nothing yet"
 

@@ -9,7 +9,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rmpa.core.statistics import SampleSummary
+from rmpa.core.statistics import SampleSpread
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -66,8 +66,8 @@ class TopicView:
 
     messages: int
     rate: float
-    period: SampleSummary
-    latency: SampleSummary | None
+    period: SampleSpread
+    latency: SampleSpread | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ class View:
     seconds: float
     modules: dict[str, ModuleView]
     topics: dict[str, TopicView]
-    command_to_velocity: SampleSummary
+    command_to_velocity: SampleSpread
     unanswered: int
     """Commands without an order in time."""
     pose: PoseView | None
@@ -132,8 +132,8 @@ class _Samples:
         self.recent.append(sample)
         self.whole.append(sample)
 
-    def summary(self, *, whole: bool) -> SampleSummary:
-        return SampleSummary.of(self.whole if whole else self.recent)
+    def summary(self, *, whole: bool) -> SampleSpread:
+        return SampleSpread.of(self.whole if whole else self.recent)
 
 
 @dataclass(slots=True)

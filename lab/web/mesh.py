@@ -19,10 +19,11 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from lab.nodes.node import say
+from rmpa.core.facts import LatencyInfo, LinkInfo, RouteInfo, ServiceInfo, TopicInfo
+from rmpa.core.statistics import SampleSpread
 from rmpa.observe.control import ControlReply, ControlRequest
 from rmpa.observe.control_client import ControlClient
-from rmpa.observe.peer_info import LinkInfo, PeerInfo
-from rmpa.observe.snapshot import LatencyInfo, RouteInfo, SampleSpread, ServiceInfo, Snapshot, TopicInfo
+from rmpa.observe.snapshot import PeerInfo, Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

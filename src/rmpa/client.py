@@ -23,12 +23,12 @@ from typing import TYPE_CHECKING, Final, Self, TypeAlias
 import msgspec
 
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.core.facts import LinkInfo, RouteInfo, ServiceInfo, TopicInfo
 from rmpa.core.timers import positive
 from rmpa.observe import limits
-from rmpa.observe.control import GraphRevision
 from rmpa.observe.control_client import ControlClient, choose_agent
-from rmpa.observe.peer_info import LinkInfo, PeerInfo
-from rmpa.observe.snapshot import AgentInfo, RouteInfo, ServiceInfo, Snapshot, TopicInfo
+from rmpa.observe.graph import GraphRevision
+from rmpa.observe.snapshot import AgentInfo, PeerInfo, Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Iterator
@@ -252,8 +252,8 @@ class AgentClient:
     async def events(self, *, since: Snapshot | None = None, period: float = 1.0) -> AsyncGenerator[AgentEvent, None]:
         """The changes from a snapshot on, without end.
 
-        A change of the local graph, which peers' topics are part of, is told at once; other changes at the end of a
-        period. What appears and is gone again in between is not told. An agent that ends is waited for.
+        A change of the local graph, which peers' topics are part of, is an event at once; other changes at the end of
+        a period. What appears and is gone again in between is no event. An agent that ends is waited for.
 
         Args:
             since: The snapshot that the caller knows; ``None``: what is there now comes first, as if it had appeared.

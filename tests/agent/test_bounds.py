@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
-    from rmpa.observe.peer_info import BoundInfo
+    from rmpa.core.facts import BoundInfo
     from rmpa.observe.snapshot import Snapshot
     from rmpa.observe.why.diagnosis import Diagnosis
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -13,10 +14,10 @@ import rmpa
 from rmpa.config.read import Loaded
 from rmpa.core.contract import ContractRule, Reliability
 from rmpa.core.errors import PeerRefused
-from rmpa.observe.control import GraphRevision, TopicRow
 from rmpa.observe.control_client import ControlClient
+from rmpa.observe.graph import GraphRevision, TopicRow
 from rmpa.observe.operations import REPLIES
-from rmpa.observe.peer_info import PeerAgent
+from rmpa.observe.snapshot import ModuleFacts
 from rmpa.ros.environment import NodeFacts
 from tests.agent.test_agent import DEADLINE, node, running
 
@@ -106,8 +107,8 @@ async def test_a_node_tells_its_connections_here_and_at_a_peer(settings: Callabl
 
 async def test_a_peer_tells_of_itself_and_a_module_is_diagnosed(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, b):
-        told = msgspec.convert(await a.operations.agent({"peer": "b"}), PeerAgent)
-        assert (told.version, told.core_uri) == (rmpa.__version__, b.core.uri)
+        told = msgspec.convert(await a.operations.agent({"peer": "b"}), ModuleFacts)
+        assert (told.version, told.core_uri, told.host) == (rmpa.__version__, b.core.uri, os.uname().nodename)
         assert told.rss
         answer = await a.operations.ping({"peer": "b", "count": 2})
         assert len(answer.times) == 2

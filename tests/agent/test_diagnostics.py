@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.config.settings import Settings
-    from rmpa.observe.snapshot import RouteInfo
+    from rmpa.core.facts import RouteInfo
     from rmpa.ros.node.endpoints import Publisher, Received
 
 

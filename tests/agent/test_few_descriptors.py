@@ -43,7 +43,8 @@ if TYPE_CHECKING:
 
     from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
-    from rmpa.observe.snapshot import FilesInfo, RouteInfo, Snapshot
+    from rmpa.core.facts import FilesInfo, RouteInfo
+    from rmpa.observe.snapshot import Snapshot
 
 HARD = 64
 NODES = 40

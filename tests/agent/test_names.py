@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
-    from rmpa.observe.snapshot import TopicInfo
+    from rmpa.core.facts import TopicInfo
 
 PREFIX = (PeerRule("robot", "/{peer}"),)
 

@@ -14,7 +14,7 @@ from unittest import mock
 import pytest
 
 from rmpa.agent.agent import Agent, permission_notes
-from rmpa.bridge.nodes import INFO, KILL, LIST, PING
+from rmpa.bridge.nodes import KILL, LIST, NODE_INFO, PING
 from rmpa.config.peer_rules import Effect, PermissionRule
 from rmpa.config.settings import NodeSettings, ServiceSettings, Settings, TrustSettings
 from rmpa.core.contract import ContractRule, Transport
@@ -137,10 +137,10 @@ async def test_nodes_and_names_of_which_a_module_may_have_nothing_are_not_there_
         (line,) = await b.bridge.rpc.request(link, LIST, {})
         assert (line["name"], line["publications"], line["subscriptions"]) == ("/base", 1, 1)
         assert (await b.bridge.rpc.request(link, PING, {"node": "/base"}))["pid"]
-        facts = await b.bridge.rpc.request(link, INFO, {"node": "/base"})
+        facts = await b.bridge.rpc.request(link, NODE_INFO, {"node": "/base"})
         assert (list(facts["publications"]), list(facts["subscriptions"])) == (["/odom"], ["/cmd_vel"])
         assert facts["services"] == []
-        for what in (PING, INFO):
+        for what in (PING, NODE_INFO):
             said = []
             for name in ("/secret_driver", "/secret_drivex"):
                 with pytest.raises(PeerRefused) as refused:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rmpa.agent.agent import Agent
     from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
-    from rmpa.observe.snapshot import ServiceInfo
+    from rmpa.core.facts import ServiceInfo
 
 CLIENT = "/client"
 AGAIN = "direct.service_again"

@@ -47,7 +47,8 @@ def _module(module: ModuleType, done: set[str]) -> Iterator[str]:
 def _members(kind: type) -> Iterator[str]:
     if issubclass(kind, msgspec.Struct):
         for field in msgspec.structs.fields(kind):
-            yield f"{field.name}: {re.sub(_OURS, '', inspect.formatannotation(field.type))}"
+            plain = field.type.__origin__ if hasattr(field.type, "__metadata__") else field.type
+            yield f"{field.name}: {re.sub(_OURS, '', inspect.formatannotation(plain))}"
         return
     for name in dir(kind):
         found = inspect.getattr_static(kind, name)

@@ -13,9 +13,9 @@ import pytest
 
 from rmpa import client
 from rmpa.core.errors import RmpaError, UnreachableError
-from rmpa.observe.control import GraphRevision
+from rmpa.core.facts import RouteInfo
 from rmpa.observe.control_server import ControlServer
-from rmpa.observe.snapshot import RouteInfo
+from rmpa.observe.graph import GraphRevision
 from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:

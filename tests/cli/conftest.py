@@ -285,6 +285,7 @@ def agent(place: Place, background: Background) -> Iterator[Callable[..., None]]
         name: str = "base", snapshot: Snapshot = SNAPSHOT, ping: Handler | None = None, **others: Handler
     ) -> None:
         times = iter([0.0004, None, 0.0006] * 100)
+        others.setdefault("agent", lambda _: snapshot.agent.for_peers())
         answer = ping or (lambda _: PingReply(times=(next(times),), remote="10.0.0.2:40002"))
         server = ControlServer(place.path, name, {"snapshot": lambda _: snapshot, "ping": answer, **others})
         background.do(server.start())

@@ -11,7 +11,7 @@ import pytest
 
 from rmpa.cli.node import _untold
 from rmpa.core.errors import PeerRefused, UnreachableError
-from rmpa.observe.snapshot import UnreachableInfo
+from rmpa.core.facts import UnreachableInfo
 from rmpa.ros.environment import NodeFacts, NodeLine, NodePing, PeerNodes
 from tests.cli.conftest import compare, settled, with_core
 

@@ -16,8 +16,8 @@ from rmpa.cli.topic import facts
 from rmpa.cli.values import fill_stamps, flatten, pick, read_values, shorten, to_text
 from rmpa.core import errors
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
+from rmpa.core.facts import RouteInfo
 from rmpa.core.log import _Formatter
-from rmpa.observe.snapshot import RouteInfo
 from tests.observe.samples import DIRECT
 
 if TYPE_CHECKING:

@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
+from rmpa.cli import peer
 from rmpa.cli.options import Selection, summary
+from rmpa.core.errors import RmpaError
+from rmpa.observe.snapshot import ModuleFacts, read_facts, reading
+from tests.cli.test_pictures import refuse
 from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:
@@ -20,6 +24,14 @@ if TYPE_CHECKING:
 Agent = Callable[..., None]
 
 
+def _serial() -> str:
+    return "SN-4711"
+
+
+class WithSerial(ModuleFacts, kw_only=True, frozen=True):
+    serial: Annotated[str, reading(_serial)] = ""
+
+
 def test_ctrl_c_shows_the_summary(place: Place, agent: Agent) -> None:
     agent()
     with place.start("peer", "ping", "joystick", "-i", "0.01") as process:
@@ -28,6 +40,25 @@ def test_ctrl_c_shows_the_summary(place: Place, agent: Agent) -> None:
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
     assert ("rtt min/avg/max/sd" in out, process.returncode, err) == (True, 0, "")
+
+
+def test_a_new_fact_of_a_module_is_one_declaration_and_one_column(
+    place: Place, agent: Agent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent(agent=lambda _: WithSerial(**read_facts(WithSerial)))
+    assert "SN-4711" not in place.run("peer", "info", "joystick")[1], "as this release, which does not know it"
+    monkeypatch.setattr(peer, "ModuleFacts", WithSerial)
+    monkeypatch.setattr(peer, "MODULE_FACTS", (("Serial", lambda module: module.serial),))
+    assert "\nSerial:       SN-4711\n" in place.run("peer", "info", "joystick")[1]
+    (shown,) = place.json("peer", "info", "joystick", "--json")
+    assert (shown["name"], shown["module"]["serial"]) == ("joystick", "SN-4711")
+
+
+def test_a_peer_that_does_not_tell_of_itself_is_shown_all_the_same(place: Place, agent: Agent) -> None:
+    agent(agent=refuse(RmpaError("it does not know the question")))
+    code, out, _ = place.run("peer", "info", "joystick")
+    assert (code, "Its agent:    it does not know the question" in out) == (0, True)
+    assert "Version:" not in out
 
 
 def test_without_an_agent_or_with_two(place: Place, agent: Agent) -> None:

@@ -12,18 +12,12 @@ from msgspec.structs import replace
 
 from rmpa.cli.main import main
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
+from rmpa.core.facts import FollowedInfo
+from rmpa.observe.check import Check, CheckLevel
 from rmpa.observe.control import ReloadReply
-from rmpa.observe.peer_info import (
-    Check,
-    CheckLevel,
-    PeerInfo,
-    SiteInfo,
-    SiteModuleInfo,
-    SiteSourceInfo,
-    SitesReport,
-    judge_refusal,
-)
-from rmpa.observe.snapshot import FollowedInfo, PingReply
+from rmpa.observe.peers import judge_refusal
+from rmpa.observe.sites import SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
+from rmpa.observe.snapshot import PeerInfo, PingReply
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.trust.permissions import TrustReason
 from tests.cli.conftest import compare, with_core

@@ -21,7 +21,7 @@ from tests.cli.test_web import running
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.observe.peer_info import Check
+    from rmpa.observe.check import Check
     from tests.cli.conftest import Place
 
 HELLO = Path(__file__).parents[2] / "examples/hello"
@@ -131,9 +131,7 @@ def checks(module: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[C
 
 
 def test_a_package_adds_a_check(other: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    module = (
-        "from rmpa.observe.peer_info import *\ndef thing(given): yield Check('other', CheckLevel.OK, 'all is well')"
-    )
+    module = "from rmpa.observe.check import *\ndef thing(given): yield Check('other', CheckLevel.OK, 'all is well')"
     assert [str(found.text) for found in checks(module, other, monkeypatch)] == ["all is well"]
 
 

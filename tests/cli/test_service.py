@@ -8,7 +8,8 @@ import msgspec
 import pytest
 
 from rmpa.core.errors import RmpaError
-from rmpa.observe.snapshot import SampleSpread, ServiceInfo
+from rmpa.core.facts import ServiceInfo
+from rmpa.core.statistics import SampleSpread
 from rmpa.ros.types.installed import ServiceType
 from tests.cli.conftest import compare, settled, with_core
 

@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 from rmpa.cli.topic import route_line
-from rmpa.observe.snapshot import RouteInfo
+from rmpa.core.facts import RouteInfo
 from rmpa.ros.types.messages import MessageType
 from tests.cli.conftest import compare, settled, with_core
 from tests.ros.types.workspaces import package

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from rmpa.core import limits
 from rmpa.core.log import LOG_INTERVAL, RefusalLog, _room_of, configure_logging
-from rmpa.core.statistics import Counters, SampleSummary, percentile
+from rmpa.core.statistics import Counters, SampleSpread, percentile
 from rmpa.core.timers import Backoff, TimerQueue, TokenBucket
 
 if TYPE_CHECKING:
@@ -230,17 +230,17 @@ SAMPLES = st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=50)
 
 @given(SAMPLES)
 def test_summary_agrees_with_the_standard_library(samples: list[float]) -> None:
-    s = SampleSummary.of(samples)
+    s = SampleSpread.of(samples)
     assert s.mean == pytest.approx(statistics.fmean(samples), abs=1e-6)
     assert s.sd == pytest.approx(statistics.pstdev(samples), abs=1e-3)
-    assert (s.count, s.minimum, s.maximum) == (len(samples), min(samples), max(samples))
-    assert s.minimum <= s.p50 <= s.p99 <= s.maximum
+    assert (s.count, s.min, s.max) == (len(samples), min(samples), max(samples))
+    assert s.min <= s.p50 <= s.p99 <= s.max
 
 
 def test_nothing_gives_nan() -> None:
-    s = SampleSummary.of([])
+    s = SampleSpread.of([])
     assert s.count == 0
-    assert all(math.isnan(x) for x in (s.mean, s.sd, s.minimum, s.maximum, s.p50, s.p99, percentile([], 5)))
+    assert all(math.isnan(x) for x in (s.mean, s.sd, s.min, s.max, s.p50, s.p99, percentile([], 5)))
 
 
 def test_percentiles_are_linear_between_neighbours() -> None:

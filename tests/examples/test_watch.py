@@ -46,7 +46,7 @@ def test_a_lost_order_is_counted() -> None:
     watch.message(ORDER, 103.102)
     view = watch.view(103.2)
     assert view.unanswered == 1
-    assert view.command_to_velocity.maximum == pytest.approx(0.002)
+    assert view.command_to_velocity.max == pytest.approx(0.002)
 
 
 def test_an_outage_of_a_module_is_no_period() -> None:
@@ -84,7 +84,7 @@ def test_an_outage_of_a_module_is_no_period() -> None:
     watch.peers({**everyone, "joystick": "linking"}, 109.8)
     assert watch.view(109.8).modules["joystick"].profile == "", "it may be another when it comes back"
     view = watch.view(109.8, whole=True)
-    assert view.topics[ODOM].period.maximum == pytest.approx(0.02)
+    assert view.topics[ODOM].period.max == pytest.approx(0.02)
 
 
 def test_everything_can_be_shown() -> None:

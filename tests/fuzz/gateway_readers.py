@@ -14,7 +14,7 @@ from rmpa.gateway.sites import keys as site_keys
 from rmpa.gateway.sites.answers import WhyQuestion, parse_ways
 from rmpa.gateway.sites.keys import AttachmentReader, MessageSource, TopicHeader
 from rmpa.gateway.sites.services import asked_type, read_description
-from rmpa.observe.peer_info import OK, Check
+from rmpa.observe.check import OK, Check
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.wire.tcpros import ServiceDescription
 from rmpa.ros.wire.xmlrpc import serialize_response

@@ -15,7 +15,7 @@ from tests.interop.ros import lacks
 
 if TYPE_CHECKING:
     from lab.bed.namespaces import Lab
-    from rmpa.observe.peer_info import PeerInfo
+    from rmpa.observe.snapshot import PeerInfo
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from lab.bed.agents import Agent
     from lab.bed.namespaces import Lab
-    from rmpa.observe.peer_info import PeerInfo
+    from rmpa.observe.snapshot import PeerInfo
     from rmpa.trust.store import TrustStore
     from tests.interop.conftest import AgentFactory
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
     from lab.bed.processes import Event, Process
-    from rmpa.observe.snapshot import SubscriberTransport
+    from rmpa.core.facts import SubscriberTransport
 
 AUTO: Final = '[bridge]\ntransport = "auto"\n'
 _BUS_INFO: Final = """

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import msgspec
 
-from rmpa.observe.snapshot import RouteInfo, Snapshot, SubscriberTransport
+from rmpa.core.facts import RouteInfo, SubscriberTransport
+from rmpa.observe.snapshot import Snapshot
 
 SNAPSHOT = msgspec.json.decode(Path(__file__).with_name("snapshot.json").read_bytes(), type=Snapshot)
 

@@ -27,7 +27,7 @@ from tests.observe.why import test_services, test_topics
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from rmpa.observe.peer_info import Check
+    from rmpa.observe.check import Check
 
 GOLDEN: Final = Path(__file__).with_name("golden")
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from rmpa.observe import control as graph_changes
+from rmpa.observe import graph as graph_changes
 from rmpa.observe import limits
-from rmpa.observe.control import GraphRevision, GraphRows, ServiceRow, TopicRow
-from rmpa.observe.operations import GraphHistory
+from rmpa.observe.graph import GraphHistory, GraphRevision, GraphRows, ServiceRow, TopicRow
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import Registrations
 

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
+from rmpa.core.facts import EventInfo, FilesInfo, RouteInfo, ServiceInfo, UnreachableInfo
 from rmpa.observe import limits
 from rmpa.observe.health import HERE, Health, diagnostic_status
-from rmpa.observe.snapshot import EventInfo, FilesInfo, RouteInfo, ServiceInfo, Snapshot, UnreachableInfo
+from rmpa.observe.snapshot import Snapshot
 from tests.observe.samples import DIRECT, SNAPSHOT, VIEWER
 
 if TYPE_CHECKING:
-    from rmpa.observe.peer_info import PeerInfo
+    from rmpa.observe.snapshot import PeerInfo
 
 JOYSTICK, _ = SNAPSHOT.peers
 assert JOYSTICK.link is not None

@@ -98,7 +98,7 @@ class LanesScenario(MeshScenario):
         elif self.calm:
             link = source.mesh.link(peer.identity.guid)
             assert link is not None
-            left_out = link.express.outbox.expired.total() + link.bulk.outbox.expired.total() + link.dropped
+            left_out = link.express.outbox.expired.total() + link.bulk.outbox.expired.total() + link.info().dropped
             lost, stale = inbox.flow.counts["lost"], inbox.flow.counts["stale"]
             assert left_out <= lost <= left_out + source.aborted, f"{who}: {lost} lost, {left_out} left out"
             assert len(missing) == left_out + stale, f"{who}: {len(missing)} are missing: {missing[:5]}"

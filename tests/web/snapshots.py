@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from rmpa.observe.peer_info import BoundInfo, LinkInfo, PeerInfo
-from rmpa.observe.snapshot import (
-    AgentInfo,
+from rmpa.core.facts import (
+    BoundInfo,
     EventInfo,
     FilesInfo,
     LatencyInfo,
+    LinkInfo,
     RouteInfo,
-    SampleSpread,
     ServiceInfo,
-    Snapshot,
     TopicInfo,
     UnreachableInfo,
 )
+from rmpa.core.statistics import SampleSpread
+from rmpa.observe.snapshot import AgentInfo, PeerInfo, Snapshot
 
 SPREAD = SampleSpread(count=60, mean=0.1, sd=0.01, min=0.08, max=0.2, p50=0.1, p99=0.15)
 LATENCY = LatencyInfo(

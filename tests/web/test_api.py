@@ -17,8 +17,8 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families 
 from prometheus_client.parser import text_string_to_metric_families
 
 from rmpa.bridge.data.quality import QosEventKind
-from rmpa.observe.peer_info import PeerInfo
-from rmpa.observe.snapshot import RouteInfo, ServiceInfo, Snapshot, TopicInfo
+from rmpa.core.facts import RouteInfo, ServiceInfo, TopicInfo
+from rmpa.observe.snapshot import PeerInfo, Snapshot
 from rmpa.web import api as rest
 from rmpa.web import limits
 from rmpa.web.api import EVENT_KINDS, content_type, exposition, metrics, web_metrics

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.agent.process import Reloader, WebProcess, run_process, serve
 from rmpa.agent.trust import AgentTrust, TrustCommands, open_membership, restart_to_join
 from rmpa.bridge.bridge import Bridge, TwinWatch
+from rmpa.bridge.facts import BridgeFacts
 from rmpa.bridge.nodes import Nodes
 from rmpa.bridge.params.follower import Params
 from rmpa.bridge.policy import Needs
@@ -35,9 +36,11 @@ from rmpa.mesh.io.mesh import Mesh
 from rmpa.mesh.peering import REPLACED
 from rmpa.observe.control_client import ControlClient, find_agents, runtime_dir
 from rmpa.observe.control_server import ControlServer, control_group
+from rmpa.observe.graph import GraphRevisions
 from rmpa.observe.health import Diagnostics
-from rmpa.observe.operations import ControlOperations, GraphRevisions, SiteRequests
-from rmpa.observe.peer_info import INFO
+from rmpa.observe.operations import ControlOperations
+from rmpa.observe.sites import SiteRequests
+from rmpa.observe.snapshot import INFO
 from rmpa.observe.snapshot_builder import AgentParts, SnapshotBuilder
 from rmpa.observe.why.why import WhyService
 from rmpa.ros.core.embedded import RosCore
@@ -442,11 +445,10 @@ class Agent:
         self.reloaded: Callable[[], None] = lambda: None
         self.other_notes: list[Callable[[], Iterable[str]]] = []
         counters = Counters()
+        self._facts = facts = BridgeFacts(self.bridge, self.services, twins)
         parts = AgentParts(
             core=self.core,
-            bridge=self.bridge,
-            services=self.services,
-            twins=twins,
+            facts=facts,
             endpoint=lambda: (at.identity, at.mesh, at.discovery) if (at := self.network.endpoint) else None,
             counters=counters,
             notes=self._notes,
@@ -455,13 +457,11 @@ class Agent:
             restart=lambda: restart_to_join(settings) if self.trust is None else "",
         )
         self.snapshots = SnapshotBuilder(settings, parts)
-        needs = Needs((), "figures of the agent, none of the module's graph")
-        self.bridge.rpc.on_request(INFO, lambda _asker, _args: self.snapshots.peer_agent(), needs)
+        needs = Needs((), "the agent and its machine, nothing of the module's graph")
+        self.bridge.rpc.on_request(INFO, lambda _asker, _args: self.snapshots.agent().for_peers(), needs)
         self.sites = SiteRequests(self.bridge)
-        self.why = WhyService(settings.name, parts, self.snapshots, self.sites)
-        self.operations = ControlOperations(
-            settings.name, self.bridge, self.params, self.snapshots, nodes, self.sites
-        )
+        self.why = WhyService(settings.name, facts, self.snapshots, self.sites)
+        self.operations = ControlOperations(settings.name, facts, self.params, self.snapshots, nodes, self.sites)
         self.trust_commands = TrustCommands(settings, self.trust)
         handlers: dict[str, Handler] = {
             **self.operations.handlers(),
@@ -494,7 +494,7 @@ class Agent:
             undo.push_async_callback(self.core.close)
             await self.bridge.start()
             undo.push_async_callback(self.bridge.close)
-            diagnostics = Diagnostics(self.core, self.bridge, self.snapshots)
+            diagnostics = Diagnostics(self._facts, self.snapshots)
             diagnostics.start()
             undo.callback(diagnostics.close)
             loggers = LoggerServices(self.bridge.node, self.core.call, _LOGGERS)

@@ -48,7 +48,7 @@ NODES: Final = "nodes"
 # The request for a module's own nodes.
 LIST: Final = "node.list"
 # The request for the facts about a ``node``: ``NodeFacts``.
-INFO: Final = "node.info"
+NODE_INFO: Final = "node.info"
 # The request to ping a ``node``.
 PING: Final = "node.ping"
 # The request to a node's agent to end the node, with ``node``, ``by`` (the caller's node) and ``reason``. The
@@ -57,7 +57,7 @@ KILL: Final = "node.kill"
 # The type of each response; ``KILL`` ends a ``node``, where ``nodes.kill`` allows it.
 REPLIES: Final[dict[str, object]] = {
     LIST: tuple[NodeLine, ...],
-    INFO: NodeFacts,
+    NODE_INFO: NodeFacts,
     PING: NodePing,
     KILL: dict[str, bool],
 }
@@ -97,7 +97,7 @@ class Nodes(Part):
         rpc = shared.rpc
         rpc.on_notification(NODES, self._told_by_peer, Needs((), "names of the peer's own nodes"))
         rpc.on_request(LIST, self._list, _VISIBLE)
-        rpc.on_request(INFO, self._info, _VISIBLE)
+        rpc.on_request(NODE_INFO, self._info, _VISIBLE)
         rpc.on_request(PING, self._ping, _VISIBLE)
         rpc.on_request(KILL, self._kill, Needs((Access.KILL,), "the node"))
 

@@ -81,6 +81,10 @@ class PeerSession:
         """Whether the peer has a link now."""
         return self.state is PeerState.LINKED
 
+    def instance_of(self, origin: Origin | None) -> str:
+        """The run of a module that the link brings, 32 hexadecimal digits: the peer's own without an ``origin``."""
+        return self.link.identity.instance.hex() if origin is None else origin.instance
+
     @property
     def same_machine(self) -> bool:
         """Whether the peer's agent runs on this machine, so that both modules share its loopback device."""

@@ -28,9 +28,9 @@ from rmpa.core import codes
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.log import configure_logging
 from rmpa.observe import limits
+from rmpa.observe.check import FAIL, OK, WARN
 from rmpa.observe.control import ReloadReply
 from rmpa.observe.control_client import find_agents
-from rmpa.observe.peer_info import FAIL, OK, WARN
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.runtime.log_writer import LogWriter
 from rmpa.runtime.systemd import in_journal

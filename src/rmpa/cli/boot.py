@@ -386,8 +386,8 @@ def _start(machine: Machine, wanted: Sequence[str], changed: Sequence[str]) -> N
 
 def _shown(unit: str) -> dict[str, str]:
     """What ``systemctl show`` says of a unit; empty where it says nothing."""
-    told = _said("systemctl", "show", unit, f"--property={','.join(_PROPERTIES)}")
-    return dict(line.partition("=")[::2] for line in told)
+    lines = _said("systemctl", "show", unit, f"--property={','.join(_PROPERTIES)}")
+    return dict(line.partition("=")[::2] for line in lines)
 
 
 def _log(unit: str) -> list[str]:

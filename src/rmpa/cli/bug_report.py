@@ -176,8 +176,8 @@ def collect(environ: Mapping[str, str], log: str | None) -> tuple[dict[str, str]
                 f"{agent.name}/{file}": own_command(*of.split(), *of_agent) for file, of in _OF_AGENTS.items()
             }
     programs["log.txt"] = [*_LOG.split(), *(f"--unit={unit}" for unit in UNITS.values())]
-    told, late = run_programs(programs, environ)
-    found |= told
+    said, late = run_programs(programs, environ)
+    found |= said
     missing |= late
     if not found["log.txt"]:
         found["log.txt"] = _NO_LOG

@@ -13,7 +13,7 @@ import msgspec
 from rmpa.cli.output import Painted, paint, printable, warn
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
-from rmpa.core.identity import is_legal_name, proxied_node, proxied_peer
+from rmpa.core.identity import is_legal_name, is_meant, proxied_node, proxied_peer
 from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
 from rmpa.observe.snapshot import Snapshot
 from rmpa.ros.environment import DEFAULT_MASTER_URI
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from rmpa.observe.peer_info import PeerInfo
-    from rmpa.observe.snapshot import RouteInfo
+    from rmpa.core.facts import RouteInfo
+    from rmpa.observe.snapshot import PeerInfo
     from rmpa.ros.node.node import Node, Received
 
 # Seconds between two lines of figures, as rostopic has it.
@@ -170,7 +170,7 @@ def find_peer(snapshot: Snapshot, wanted: str) -> PeerInfo:
         RmpaError: There is none; the text offers the nearest name.
     """
     for info in (*snapshot.peers, *snapshot.strangers):
-        if wanted in (info.name, info.guid, info.guid.partition("#")[0]):
+        if is_meant(wanted, info.name, info.guid):
             return info
     names = [info.name for info in snapshot.peers]
     known = f"known are {', '.join(names)}" if names else "no peer is known yet"

@@ -28,7 +28,7 @@ _BOOTED: Final = Path("/run/systemd/system")
 
 
 class Machine:
-    """The machine that is changed, or one below a folder; each change is told, and with ``dry`` only told.
+    """The machine that is changed, or one below a folder; each change is printed, and with ``dry`` only printed.
 
     Args:
         root: The folder; empty for this machine.

@@ -23,10 +23,10 @@ from rmpa.cli.graph import suggestion
 from rmpa.cli.options import Options, agent_verb, argument, flag, graph_verb
 from rmpa.cli.output import Painted, Table, json_text, size, warn
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
+from rmpa.core.facts import FollowedInfo
 from rmpa.core.identity import is_legal_name, resolve_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.operations import PeerParams, parameters_in
-from rmpa.observe.snapshot import FollowedInfo
 from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:

@@ -15,19 +15,21 @@ from rmpa.cli.graph import find_peer, shown_state, suggestion
 from rmpa.cli.options import Options, Selection, agent_verb, argument, flag, limit_options, ping_options, summary
 from rmpa.cli.output import Table, duration, printable, size, warn
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
-from rmpa.core.statistics import SampleSummary
+from rmpa.core.statistics import SampleSpread
 from rmpa.observe import limits
 from rmpa.observe.control import GATEWAY_REPORT
-from rmpa.observe.peer_info import PENDING, SitesReport
-from rmpa.observe.snapshot import PingReply
+from rmpa.observe.peers import PENDING
+from rmpa.observe.sites import SitesReport
+from rmpa.observe.snapshot import ModuleFacts, PingReply
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from rmpa.cli.output import Text
+    from rmpa.core.facts import RouteInfo, TopicInfo
     from rmpa.observe.control_client import ControlClient
-    from rmpa.observe.peer_info import PeerInfo, SiteInfo
-    from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo
+    from rmpa.observe.sites import SiteInfo
+    from rmpa.observe.snapshot import PeerInfo, Snapshot
 
 _T = TypeVar("_T")
 # By the state of a peer or site.
@@ -42,6 +44,18 @@ _USUAL: Final = frozenset({"linked", "relayed"})
 _YOUNG: Final = 5.0
 # Columns that are shown without ``-v``: they fit 80 characters.
 _BRIEF: Final = "PEER, STATE, >SINCE, ADDRESS, RTT"
+# What is shown of a module, of what its agent tells: a title, and the fact as text; empty where it is not known.
+MODULE_FACTS: Final[tuple[tuple[str, Callable[[ModuleFacts], str]], ...]] = (
+    ("Version", lambda module: module.version),
+    ("Host", lambda module: module.host),
+    ("System", lambda module: module.system),
+    ("Runs for", lambda module: duration(module.uptime)),
+    ("CPU", lambda module: "" if module.cpu is None else f"{module.cpu:.1f} % of a core"),
+    ("Memory", lambda module: "" if module.rss is None else size(module.rss)),
+    ("Open files", lambda module: "" if module.files is None else f"{module.files.open} of {module.files.limit}"),
+    ("Proxies", lambda module: str(module.proxies)),
+    ("Core", lambda module: module.core_uri),
+)
 
 
 @agent_verb(
@@ -156,21 +170,29 @@ def _troubles(snapshot: Snapshot, peers: list[PeerInfo]) -> list[tuple[str, str]
 def peer_info(name: str, options: Options) -> None:
     """Show all that is known of the peer NAME (or of one by its GUID).
 
-    Clock is its wall clock minus ours, with the largest possible error. For each topic that comes from it: the rate
-    over the last minute, and the median and 99th percentile of the one-way latency, with the largest possible error
-    (±).
+    Its own agent is asked for its version, machine and figures. Clock is its wall clock minus ours, with the largest
+    possible error. For each topic that comes from it: the rate over the last minute, and the median and 99th
+    percentile of the one-way latency, with the largest possible error (±).
 
     ---
 
     Examples:
       rmpa peer info base
     """
+    facts, problem = None, ""
     with options.client() as client:
         snapshot = client.snapshot()
-    found = find_peer(snapshot, name)
+        found = find_peer(snapshot, name)
+        if found.link is not None:
+            try:
+                facts = client.call("agent", ModuleFacts, peer=found.guid)
+            except RmpaError as error:
+                problem = error.reason if isinstance(error, PeerRefused) else str(error)
 
     def text() -> Iterator[Text]:
-        yield (f"{label + ':':<13} {text}" for label, text in _facts(found))
+        about = [(label, shown(facts)) for label, shown in MODULE_FACTS] if facts is not None else []
+        lines = (*_link_facts(found), *about, ("Its agent", problem))
+        yield (f"{label + ':':<13} {text}" for label, text in lines if text)
         for direction, title in (("in", "it publishes"), ("out", "we publish to it")):
             of_topics = [(topic, route) for topic in snapshot.topics for route in topic.routes]
             rows = [_route(t, r) for t, r in of_topics if r.peer == found.name and r.direction == direction]
@@ -181,7 +203,7 @@ def peer_info(name: str, options: Options) -> None:
                 yield from ("", f"Topics that {title}:")
                 yield Table(titles, [row[: titles.count(",") + 1] for row in rows])
 
-    options.show(found, text())
+    options.show(msgspec.to_builtins(found) | {"module": facts}, text())
 
 
 def _route(topic: TopicInfo, route: RouteInfo) -> list[str]:
@@ -196,7 +218,7 @@ def _route(topic: TopicInfo, route: RouteInfo) -> list[str]:
     ]
 
 
-def _facts(info: PeerInfo) -> Iterator[tuple[str, str]]:
+def _link_facts(info: PeerInfo) -> Iterator[tuple[str, str]]:
     yield "Peer", info.name
     yield "GUID", info.guid
     if info.via:
@@ -222,10 +244,7 @@ def _facts(info: PeerInfo) -> Iterator[tuple[str, str]]:
         if info.direct_in or info.direct_out:
             ours = f"{info.direct_in} of the subscribers here to its nodes"
             yield "Direct", f"{ours}, {info.direct_out} of its subscribers to nodes here"
-    if info.last_error:
-        yield "Last error", info.last_error
-    if info.invite:
-        yield "Invitation", info.invite
+    yield from (("Last error", info.last_error), ("Invitation", info.invite))
     if info.next_attempt is not None:
         yield "Next attempt", f"in {duration(info.next_attempt)}"
     yield from (("Limit", bound.text) for bound in info.beyond)
@@ -254,8 +273,8 @@ def peer_ping(name: str, count: int | None, interval: float, options: Options) -
                     time.sleep(interval)
                 sent += 1
                 _ping_once(client, found, sent, times, options)
-    of = SampleSummary.of(times)
-    figures = {"min": of.minimum, "avg": of.mean, "max": of.maximum, "sd": of.sd}
+    of = SampleSpread.of(times)
+    figures = {"min": of.min, "avg": of.mean, "max": of.max, "sd": of.sd}
     lost = 100 * (sent - len(times)) / sent if sent else 0
     lines = [f"--- {found.name} ping statistics ---", f"{sent} sent, {len(times)} received, {lost:.0f} % lost"]
     if times:
@@ -272,12 +291,12 @@ def _ping_once(client: ControlClient, peer: PeerInfo, number: int, times: list[f
     except PeerRefused as error:
         problem = error.reason
     elapsed = reply.times[0] if reply.times else None
-    told = {"peer": peer.name, "seq": number, "time": elapsed, "remote": reply.remote}
+    shown = {"peer": peer.name, "seq": number, "time": elapsed, "remote": reply.remote}
     if elapsed is None:
-        options.show(told | {"error": problem}, f"{peer.name}: seq={number} {problem}")
+        options.show(shown | {"error": problem}, f"{peer.name}: seq={number} {problem}")
     else:
         times.append(elapsed)
-        options.show(told, f"{peer.name} ({reply.remote}): seq={number} time={elapsed * 1e3:.3f} ms")
+        options.show(shown, f"{peer.name} ({reply.remote}): seq={number} time={elapsed * 1e3:.3f} ms")
 
 
 name_option = click.option("--name", metavar="GATEWAY", help="Ask this gateway of this machine, not --agent's.")
@@ -313,7 +332,7 @@ def site_list(name: str | None, options: Options) -> int:
       rmpa site list --name store-gateway
       rmpa site list --json | jq -r '.[].sites[].name'
     """
-    from rmpa.observe.operations import REPORT
+    from rmpa.observe.sites import REPORT
 
     with _connect(options, name) as client:
         reports = _ask(client, REPORT, tuple[SitesReport, ...])
@@ -368,10 +387,10 @@ def site_info(site: str, name: str | None, options: Options) -> int:
       rmpa site info warehouse
       rmpa site info hall --json | jq '.sites[0].sources[] | select(.here=="")'
     """
-    from rmpa.observe.operations import INFO
+    from rmpa.observe.sites import SITE_INFO
 
     with _connect(options, name) as client:
-        report = _ask(client, INFO, SitesReport, site=site)
+        report = _ask(client, SITE_INFO, SitesReport, site=site)
     found = next((each for each in report.sites if each.name == site), None)
     if found is None:
         known = [each.name for each in report.sites]

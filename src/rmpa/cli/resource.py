@@ -179,7 +179,7 @@ async def find_resources(node: Node, graph: Graph, sites: Iterable[str] = ()) ->
     Args:
         node: This command's own node.
         graph: The master's graph.
-        sites: The names of other sites, whose modules are told apart: ``site/module``.
+        sites: The names of other sites, whose modules are written ``site/module``.
     """
     ending = f"/{TOPIC}"
     wanted = [

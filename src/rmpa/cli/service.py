@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from rmpa.cli.graph import Graph, GraphName, Master
     from rmpa.cli.output import Text
-    from rmpa.observe.snapshot import ServiceInfo
+    from rmpa.core.facts import ServiceInfo
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import ServiceDescription
 
@@ -50,7 +50,7 @@ class Probed:
     description: ServiceDescription | None = None
     problem: str = ""
 
-    def told(self, name: str) -> ServiceDescription:
+    def says(self, name: str) -> ServiceDescription:
         """What the server says.
 
         Raises:
@@ -220,7 +220,7 @@ def service_list(namespace: str, verbose: bool, selection: Selection, options: O
 
 
 def _find(text: str, options: Options) -> tuple[GraphName, Master, Graph]:
-    """The service that a user names, the master, and its graph; where another module serves it, that is told."""
+    """The service that a user names, the master, and its graph; where another module serves it, a line says so."""
     wanted = read_name(text, "service")
     master, graph = options.graph()
     if wanted.name not in graph.services:
@@ -274,7 +274,7 @@ def service_info(service: str, options: Options) -> None:
                 yield from (f"  {field} {field.name}" for field in half.fields)
         if mesh:
             yield from ("", "Mesh:", *_crossing(mesh))
-        found.told(wanted.name)
+        found.says(wanted.name)
 
     options.show(_json(graph, wanted.name, found) | names | {"mesh": mesh}, text())
 
@@ -290,7 +290,7 @@ def service_type(service: str, options: Options) -> None:
     """
     wanted, master, graph = _find(service, options)
     graph.require_service(wanted)
-    said = probe(master, (wanted.name,))[wanted.name].told(wanted.name)
+    said = probe(master, (wanted.name,))[wanted.name].says(wanted.name)
     options.show({"name": wanted.name, "type": said.type, "md5": said.md5sum}, said.type)
 
 

@@ -29,7 +29,7 @@ from rmpa.cli.options import Options, Selection, argument, count_option, flag, g
 from rmpa.cli.output import Painted, duration, print_json, print_text, printable, size, warn
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
-from rmpa.core.statistics import SampleSummary
+from rmpa.core.statistics import SampleSpread
 from rmpa.observe.why.diagnosis import UNMEASURED, route_texts, subscriber_text
 from rmpa.ros import limits
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from rmpa.cli.graph import Graph, GraphName, Master
     from rmpa.cli.output import Text
-    from rmpa.observe.snapshot import LatencyInfo, RouteInfo, SubscriberTransport, TopicInfo
+    from rmpa.core.facts import LatencyInfo, RouteInfo, SubscriberTransport, TopicInfo
     from rmpa.ros.node.node import Received
 
 
@@ -387,9 +387,9 @@ class _Rate(_Figures):
     """Messages a second, in the format of ``rostopic hz``; Hz and seconds."""
 
     def own(self) -> dict[str, float]:
-        p = SampleSummary.of(self.periods)
+        p = SampleSpread.of(self.periods)
         rate = 1 / p.mean if p.mean > 0 else math.nan
-        return {"rate": rate, "min": p.minimum, "max": p.maximum, "sd": p.sd, "window": p.count + 1}
+        return {"rate": rate, "min": p.min, "max": p.max, "sd": p.sd, "window": p.count + 1}
 
     def text(self) -> str:
         v = self.own()
@@ -406,10 +406,10 @@ class _Bandwidth(_Figures):
     """Bytes a second, in the format of ``rostopic bw``."""
 
     def own(self) -> dict[str, float]:
-        s, elapsed = SampleSummary.of(self.sizes), math.fsum(self.periods)
+        s, elapsed = SampleSpread.of(self.sizes), math.fsum(self.periods)
         first = self.sizes[0] if len(self.sizes) > len(self.periods) else 0  # came before the first period
         rate = (sum(self.sizes) - first) / elapsed if elapsed > 0 else math.nan
-        return {"bandwidth": rate, "mean": s.mean, "min": s.minimum, "max": s.maximum, "window": s.count}
+        return {"bandwidth": rate, "mean": s.mean, "min": s.min, "max": s.max, "window": s.count}
 
     def text(self) -> str:
         v = self.own()
@@ -453,8 +453,8 @@ class _Delay(_Figures):
         return {"source": "link", "error": latency.error, **spread, "window": latency.count}
 
     def own(self) -> dict[str, float]:
-        s = SampleSummary.of(self.delays)
-        return {"delay": s.mean, "min": s.minimum, "max": s.maximum, "sd": s.sd, "window": s.count}
+        s = SampleSpread.of(self.delays)
+        return {"delay": s.mean, "min": s.min, "max": s.max, "sd": s.sd, "window": s.count}
 
     def text(self) -> str:
         """As ``rostopic delay``, with a digit more."""

@@ -126,9 +126,9 @@ def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str
     decisions = [permissions.judge(access, peer, each) for access, each in asked]
     decision = next((each for each in decisions if not each.allowed), decisions[0])
     files = sorted({str(given.path) for given in loaded.given.values() if given.path is not None})
-    told = {"allowed": decision.allowed, "rule": decision.rule, "number": decision.number}
+    shown = {"allowed": decision.allowed, "rule": decision.rule, "number": decision.number}
     text = f"{'yes' if decision.allowed else 'no'}: {decision.rule}"
-    options.show({**told, "groups": permissions.groups_of(peer), "files": files}, text)
+    options.show({**shown, "groups": permissions.groups_of(peer), "files": files}, text)
     if not files and not options.as_json:
         warn("no rmpa.toml was found here; --config names the file that rmpa up was started with", "doubtful-setting")
     ctx.exit(0 if decision.allowed else 1)

@@ -9,7 +9,7 @@
     for name, text in unit_texts("/usr/bin/rmpa").items(): ...  # rmpa.service, rmpa-web.service, rmpa-gateway.service
     config_text()                                               # /etc/rmpa/rmpa.toml
 
-A key that is newer than the system's systemd is left out there, and told in the journal; none of the others needs it.
+A key that is newer than the system's systemd is left out there, and said in the journal; none of the others needs it.
 """
 
 from __future__ import annotations

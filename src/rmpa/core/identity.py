@@ -324,6 +324,11 @@ class Identity:
 OWN_NODE: Final = "/rmpa"
 
 
+def is_meant(wanted: str, name: str, guid: str) -> bool:
+    """Whether a user means a module: by its name, its GUID as text, or that without the incarnation."""
+    return wanted in (name, guid, guid.partition("#")[0])
+
+
 def is_own(node: str) -> bool:
     """Whether a local node is the agent's own or a proxy."""
     return node == OWN_NODE or node.startswith(OWN_NODE + "/")

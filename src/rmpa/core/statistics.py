@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
+
+import msgspec
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -32,28 +33,39 @@ class Counters:
         return dict(sorted(self._counts.items()))
 
 
-@dataclass(frozen=True, slots=True)
-class SampleSummary:
-    """The statistics of a set of samples, in the samples' unit; ``nan`` where there are too few samples."""
+class SampleSpread(msgspec.Struct, kw_only=True, frozen=True):
+    """The statistics of a set of samples, in the samples' unit; in a snapshot seconds. ``nan``: there are too few.
+
+    Attributes:
+        count: The number of samples.
+        mean: Their mean.
+        sd: Their standard deviation: the population's, as in ``rostopic hz``.
+        min: The least.
+        max: The greatest.
+        p50: The median.
+        p99: The 99th percentile. Percentiles are interpolated linearly.
+    """
 
     count: int
     mean: float
     sd: float
-    minimum: float
-    maximum: float
+    min: float
+    max: float
     p50: float
     p99: float
 
     @classmethod
-    def of(cls, samples: Iterable[float]) -> SampleSummary:
-        """The summary of some samples; the standard deviation is the population's, as in ``rostopic hz``."""
+    def of(cls, samples: Iterable[float], **more: Any) -> Self:
+        """The statistics of some samples; ``more`` are the fields of a subclass."""
         data = sorted(samples)
+        count, nan = len(data), math.nan
         if not data:
-            return cls(0, *[math.nan] * 6)
-        mean = math.fsum(data) / len(data)
+            return cls(count=0, mean=nan, sd=nan, min=nan, max=nan, p50=nan, p99=nan, **more)
+        mean = math.fsum(data) / count
         # Computed as the distance between two points: ``math.dist`` sums in C, ten times as fast as a loop.
-        sd = math.dist(data, [mean] * len(data)) / math.sqrt(len(data))
-        return cls(len(data), mean, sd, data[0], data[-1], *(percentile(data, percent) for percent in (50, 99)))
+        sd = math.dist(data, [mean] * count) / math.sqrt(count)
+        p50, p99 = percentile(data, 50), percentile(data, 99)
+        return cls(count=count, mean=mean, sd=sd, min=data[0], max=data[-1], p50=p50, p99=p99, **more)
 
 
 def percentile(ordered: list[float], percent: float) -> float:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 from rmpa.core.errors import RmpaError
 from rmpa.core.timers import TokenBucket
 from rmpa.gateway import limits
-from rmpa.observe.peer_info import OK, WARN, Check
+from rmpa.observe.check import OK, WARN, Check
 from rmpa.runtime.stream import after_read
 
 if TYPE_CHECKING:

@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from rmpa.core.timers import Yielder
 
 
-# --- The value of the control socket's operation ``reload`` ---------------------------------------------------------
-
-
 class ReloadReply(msgspec.Struct, kw_only=True, frozen=True):
     """The settings as read again, against those that the agent runs with.
 
@@ -49,9 +46,6 @@ class ReloadReply(msgspec.Struct, kw_only=True, frozen=True):
     notes: tuple[str, ...] = ()
     problem: str = ""
     code: str = ""
-
-
-# --- Encodes large JSON values in pieces, between which other work can be done --------------------------------------
 
 
 # Elements of a list in one piece: some 50 microseconds where they are topics.
@@ -97,75 +91,6 @@ def _struct(value: msgspec.Struct) -> Iterator[bytes]:
 
 def _default(field: msgspec.structs.FieldInfo) -> object:
     return field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
-
-
-# --- The local graph as the control socket tells it -----------------------------------------------------------------
-#
-# All of it, or the topics and services that have changed since.
-#
-# A row is the present state of one topic or service, so it does not matter how often it changed meanwhile. The
-# history has names alone; the rows are read from the graph when a client asks.
-
-
-_Nodes = tuple[str, ...]
-
-
-class TopicRow(msgspec.Struct, frozen=True, array_like=True):
-    """A topic as it is now; one without publishers and subscribers is gone.
-
-    Attributes:
-        name: Its name.
-        type: The type last registered; ``*`` or empty where none is known.
-        publishers: Names of nodes.
-        subscribers: Likewise.
-    """
-
-    name: str
-    type: str
-    publishers: _Nodes
-    subscribers: _Nodes
-
-
-class ServiceRow(msgspec.Struct, frozen=True, array_like=True):
-    """A service as it is now; one without providers is gone.
-
-    Attributes:
-        name: Its name.
-        providers: Names of nodes.
-    """
-
-    name: str
-    providers: _Nodes
-
-
-class GraphRows(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=True):
-    """What a client has to know of the graph.
-
-    Attributes:
-        whole: Whether these are all topics and services; else those that have changed since the revision that the
-            client knows.
-        topics: Topics.
-        services: Services.
-    """
-
-    whole: bool = False
-    topics: tuple[TopicRow, ...] = ()
-    services: tuple[ServiceRow, ...] = ()
-
-
-class GraphRevision(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=True):
-    """The value of the operation ``graph``.
-
-    Attributes:
-        revision: Stands for the present local graph; another number stands for another graph.
-        core_uri: The master whose graph it is; empty without ``rows``.
-        rows: The graph, for a client that asked for rows. ``None`` where the core is another program, which can be
-            read without the agent and knows its graph first; an older agent has none either.
-    """
-
-    revision: int
-    core_uri: str = ""
-    rows: GraphRows | None = None
 
 
 # The operation that only an agent with another role than a module's serves; its value names that.

@@ -32,9 +32,6 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot import AgentInfo
 
 
-# --- The directory of the control sockets, and the lock that keeps agents' names apart ------------------------------
-
-
 _SYSTEM: Final = Path("/run/rmpa")
 _REMEDY: Final = "set RMPA_RUNTIME_DIR to a directory of your own"
 

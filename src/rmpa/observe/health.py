@@ -11,7 +11,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 from rmpa.observe import limits
-from rmpa.observe.peer_info import FAIL, OK, STALE, WARN, Check
+from rmpa.observe.check import FAIL, OK, STALE, WARN, Check
 from rmpa.observe.why.diagnosis import BY_RULE, connected_directly, misplaced, subscriber_text
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array, known_description
@@ -22,16 +22,21 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from rmpa.bridge.bridge import Bridge
-    from rmpa.observe.peer_info import CheckLevel, PeerInfo
-    from rmpa.observe.snapshot import RouteInfo, SampleSpread, ServiceInfo, Snapshot, TopicInfo
+    from rmpa.bridge.facts import BridgeFacts
+    from rmpa.core.facts import RouteInfo, ServiceInfo, TopicInfo
+    from rmpa.core.statistics import SampleSpread
+    from rmpa.observe.check import CheckLevel
+    from rmpa.observe.snapshot import PeerInfo, Snapshot
     from rmpa.observe.snapshot_builder import SnapshotBuilder
-    from rmpa.ros.core.external import Core
 
 
-# --- the evidence of each status: figures as text, their units in the keys, so that rqt can plot them ---------------
+_log = logging.getLogger(__name__)
 
-# Figures by their name; what is empty or ``None`` is left out.
+# The topic of REP 107.
+TOPIC: Final = "/diagnostics"
+_ARRAY: Final = known_description(ARRAY_TYPE)
+# The figures of a status by their name, with their unit, so that rqt can plot them; what is empty or ``None`` is left
+# out.
 Values = dict[str, str | float | None]
 
 
@@ -147,8 +152,6 @@ def route_values(route: RouteInfo) -> dict[str, str]:
     contract: Values = {f"contract {key}": str(value) for key, value in route.contract.items()}
     return _texts(known, contract, {f"events {kind}": count for kind, count in route.events.items()})
 
-
-# --- the judgement --------------------------------------------------------------------------------------------------
 
 # The name of the agent's own status.
 HERE: Final = "rmpa: this module"
@@ -385,36 +388,25 @@ def _relayed(route: RouteInfo) -> str:
     return f"{route.rate:.1f} Hz{latency}"
 
 
-# --- Publishes the agent's health on ``/diagnostics`` once a second (REP 107) ---------------------------------------
-#
-# The agent's own node publishes it, so it does not cross to other modules. Without a subscriber nothing is built.
-
-
-_log = logging.getLogger(__name__)
-
-TOPIC: Final = "/diagnostics"
-# The topic of REP 107.
-_ARRAY: Final = known_description(ARRAY_TYPE)
-
-
 class Diagnostics(PublicationEvents):
     """Publishes judged snapshots; follows the peers' clocks as often, and seldom while no link is in use.
 
+    The agent's own node publishes them, so they do not cross to other modules. Without a subscriber nothing is built.
+
     Args:
-        core: The local core.
-        bridge: Has the node that publishes; started before.
+        facts: What the bridge tells; its node publishes, and has been started.
         snapshots: Builds what is judged.
     """
 
-    def __init__(self, core: Core, bridge: Bridge, snapshots: SnapshotBuilder) -> None:
-        self._core = core
-        self._bridge = bridge
+    def __init__(self, facts: BridgeFacts, snapshots: SnapshotBuilder) -> None:
+        self._facts = facts
+        self._bridge, self._core = facts.bridge, facts.bridge.core
         self._snapshots = snapshots
         self._clock = SystemClock()
         self._health = Health()
         self._sequence = 0
         # The queue is short: a newer message repeats all of an older one.
-        self._publication = Publication(TOPIC, bridge.node.name, _ARRAY, queue_messages=10, events=self)
+        self._publication = Publication(TOPIC, facts.bridge.node.name, _ARRAY, queue_messages=10, events=self)
         self._timer: asyncio.TimerHandle | None = None
 
     def start(self) -> None:
@@ -447,7 +439,7 @@ class Diagnostics(PublicationEvents):
 
     def _look(self) -> None:
         self._again()
-        self._snapshots.topics.follow_clocks()
+        self._facts.topics.follow_clocks()
         if self._publication.subscribers:
             self._publish()
 

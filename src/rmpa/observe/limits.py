@@ -9,7 +9,6 @@ from typing import Final
 
 from rmpa.core.limits import MIB
 
-# --- control socket, snapshot, /diagnostics ------------------------------------------------------------------------
 # Bytes of one request; the longest request names the topics that a client wants.
 CONTROL_REQUEST_MAX: Final = 1 * MIB
 # Bytes of a text that follows a request: a parameter.
@@ -53,7 +52,6 @@ DIAGNOSTICS_STALE: Final = 60.0
 # Why: Each second it would take 0.03 ms for each of them, two thirds of a core with 20,000.
 DIAGNOSTICS_TOPICS: Final = 2000
 
-# --- doctor -----------------------------------------------------------------------------------------------------
 # Time-out for a multicast packet to return to its sender; where that works, it takes less than a millisecond.
 DOCTOR_HEAR: Final = 1.0
 # Time-out of a program of the system (nft, iptables).
@@ -67,7 +65,6 @@ DOCTOR_PEERS_LISTED: Final = 16
 # How long both clocks are watched, to notice that the wall clock is set.
 DOCTOR_CLOCK_LOOK: Final = 0.3
 
-# --- why --------------------------------------------------------------------------------------------------------
 # Time between the two counts that ``rmpa why`` compares: a topic of some messages a second has moved by then.
 WHY_WINDOW: Final = 1.0
 # [Agent] Publishers of one topic that `rmpa why` reports

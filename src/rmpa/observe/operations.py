@@ -1,277 +1,43 @@
-"""The operations of the control socket: ``REPLIES`` has them all. A new operation is a row there and a handler.
-
-Questions about other sites are answered by a gateway; another agent asks the gateways that it is linked to. Clients
-may wait for the next change of the local graph, and are told what has changed.
-"""
+"""The operations of the control socket: ``REPLIES`` has them all. A new operation is a row there and a handler."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import itertools
-import secrets
-from collections import deque
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge import nodes as node_requests
 from rmpa.bridge.params import rules as transfer
-from rmpa.bridge.policy import Needs
-from rmpa.bridge.rpc import UNKNOWN_QUESTION
-from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
-from rmpa.core.identity import OWN_NODE, is_global_name
+from rmpa.core.facts import ContractTerm, FollowedInfo
+from rmpa.core.identity import OWN_NODE, is_global_name, is_meant
 from rmpa.observe import limits
-from rmpa.observe.control import GraphRevision, GraphRows, ReloadReply, ServiceRow, TopicRow
-from rmpa.observe.peer_info import INFO as AGENT_INFO
-from rmpa.observe.peer_info import ContractTerm, PeerAgent
-from rmpa.observe.snapshot import FollowedInfo, PingReply, Snapshot
+from rmpa.observe.control import ReloadReply
+from rmpa.observe.graph import GraphRevision
+from rmpa.observe.snapshot import INFO, ModuleFacts, PingReply, Snapshot
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.environment import NodeLine, PeerNodes
-from rmpa.ros.master.parameters import RegistrationKind, leaves
+from rmpa.ros.master.parameters import leaves
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Collection, Iterable
+    from collections.abc import Collection
 
-    from rmpa.bridge.bridge import Bridge
+    from rmpa.bridge.facts import BridgeFacts
     from rmpa.bridge.nodes import Nodes
     from rmpa.bridge.params.follower import Params
     from rmpa.bridge.sessions import PeerSession
     from rmpa.observe.control_client import ControlClient
     from rmpa.observe.control_server import Handler
+    from rmpa.observe.sites import SiteRequests
     from rmpa.observe.snapshot_builder import SnapshotBuilder
-    from rmpa.ros.core.external import Core
-    from rmpa.ros.master.parameters import GraphChange, GraphState
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 Args = dict[str, Any]
-
-# --- other sites ----------------------------------------------------------------------------------------------------
-
-# The request for a ``SitesReport`` without sources.
-REPORT: Final = "site.report"
-# The request for a ``SitesReport`` of one site with its sources: ``{site}``.
-INFO: Final = "site.info"
-# The request for the ways of a topic or a service through gateways: ``{name, site, module, service}``.
-WHY: Final = "site.why"
-_SOURCES: Final = Needs(
-    (Access.SUBSCRIBE, Access.CALL),
-    "each topic and service; of this site the asking module's own alone. Sites and modules are named to all",
-)
-_WAYS: Final = Needs(
-    (Access.SUBSCRIBE, Access.CALL), "the topic or service, by its name here; what leaves is the asking module's own"
-)
-# The questions about other sites.
-QUESTIONS: Final = (REPORT, INFO, WHY)
-
-
-class SiteAnswerer(Protocol):
-    """Answers questions about other sites: ``gateway.sites`` has it."""
-
-    def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Awaitable[Any]:
-        """The reply to one of ``QUESTIONS``, which tells ``asker``, a linked module, only what it may have.
-
-        Without ``asker`` the question is of this machine's user, to which everything is shown.
-
-        Raises:
-            RmpaError: It cannot be answered; the text says why.
-        """
-        ...
-
-
-class SiteRequests:
-    """The operation ``site`` of the control socket, and the peers' requests about sites.
-
-    Args:
-        bridge: Carries requests between the modules, and says which peers are believed about other sites.
-    """
-
-    def __init__(self, bridge: Bridge) -> None:
-        self._bridge = bridge
-        # What answers as a gateway; ``None``: this agent is none.
-        self.answerer: SiteAnswerer | None = None
-        # The gateway that answered for a site, by its GUID.
-        self._liked: dict[str, str] = {}
-
-    def serve(self, gateway: SiteAnswerer) -> None:
-        """Answer as a gateway from now on."""
-        self.answerer, rpc = gateway, self._bridge.rpc
-        rpc.on_request(REPORT, partial(self._answer_peer, gateway, REPORT), _SOURCES)
-        rpc.on_request(INFO, partial(self._answer_peer, gateway, INFO), _SOURCES)
-        rpc.on_request(WHY, partial(self._answer_peer, gateway, WHY), _WAYS)
-
-    async def answer(self, args: Args) -> Any:
-        """The operation ``site``: ``what`` (one of ``QUESTIONS``) and its ``args``.
-
-        ``site.report`` and ``site.why`` return a list with the answers of all gateways; the others one answer.
-        """
-        what, inner = args.get("what"), args.get("args")
-        if what not in QUESTIONS or not isinstance(inner, dict):
-            raise ConfigError("what", f"{what!r} is no question about sites")
-        return await (self.all(what, inner) if what in {REPORT, WHY} else self.one(what, inner))
-
-    async def all(self, what: str, args: Args) -> list[Any]:
-        """The answers of all gateways; those that fail are left out."""
-        if self.answerer is not None:
-            return [await self.answerer.answer(what, args)]
-        # Twice the time: the gateway itself asks the other site for so long.
-        asks = [self._bridge.rpc.request(at, what, args, 2 * bridge_limits.ASK_TIMEOUT) for at in self._believed()]
-        found = await asyncio.gather(*asks, return_exceptions=True)
-        for error in found:
-            if isinstance(error, BaseException) and not isinstance(error, RmpaError):
-                raise error
-        return [value for value in found if not isinstance(value, RmpaError)]
-
-    async def one(self, what: str, args: Args) -> Any:
-        """The answer of the first gateway that has one.
-
-        Raises:
-            UnreachableError: This module is linked to no gateway.
-            RmpaError: No gateway has an answer; the text is that of the one that knew most.
-        """
-        if self.answerer is not None:
-            return await self.answerer.answer(what, args)
-        site = str(args.get("site", ""))
-        problem: RmpaError | None = None
-        for session in sorted(self._believed(), key=lambda each: str(each.link.guid) != self._liked.get(site)):
-            try:
-                value = await self._bridge.rpc.request(session, what, args, bridge_limits.PARAM_ASK_TIMEOUT)
-            except RmpaError as error:
-                if not (isinstance(error, PeerRefused) and UNKNOWN_QUESTION in error.reason):
-                    problem = problem or error
-            else:
-                self._liked[site] = str(session.link.guid)
-                return value
-        self._liked.pop(site, None)
-        raise problem or UnreachableError(
-            "gateway",
-            "any linked peer",
-            "start one with `rmpa gateway`; `rmpa peer list` shows the links. In a secured mesh "
-            "`relays` of [trust] names the gateways that are believed",
-        )
-
-    def _believed(self) -> list[PeerSession]:
-        """The linked peers whose word about other sites counts: any member could answer as a gateway."""
-        return [at for at in self._bridge.sessions.linked() if self._bridge.gate.may_relay(at.link.name)]
-
-    @staticmethod
-    def _answer_peer(gateway: SiteAnswerer, what: str, asker: PeerSession, args: Args) -> Awaitable[object]:
-        return gateway.answer(what, args, asker.link.name)
-
-
-# --- changes of the local graph -------------------------------------------------------------------------------------
-
-# Each revision is an integer that all programs read exactly from JSON, and no two agents begin near each other.
-_REVISION_BITS = 52
-
-
-class GraphHistory:
-    """Which topics and services have changed at the last ``limits.GRAPH_HISTORY`` revisions.
-
-    A row is the present state of one topic or service, so it does not matter how often it changed meanwhile. The
-    history has names alone, and is kept while clients ask for rows: without one, a change of the graph costs nothing.
-
-    Args:
-        revision: The first one.
-    """
-
-    def __init__(self, revision: int) -> None:
-        # The present one: stands for the present local graph.
-        self.revision = revision
-        self._changes: deque[tuple[RegistrationKind, str]] | None = None
-        self._asked = 0
-
-    def add(self, change: GraphChange) -> None:
-        """The graph has changed, which makes a new revision."""
-        self.revision += 1
-        if self._changes is None:
-            return
-        if self.revision - self._asked > limits.GRAPH_HISTORY:
-            self._changes = None  # the client that asked last is too far behind by now, or has gone
-        else:
-            self._changes.append((change.kind, change.name))
-
-    def rows_since(self, known: object, state: GraphState) -> GraphRows:
-        """What has changed since a revision, or everything where the history does not reach back to it.
-
-        Args:
-            known: The revision that a client knows; ``None``, or anything that is not one of this agent: none.
-            state: The present graph.
-        """
-        self._asked = self.revision
-        if self._changes is None:
-            self._changes = deque(maxlen=limits.GRAPH_HISTORY)
-        behind = self.revision - known if type(known) is int else -1
-        whole = not 0 <= behind <= len(self._changes)
-        topics: Iterable[str] = sorted(state.publishers.keys() | state.subscribers.keys()) if whole else ()
-        services: Iterable[str] = sorted(state.services) if whole else ()
-        if not whole:
-            recent = dict.fromkeys(itertools.islice(reversed(self._changes), behind))
-            topics = dict.fromkeys(name for kind, name in recent if kind is not RegistrationKind.SERVICE)
-            services = [name for kind, name in recent if kind is RegistrationKind.SERVICE]
-        publishers, subscribers, types = state.publishers, state.subscribers, state.types
-        return GraphRows(
-            whole=whole,
-            topics=tuple(
-                TopicRow(name, types.get(name, ""), tuple(publishers.get(name, ())), tuple(subscribers.get(name, ())))
-                for name in topics
-            ),
-            services=tuple(ServiceRow(name, tuple(state.services.get(name, ()))) for name in services),
-        )
-
-
-class GraphRevisions:
-    """The revision of a core's graph: a number that every change of the graph replaces.
-
-    Args:
-        core: Tells the changes.
-        rows: Whether clients get the changes themselves. Those of a core that is another program are known here later
-            than there.
-    """
-
-    def __init__(self, core: Core, *, rows: bool) -> None:
-        self._core = core
-        self._rows = rows
-        # Begins anywhere, so that a client takes the graph of an agent that was started again for another one.
-        self._history = GraphHistory(secrets.randbits(_REVISION_BITS))
-        self._changed = asyncio.Event()
-        core.on_change(self._add)
-
-    def _add(self, change: GraphChange) -> None:
-        self._history.add(change)
-        self._changed.set()
-
-    async def after(self, args: Args) -> GraphRevision:
-        """The revision, as soon as it differs from the one that the client knows.
-
-        Args:
-            args: ``after``: the known revision; ``wait``: the most seconds to wait for another one, 0 by default;
-                ``rows``: true for what has changed since ``after``.
-
-        Raises:
-            ConfigError: An argument is out of range.
-        """
-        known, wait = args.get("after"), args.get("wait", 0)
-        if not isinstance(wait, int | float) or not 0 <= wait <= limits.CONTROL_WAIT_MAX:
-            raise ConfigError("wait", f"{wait!r} is not between 0 and {limits.CONTROL_WAIT_MAX:g} s")
-        if known == self._history.revision:
-            self._changed.clear()  # those who wait already were called when it was set
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(wait):
-                    await self._changed.wait()
-        if not self._rows or args.get("rows") is not True:
-            return GraphRevision(revision=self._history.revision)
-        rows = self._history.rows_since(known, self._core.state())
-        return GraphRevision(revision=self._history.revision, core_uri=self._core.uri, rows=rows)
-
-
-# --- the operations -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,7 +46,7 @@ class ControlOperations:
 
     Args:
         name: The agent's name.
-        bridge: Its bridge.
+        facts: What its bridge tells.
         params: The bridge's part for parameters.
         snapshots: Builds its snapshots.
         nodes: Knows the nodes of this module.
@@ -288,7 +54,7 @@ class ControlOperations:
     """
 
     name: str
-    bridge: Bridge
+    facts: BridgeFacts
     params: Params
     snapshots: SnapshotBuilder
     nodes: Nodes
@@ -329,7 +95,7 @@ class ControlOperations:
         """Pass a request about parameters on to a peer: ``peer``, ``what``, and its ``key`` and ``text``."""
         what, session = _request(args, transfer.QUESTIONS), self._session(args.get("peer", ""))
         inner: Args = {name: args[name] for name in ("key", "text") if name in args}
-        return await self.bridge.rpc.request(session, what, inner, bridge_limits.PARAM_ASK_TIMEOUT)
+        return await self.facts.bridge.rpc.request(session, what, inner, bridge_limits.PARAM_ASK_TIMEOUT)
 
     def followed(self, _args: Args) -> tuple[FollowedInfo, ...]:
         """The parameters of other modules that this one follows."""
@@ -351,36 +117,36 @@ class ControlOperations:
         Without a peer: the facts about a node of this module, or a list of the nodes of all peers.
         """
         what, peer = _request(args, node_requests.REPLIES), args.get("peer")
-        if peer is None and what == node_requests.INFO:
+        if peer is None and what == node_requests.NODE_INFO:
             return await self.nodes.info(args)
         if peer is None:
-            return await asyncio.gather(*map(self._nodes_of, self.bridge.sessions.linked()))
+            return await asyncio.gather(*map(self._nodes_of, self.facts.bridge.sessions.linked()))
         session = self._session(peer)
         if what == node_requests.LIST:
             return [await self._nodes_of(session)]
         request = {"node": str(args.get("node", "")), "by": OWN_NODE, "reason": "user request"}
-        return await self.bridge.rpc.request(session, what, request, bridge_limits.NODE_KILL_TIMEOUT)
+        return await self.facts.bridge.rpc.request(session, what, request, bridge_limits.NODE_KILL_TIMEOUT)
 
     async def _nodes_of(self, session: PeerSession) -> PeerNodes:
         """The nodes of a peer; where it does not answer, those of which this module has proxies."""
         peer = session.link.name
         try:
-            value = await self.bridge.rpc.request(session, node_requests.LIST, {})
+            value = await self.facts.bridge.rpc.request(session, node_requests.LIST, {})
             return PeerNodes(peer=peer, nodes=msgspec.convert(value, tuple[NodeLine, ...]))
         except (RmpaError, msgspec.ValidationError) as error:
             nodes = tuple(NodeLine(name=node) for node, _ in session.proxies)
             return PeerNodes(peer=peer, nodes=nodes, problem=str(error))
 
     async def agent(self, args: Args) -> Any:
-        """What the agent of a peer tells of itself: ``peer``, its name or GUID."""
-        return await self.bridge.rpc.request(self._session(args.get("peer", "")), AGENT_INFO, {})
+        """The facts of a peer's module: ``peer``, its name or GUID."""
+        return await self.facts.bridge.rpc.request(self._session(args.get("peer", "")), INFO, {})
 
     def contract(self, args: Args) -> dict[str, ContractTerm]:
         """The terms that this module's settings give a ``topic`` of a ``type_name``, by key; it need not exist."""
         topic, type_name = str(args.get("topic", "")), str(args.get("type_name", ""))
         if not is_global_name(topic):
             raise ConfigError("topic", f"{topic!r} is not a topic", "write /name")
-        return self.snapshots.topics.contract(topic, type_name)
+        return self.facts.topics.contract(topic, type_name)
 
     def _session(self, name: object) -> PeerSession:
         """The linked peer of a name or GUID.
@@ -390,8 +156,8 @@ class ControlOperations:
             UnreachableError: No such peer has it.
         """
         peer = str(name)
-        sessions = list(self.bridge.sessions.linked())
-        fitting = [s for s in sessions if peer in {s.link.name, str(s.link.guid), str(s.link.guid).partition("#")[0]}]
+        sessions = list(self.facts.bridge.sessions.linked())
+        fitting = [session for session in sessions if is_meant(peer, session.link.name, str(session.link.guid))]
         if len(fitting) == 1:
             return fitting[0]
         if fitting:
@@ -426,14 +192,11 @@ REPLIES: Final[dict[str, object]] = {
     "graph": GraphRevision,
     "followed": tuple[FollowedInfo, ...],
     "trust": object,  # TrustStatus, or as the command says (trust.status)
-    "agent": PeerAgent,
+    "agent": ModuleFacts,
     "contract": dict[str, ContractTerm],
     "site": object,  # as ``QUESTIONS`` say
     "node": object,  # tuple[PeerNodes, ...] for lists, else as node_requests.REPLIES says
 }
-
-
-# --- the client's side of ``param`` -------------------------------------------------------------------------------
 
 
 def parameters_in(key: str, value: XmlRpcValue) -> list[tuple[str, XmlRpcValue]]:

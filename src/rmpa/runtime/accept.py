@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rmpa.core.errors import OutOfDescriptors, StartError
+from rmpa.core.facts import FilesInfo
 from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.runtime import limits
@@ -127,11 +128,6 @@ class Descriptors:
         return _file_limits()[0]
 
     @property
-    def hard_limit(self) -> int:
-        """The highest soft limit that needs no privileges."""
-        return _file_limits()[1]
-
-    @property
     def reserve(self) -> int:
         """The number of descriptors that are kept for the core and the links."""
         return min(limits.DESCRIPTORS_RESERVED, self.limit // limits.DESCRIPTORS_RESERVED_PART)
@@ -154,6 +150,19 @@ class Descriptors:
     def problem(self) -> str:
         """What was refused in the last seconds and what to do, as a text for the user; empty for nothing."""
         return self._problem if time.monotonic() - self._refused_at < limits.DESCRIPTORS_TOLD else ""
+
+    def info(self) -> FilesInfo:
+        """Its piece of the snapshot."""
+        used, limit, reserved = self.open, self.limit, self.reserve
+        return FilesInfo(
+            open=used,
+            limit=limit,
+            hard=_file_limits()[1],
+            reserved=reserved,
+            near=used >= limits.DESCRIPTORS_NEAR * (limit - reserved),
+            refused=sum(count for name, count in self.counters.as_dict().items() if ".refused." in name),
+            problem=self.problem,
+        )
 
     def open_socket(
         self,

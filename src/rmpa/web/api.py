@@ -25,8 +25,9 @@ from rmpa.web.clients.clients import REASONS as GATEWAY_REASONS
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from rmpa.observe.peer_info import LinkInfo, PeerInfo
-    from rmpa.observe.snapshot import RouteInfo, SampleSpread, ServiceInfo, Snapshot
+    from rmpa.core.facts import LinkInfo, RouteInfo, ServiceInfo
+    from rmpa.core.statistics import SampleSpread
+    from rmpa.observe.snapshot import PeerInfo, Snapshot
 
 # Begins each path; a later version that breaks clients has another number.
 PREFIX: Final = "/api/v1"

@@ -19,8 +19,8 @@ from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.gateway.sites.answers import SiteAnswers, WhyQuestion, here_stages, parse_ways, sent_stages
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
 from rmpa.gateway.sites.plans import SiteImport
-from rmpa.observe.operations import INFO, REPORT, WHY
-from rmpa.observe.peer_info import FAIL, OK, WARN, Check
+from rmpa.observe.check import FAIL, OK, WARN, Check
+from rmpa.observe.sites import REPORT, SITE_INFO, WHY
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.wire.tcpros import TopicDescription
 from rmpa.trust.permissions import Permissions
@@ -30,7 +30,7 @@ from tests.gateway.sites.site_bed import site_bed
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from rmpa.observe.peer_info import SitesReport
+    from rmpa.observe.sites import SitesReport
     from tests.gateway.sites.site_bed import Site, SiteBed
 
 TEXT = TopicDescription("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n")
@@ -110,7 +110,7 @@ async def test_rules_of_both_sites_are_named(bed: AskedBed) -> None:
     assert failed(own).name == "rule here"
     (none,) = await hall.why("/none", "yard", "arm")
     assert failed(none).text == "no node of arm at yard has /none, as the gateway there sees it"
-    info = await hall.report(INFO, site="yard")
+    info = await hall.report(SITE_INFO, site="yard")
     (site,) = info.sites
     problems = {source.name: source.problem for source in site.sources}
     assert problems["/told"] == ""
@@ -131,10 +131,10 @@ async def test_a_module_and_a_site_are_told_only_of_what_they_may_have(bed: Aske
     hall.site.graph.add("/home/mine", TEXT, module="desk")
     await until(lambda: hall.site.shows("/hidden") and hall.site.shows("/open"))
     for site, names in (("yard", {"/open"}), ("hall", {"/home/mine"})):
-        (told,) = (await hall.report(INFO, "desk", site=site)).sites
+        (told,) = (await hall.report(SITE_INFO, "desk", site=site)).sites
         assert {source.name for source in told.sources} == names
         assert sum(module.topics for module in told.modules) == 1
-        assert len((await hall.report(INFO, site=site)).sites[0].sources) > 1, "this machine's user"
+        assert len((await hall.report(SITE_INFO, site=site)).sites[0].sources) > 1, "this machine's user"
     for name, real in (("/hidden", True), ("/none", False)):
         assert await hall.why(name, asker="desk") == []
         (denied,) = await hall.why(name, "yard", asker="desk")
@@ -232,7 +232,7 @@ async def test_a_topic_for_some_sites_is_told_of_to_each_as_the_rules_are_for_it
     assert levels(way)["rule there"] == "fail"
     assert "gateway.rule 1" in way.stages[-1].text
     assert {way.to for way in await yard.why("/chatter", asker="arm")} == {"site attic", "site cellar"}
-    report = await yard.report(INFO, site="yard")
+    report = await yard.report(SITE_INFO, site="yard")
     assert [(module.name, module.topics) for module in report.sites[0].modules] == [("arm", 1)]
 
 

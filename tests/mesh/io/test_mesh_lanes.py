@@ -108,8 +108,8 @@ async def test_each_route_has_its_own_bound_and_drops_its_own() -> None:
         await until(lambda: len(other.data) == 4, "what was kept")
         assert other.messages(8) == [(3, b"3"), (4, b"4")]
         assert other.messages(9) == [(0, b"other")]
-        assert one.link(other).dropped == 3
-        assert [link.dropped for link in one.mesh.links()] == [3]
+        assert one.link(other).info().dropped == 3
+        assert [link.info().dropped for link in one.mesh.links()] == [3]
 
 
 async def test_closed_route_drops_what_waits() -> None:

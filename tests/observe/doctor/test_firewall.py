@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa.observe.check import CheckLevel
 from rmpa.observe.doctor.network import FirewallRules, judge_rules, names_port, read_iptables, read_nft
-from rmpa.observe.peer_info import CheckLevel
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 import pytest
 
+from rmpa.core.facts import FilesInfo, UnreachableInfo
 from rmpa.discovery.network import NetworkInterface
+from rmpa.observe.check import FAIL, WARN, Check
 from rmpa.observe.doctor.checks import is_beyond_loopback, judge_agents, judge_exposed_nodes, judge_membership
 from rmpa.observe.doctor.machine import (
     judge_clock,
@@ -26,8 +28,8 @@ from rmpa.observe.doctor.network import (
     judge_routes,
     judge_rp_filter,
 )
-from rmpa.observe.peer_info import FAIL, FOREIGN, WARN, Check, PeerInfo
-from rmpa.observe.snapshot import FilesInfo, Snapshot, UnreachableInfo
+from rmpa.observe.peers import FOREIGN
+from rmpa.observe.snapshot import PeerInfo, Snapshot
 from rmpa.observe.why.diagnosis import judge_peer_clock
 from rmpa.trust.permissions import TrustStatus
 from tests.observe.samples import SNAPSHOT

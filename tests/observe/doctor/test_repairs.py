@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.config.settings import Settings
+from rmpa.observe.check import Check
 from rmpa.observe.doctor.machine import DoctorInput
 from rmpa.observe.doctor.repairs import Repair, directories, of_directories, of_group, of_leavings, of_mode, of_unit
-from rmpa.observe.peer_info import Check
 
 if TYPE_CHECKING:
     from collections.abc import Callable

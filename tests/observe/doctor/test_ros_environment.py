@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
+from rmpa.observe.check import CheckLevel
 from rmpa.observe.doctor.machine import RosShell, judge_shell, names_of
-from rmpa.observe.peer_info import CheckLevel
 
 SHELL = RosShell(
     environ={},

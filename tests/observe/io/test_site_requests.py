@@ -10,7 +10,7 @@ import pytest
 
 from rmpa.bridge.policy import OPEN_GATE
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
-from rmpa.observe.operations import INFO, REPORT, SiteRequests
+from rmpa.observe.sites import REPORT, SITE_INFO, SiteRequests
 
 
 def peer(name: str) -> Any:
@@ -66,7 +66,7 @@ NO_GATEWAY = PeerRefused("arm", "this agent does not know the question 'site.inf
 async def test_the_peer_that_is_a_gateway_answers_and_is_asked_first_the_next_time() -> None:
     rpc = Rpc({"arm": NO_GATEWAY, "gate": {"x": 1}})
     asks = requests(rpc, "arm", "gate")
-    args = {"what": INFO, "args": {"site": "hall"}}
+    args = {"what": SITE_INFO, "args": {"site": "hall"}}
     assert await asks.answer(args) == {"x": 1}
     assert await asks.answer(args) == {"x": 1}
     assert rpc.asked == ["arm", "gate", "gate"]
@@ -77,19 +77,19 @@ async def test_no_member_but_the_relays_is_believed_about_other_sites() -> None:
     """It would answer for every site."""
     rpc = Rpc({"eve": {"x": 666}, "gate": {"x": 1}})
     asks = requests(rpc, "eve", "gate", gate=Gate())
-    assert await asks.one(INFO, {"site": "hall"}) == {"x": 1}
+    assert await asks.one(SITE_INFO, {"site": "hall"}) == {"x": 1}
     assert await asks.all(REPORT, {}) == [{"x": 1}]
     assert rpc.asked == ["gate", "gate"]
     with pytest.raises(UnreachableError, match=r"`relays` of \[trust\]"):
-        await requests(rpc, "eve", gate=Gate()).one(INFO, {"site": "hall"})
+        await requests(rpc, "eve", gate=Gate()).one(SITE_INFO, {"site": "hall"})
 
 
 async def test_the_error_of_a_gateway_goes_before_that_of_others() -> None:
     rpc = Rpc({"arm": NO_GATEWAY, "gate": PeerRefused("gate", "site hall is unreachable since 3 s")})
     with pytest.raises(PeerRefused, match="site hall is unreachable"):
-        await requests(rpc, "arm", "gate").one(INFO, {"site": "hall"})
+        await requests(rpc, "arm", "gate").one(SITE_INFO, {"site": "hall"})
     with pytest.raises(UnreachableError, match="no gateway answers at any linked peer"):
-        await requests(rpc, "arm").one(INFO, {"site": "hall"})
+        await requests(rpc, "arm").one(SITE_INFO, {"site": "hall"})
     assert await requests(rpc, "arm").all(REPORT, {}) == []
     with pytest.raises(ConfigError):
         await requests(rpc).answer({"what": "site.shout", "args": {}})
@@ -104,5 +104,5 @@ async def test_a_gateway_answers_itself_and_is_told_which_module_asks() -> None:
     async def ask(who: str, what: str, args: dict[str, Any]) -> object:
         return await rpc.handlers[what](peer(who), args)
 
-    assert await ask("other", INFO, {"asker": "desk"}) == "answer"
-    assert gateway.answered == [(REPORT, ""), (INFO, "other")]
+    assert await ask("other", SITE_INFO, {"asker": "desk"}) == "answer"
+    assert gateway.answered == [(REPORT, ""), (SITE_INFO, "other")]

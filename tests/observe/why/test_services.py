@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
 
-from rmpa.observe.peer_info import BoundInfo, Check, CheckLevel, LaneInfo, PeerAgent, PeerInfo
-from rmpa.observe.snapshot import ServiceInfo
+from rmpa.core.facts import BoundInfo, FilesInfo, LaneInfo, ServiceInfo
+from rmpa.observe.check import Check, CheckLevel
+from rmpa.observe.snapshot import ModuleFacts
 from rmpa.observe.why.diagnosis import Diagnosis, ServiceAtServer
 from rmpa.observe.why.services import ServiceHere, diagnose_module, diagnose_service
 from tests.observe.samples import SNAPSHOT
 from tests.observe.why.test_topics import LINK, PEER, unlinked
+
+if TYPE_CHECKING:
+    from rmpa.observe.snapshot import PeerInfo
 
 BEGIN = (Check("peer", CheckLevel.OK, "known"), Check("link", CheckLevel.OK, "linked"))
 THERE = ServiceAtServer(node="/arm", service="/move", rule="services.allow has '/**'")
@@ -94,27 +98,26 @@ def test_without_a_link_nothing_else_is_judged() -> None:
     assert walk(begin=begin).stages == begin
 
 
-# --- modules --------------------------------------------------------------------------------------------------------
-
 LANES = (LaneInfo(name="express", connected=True), LaneInfo(name="bulk", connected=True))
 UNNEEDED = (LANES[0], LaneInfo(name="bulk", connected=False, unneeded=True))
 CUT = (LANES[0], LaneInfo(name="bulk", connected=False, queued=9))
-TOLD = PeerAgent(version=SNAPSHOT.agent.version, cpu=3.0, files_open=60, files_limit=1024)
+FILES = FilesInfo(open=60, limit=1024, hard=1024, reserved=0)
+TOLD = ModuleFacts(version=SNAPSHOT.agent.version, cpu=3.0, files=FILES)
 
 
 def module(
-    agent: PeerAgent | None = TOLD, link: dict[str, Any] | None = None, name: str = "joystick", **changes: Any
+    agent: ModuleFacts | None = TOLD, link: dict[str, Any] | None = None, name: str = "joystick", **changes: Any
 ) -> Diagnosis:
     linked = msgspec.structs.replace(LINK, **{"lanes": LANES, "clock_offset": 0.001, **(link or {})})
     return asked(msgspec.structs.replace(PEER, link=linked, **changes), name, agent)
 
 
-def asked(peer: PeerInfo, name: str = "joystick", agent: PeerAgent | None = None) -> Diagnosis:
+def asked(peer: PeerInfo, name: str = "joystick", agent: ModuleFacts | None = None) -> Diagnosis:
     refusal = "" if agent else "it does not know the question"
     return diagnose_module(msgspec.structs.replace(SNAPSHOT, peers=(peer,)), name, agent, refusal)
 
 
-def agent(**changes: Any) -> PeerAgent:
+def agent(**changes: Any) -> ModuleFacts:
     return msgspec.structs.replace(TOLD, **changes)
 
 
@@ -128,7 +131,7 @@ MODULES: dict[str, tuple[Diagnosis, list[tuple[str, str]]]] = {
     "an agent that does not tell": (module(None), [("answer", "unknown")]),
     "a clock ahead": (module(link={"clock_offset": 2.0}), [("clock", "warn")]),
     "a busy agent": (module(agent(cpu=97.0)), [("load", "warn")]),
-    "few files": (module(agent(files_open=1000)), [("files", "warn")]),
+    "few files": (module(agent(files=FilesInfo(open=1000, limit=1024, hard=1024, reserved=0))), [("files", "warn")]),
     "a limit": (
         module(beyond=(BoundInfo(kind="nodes", limit=2, hidden=1, text="1 node hides; raise it"),)),
         [("limits", "warn")],

@@ -10,11 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa.core.facts import Arrival, FilesInfo, LinkInfo, PublisherReport, RouteInfo, SubscriberTransport
+from rmpa.core.statistics import SampleSpread
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.peer_info import Check, CheckLevel, LinkInfo, PeerInfo
-from rmpa.observe.snapshot import FilesInfo, RouteInfo, SampleSpread, Snapshot, SubscriberTransport
-from rmpa.observe.why.diagnosis import Diagnosis, PublisherReport, TopicAtPublisher
-from rmpa.observe.why.stages import Arrival, Ends, diagnose_topic, peer_stages
+from rmpa.observe.check import Check, CheckLevel
+from rmpa.observe.snapshot import PeerInfo, Snapshot
+from rmpa.observe.why.diagnosis import Diagnosis, TopicAtPublisher
+from rmpa.observe.why.stages import Ends, diagnose_topic, peer_stages
 from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:
@@ -99,7 +101,7 @@ class Case:
         arrivals = {}
         if route is not None and self.known:
             arrivals["/joy"] = Arrival(
-                route,
+                route=route,
                 registered=self.registered,
                 cause="conflict" if self.conflict else "",
                 readers=dict(enumerate(readers)),

@@ -253,7 +253,7 @@ async def test_a_module_tells_its_agents_figures_its_lanes_and_why(site: Site) -
     page = await site.open("module/base")
     await page.wait_text("4.2")
     await page.wait_text("large messages")
-    for text in ("of a core", "61 of 1,024"):
+    for text in ("base-nuc", "of a core", "61 of 1,024"):
         assert text in await page.run("document.querySelector('main').innerText")
     assert await page.run("[...document.querySelectorAll('main a')].some((each) => each.textContent === '/base')")
     await page.press("w")

@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rmpa.observe import limits
-from rmpa.observe.control import GraphRows, ServiceRow, TopicRow
-from rmpa.observe.operations import GraphHistory
+from rmpa.observe.graph import GraphHistory, GraphRows, ServiceRow, TopicRow
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import Registrations
 from rmpa.web.hub.graph import GraphTable, rows_of

@@ -28,8 +28,9 @@ from aiohttp import WSMsgType, web
 
 from rmpa.core.contract import ContractRule, Contracts
 from rmpa.core.errors import RmpaError
-from rmpa.observe.peer_info import LaneInfo, PeerAgent, PeerInfo, judge_stranger
-from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo
+from rmpa.core.facts import LaneInfo, RouteInfo, TopicInfo
+from rmpa.observe.peers import judge_stranger
+from rmpa.observe.snapshot import ModuleFacts, PeerInfo, Snapshot
 from rmpa.observe.why.services import diagnose_module
 from rmpa.trust.permissions import TrustReason, TrustStatus
 from rmpa.web.clients.frame_writer import Opcode
@@ -294,7 +295,7 @@ class FakeServer:
 
     def _answer_why(self, args: dict[str, Any]) -> Any:
         if args["kind"] == "module":
-            told = msgspec.convert(self._answer_agent({"peer": args["name"]}), PeerAgent)
+            told = msgspec.convert(self._answer_agent({"peer": args["name"]}), ModuleFacts)
             return msgspec.to_builtins((diagnose_module(self._snapshot, args["name"], told),))
         flows = self._answers["flows"]
         if self.agent.scene == "demo":

@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa.core.facts import RouteInfo, TopicInfo, UnreachableInfo
 from rmpa.core.limits import KIB
-from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo, UnreachableInfo
+from rmpa.observe.snapshot import Snapshot
 from rmpa.trust.permissions import TrustStatus
 from rmpa.web import limits as web_limits
 from rmpa.web.monitor import limits, messages, questions, session
@@ -25,7 +26,7 @@ from tests.web.monitor.patches import apply
 from tests.web.snapshots import AGENT, FULL, LINK, peer
 
 if TYPE_CHECKING:
-    from rmpa.observe.peer_info import PeerInfo
+    from rmpa.observe.snapshot import PeerInfo
 
 RECORDED = snapshots()
 RESOURCES = resources()

@@ -16,7 +16,7 @@ import pytest
 from rmpa.core.errors import UnreachableError
 from rmpa.observe.control import ControlReply
 from rmpa.observe.control_server import ControlServer
-from rmpa.observe.operations import GraphRevisions
+from rmpa.observe.graph import GraphRevisions
 from rmpa.trust.permissions import TrustStatus
 from rmpa.web import limits
 from rmpa.web.server.agent_watch import AgentFollower, AgentWatch, ControlReader
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from rmpa.observe.control import GraphRevision
+    from rmpa.observe.graph import GraphRevision
     from rmpa.observe.snapshot import Snapshot
     from rmpa.ros.core.embedded import RosCore
     from rmpa.ros.node.node import Node

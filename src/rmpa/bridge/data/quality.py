@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from rmpa.bridge import limits
 from rmpa.core.contract import Liveliness
-from rmpa.core.statistics import SampleSummary
+from rmpa.core.facts import LatencyInfo
+from rmpa.core.statistics import SampleSpread
 from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
@@ -241,10 +242,8 @@ class QualitySummary(NamedTuple):
     Args:
         latency: From the arrival of a message at the publisher's agent to its delivery here; ``None`` where the
             peer's clock is unknown, or nothing came.
-        latency_last: The latency of the last message.
-        latency_error: The true latencies lie within ± this.
         period: Between messages.
-        jitter: The period's 99th percentile less its median; ``nan`` before the third message.
+        jitter: The period's 99th percentile less its median; ``None`` before the third message.
         rate: Messages a second, over what the ring holds and at least over the last second; a silence longer than
             every period counts, so the rate of a dead source falls.
         bandwidth: Bytes a second, over the same time.
@@ -253,13 +252,11 @@ class QualitySummary(NamedTuple):
         bytes: Since the route was opened.
     """
 
-    latency: SampleSummary | None
-    latency_last: float | None
-    latency_error: float | None
-    period: SampleSummary
-    jitter: float
-    rate: float
-    bandwidth: float
+    latency: LatencyInfo | None
+    period: SampleSpread
+    jitter: float | None
+    rate: float | None
+    bandwidth: float | None
     age: float | None
     messages: int
     bytes: int
@@ -344,20 +341,18 @@ class Quality:
         times = self._latest(self._times, self.messages)
         times = times[bisect_left(times, now - limits.QUALITY_SPAN, 0, max(len(times) - 1, 0)) :]  # at least the last
         periods = list(map(sub, times[1:], times))
-        period = SampleSummary.of(periods)
+        period = SampleSpread.of(periods)
         silence = now - times[-1] if times else 0.0
         count, size, elapsed = self._counted(times, now)
-        if periods and silence > max(period.maximum, limits.QUALITY_SILENCE):
+        if periods and silence > max(period.max, limits.QUALITY_SILENCE):
             elapsed += silence
         latencies, error = self._latencies(times, clock, latching=latching) if clock is not None else ([], 0.0)
         return QualitySummary(
-            latency=SampleSummary.of(latencies) if latencies else None,
-            latency_last=latencies[-1] if latencies else None,
-            latency_error=error if latencies else None,
+            latency=LatencyInfo.of(latencies, last=latencies[-1], error=error) if latencies else None,
             period=period,
-            jitter=period.p99 - period.p50 if period.count > 1 else math.nan,
-            rate=count / elapsed if elapsed > 0 else math.nan,
-            bandwidth=size / elapsed if elapsed > 0 else math.nan,
+            jitter=period.p99 - period.p50 if period.count > 1 else None,
+            rate=count / elapsed if elapsed > 0 else None,
+            bandwidth=size / elapsed if elapsed > 0 else None,
             age=silence if times else None,
             messages=self.messages,
             bytes=self.bytes,

@@ -20,8 +20,8 @@ from rmpa.gateway.ros2.topics import Ros2Topics
 from rmpa.gateway.ros2.types import DISTRIBUTIONS
 from rmpa.gateway.rules import CrossingRules, SourceKind
 from rmpa.gateway.topics import flow
-from rmpa.observe.operations import INFO, REPORT, WHY
-from rmpa.observe.peer_info import FAIL, OK, WARN, Check, SiteInfo, SiteSourceInfo, SitesReport
+from rmpa.observe.check import FAIL, OK, WARN, Check
+from rmpa.observe.sites import REPORT, SITE_INFO, WHY, SiteInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.why.diagnosis import Diagnosis, until_failure
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.topics import Ros2Dialect, Ros2Import, Ros2Publisher
     from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.topics import ExportedTopic
-    from rmpa.observe.operations import SiteAnswerer
+    from rmpa.observe.sites import SiteAnswerer
     from rmpa.ros.types.messages import MessageType
 
     _Part: TypeAlias = Ros2Actions | Ros2Services | Ros2Topics
@@ -189,9 +189,9 @@ class Ros2Neighbour:
             visible = any(self.permissions.tells(asker, kind, name) for kind in SourceKind)
             ways = self.ways(name, site, module) if visible and args.get("service") is not True else []
             return [*ways, *(await self.sites.answer(what, args, asker) if self.sites is not None else ())]
-        if what == REPORT or (what == INFO and site == SITE):
+        if what == REPORT or (what == SITE_INFO and site == SITE):
             report = await self._report(asker)
-            if what == INFO:
+            if what == SITE_INFO:
                 return msgspec.structs.replace(report, sites=(self._site(asker, sources=True),))
             return msgspec.structs.replace(report, sites=(*report.sites, self._site(asker, sources=False)))
         if self.sites is None:

@@ -29,18 +29,8 @@ from rmpa.gateway.sites.site import SiteNeighbour
 from rmpa.gateway.sites.topics import SiteContext
 from rmpa.gateway.topics import flow
 from rmpa.gateway.zenoh.threads import first_answer
-from rmpa.observe.operations import INFO, REPORT, WHY
-from rmpa.observe.peer_info import (
-    FAIL,
-    OK,
-    UNKNOWN,
-    WARN,
-    Check,
-    SiteInfo,
-    SiteModuleInfo,
-    SiteSourceInfo,
-    SitesReport,
-)
+from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
+from rmpa.observe.sites import REPORT, SITE_INFO, WHY, SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.why.diagnosis import Diagnosis, permission_there, until_failure
 from rmpa.ros.wire.tcpros import printable
 
@@ -218,7 +208,7 @@ class SiteAnswers:
             return self._report(known, asker, sources=False)
         if what == WHY:
             return await self.ways(name, site, module, asker, service=args.get("service") is True)
-        if what == INFO:
+        if what == SITE_INFO:
             # Of a site that is not known the names of all are the answer.
             return self._report([site] if site in known else known, asker, sources=site in known)
         raise RemoteProtocolError(f"{what[:80]!r} is no question about sites")

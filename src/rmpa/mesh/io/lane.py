@@ -9,6 +9,7 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from rmpa.core import limits as core_limits
+from rmpa.core.facts import LaneInfo
 from rmpa.core.identity import SERIAL_MASK
 from rmpa.core.outbox import Outbox, QueuedMessage
 from rmpa.mesh import limits
@@ -45,6 +46,12 @@ class LaneSender:
         # The messages that ``open`` has begun, by route.
         self._open: dict[int, QueuedMessage] = {}
         self._loop = asyncio.get_running_loop()
+
+    def info(self, *, unneeded: bool = False) -> LaneInfo:
+        """Its piece of the snapshot; ``unneeded``: no message has wanted it yet."""
+        it, dropped = self._stream, self.outbox.dropped.total()
+        counts = (0, 0, self.outbox.pending_bytes) if it is None else (it.bytes_in, it.bytes_out, it.pending_bytes)
+        return LaneInfo(self.name, it is not None, unneeded, *counts, dropped)
 
     def connect(self, stream: Stream) -> None:
         """Use a connection from now on; waiting messages are sent first."""

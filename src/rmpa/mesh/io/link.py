@@ -10,6 +10,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, cast
 
+from rmpa.core.facts import LinkInfo
 from rmpa.core.identity import SERIAL_MASK
 from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import URGENT, Outbox
@@ -475,11 +476,6 @@ class PeerLink:
         return stream.pending_bytes > 0 or stream.unacknowledged > _TELL_BACKLOG
 
     @property
-    def dropped(self) -> int:
-        """Messages dropped so far because the peer took them too slowly."""
-        return self.express.outbox.dropped.total() + self.bulk.outbox.dropped.total()
-
-    @property
     def heard_at(self) -> float:
         """Monotonic seconds at which bytes were last received on the express lane."""
         return max(self.connection.keepalive.heard, self.connection.stream.last_in)
@@ -488,6 +484,27 @@ class PeerLink:
     def rests(self) -> bool:
         """Whether the link is at rest: keepalives are rare, and silence is noticed late."""
         return self.connection.rests
+
+    def info(self) -> LinkInfo:
+        """Its piece of the snapshot."""
+        now, (host, port) = self._mesh.clock.now(), self.remote_endpoint
+        lanes = self.express.info(), self.bulk.info(unneeded=not self.bulk_wanted)
+        return LinkInfo(
+            remote=f"{host}:{port}",
+            dialled=self.dialled,
+            up_ago=now - (self.since or now),
+            rtt=self.connection.clock.rtt,
+            clock_offset=self.clock_offset,
+            clock_error=self.clock_error,
+            bytes_in=self.bytes_in,
+            bytes_out=self.bytes_out,
+            queued=self.queue_bytes,
+            dropped=sum(lane.dropped for lane in lanes),
+            heard_ago=now - self.heard_at,
+            rests=self.rests,
+            lease=self.connection.keepalive.remote_lease,
+            lanes=lanes,
+        )
 
     def send_control(self, payload: bytes) -> None:
         """Send one control frame, before all data that waits; never dropped; see ``Connection``."""

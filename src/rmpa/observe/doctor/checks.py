@@ -19,8 +19,8 @@ import rmpa
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
 from rmpa.observe import limits
+from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.doctor import machine, network, repairs
-from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.why.diagnosis import judge_peer_clock, misplaced, remedy_for, subscriber_text
 from rmpa.ros.http.rpc import call_api
 from rmpa.runtime.accept import open_files_advice
@@ -30,9 +30,9 @@ from rmpa.runtime.plugins import find_plugins, load_plugin, plugin_error
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
+    from rmpa.core.facts import UnreachableInfo
     from rmpa.observe.doctor.machine import DoctorInput
-    from rmpa.observe.peer_info import PeerInfo
-    from rmpa.observe.snapshot import AgentInfo, Snapshot, UnreachableInfo
+    from rmpa.observe.snapshot import AgentInfo, PeerInfo, Snapshot
     from rmpa.trust.permissions import TrustStatus
 
 # The counters of what ``[[permission]]`` refused begin so.
@@ -172,8 +172,6 @@ def _peer(agent: str, peer: PeerInfo) -> Iterator[Check]:
         if link.clock_offset is not None:
             yield judge_peer_clock(agent, peer.name, link.clock_offset, link.clock_error)
 
-
-# --- which nodes of a secured module listen beyond this machine: what ROS 1 leaves open (docs/reference/security.md)
 
 _LISTED: Final = 5
 _AGENTS_OWN: Final = ("/rmpa", "/rosout")

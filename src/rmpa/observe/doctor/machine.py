@@ -26,8 +26,8 @@ from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.limits import KIB, MIB
 from rmpa.discovery.network import NetworkInterface, read_interfaces
 from rmpa.observe import limits
+from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check, CheckLevel
 from rmpa.observe.control_client import ControlClient, find_agents
-from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check, CheckLevel
 from rmpa.observe.snapshot import Snapshot
 from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback, shown_uri
 from rmpa.ros.http.rpc import call_api
@@ -38,7 +38,6 @@ from rmpa.runtime.systemd import INSTALL, START, UNIT, is_set_up
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-# --- what several checks need ---------------------------------------------------------------------------------------
 
 # The name under which a core is asked.
 CALLER: Final = "/rmpa_doctor"
@@ -130,8 +129,6 @@ def resolve(names: Iterable[str]) -> dict[str, tuple[str, ...]]:
     return dict(found)
 
 
-# --- clocks ---------------------------------------------------------------------------------------------------------
-
 # STA_UNSYNC of adjtimex(2).
 _UNSYNCHRONISED: Final = 0x40
 
@@ -222,9 +219,6 @@ async def _clock_publishers(core_uri: str) -> list[str] | None:
     return []
 
 
-# --- the start with the machine -------------------------------------------------------------------------------------
-
-
 def at_boot(_: DoctorInput) -> Iterable[Check]:
     """The check of the unit of ``rmpa service install``."""
     return [judge_unit(read_unit())]
@@ -233,8 +227,8 @@ def at_boot(_: DoctorInput) -> Iterable[Check]:
 def read_unit() -> dict[str, str]:
     """What ``systemctl show`` says of the agent's unit; empty where there is no systemd."""
     properties = "--property=LoadState,ActiveState,UnitFileState,Result,FragmentPath"
-    told = ask_program("systemctl", "show", UNIT, properties) or ""
-    return dict(line.partition("=")[::2] for line in told.splitlines())
+    shown = ask_program("systemctl", "show", UNIT, properties) or ""
+    return dict(line.partition("=")[::2] for line in shown.splitlines())
 
 
 def judge_unit(unit: Mapping[str, str]) -> Check:
@@ -252,9 +246,6 @@ def judge_unit(unit: Mapping[str, str]) -> Check:
             "boot", WARN, "rmpa.service starts with the machine, and was stopped", "sudo systemctl start rmpa"
         )
     return Check("boot", OK, f"rmpa.service is {unit['ActiveState']}, and starts with the machine")
-
-
-# --- rights for real time, and the limit of open files --------------------------------------------------------------
 
 
 def rights(given: DoctorInput) -> Iterable[Check]:
@@ -314,9 +305,6 @@ def judge_rights(fifo: str, memlock: int | None, files: int | None, *, wanted: b
         yield Check("files", WARN, text, remedy)
     elif files is not None:
         yield Check("files", OK, f"an agent started here may have {files} open")
-
-
-# --- the ROS_* variables of a shell: whether nodes started in it find the module's core, and can be reached ---------
 
 
 @dataclass(frozen=True, slots=True)
@@ -481,19 +469,19 @@ def _own_name(shell: RosShell) -> Iterator[Check]:
 def _host_name(shell: RosShell, remedy: str) -> tuple[Any, ...]:
     """Without those variables nodes are to be reached under the host's name."""
     name, addresses = shell.host_name, shell.resolved.get(shell.host_name, ())
-    told = f"nodes register with the host name {name}"
+    begin = f"nodes register with the host name {name}"
     if name == "localhost":
         return OK, "nodes are reached by this machine's address"
     if not addresses:
         return (
             FAIL,
-            f"{told}, and that name cannot be resolved",
+            f"{begin}, and that name cannot be resolved",
             f"put '127.0.1.1 {name}' into /etc/hosts, or {remedy}",
         )
     if not shell.is_here(name):
         return (
             FAIL,
-            f"{told}, which resolves to {addresses[0]}: not this machine",
+            f"{begin}, which resolves to {addresses[0]}: not this machine",
             f"correct /etc/hosts, or {remedy}",
         )
     return OK, f"{name} is this machine ({addresses[0]})"

@@ -29,8 +29,8 @@ from rmpa.discovery.beacon import MAGIC, VERSION, BeaconKind
 from rmpa.discovery.network import CONTAINERS, choose, join_group, list_interfaces, open_receiver, receive
 from rmpa.mesh.io.dial import may_use_bbr, repeats_quickly
 from rmpa.observe import limits
+from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.doctor.machine import ask_program, resolve
-from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.runtime.kernel_tcp import program_at
 
 if TYPE_CHECKING:
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from rmpa.discovery.network import Interface, NetworkInterface
     from rmpa.observe.doctor.machine import DoctorInput
 
-# --- interfaces -----------------------------------------------------------------------------------------------------
 
 _TUNNELS: Final = re.compile(r"(tun|tap|wg|zt|tailscale|ppp|utun|nordlynx|proton)")
 _CONTAINER_MARKS: Final = (Path("/.dockerenv"), Path("/run/.containerenv"))
@@ -111,8 +110,6 @@ def _judge_interface(one: NetworkInterface) -> Check:
         return check(WARN, text, "is the cable in the right network?")
     return check(OK, addresses)
 
-
-# --- multicast ------------------------------------------------------------------------------------------------------
 
 _PKTINFO: Final = struct.Struct("@i4s4s")
 _IP_PKTINFO: Final = 8  # Linux's (linux/in.h); not in the socket module of every supported Python
@@ -237,8 +234,6 @@ def judge_multicast(echoes: Sequence[MulticastEcho], group: str, port: int, list
         remedy = "run `rmpa doctor` there meanwhile; if it was: a switch, an access point or a firewall drops it"
         yield Check("multicast", WARN, f"nothing of another machine was heard within {listened:g} s", remedy)
 
-
-# --- firewalls ------------------------------------------------------------------------------------------------------
 
 _DROPS: Final = re.compile(r"\b(drop|reject|DROP|REJECT)\b")
 _ACCEPTS: Final = re.compile(r"\b(accept|ACCEPT)\b")
@@ -365,8 +360,6 @@ def firewall(given: DoctorInput) -> Iterator[Check]:
         yield Check("firewall", WARN, text, "`firewall-cmd --list-all` shows its zone", where="firewalld")
 
 
-# --- what the kernel does to packets --------------------------------------------------------------------------------
-
 # The value of rp_filter that drops a packet whose answer would leave by another interface (RFC 3704).
 _STRICT: Final = 1
 
@@ -437,9 +430,6 @@ def judge_radio(radios: Sequence[tuple[str, str, str]], *, quick: bool, bbr: boo
             yield check(WARN, text, permit)
     if not radios:
         yield Check("radio", SKIPPED, "no wireless interface is used")
-
-
-# --- routes and ports -----------------------------------------------------------------------------------------------
 
 
 def routes(given: DoctorInput) -> Iterable[Check]:

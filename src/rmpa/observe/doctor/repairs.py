@@ -26,9 +26,9 @@ from typing import TYPE_CHECKING, Final
 from rmpa.config.module_name import state_dir
 from rmpa.core.identity import peer_name_problem
 from rmpa.observe import limits
+from rmpa.observe.check import OK, WARN, Check
 from rmpa.observe.control_client import closed_to_us, runtime_dir, runtime_dirs
 from rmpa.observe.doctor.machine import read_unit
-from rmpa.observe.peer_info import OK, WARN, Check
 from rmpa.runtime.systemd import UNIT
 
 if TYPE_CHECKING:

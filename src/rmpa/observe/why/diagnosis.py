@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Final, Self
 import msgspec
 
 from rmpa.config.peer_rules import Access
-from rmpa.observe.peer_info import FAIL, OK, WARN, Check
+from rmpa.core.facts import PublisherReport  # noqa: TC001 - msgspec needs it to decode
+from rmpa.observe.check import FAIL, OK, WARN, Check
 from rmpa.trust.permissions import prohibition, refusal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rmpa.observe.snapshot import RouteInfo, SubscriberTransport
+    from rmpa.core.facts import RouteInfo, SubscriberTransport
 
 # The stage of what the publisher's (server's) module lets this one do.
 PERMISSION_THERE: Final = "permission there"
@@ -96,8 +97,8 @@ def without_rules(found: Diagnosis) -> Diagnosis:
     denied = permission_there(found.to, found.peer, Access.PUBLISH, found.name)
     allowed = Check(PERMISSION_HERE, OK, f"{found.to} lets {found.peer} publish it")
     ruled = ((stage, stage.name == PERMISSION_HERE) for stage in found.stages)
-    told = (stage if not by_rule else denied if stage.level is FAIL else allowed for stage, by_rule in ruled)
-    return msgspec.structs.replace(found, stages=tuple(told))
+    shown = (stage if not by_rule else denied if stage.level is FAIL else allowed for stage, by_rule in ruled)
+    return msgspec.structs.replace(found, stages=tuple(shown))
 
 
 def until_failure(stages: Iterable[Check]) -> tuple[Check, ...]:
@@ -108,43 +109,6 @@ def until_failure(stages: Iterable[Check]) -> tuple[Check, ...]:
         if stage.level is FAIL:
             break
     return tuple(walked)
-
-
-class PublisherReport(msgspec.Struct, frozen=True, kw_only=True):
-    """One publisher, as its own agent sees it.
-
-    Attributes:
-        node: Its name.
-        topic: The topic's name in its own graph.
-        type: Its message type; ``*`` where it is not known.
-        crosses: Whether the policy of its module lets it cross to the agent that asks.
-        rule: The rule that says so.
-        offered: Whether peers are offered it.
-        route: The state of the route to the agent that asks: empty (none), ``opening`` (the publisher has not
-            answered) or ``open``.
-        messages: Messages received from the publisher since its agent connected to it.
-        dropped: Of these, those that were dropped because a link was too slow.
-        lost: Messages of a reliable route to the agent that asks that were given up after too long an outage.
-        oversized: Messages that are too long, and were left out.
-        oversized_bytes: The length of the last of these, in bytes.
-        beyond: ``limits.topics`` of its module, if it is not offered because there are more; else 0.
-        unreachable: Why its agent cannot connect to it, ready to read; empty where it can.
-    """
-
-    node: str
-    topic: str = ""
-    type: str = ""
-    crosses: bool = True
-    rule: str = ""
-    offered: bool = True
-    route: str = ""
-    messages: int = 0
-    dropped: int = 0
-    lost: int = 0
-    oversized: int = 0
-    oversized_bytes: int = 0
-    beyond: int = 0
-    unreachable: str = ""
 
 
 class TopicAtPublisher(msgspec.Struct, frozen=True, kw_only=True):

@@ -18,7 +18,9 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
 from rmpa.config.peer_rules import Access
-from rmpa.observe.peer_info import FAIL, OK, UNKNOWN, WARN, Check, PeerAgent
+from rmpa.core.identity import is_meant
+from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
+from rmpa.observe.snapshot import ModuleFacts
 from rmpa.observe.why.diagnosis import (
     PERMISSION_THERE,
     Diagnosis,
@@ -32,8 +34,8 @@ from rmpa.observe.why.stages import find_peer, peer_stages
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.observe.peer_info import LinkInfo, PeerInfo
-    from rmpa.observe.snapshot import ServiceInfo, Snapshot
+    from rmpa.core.facts import LinkInfo, ServiceInfo
+    from rmpa.observe.snapshot import PeerInfo, Snapshot
     from rmpa.observe.why.diagnosis import ServiceAtServer
 
 # Percent of a core from which on an agent counts as busy: it has one thread for all messages.
@@ -169,7 +171,7 @@ def _transport(peer: str, info: ServiceInfo) -> Check:
     return Check("transport", OK, f"relayed by both agents ({info.condition}): {info.relayed_because}")
 
 
-def diagnose_module(snapshot: Snapshot, name: str, told: PeerAgent | None = None, refusal: str = "") -> Diagnosis:
+def diagnose_module(snapshot: Snapshot, name: str, told: ModuleFacts | None = None, refusal: str = "") -> Diagnosis:
     """Judge all stages for one module.
 
     Args:
@@ -180,7 +182,7 @@ def diagnose_module(snapshot: Snapshot, name: str, told: PeerAgent | None = None
     """
     own, peer = snapshot.agent, find_peer(snapshot, name)
     shown, stages = peer.name if peer is not None else name, peer_stages(snapshot, name)
-    if name in (own.name, own.guid, own.guid.partition("#")[0]):
+    if is_meant(name, own.name, own.guid):
         shown, stages = (
             own.name,
             (Check("peer", OK, f"{own.name} is this module ({own.guid}); its agent has answered"),),
@@ -190,7 +192,7 @@ def diagnose_module(snapshot: Snapshot, name: str, told: PeerAgent | None = None
     return Diagnosis.of(stages, name=shown, peer=shown, to=own.name, kind="module")
 
 
-def _module(snapshot: Snapshot, peer: PeerInfo, told: PeerAgent | None, refusal: str) -> Iterator[Check]:
+def _module(snapshot: Snapshot, peer: PeerInfo, told: ModuleFacts | None, refusal: str) -> Iterator[Check]:
     link, name, version = peer.link, peer.name, snapshot.agent.version
     if link is not None:
         yield from _lanes(link)
@@ -204,7 +206,7 @@ def _module(snapshot: Snapshot, peer: PeerInfo, told: PeerAgent | None, refusal:
             yield Check("answer", OK, f"its agent answers, and is of version {told.version}, as this one")
         if link.clock_offset is not None:
             yield judge_peer_clock(snapshot.agent.name, name, link.clock_offset, link.clock_error)
-        yield from _load(name, told or PeerAgent())
+        yield from _load(name, told or ModuleFacts())
     for bound in peer.beyond:
         yield Check.from_message("limits", WARN, bound.text)
     text = f"{name} offers {peer.topics_in} topics, and is offered {peer.topics_out}"
@@ -231,12 +233,12 @@ def _lanes(link: LinkInfo) -> Iterator[Check]:
         yield Check("lanes", OK, f"{len(link.lanes) or 'all'} lanes are connected, nothing was dropped")
 
 
-def _load(name: str, told: PeerAgent) -> Iterator[Check]:
+def _load(name: str, told: ModuleFacts) -> Iterator[Check]:
     if told.cpu is not None:
         text = f"the agent of {name} uses {told.cpu:.0f} % of a core"
         remedy = "`rmpa topic hz` there shows what is so much; direct transport relieves agents"
         busy = Check("load", WARN, f"{text}: messages wait", remedy)
         yield busy if told.cpu >= _BUSY else Check("load", OK, text)
-    if told.files_open is not None and told.files_limit and told.files_open >= _FILES * told.files_limit:
-        text = f"the agent of {name} has {told.files_open} of {told.files_limit} files open"
+    if (files := told.files) is not None and files.open >= _FILES * files.limit:
+        text = f"the agent of {name} has {files.open} of {files.limit} files open"
         yield Check("files", WARN, text, "raise its limit: ulimit -n, or LimitNOFILE of its service")

@@ -22,16 +22,16 @@ from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
 from rmpa.config.values import did_you_mean
 from rmpa.core import limits as core_limits
+from rmpa.core.facts import Arrival, PublisherReport, RouteInfo
+from rmpa.core.identity import is_meant
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.peer_info import FAIL, OK, UNKNOWN, WARN, Check, CheckLevel
-from rmpa.observe.snapshot import RouteInfo
+from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check, CheckLevel
 from rmpa.observe.why.diagnosis import (
     PERMISSION_HERE,
     PERMISSION_THERE,
     UNASKED,
     UNMEASURED,
     Diagnosis,
-    PublisherReport,
     connected_directly,
     misplaced,
     permission_here,
@@ -44,8 +44,7 @@ from rmpa.ros import limits as ros_limits
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from rmpa.observe.peer_info import PeerInfo
-    from rmpa.observe.snapshot import Snapshot
+    from rmpa.observe.snapshot import PeerInfo, Snapshot
     from rmpa.observe.why.diagnosis import TopicAtPublisher
 
 # Messages sent without one arriving that count as a fault: a single one may still be on its way.
@@ -53,31 +52,7 @@ _SEVERAL: Final = 2
 _FLOWING: Final = frozenset({"open", "lingering"})
 
 
-@dataclass(frozen=True, slots=True)
-class Arrival:
-    """What the subscribers' agent knows of one publisher of a peer: its route, and the proxy that stands for it.
-
-    Args:
-        route: The route.
-        proxy: The proxy's name.
-        registered: Whether it is a publisher of the topic in the local graph.
-        cause: Why it is hidden, as ``bridge.peer_offers`` has it; empty if it is not.
-        permission: The rule by which the module may publish it here, or may not; empty: trust is off.
-        readers: The node, the bytes that wait, and the dropped messages of each local subscriber's connection to the
-            proxy, by its number.
-        mismatches: The subscribers that were refused here or at the peer, ready to read.
-    """
-
-    route: RouteInfo
-    proxy: str = ""
-    registered: bool = False
-    cause: str = ""
-    permission: str = ""
-    readers: Mapping[int, tuple[str, int, int]] = field(default_factory=dict)
-    mismatches: tuple[str, ...] = ()
-
-
-_NOT_OFFERED: Final = Arrival(RouteInfo(peer="", node="", direction="in", state=""))
+_NOT_OFFERED: Final = Arrival(route=RouteInfo(peer="", node="", direction="in", state=""))
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +110,7 @@ def find_peer(snapshot: Snapshot, name: str) -> PeerInfo | None:
 
 
 def _fitting(peers: Iterable[PeerInfo], name: str) -> list[PeerInfo]:
-    return [p for p in peers if name in (p.name, p.guid, p.guid.partition("#")[0])]
+    return [peer for peer in peers if is_meant(name, peer.name, peer.guid)]
 
 
 def peer_stages(snapshot: Snapshot, name: str) -> tuple[Check, ...]:
@@ -284,9 +259,6 @@ def _published(ends: Ends, peer: str) -> Check:
     text += f"; {', '.join(there.subscribers)} there only subscribe to it" if there.subscribers else ""
     remedy = f"start its publisher there, or see `rmpa topic list {peer}:/`"
     return Check("publisher", FAIL, text, f"did you mean {there.similar}?" if there.similar else remedy)
-
-
-# --- the stages of one publisher ------------------------------------------------------------------------------------
 
 
 def _policy_there(way: Way) -> Check:

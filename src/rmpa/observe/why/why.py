@@ -15,37 +15,34 @@ from rmpa.bridge.policy import Needs
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
-from rmpa.core.contract import Reliability
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.identity import OWN_NODE, is_global_name, is_own
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.operations import WHY as WHY_SITES
-from rmpa.observe.peer_info import FAIL, OK, Check, PeerAgent
-from rmpa.observe.peer_info import INFO as AGENT_INFO
+from rmpa.observe.check import FAIL, OK, Check
+from rmpa.observe.sites import WHY as WHY_SITES
+from rmpa.observe.snapshot import INFO, ModuleFacts
 from rmpa.observe.why.diagnosis import (
     PERMISSION_THERE,
     Diagnosis,
-    PublisherReport,
     ServiceAtServer,
     TopicAtPublisher,
     connected_directly,
     without_rules,
 )
 from rmpa.observe.why.services import ServiceHere, diagnose_module, diagnose_service
-from rmpa.observe.why.stages import Arrival, Ends, diagnose_topic, find_peer, peer_stages
+from rmpa.observe.why.stages import Ends, diagnose_topic, find_peer, peer_stages
 from rmpa.ros.node.service_client import ServiceConnection
-from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable
 
+    from rmpa.bridge.facts import BridgeFacts
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.topics.imports import RemoteTopic
-    from rmpa.observe.operations import SiteRequests
-    from rmpa.observe.peer_info import PeerInfo
-    from rmpa.observe.snapshot import Snapshot
-    from rmpa.observe.snapshot_builder import AgentParts, SnapshotBuilder
+    from rmpa.core.facts import Arrival, PublisherReport
+    from rmpa.observe.sites import SiteRequests
+    from rmpa.observe.snapshot import PeerInfo, Snapshot
+    from rmpa.observe.snapshot_builder import SnapshotBuilder
 
 _T = TypeVar("_T")
 # The request to a publisher's agent: what it knows of a topic. Replied by ``TopicAtPublisher``.
@@ -66,17 +63,18 @@ class WhyService:
 
     Args:
         name: The module's.
-        parts: The parts of its agent.
+        facts: What its bridge tells.
         snapshots: Its snapshots.
         sites: Asks gateways for the ways through them.
     """
 
-    def __init__(self, name: str, parts: AgentParts, snapshots: SnapshotBuilder, sites: SiteRequests) -> None:
+    def __init__(self, name: str, facts: BridgeFacts, snapshots: SnapshotBuilder, sites: SiteRequests) -> None:
         self._name = name
-        self._core, self._bridge, self._services = parts.core, parts.bridge, parts.services
+        self._facts, self._services = facts, facts.services.part
+        self._bridge, self._core = facts.bridge, facts.bridge.core
         self._snapshots = snapshots
         self._sites = sites
-        rpc = parts.bridge.rpc
+        rpc = self._bridge.rpc
         rpc.on_request(TOPIC, self._answer_topic, Needs((Access.SUBSCRIBE,), "the topic, and those like it"))
         rpc.on_request(SERVICE, self._answer_service, Needs((Access.CALL,), "the service, and those like it"))
         rpc.on_request(HERE, self._answer_here, Needs((Access.PUBLISH,), "the topic, which the peer publishes"))
@@ -141,7 +139,7 @@ class WhyService:
         session = self._session(peer) if peer is not None else None
         if peer is not None and session is not None and session.linked and str(session.link.guid) == peer.guid:
             try:
-                told = await self._ask(session, AGENT_INFO, {}, PeerAgent)
+                told = await self._ask(session, INFO, {}, ModuleFacts)
             except RmpaError as error:
                 refusal = str(error)
         return diagnose_module(self._snapshot(), name, told, refusal)
@@ -149,9 +147,6 @@ class WhyService:
     def _snapshot(self) -> Snapshot:
         """Of the agent and its peers."""
         return self._snapshots.build(())
-
-    def _reachable_peers(self) -> list[PeerInfo]:
-        return [peer for peer in self._snapshot().peers if peer.state in _REACHED]
 
     def _is_service(self, name: str) -> bool:
         state = self._core.state()
@@ -177,8 +172,6 @@ class WhyService:
         wires = names.wires_of(name)
         return (name, wires[0]) if wires else (names.local_name(name), name)
 
-    # --- topics of peers --------------------------------------------------------------------------------------
-
     def _own(self, topic: str) -> list[str]:
         """The module's own publishers of a topic."""
         return [node for node in self._core.publishers(topic) if not is_own(node)]
@@ -192,13 +185,13 @@ class WhyService:
         """All paths of a topic, in and out; where there is none, what is known of it."""
         known, own = self._snapshot().peers, self._own(topic)
         peers = [peer for peer in known if peer.state in _REACHED]
-        coming = [peer.guid for peer in peers if any(self._arrivals(peer, topic))]
+        coming = [peer.guid for peer in peers if self._arrivals(peer, topic)]
         # Peers whose agent has died while a node of theirs is connected directly to a subscriber here.
         adrift = [
             peer.guid
             for peer in known
             if peer.state not in _REACHED
-            and any(connected_directly(arrival.route) for _, arrival in self._arrivals(peer, topic))
+            and any(connected_directly(arrival.route) for arrival in self._arrivals(peer, topic).values())
         ]
         if not coming and not own and not adrift:
             # No peer offers it; one may have it, and not let it cross.
@@ -251,45 +244,13 @@ class WhyService:
             except RmpaError as error:
                 refusal = str(error)
         subscribers = tuple(node for node in self._core.state().subscribers.get(topic, ()) if not is_own(node))
-        arrivals = dict(self._arrivals(peer, topic))
+        arrivals = self._arrivals(peer, topic)
         return Ends(self._snapshot(), topic, wire, subscribers, arrivals, there, refusal)
 
-    def _arrivals(self, peer: PeerInfo, topic: str) -> Iterator[tuple[str, Arrival]]:
+    def _arrivals(self, peer: PeerInfo, topic: str) -> dict[str, Arrival]:
         """What is known here of a peer's publishers of a topic, by node."""
-        if (session := self._session(peer)) is None:
-            return
-        topics, facts = self._bridge.topics, self._snapshots.topics
-        publishers = self._core.publishers(topic)
-        facts.follow_clocks()
-        for number, source in list(topics.imports.at(topic)):
-            entry = topics.imports.get(number, source)
-            if number != session.peer or entry is None or _instance(session, entry.origin) != peer.instance:
-                continue
-            node, publication = source.node, topics.peers[session.peer].publication(source)
-            proxies, owner = self._bridge.sessions.proxies(session, node, entry.origin)
-            name, proxy = proxies.name(owner), proxies.get(owner)
-            links = publication.connections() if publication is not None else ()
-            yield (
-                node,
-                Arrival(
-                    route=facts.incoming(session, source, entry),
-                    proxy=name,
-                    registered=proxy is not None and publishers.get(name) == proxy.uri,
-                    cause=entry.cause,
-                    permission=self._permission(session.link.name, entry),
-                    readers={at.number: (printable(at.other), at.waiting, at.dropped) for at in links},
-                    mismatches=topics.mismatches(source),
-                ),
-            )
-
-    def _permission(self, peer: str, entry: RemoteTopic) -> str:
-        """The rule about which modules may publish a peer's topic; empty if trust is off."""
-        if not self._bridge.gate.on:
-            return ""
-        module, relay = (peer, "") if entry.origin is None else (entry.origin.name, peer)
-        return self._bridge.gate.judge(Access.PUBLISH, module, entry.name, relay=relay).rule
-
-    # --- topics of this module -------------------------------------------------------------------------------
+        session = self._session(peer)
+        return dict(self._facts.topics.arrivals(session, peer.instance, topic)) if session is not None else {}
 
     async def _leaves(self, topic: str, name: str) -> tuple[Diagnosis, ...]:
         """Have a peer judge the paths from here to it."""
@@ -334,7 +295,7 @@ class WhyService:
         subscribers: list[str] = []
         for topic in topics:
             nodes = self._relayed(topic, instance) if instance else self._own(topic)
-            sources += [self._report(session, Source(topic, node)) for node in nodes]
+            sources += [self._facts.topics.report(session, Source(topic, node)) for node in nodes]
             subscribers += [node for node in state.subscribers.get(topic, {}) if not is_own(node)]
         known = (topic for topic, nodes in state.publishers.items() if not all(map(is_own, nodes)))
         similar = "" if sources else await self._similar(asker, Access.SUBSCRIBE, wire, known)
@@ -359,39 +320,11 @@ class WhyService:
         relayed = ((node, offered.get(Source(topic, node))) for node in self._core.publishers(topic))
         return [node for node, local in relayed if local and local.origin and local.origin.instance == instance]
 
-    def _report(self, session: PeerSession, source: Source) -> PublisherReport:
-        exports, outbound = self._bridge.topics.exports, self._bridge.topics.outbound
-        local, flow = exports.seen.get(source), outbound.flows.get(source)
-        kind = local.type if local is not None else self._core.type_of(source.topic)
-        decision = exports.decision(session.peer, source)
-        if decision is None:  # it has just come, or cannot be reached
-            decision = self._bridge.context.policy.judge(source.topic, kind, source.node)
-        sender, contract = outbound.sender_of(source, session.peer), exports.contract(source, session.peer)
-        reliable = contract is not None and contract.reliability is Reliability.RELIABLE
-        lost = self._core.unreachable().get(source.node) if flow is None or not flow.messages else None
-        figures = {} if flow is None else {n: getattr(flow, n) for n in ("messages", "oversized", "oversized_bytes")}
-        return PublisherReport(
-            node=source.node,
-            topic=source.topic,
-            type=kind,
-            crosses=decision.allowed,
-            rule=decision.rule,
-            offered=exports.offer(session.peer, source) is not None,
-            route="open" if session.peer in exports.flowing(source) else "opening" if contract is not None else "",
-            dropped=flow.dropped if flow is not None and not reliable else 0,
-            lost=sender.lost if sender is not None else 0,
-            beyond=exports.limit if source in exports.beyond else 0,
-            unreachable=f"{lost.api}: {lost.problem}" if lost is not None else "",
-            **figures,
-        )
-
-    # --- services ---------------------------------------------------------------------------------------------
-
     async def _service(self, service: str, name: str | None) -> tuple[Diagnosis, ...]:
         """Judge the path of a service from one peer, or from each, to here."""
         if name is not None:
             return (await self._calls(name, service),)
-        peers = self._reachable_peers()
+        peers = [peer for peer in self._snapshot().peers if peer.state in _REACHED]
         offering = [peer.guid for peer in peers if self._offers(peer, service)]
         found = await asyncio.gather(*(self._calls(guid, service) for guid in offering or [p.guid for p in peers]))
         served = tuple(diagnosis for diagnosis in found if diagnosis.node) or tuple(filter(_is_denied, found))
@@ -401,7 +334,7 @@ class WhyService:
         """Whether a link carries a service of a peer: the link's own peer, or a relayed one."""
         session = self._session(peer)
         remote = self._services.imports.get(session.peer, service) if session is not None else None
-        return session is not None and remote is not None and _instance(session, remote.origin) == peer.instance
+        return session is not None and remote is not None and session.instance_of(remote.origin) == peer.instance
 
     async def _no_server(self, service: str, linked: list[str]) -> Diagnosis:
         """The diagnosis of a service that no peer has."""
@@ -436,7 +369,7 @@ class WhyService:
         remote = self._services.imports.get(session.peer, service)
         if remote is None:
             return ServiceHere()
-        info, shown = self._snapshots.peers_service(session.peer, remote), self._services.shown(remote)
+        info, shown = self._facts.services.of_peer(session.peer, remote), self._services.shown(remote)
         if shown is None or shown.proxy is None:
             return ServiceHere(info, denied=self._services.imports.why_hidden(remote)[1] == DENIED)
         uri = self._core.state().services.get(service, {}).get(shown.proxy.name, "")
@@ -485,11 +418,6 @@ class WhyService:
             return msgspec.convert(value, kind)
         except (msgspec.ValidationError, RecursionError) as error:
             raise RemoteProtocolError(f"it answers in another way: {error}; is it another version?") from None
-
-
-def _instance(session: PeerSession, origin: Any) -> str:
-    """The instance id of the module of an offer that a link brought."""
-    return str(origin.instance) if origin is not None else session.link.identity.instance.hex()
 
 
 def _name_in(args: dict[str, Any], key: str) -> str:

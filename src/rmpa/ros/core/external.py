@@ -14,6 +14,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.core.facts import UnreachableInfo
 from rmpa.core.log import logged_failure
 from rmpa.core.statistics import Counters
 from rmpa.ros import limits
@@ -185,6 +186,16 @@ class Core(Protocol):
     def unreachable(self) -> Mapping[str, Unreachable]:
         """The registered nodes to which connecting fails, by name; the caller must not change the mapping."""
         return self.liveness.unreachable
+
+    def unreachable_infos(self) -> tuple[UnreachableInfo, ...]:
+        """The piece of the snapshot: the nodes to which connecting fails, by name."""
+        now = asyncio.get_running_loop().time()
+        return tuple(
+            UnreachableInfo(
+                node=node, uri=found.api, problem=found.problem, ago=now - found.since, withdrawn=found.withdrawn
+            )
+            for node, found in sorted(self.unreachable().items())
+        )
 
     def suspect(self, node: str) -> None:
         """Check now whether this node is dead or has moved."""

@@ -13,7 +13,7 @@ import msgspec
 from rmpa.core.errors import RmpaError
 from rmpa.core.log import logged_failure
 from rmpa.core.timers import TokenBucket
-from rmpa.observe.control import GraphRows, ServiceRow, TopicRow
+from rmpa.observe.graph import GraphRows, ServiceRow, TopicRow
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.http.rpc import exchange, read_response
 from rmpa.ros.node.fetch_type import fetch_type

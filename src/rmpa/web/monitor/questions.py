@@ -15,17 +15,18 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
 import msgspec
 
-from rmpa.bridge.nodes import INFO
+from rmpa.bridge.nodes import NODE_INFO
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.identity import is_global_name, is_own, proxied_node, proxied_peer
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.observe.operations import PeerParams, parameters_in
+from rmpa.observe.snapshot import ModuleFacts
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.descriptor import SERVICE_TYPE
 from rmpa.trust.permissions import InviteReply
 from rmpa.web.monitor import limits
-from rmpa.web.monitor.state import node_key
+from rmpa.web.monitor.state import module_facts, node_key
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -111,7 +112,8 @@ class Answers:
 
     @question("agent")
     async def _agent(self, args: Args) -> Any:
-        return await self._control_call("agent", peer=_text(args, "peer"))
+        answer = await self._control_call("agent", peer=_text(args, "peer"))
+        return module_facts(msgspec.convert(answer, ModuleFacts))
 
     @question("contract")
     async def _contract(self, args: Args) -> Any:
@@ -123,7 +125,7 @@ class Answers:
         name, peer = _name(args, "name"), _text(args, "peer")
         if not peer and is_own(name):
             raise RmpaError(f"{name} belongs to the agent of this module; nothing is asked of it")
-        about = await self._control_call("node", what=INFO, node=name, **({"peer": peer} if peer else {}))
+        about = await self._control_call("node", what=NODE_INFO, node=name, **({"peer": peer} if peer else {}))
         for each in about.get("connections") or ():
             other = str(each["other"])
             each["other"] = shown_node(other) if not peer or is_own(other) else node_key(peer, other)

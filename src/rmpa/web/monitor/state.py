@@ -21,8 +21,8 @@ from rmpa.web.monitor.resources import resource_detail, resource_entry, resource
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from rmpa.observe.peer_info import LinkInfo, PeerInfo
-    from rmpa.observe.snapshot import AgentInfo, ServiceInfo, Snapshot, TopicInfo
+    from rmpa.core.facts import LinkInfo, ServiceInfo, TopicInfo
+    from rmpa.observe.snapshot import AgentInfo, ModuleFacts, PeerInfo, Snapshot
     from rmpa.web.monitor.resources import ResourceFacts
 
 _T = TypeVar("_T")
@@ -46,22 +46,6 @@ _STEADY: Final[Mapping[str, tuple[float, float]]] = {
 }
 # Is computed from a moving age: seconds since the epoch, of which three digits would say nothing.
 _MOMENT: Final = "since"
-_AGENT: Final = (
-    "name",
-    "guid",
-    "version",
-    "domain",
-    "core_uri",
-    "pid",
-    "started",
-    "cpu",
-    "rss",
-    "addresses",
-    "config_file",
-    "realtime",
-    "proxies",
-    "core_memory",
-)
 _GONE: Final = "has left the roster: no beacon and no link"
 # States of a module of which nothing comes any more.
 _LOST: Final = frozenset({"linking", "refused", "away"})
@@ -275,12 +259,17 @@ class StateBuilder:
         })  # fmt: skip
 
 
+def module_facts(module: ModuleFacts) -> Tree:
+    """The facts of this module, or of a peer's; those of its files stand beside the others."""
+    built: dict[str, Any] = msgspec.to_builtins(module)
+    files = built.pop("files") or {}
+    return _tree(built | {f"files_{name}": files.get(name) for name in ("open", "limit", "problem")})
+
+
 def _agent(agent: AgentInfo) -> Tree:
-    built, files = msgspec.to_builtins(agent), agent.files
-    told = {key: built.get(key) for key in _AGENT}
-    if files is not None:
-        told |= {"files_open": files.open, "files_limit": files.limit, "files_problem": files.problem}
-    return _tree(told)
+    facts = module_facts(agent)
+    del facts["uptime"]  # it would change all the time; ``started`` says it
+    return facts
 
 
 def module_state(peer: PeerInfo) -> str:

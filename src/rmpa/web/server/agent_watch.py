@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.control import GraphRevision
 from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
+from rmpa.observe.graph import GraphRevision
 from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 from rmpa.trust.permissions import TrustStatus
 from rmpa.web import limits

@@ -13,8 +13,7 @@ from rmpa.gateway.ros2.actions import Ros2Actions
 from rmpa.gateway.ros2.conversion import ActionPair
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, data_key
 from rmpa.gateway.ros2.types import Ros2Types, TypePair
-from rmpa.observe.operations import INFO, REPORT, WHY
-from rmpa.observe.peer_info import SiteInfo, SitesReport
+from rmpa.observe.sites import REPORT, SITE_INFO, WHY, SiteInfo, SitesReport
 from rmpa.ros.types.definitions import SEPARATOR, known_text
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_zenoh import MemoryQuery, eventually
@@ -145,19 +144,19 @@ async def test_ros2_is_listed_with_its_topics_and_what_is_wrong_with_them(bed: R
     answer = bed.neighbour.answer
     report: SitesReport = await answer(REPORT, {})
     assert [(site.name, site.state) for site in report.sites] == [("ros2", "joined")]
-    (info,) = (await answer(INFO, {"site": "ros2"})).sites
+    (info,) = (await answer(SITE_INFO, {"site": "ros2"})).sites
     rows = {(row.name, row.node): row for row in info.sources}
     assert rows["/chatter", "/bot"].type == "std_msgs/String"
     assert "definitions differ" in rows["/mine", "/older"].problem
     ways = await answer(WHY, {"name": "/chatter", "site": "ros2"})
     assert [(way.peer, way.node) for way in ways] == [("ros2", "/bot")]
     with pytest.raises(UnreachableError):
-        await answer(INFO, {"site": "hall"})
+        await answer(SITE_INFO, {"site": "hall"})
 
 
 async def test_questions_about_sites_go_to_what_answers_for_them(bed: Ros2Bed) -> None:
     bed.neighbour.sites = OtherSites()
     report: SitesReport = await bed.neighbour.answer(REPORT, {})
     assert [site.name for site in report.sites] == ["hall", "ros2"]
-    for what, args in ((INFO, {"site": "hall"}), (WHY, {"name": "/nothing"})):
+    for what, args in ((SITE_INFO, {"site": "hall"}), (WHY, {"name": "/nothing"})):
         assert await bed.neighbour.answer(what, args) == ["of a site"]

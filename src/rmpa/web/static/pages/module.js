@@ -113,6 +113,18 @@ const LinkPanel = ({ module, detail }) => {
   /><//>`;
 };
 
+// What is shown of a module, this one or a peer, of what its agent tells: a title, and the fact.
+const MODULE_FACTS = [
+  ["Host", (module) => module.host],
+  ["System", (module) => module.system],
+  ["CPU", (module) => module.cpu !== undefined && html`${percent(module.cpu)} of a core`],
+  ["Memory", (module) => module.rss !== undefined && bytes(module.rss)],
+  ["Open files", (module) => module.files_limit && `${count(module.files_open)} of ${count(module.files_limit)}`],
+  ["Proxies", (module) => count(module.proxies)],
+  ["Core", (module) => html`<code>${module.core_uri}</code>`],
+];
+const moduleFacts = (module) => MODULE_FACTS.map(([title, shown]) => [title, shown(module) || undefined]);
+
 const PEER_PERIOD = 2; // seconds between two questions to a peer's agent while its page is open
 
 // What a peer's agent tells of itself. One of an earlier release does not know the question.
@@ -126,19 +138,10 @@ function PeerAgent({ name, up, connection, version }) {
               "Version",
               value.version === version
                 ? value.version
-                : html`<${Mark} state="WARN" word=${`${value.version || "not told"}, here ${version}`} />`,
+                : html`<${Mark} state="WARN" word=${`${value.version || "unknown"}, here ${version}`} />`,
             ],
             ["Runs for", duration(value.uptime)],
-            ["CPU", value.cpu != null ? html`${percent(value.cpu)} of a core` : "not told by this peer"],
-            ["Memory", value.rss != null ? bytes(value.rss) : "not told by this peer"],
-            [
-              "Open files",
-              value.files_open != null && value.files_limit != null
-                ? `${count(value.files_open)} of ${count(value.files_limit)}`
-                : undefined,
-            ],
-            ["Proxies", value.proxies != null ? count(value.proxies) : undefined],
-            ["Core", html`<code>${value.core_uri}</code>`],
+            ...moduleFacts(value),
           ]}
         />`
       : html`<p class="empty">
@@ -186,12 +189,8 @@ const Agent = ({ agent, detail }) =>
       rows=${[
         ["Version", agent.version],
         ["Runs for", html`<${Since} moment=${agent.started} />`],
-        ["CPU", agent.cpu !== undefined ? html`${percent(agent.cpu)} of a core` : undefined],
-        ["Memory", bytes(agent.rss)],
-        ["Open files", agent.files_limit && `${count(agent.files_open)} of ${count(agent.files_limit)}`],
-        ["Proxies", count(agent.proxies)],
+        ...moduleFacts(agent),
         ["Domain", agent.domain],
-        ["Core", html`<code>${agent.core_uri}</code>`],
         ["Addresses", (agent.addresses || []).join(", ")],
         ["Settings", agent.config_file],
         ["Process", agent.pid],

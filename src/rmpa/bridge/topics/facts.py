@@ -1,11 +1,7 @@
-"""The facts of the topics of an agent: the local graph, the routes across the mesh, their figures and transports.
-
-The snapshot, ``/diagnostics``, ``rmpa why``, ``/metrics`` and the page are views of what is collected here.
-"""
+"""The topics' piece of the snapshot: the local graph, the routes across the mesh, their figures and transports."""
 
 from __future__ import annotations
 
-import math
 from itertools import chain
 from typing import TYPE_CHECKING, Any, cast
 
@@ -15,20 +11,20 @@ from rmpa.bridge.direct.conditions import Condition, Want, unmet_by_contract
 from rmpa.bridge.direct.paths import AGENTS
 from rmpa.bridge.peer_offers import CONFLICT, CROWDED
 from rmpa.bridge.policy import PolicyDecision
+from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
-from rmpa.core.contract import KEYS, Contract, Transport
-from rmpa.core.identity import is_own
-from rmpa.observe.peer_info import ContractTerm
-from rmpa.observe.snapshot import (
+from rmpa.core.contract import KEYS, Contract, Reliability, Transport
+from rmpa.core.facts import (
+    Arrival,
+    ContractTerm,
     EventInfo,
-    LatencyInfo,
+    PublisherReport,
     RouteInfo,
-    SampleSpread,
     SubscriberTransport,
     TopicInfo,
-    UnreachableInfo,
 )
-from rmpa.ros.wire.tcpros import LENGTH
+from rmpa.core.identity import is_own
+from rmpa.ros.wire.tcpros import LENGTH, printable
 from rmpa.runtime.loop import SystemClock, sorted_yielding, yield_to_data, yielding_to_data
 
 if TYPE_CHECKING:
@@ -40,7 +36,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
     from rmpa.bridge.topics.imports import RemoteTopic
-    from rmpa.ros.core.external import Core
 
 _DEFAULT = Contract()
 
@@ -51,12 +46,11 @@ class TopicFacts:
     It yields to data between two topics. What it iterates over is a copy, because data may change the routes.
 
     Args:
-        core: The agent's ROS core.
-        bridge: Its bridge.
+        bridge: The bridge, with the local core.
     """
 
-    def __init__(self, core: Core, bridge: Bridge) -> None:
-        self._core = core
+    def __init__(self, bridge: Bridge) -> None:
+        self._core = bridge.core
         self._bridge = bridge
         self._clock = SystemClock()
         # Over the last minute, by the session's number; those of peers that are away for a moment are kept.
@@ -78,16 +72,6 @@ class TopicFacts:
             for key, (value, rule) in self._bridge.context.contracts.explain(topic, type_name).items()
         }
 
-    def unreachable(self) -> tuple[UnreachableInfo, ...]:
-        """The nodes of the local graph to which no connection can be made, by name."""
-        now = self._clock.now()
-        return tuple(
-            UnreachableInfo(
-                node=node, uri=found.api, problem=found.problem, ago=now - found.since, withdrawn=found.withdrawn
-            )
-            for node, found in sorted(self._core.unreachable().items())
-        )
-
     def infos(self, wanted: Collection[str] | None = None) -> tuple[TopicInfo, ...]:
         """All topics of the local graph and of the peers, by name; or those that are wanted."""
         if wanted is not None and not wanted:
@@ -103,7 +87,7 @@ class TopicFacts:
         tables = (state.publishers, state.subscribers, routes)
         names: Iterable[str] = chain(*tables) if wanted is None else wanted
         known = {name for name in yielding_to_data(names) if any(name in table for table in tables)}
-        unreachable = {info.node: str(info) for info in self.unreachable()}
+        unreachable = {info.node: str(info) for info in self._core.unreachable_infos()}
         found = []
         for name in sorted_yielding(known):
             yield_to_data()
@@ -166,9 +150,9 @@ class TopicFacts:
             yield_to_data()
             texts = [f"{sessions[peer].link.name}: {entry.hidden}"] if entry.cause == CONFLICT else []
             texts += self._bridge.topics.mismatches(source)
-            yield entry.name, self.incoming(sessions[peer], source, entry), texts
+            yield entry.name, self._incoming_route(sessions[peer], source, entry), texts
 
-    def incoming(self, session: PeerSession, source: Source, entry: RemoteTopic) -> RouteInfo:
+    def _incoming_route(self, session: PeerSession, source: Source, entry: RemoteTopic) -> RouteInfo:
         """The route of a peer's source; ``source`` has its wire name."""
         topics, contracts = self._bridge.topics.peers[session.peer], self._bridge.context.contracts
         flow, publication = topics.flow(source), topics.publication(source)
@@ -266,17 +250,13 @@ class TopicFacts:
                 continue
             yield_to_data()
             yield source.topic, None, list(self._bridge.topics.mismatches(source))
-            flowing = list(exports.flowing(source))
-            for peer in flowing:
-                route = self._route_to(
-                    peer, names.get(peer, ""), source, local, "open", exports.contract(source, peer)
-                )
-                yield source.topic, route, []
+            flowing = dict.fromkeys(exports.flowing(source), "open")
             grants = self._bridge.topics.direct_exports.of(source.topic, source.node)
-            for peer in dict.fromkeys(peer for peer, _, _ in grants):
-                session = sessions.get(peer)
-                if peer not in flowing and session is not None:
-                    yield source.topic, self._route_to(peer, session.link.name, source, local, "idle"), []
+            idle = {peer: "idle" for peer, _, _ in grants if peer not in flowing}
+            for peer, state in (flowing | idle).items():
+                if (session := sessions.get(peer)) is not None:
+                    contract = exports.contract(source, peer)
+                    yield source.topic, self._route_to(peer, session.link.name, source, local, state, contract), []
             for peer, contract in exports.absent(source).items():
                 if peer not in names or exports.contract(source, peer) is None:
                     name, seconds = self._bridge.topics.losses.away(peer)
@@ -299,7 +279,7 @@ class TopicFacts:
         flow = topics.outbound.flows.get(source)
         route = flow.by_peer.get(peer) if flow is not None else None
         kept = route.sender if isinstance(route, ReliableRouteSender) else None
-        subscribers = self._granted(peer, source) if state != "away" else ()
+        subscribers = self._granted(peer, name, source) if state != "away" else ()
         figures = {}
         if flow is not None:
             figures = {name: getattr(flow, name) for name in ("messages", "dropped", "oversized", "oversized_bytes")}
@@ -323,21 +303,84 @@ class TopicFacts:
             **figures,
         )
 
-    def _granted(self, peer: int, source: Source) -> tuple[SubscriberTransport, ...]:
+    def _granted(self, peer: int, link: str, source: Source) -> tuple[SubscriberTransport, ...]:
         """A peer's subscribers that may connect to a local source directly, by name."""
-        exports, session = self._bridge.topics.direct_exports, self._bridge.sessions.get(peer)
-        known = exports.interruptions if session is not None else {}
-        link = session.link.name if session is not None else ""
+        exports = self._bridge.topics.direct_exports
         return tuple(
             SubscriberTransport(
                 node=name,
                 transport="direct",
                 state="granted",
                 endpoint=str(grant.port),
-                **_interruptions(known.get((link, Want(source.topic, source.node, name))), self._clock.now()),
+                **_interruptions(
+                    exports.interruptions.get((link, Want(source.topic, source.node, name))), self._clock.now()
+                ),
             )
             for owner, name, grant in exports.of(source.topic, source.node)
             if owner == peer
+        )
+
+    def arrivals(self, session: PeerSession, instance: str, topic: str) -> Iterator[tuple[str, Arrival]]:
+        """What is known here of the publishers that a module has of a topic, by node.
+
+        Args:
+            session: The peer that brings them.
+            instance: The run of the module: the peer's own, or of one that the peer relays.
+            topic: The topic's name here.
+        """
+        topics, publishers = self._bridge.topics, self._core.publishers(topic)
+        self.follow_clocks()
+        for number, source in list(topics.imports.at(topic)):
+            entry = topics.imports.get(number, source)
+            if number != session.peer or entry is None or session.instance_of(entry.origin) != instance:
+                continue
+            publication = topics.peers[session.peer].publication(source)
+            proxies, owner = self._bridge.sessions.proxies(session, source.node, entry.origin)
+            name, proxy = proxies.name(owner), proxies.get(owner)
+            links = publication.connections() if publication is not None else ()
+            arrival = Arrival(
+                route=self._incoming_route(session, source, entry),
+                proxy=name,
+                registered=proxy is not None and publishers.get(name) == proxy.uri,
+                cause=entry.cause,
+                permission=self._permission(session.link.name, entry),
+                readers={at.number: (printable(at.other), at.waiting, at.dropped) for at in links},
+                mismatches=topics.mismatches(source),
+            )
+            yield source.node, arrival
+
+    def _permission(self, peer: str, entry: RemoteTopic) -> str:
+        """The rule about which modules may publish a peer's topic; empty if trust is off."""
+        if not self._bridge.gate.on:
+            return ""
+        module, relay = (peer, "") if entry.origin is None else (entry.origin.name, peer)
+        return self._bridge.gate.judge(Access.PUBLISH, module, entry.name, relay=relay).rule
+
+    def report(self, session: PeerSession, source: Source) -> PublisherReport:
+        """What a peer is told of a publisher here."""
+        exports, outbound = self._bridge.topics.exports, self._bridge.topics.outbound
+        local, flow = exports.seen.get(source), outbound.flows.get(source)
+        kind = local.type if local is not None else self._core.type_of(source.topic)
+        decision = exports.decision(session.peer, source)
+        if decision is None:  # it has just come, or cannot be reached
+            decision = self._bridge.context.policy.judge(source.topic, kind, source.node)
+        sender, contract = outbound.sender_of(source, session.peer), exports.contract(source, session.peer)
+        reliable = contract is not None and contract.reliability is Reliability.RELIABLE
+        lost = self._core.unreachable().get(source.node) if flow is None or not flow.messages else None
+        figures = {} if flow is None else {n: getattr(flow, n) for n in ("messages", "oversized", "oversized_bytes")}
+        return PublisherReport(
+            node=source.node,
+            topic=source.topic,
+            type=kind,
+            crosses=decision.allowed,
+            rule=decision.rule,
+            offered=exports.offer(session.peer, source) is not None,
+            route="open" if session.peer in exports.flowing(source) else "opening" if contract is not None else "",
+            dropped=flow.dropped if flow is not None and not reliable else 0,
+            lost=sender.lost if sender is not None else 0,
+            beyond=exports.limit if source in exports.beyond else 0,
+            unreachable=f"{lost.api}: {lost.problem}" if lost is not None else "",
+            **figures,
         )
 
 
@@ -381,25 +424,12 @@ def _transport_name(*, direct: bool, relayed: bool) -> str:
     return "relay" if relayed else ""
 
 
-def _known(figure: float) -> float | None:
-    return None if math.isnan(figure) else figure
-
-
 def _quality(quality: QualitySummary) -> dict[str, Any]:
-    """The fields of a route that its quality gives."""
-    latency = None
-    if quality.latency is not None and quality.latency_last is not None and quality.latency_error is not None:
-        latency = LatencyInfo.of(quality.latency, last=quality.latency_last, error=quality.latency_error)
-    return {
-        "messages": quality.messages,
-        "bytes": quality.bytes - LENGTH.size * quality.messages,
-        "age": quality.age,
-        "rate": _known(quality.rate),
-        "bandwidth": _known(quality.bandwidth - LENGTH.size * quality.rate),
-        "period": SampleSpread.of(quality.period) if quality.period.count else None,
-        "jitter": _known(quality.jitter),
-        "latency": latency,
-    }
+    """The fields of a route that its quality gives; bytes without TCPROS's length fields."""
+    known = quality._asdict() | {"bytes": quality.bytes - LENGTH.size * quality.messages}
+    if quality.bandwidth is not None and quality.rate is not None:
+        known["bandwidth"] = quality.bandwidth - LENGTH.size * quality.rate
+    return known | {"period": quality.period if quality.period.count else None}
 
 
 def _events(watch: QosWatch | None, now: float) -> dict[str, Any]:
