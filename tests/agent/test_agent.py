@@ -57,8 +57,8 @@ def hears(subscriber: Subscriber, publishers: int) -> bool:
 
 def flows_to(agent: Agent, peers: int) -> bool:
     """Whether what the agent's module publishes goes to that many peers."""
-    flows = agent.bridge.topics.outbound.flows
-    return bool(flows) and all(len(agent.bridge.topics.exports.flowing(source)) == peers for source in flows)
+    flows = agent.bridge.topics.exports.flows.values()
+    return bool(flows) and all(len(flow.flowing) == peers for flow in flows)
 
 
 def has_subscribers(publisher: Publisher) -> bool:
@@ -147,7 +147,7 @@ async def test_data_crosses_only_with_a_subscriber_and_once_for_many(settings: C
                     async for received in subscriber:
                         assert received.message.data == "x"
                         break
-            [flow] = a.bridge.topics.outbound.flows.values()
+            [flow] = a.bridge.topics.exports.flows.values()
             assert flow.messages == 1
         await until(lambda: publisher.subscribers == 0)
 

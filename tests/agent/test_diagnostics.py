@@ -70,7 +70,7 @@ async def test_figures_of_a_topic_that_crosses(settings: Callable[..., Settings]
             lambda: all(
                 flow.quality.messages == 20
                 for at in b.bridge.sessions.linked()
-                for flow in b.bridge.topics.peers[at.peer].flows.values()
+                for flow in b.bridge.topics.imports.flows(at.peer)
             )
         )
         route = await shown("b", tmp_path, "/chatter")

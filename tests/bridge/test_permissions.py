@@ -88,7 +88,7 @@ class Secured:
             self.exports.link_up(number, name)
             self.imports.link_up(number, name)
             self.service_exports.link_up(number, name)
-            self.service_imports.link_up(number, name, number)
+            self.service_imports.link_up(number, name, rank=number)
 
     def publishes(self, *topics: str) -> None:
         for topic in topics:

@@ -252,7 +252,7 @@ def test_new_names_and_policy_here_leave_all_else_alone() -> None:
     ]
     assert changed(imports, new) == []
     entry = imports.entry(1, Source("/a", "/n"))
-    assert (entry.state, entry.route) == ("open", 1)
+    assert (entry.state, entry.number) == ("open", 1)
     assert changed(imports, Side()) == [Retract(1, b), Publish(1, b, TYPE), Publish(1, c, TYPE)]
 
 

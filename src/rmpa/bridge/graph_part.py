@@ -23,9 +23,10 @@ if TYPE_CHECKING:
     from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.direct.grants import Grants
     from rmpa.bridge.direct.paths import Paths
-    from rmpa.bridge.messages import Message
+    from rmpa.bridge.messages import Message, Source
     from rmpa.bridge.offers import OfferBook
-    from rmpa.bridge.peer_offers import ImportBook
+    from rmpa.bridge.peer_offers import ImportBook, Remote
+    from rmpa.bridge.policy import Place
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
     from rmpa.ros.master.parameters import GraphState
@@ -117,6 +118,22 @@ class GraphPart(Part, Effects):
         """As of ``Effects``."""
         self._timer.arm()
 
+    def path_changed(self, entry: Remote[Any]) -> None:
+        """As of ``Effects``."""
+        if entry.shown:
+            self.pass_on(entry)
+            self.look((entry.name,))
+
+    def pass_on(self, entry: Remote[Any]) -> None:
+        """Have what a peer offers relayed to others, if this module relays."""
+        if (session := self._shared.sessions.get(entry.peer)) is not None:
+            source, place = self._relayed(entry, self._shared.sessions.proxy_name(session, entry.node, entry.origin))
+            self._shared.relay.pass_on(entry.peer, session.link.identity, source, place, entry.origin)
+
+    @abstractmethod
+    def _relayed(self, entry: Remote[Any], proxy: str) -> tuple[Source, Place]:
+        """What ``policy.Relay`` knows an entry by: its source, and its place at its proxy."""
+
     def refuse(self, session: PeerSession, error: RemoteProtocolError) -> None:
         """Log that a peer broke the protocol, and close its link."""
         text = f"{session.link.name} broke the protocol: {error}"
@@ -131,11 +148,9 @@ class GraphPart(Part, Effects):
 
     def link_up(self, session: PeerSession) -> None:
         """Begin the advertisement to a peer, and wait for the peer's own."""
-        peer, identity = session.peer, session.link.identity
-        instance = identity.instance.hex()
         self.imports.ways.instance = self._shared.relay.instance
-        self.imports.link_up(peer, identity.name, instance, identity.guid.value)
-        self.exports.link_up(peer, identity.name, instance)
+        self.imports.link_up(session)
+        self.exports.link_up(session)
         self.direct_imports.link_up(session)
         self.direct_exports.link_up(session)
         self.schedule()

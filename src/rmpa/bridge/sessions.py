@@ -6,10 +6,10 @@ import asyncio
 import itertools
 import logging
 from dataclasses import dataclass, field
-from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.data.reception import LinkTime
+from rmpa.bridge.peer import Peer, PeerState
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.bridge.proxies import PeerProxies, ProxyNamespaces
 from rmpa.core.log import logged_failure
@@ -27,59 +27,27 @@ if TYPE_CHECKING:
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.master.parameters import GraphChange
 
+_log = logging.getLogger(__name__)
+
 # A peer whose agent died keeps its proxies in the local graph for this long: it may be started again at once.
 AWAY_GRACE: Final = 0.5
 
 
-# --- The state that the bridge keeps for one run of a peer, across its links ----------------------------------------
-
-
-class PeerState(Enum):
-    """The state of a session.
-
-    ::
-
-    LINKED ──silence──► SILENT ──SILENT_GRACE► AWAY ──nothing waits any more──► (gone)
-      ▲  ├──closed in order──────────────────►  │
-      ├──┼────────────── a new link ────────────┘   (from SILENT, too)
-
-    Attributes:
-        LINKED: The peer has a link.
-        SILENT: Its link ended by silence; most peers are back within ``mesh.limits.SILENT_GRACE``.
-        AWAY: It has no link, and a part of the bridge keeps something for it.
-    """
-
-    LINKED = auto()
-    SILENT = auto()
-    AWAY = auto()
-
-
-@dataclass(slots=True, eq=False)
-class PeerSession:
-    """One run of a peer.
+@dataclass(slots=True, eq=False, kw_only=True)
+class PeerSession(Peer):
+    """What the bridge keeps for one run of a peer, across its links.
 
     Args:
-        peer: Its number in this agent; never used again for another run.
         link: Its link, or the last one while it has none.
         proxies: The nodes that stand for its nodes in the local graph; those of the module, whichever peers bring it.
         time: The time base of its link: the offset between its clock and the local one.
-        state: Whether it has a link.
-        away_since: When its last link ended, monotonic seconds.
         wait: Seconds from ``away_since`` to ``due``; ``None`` while it has a link.
     """
 
-    peer: int
     link: PeerLink
     proxies: PeerProxies
     time: LinkTime = field(default_factory=LinkTime)
-    state: PeerState = PeerState.LINKED
-    away_since: float = 0.0
     wait: float | None = None
-
-    @property
-    def linked(self) -> bool:
-        """Whether the peer has a link now."""
-        return self.state is PeerState.LINKED
 
     @property
     def same_machine(self) -> bool:
@@ -102,16 +70,8 @@ class PeerSession:
         return None if self.wait is None else self.away_since + self.wait
 
 
-# --- The base class of the bridge's parts ---------------------------------------------------------------------------
-#
-# Topics, services, parameters and others.
-
-
-_log = logging.getLogger(__name__)
-
-
 class Part:
-    """Ignores every event of the bridge; parts override the methods that they need.
+    """A part of the bridge: topics, services, parameters and others. It overrides the events that it needs.
 
     All methods are called from the event loop.
 
@@ -317,7 +277,8 @@ class PeerSessions:
             old.close(f"{link.name} has another address")
         session = self._waiting_for(link)
         if session is not None:
-            session.link, session.state, session.wait = link, PeerState.LINKED, None
+            session.link, session.rank, session.wait = link, link.identity.guid.value, None
+            session.state, session.silent = PeerState.LINKED, False
             self._timer.arm()
         else:
             session = self._begin(link)
@@ -326,10 +287,11 @@ class PeerSessions:
         call_each(self._parts, lambda part: part.link_up(session))
 
     def _begin(self, link: PeerLink) -> PeerSession:
-        peer = next(self._numbers)
-        prefix = self._namespaces.add(peer, link.identity)
-        proxies = self._proxies_of(link.identity.instance.hex(), link.identity.name, prefix)
-        session = self._by_number[peer] = PeerSession(peer, link, proxies)
+        peer, identity = next(self._numbers), link.identity
+        name, instance, rank = identity.name, identity.instance.hex(), identity.guid.value
+        proxies = self._proxies_of(instance, name, self._namespaces.add(peer, identity))
+        session = PeerSession(peer=peer, name=name, instance=instance, rank=rank, link=link, proxies=proxies)
+        self._by_number[peer] = session
         return session
 
     def _waiting_for(self, link: PeerLink) -> PeerSession | None:
@@ -349,10 +311,10 @@ class PeerSessions:
         if session is None:
             return
         session.away_since = asyncio.get_running_loop().time()
-        session.state = PeerState.SILENT
+        session.state, session.silent = PeerState.SILENT, link.silent
         call_each(self._parts, lambda part: part.link_down(session))
         session.link.routes.clear()
-        if link.silent:
+        if session.silent:
             session.wait = AWAY_GRACE if link.crashed else mesh_limits.SILENT_GRACE
             self._timer.arm()
         else:
@@ -395,11 +357,12 @@ class PeerSessions:
 
     def _end(self, session: PeerSession) -> None:
         """Ends a session for good: the rest of the peer is removed from the local graph."""
-        session.wait = None
+        session.state, session.wait = PeerState.AWAY, None
         self._timer.arm()
         self._by_number.pop(session.peer, None)
         if self._by_link.pop(session.link, None) is not None:
             call_each(self._parts, lambda part: part.link_down(session))
+            session.link.routes.clear()
         call_each(self._parts, lambda part: part.gone(session))
         self._namespaces.remove(session.peer)
 

@@ -35,8 +35,10 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from rmpa.bridge.bridge import Bridge
+    from rmpa.bridge.data.export import ExportRoute
     from rmpa.bridge.data.quality import QosWatch, QualitySummary
     from rmpa.bridge.messages import Source
+    from rmpa.bridge.peer import Peer
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
     from rmpa.bridge.topics.imports import RemoteTopic
@@ -139,7 +141,7 @@ class TopicFacts:
         for _, source, entry in yielding_to_data(list(topics.imports)):
             if entry.state != "idle" or entry.direct:
                 first.add(entry.name)
-            elif not entry.shown or entry.problem or topics.mismatches(source):
+            elif not entry.shown or entry.problem or topics.mismatches.texts(source):
                 problems.add(entry.name)
             else:
                 idle.add(entry.name)
@@ -165,13 +167,12 @@ class TopicFacts:
                 continue
             yield_to_data()
             texts = [f"{sessions[peer].link.name}: {entry.hidden}"] if entry.cause == CONFLICT else []
-            texts += self._bridge.topics.mismatches(source)
+            texts += self._bridge.topics.mismatches.texts(source)
             yield entry.name, self.incoming(sessions[peer], source, entry), texts
 
     def incoming(self, session: PeerSession, source: Source, entry: RemoteTopic) -> RouteInfo:
         """The route of a peer's source; ``source`` has its wire name."""
-        topics, contracts = self._bridge.topics.peers[session.peer], self._bridge.context.contracts
-        flow, publication = topics.flow(source), topics.publication(source)
+        contracts, flow, publication = self._bridge.context.contracts, entry.flow, entry.publication
         about, now = entry.description, self._clock.now()
         latched = about.latching if about is not None else False
         proxies, node = self._bridge.sessions.proxies(session, source.node, entry.origin)
@@ -202,23 +203,23 @@ class TopicFacts:
             contract=_terms(entry.contract or contracts.of(source.topic, entry.type)),
             problem=entry.hidden or problem,
             limit="nodes" if entry.cause == CROWDED else "",
-            **_events(topics.watch(source), now),
-            **self._transport(session, source, contracts.of(entry.name, entry.type), now),
+            **_events(self._bridge.topics.watch(entry), now),
+            **self._transport(session, entry, contracts.of(entry.name, entry.type), now),
             **figures,
         )
 
-    def _transport(self, session: PeerSession, source: Source, contract: Contract, now: float) -> dict[str, Any]:
+    def _transport(self, session: PeerSession, entry: RemoteTopic, contract: Contract, now: float) -> dict[str, Any]:
         """The fields of a peer's route that say which subscribers are direct, and why others are relayed.
 
         Args:
             session: The peer.
-            source: The source, by its wire name.
+            entry: The source.
             contract: This module's for the topic.
             now: Monotonic seconds.
         """
         paths = self._bridge.topics.direct_imports
         subscribers = []
-        for path in paths.of(session.peer, source.topic, source.node):
+        for path in paths.of(session.peer, entry.wire.topic, entry.node):
             endpoint, unmet = path.endpoint, path.unmet
             one = SubscriberTransport(
                 node=path.want.user,
@@ -236,7 +237,7 @@ class TopicFacts:
         relayed = [one for one in subscribers if one.state == "relayed"]
         reason = min(relayed, key=lambda one: one.condition == Condition.MEASURES, default=None)
         condition, text = (reason.condition, reason.text) if reason is not None else ("", "")
-        publication = self._bridge.topics.peers[session.peer].publication(source)
+        publication = entry.publication
         carried = publication is not None and publication.subscribers > 0
         if (
             carried
@@ -259,46 +260,42 @@ class TopicFacts:
 
         A route is ``open``, ``idle`` (the peer's subscribers are connected directly) or ``away``.
         """
-        exports, sessions = self._bridge.topics.exports, self._bridge.sessions
-        names = {session.peer: session.link.name for session in sessions.linked()}
-        for source, local in yielding_to_data(list(exports.offered.items())):
+        topics, sessions = self._bridge.topics, self._bridge.sessions
+        for source, local in yielding_to_data(list(topics.exports.offered.items())):
             if wanted is not None and source.topic not in wanted:
                 continue
             yield_to_data()
-            yield source.topic, None, list(self._bridge.topics.mismatches(source))
-            flowing = list(exports.flowing(source))
-            for peer in flowing:
-                route = self._route_to(
-                    peer, names.get(peer, ""), source, local, "open", exports.contract(source, peer)
-                )
-                yield source.topic, route, []
-            grants = self._bridge.topics.direct_exports.of(source.topic, source.node)
+            yield source.topic, None, list(topics.mismatches.texts(source))
+            routes = list(topics.exports.routes(source).values())
+            flowing = {route.peer for route in routes if route.flows}
+            for route in routes:
+                if route.flows:
+                    yield source.topic, self._route_to(route.session, source, local, "open", route), []
+            grants = topics.direct_exports.of(source.topic, source.node)
             for peer in dict.fromkeys(peer for peer, _, _ in grants):
                 session = sessions.get(peer)
                 if peer not in flowing and session is not None:
-                    yield source.topic, self._route_to(peer, session.link.name, source, local, "idle"), []
-            for peer, contract in exports.absent(source).items():
-                if peer not in names or exports.contract(source, peer) is None:
-                    name, seconds = self._bridge.topics.losses.away(peer)
-                    kept = shown_seconds(exports.routes(source)[peer].outage)
-                    text = f"{name} is away for {shown_seconds(seconds)}; messages are kept for {kept}"
-                    yield source.topic, self._route_to(peer, name, source, local, "away", contract, text), []
+                    yield source.topic, self._route_to(session, source, local, "idle"), []
+            for route in routes:
+                if not route.number:
+                    yield source.topic, self._route_to(route.session, source, local, "away", route), []
 
     def _route_to(
         self,
-        peer: int,
-        name: str,
+        session: Peer,
         source: Source,
         local: LocalSource,
         state: str,
-        contract: Contract | None = None,
-        problem: str = "",
+        used: ExportRoute | None = None,
     ) -> RouteInfo:
-        topics = self._bridge.topics
-        about, offer = topics.exports.description(source), topics.exports.offer(peer, source)
-        flow = topics.outbound.flows.get(source)
-        route = flow.by_peer.get(peer) if flow is not None else None
-        kept = route.sender if isinstance(route, ReliableRouteSender) else None
+        exports, peer, name = self._bridge.topics.exports, session.peer, session.name
+        about, offer = exports.description(source), exports.offer(peer, source)
+        flow, route = exports.flows.get(source), exports.routes(source).get(peer)
+        sender, problem = route.sender if route is not None else None, ""
+        kept = sender.sender if isinstance(sender, ReliableRouteSender) else None
+        if state == "away" and used is not None:
+            seconds = shown_seconds(self._clock.now() - session.away_since)
+            problem = f"{name} is away for {seconds}; messages are kept for {shown_seconds(used.outage)}"
         subscribers = self._granted(peer, source) if state != "away" else ()
         figures = {}
         if flow is not None:
@@ -315,8 +312,10 @@ class TopicFacts:
             kept=kept.pending if kept is not None else 0,
             latched=about.latching if about is not None else False,
             wire=offer.topic if offer is not None and offer.topic != source.topic else "",
-            lane=route.lane if route is not None else "",
-            contract=_terms(contract or self._bridge.context.contracts.of(source.topic, local.type)),
+            lane=sender.lane if sender is not None else "",
+            contract=_terms(
+                used.contract if used is not None else self._bridge.context.contracts.of(source.topic, local.type)
+            ),
             problem=problem,
             transport=_transport_name(direct=bool(subscribers), relayed=state == "open"),
             subscribers=subscribers,

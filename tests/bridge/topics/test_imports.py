@@ -178,7 +178,7 @@ def test_a_peer_that_nothing_waits_for_leaves_what_was_open(imports: Imports) ->
     assert not imports.waits_for(1)
     assert imports.detached(1) == [Detach(1, CMD, 1, missed=True)]
     assert imports.detached(1) == []
-    assert len(list(imports.book.link_down(1))) >= 21
+    assert len(imports.book.gone(1)) >= 21
 
 
 # --- contracts, and links that come back --------------------------------------------------------------------------

@@ -229,7 +229,7 @@ class Grants:
         shared = any(
             other.address == session.address for other in self._shared.sessions.linked() if other is not session
         )
-        if session.link.silent and not shared:
+        if session.silent and not shared:
             for port in {grant.port for peer, _, grant in self if peer == session.peer}:
                 self._end(session, port)
         self.gone(session)

@@ -39,14 +39,12 @@ from rmpa.runtime.kernel_tcp import connections
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Sequence
 
     from rmpa.bridge.messages import Source
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.imports import Imports, RemoteTopic
-    from rmpa.bridge.topics.peer_topics import PeerTopics
-    from rmpa.ros.node.publication import Publication
     from rmpa.ros.wire.slave_api import BusLink
 
     TopicPath = Path[RemoteTopic]
@@ -158,7 +156,6 @@ class TopicPaths(Paths["RemoteTopic"]):
         shared: As of ``Paths``.
         on_warning: As of ``Paths``.
         imports: The remote sources.
-        topics: The peers' topics in the local graph, by the numbers of their sessions.
 
     Attributes:
         interruptions: When subscribers were without their path.
@@ -168,18 +165,11 @@ class TopicPaths(Paths["RemoteTopic"]):
 
     kind = "topic"
 
-    def __init__(
-        self,
-        shared: Shared,
-        on_warning: Callable[[str, str, str], None],
-        imports: Imports,
-        topics: Mapping[int, PeerTopics],
-    ) -> None:
+    def __init__(self, shared: Shared, on_warning: Callable[[str, str, str], None], imports: Imports) -> None:
         super().__init__(shared, on_warning)
         own = Needs((), "the peer's own topics that come directly")
         shared.rpc.on_notification("direct.topic_again", self._asked_again, own)
         self._imports = imports
-        self._topics = topics
         self.interruptions: Interruptions = {}
         self._checking: asyncio.TimerHandle | None = None
         self._kernel_tells = kernel_tells()
@@ -260,12 +250,8 @@ class TopicPaths(Paths["RemoteTopic"]):
         return _TWICE if description is not None and description.latching else None
 
     def _is_relayed(self, path: TopicPath) -> bool:
-        publication = self._publication(path)
+        publication = path.entry.publication
         return publication is not None and path.want.user in publication.callers
-
-    def _publication(self, path: TopicPath) -> Publication | None:
-        topics = self._topics.get(path.session.peer)
-        return topics.publication(path.entry.wire) if topics is not None else None
 
     def _uri(self, path: TopicPath) -> str:
         """The slave API of a path's subscriber; empty if it is not registered."""
@@ -352,7 +338,7 @@ class TopicPaths(Paths["RemoteTopic"]):
 
     async def _leave(self, path: TopicPath) -> tuple[str, int] | None:
         """Make a subscriber leave all of its connections to a node; return a direct one that stays."""
-        proxy, publication = path.session.proxies.get(path.want.node), self._publication(path)
+        proxy, publication = path.session.proxies.get(path.want.node), path.entry.publication
         await self._list(path, without=proxy.uri if proxy is not None else "")
         if publication is not None:
             publication.hang_up(path.want.user)
@@ -397,7 +383,7 @@ class TopicPaths(Paths["RemoteTopic"]):
     async def _renew(self, path: TopicPath) -> bool:
         """List without the proxy, end the connection, list with it; return whether that was done."""
         uri, proxy = self._uri(path), path.session.proxies.get(path.want.node)
-        if not uri or proxy is None or self._publication(path) is None:
+        if not uri or proxy is None or path.entry.publication is None:
             return False
         if (stays := await self._leave(path)) is not None:
             self._put(path, stays)

@@ -48,7 +48,10 @@ from rmpa.mesh import limits as mesh_limits
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
-    from rmpa.bridge.offers import Effects
+    from rmpa.bridge.data.reception import ImportFlow
+    from rmpa.bridge.topics.import_route import ImportRoute
+    from rmpa.bridge.topics.part import Topics
+    from rmpa.ros.node.publication import Publication
 
 
 # What a source is, whichever peer offers it: the run and the name of its module, its node there, and its topic here.
@@ -57,14 +60,14 @@ StreamKey = tuple[str, str, str, str]
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class RemoteTopic(Remote[Source]):
-    """One source as one peer offers it.
+    """One source as one peer offers it, and the facts of its route over that peer's link.
 
     Args:
         module: The run and the name of the module that publishes it.
         objection: Why it is not in the local graph, whichever others offer it, or empty.
         hidden: Why it is not in the local graph: that, or who carries it; or empty.
         wanted: Whether a local node listens.
-        route: The route's id while it is requested or open, else 0.
+        number: The route's id while it is requested or open, else 0.
         open: Whether the peer has opened the route.
         until: When the present state is over, monotonic seconds; ``None``: it lasts. A source without route that is
             wanted waits for the peer's next link then.
@@ -73,6 +76,7 @@ class RemoteTopic(Remote[Source]):
         description: The header of the publisher, once known.
         backoff: Delays between attempts to open a route, after the first one that failed.
         direct: Whether a local node is connected to its publisher directly, and only the peer's agent has died.
+        route: The publication and the flow, while this peer carries the source; ``None``: another one does, or none.
     """
 
     type: str
@@ -80,7 +84,7 @@ class RemoteTopic(Remote[Source]):
     objection: str = ""
     hidden: str = ""
     wanted: bool = False
-    route: int = 0
+    number: int = 0
     open: bool = False
     until: float | None = None
     asked: Contract | None = None
@@ -88,6 +92,22 @@ class RemoteTopic(Remote[Source]):
     description: Description | None = None
     backoff: Backoff | None = None
     direct: bool = False
+    route: ImportRoute | None = None
+
+    @property
+    def publication(self) -> Publication | None:
+        """What local nodes subscribe to; ``None`` if that is not in the local graph, or not by this peer."""
+        return self.route.publication if self.route is not None else None
+
+    @property
+    def flow(self) -> ImportFlow | None:
+        """The flow of its open route, or the one that waits for its peer to come back."""
+        return self.route.flow if self.route is not None else None
+
+    @property
+    def past(self) -> Source:
+        """Its name here, and its node in its module: what is remembered when it is over."""
+        return Source(self.name, self.node if self.origin is None else self.origin.node)
 
     @property
     def key(self) -> StreamKey:
@@ -97,7 +117,7 @@ class RemoteTopic(Remote[Source]):
     @property
     def state(self) -> str:
         """The state of the route, as in the figure above."""
-        if not self.route:
+        if not self.number:
             return "waiting" if self.wanted else "idle"
         if not self.open:
             return "opening"
@@ -137,8 +157,9 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     """
 
     kind = "topics"
+    _out: Topics
 
-    def __init__(self, out: Effects) -> None:
+    def __init__(self, out: Topics) -> None:
         super().__init__(out)
         self._topics: dict[int, dict[str, dict[Source, None]]] = {}
         self._ways: dict[StreamKey, dict[RemoteTopic, None]] = {}
@@ -172,7 +193,16 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         """The topics that a peer offers, by their local names, each with its sources."""
         return self._topics.get(peer, {})
 
-    # --- links ---------------------------------------------------------------------------------------------------
+    def flows(self, peer: int) -> list[ImportFlow]:
+        """The flows of a peer's open routes."""
+        known = self._peers.get(peer)
+        entries = known.routes.values() if known is not None else ()
+        return [entry.flow for entry in entries if entry.open and entry.flow is not None]
+
+    @property
+    def flowing(self) -> bool:
+        """Whether any route is open."""
+        return any(entry.open for known in self._peers.values() for entry in known.routes.values())
 
     def link_away(self, peer: int, *, briefly: bool = False) -> Iterator[None]:
         """Suspend the routes of a peer that may come back, and drop what does not outlive the link, one by one.
@@ -183,18 +213,18 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 called again without it if the peer is not.
         """
         known = self._peers[peer]
-        known.away, known.silent, known.routes = True, known.silent or briefly, {}
+        known.routes = {}
         if not briefly:
             known.give_up()
         self._ready(peer)
         for entry in list(known.entries.values()):
-            keep = briefly or entry.outlives(silent=known.silent)
+            keep = briefly or entry.outlives(silent=known.session.silent)
             if not keep:
                 self._hand_over(entry)
-            if entry.route:
+            if entry.number:
                 # A lingering route has no listener, so it is not continued.
-                self._do.detach(entry, keep=keep and entry.wanted, missed=entry.wanted and not keep)
-            entry.route, entry.open, entry.until, entry.problem = 0, False, None, "its peer is away"
+                self._out.detach(entry, keep=keep and entry.wanted, missed=entry.wanted and not keep)
+            entry.number, entry.open, entry.until, entry.problem = 0, False, None, "its peer is away"
             if not keep:
                 self._outlived(entry)
             yield
@@ -202,7 +232,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     def waits_for(self, peer: int) -> bool:
         """Whether a source outlives the peer's link: one with a local listener that is reliable or latched."""
         known = self._peers[peer]
-        return any(entry.outlives(silent=known.silent) for entry in known.entries.values())
+        return any(entry.outlives(silent=known.session.silent) for entry in known.entries.values())
 
     def outages(self, peer: int) -> set[float]:
         """The outages, in seconds, of the sources that are kept for a peer."""
@@ -223,14 +253,13 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         known = self._peers[peer]
         self._hand_all_over(peer)
         for entry in known.routes.values():
-            self._do.detach(entry, missed=entry.wanted)
+            self._out.detach(entry, missed=entry.wanted)
         known.routes = {}
 
-    def link_down(self, peer: int) -> Iterator[None]:
+    def gone(self, peer: int) -> dict[Source, RemoteTopic]:
         """Forget a peer for good; other relays may now bring its sources, and those that it relayed.
 
-        The peer is unknown as soon as this returns; closing its proxies takes its sources out of the local graph. Its
-        entries are freed as the items are taken, because freeing thousands at once takes long.
+        The peer is unknown when this returns; the caller takes the returned sources out of the local graph.
         """
         self._hand_all_over(peer)
         known = self._peers.pop(peer, None)
@@ -240,15 +269,13 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         self._ways_changed(self.ways.unlinked(peer))
         for other, source in list(self.at(CLOCK)):
             self._judge_at(other, source)
-        return _freed(known.entries if known is not None else {})
-
-    # --- what peers offer ----------------------------------------------------------------------------------------
+        return known.entries if known is not None else {}
 
     def _entry(self, peer: int, offer: TopicOffer) -> RemoteTopic:
         # Many sources share the names of nodes and types, and each is kept once.
         source, kind = Source(offer.topic, sys.intern(offer.node)), sys.intern(offer.type)
         name, origin, known = self.name_here(peer, source.topic, offer.origin), offer.origin, self._peers[peer]
-        module = (known.instance, known.name) if origin is None else (origin.instance, origin.name)
+        module = (known.session.instance, known.session.name) if origin is None else (origin.instance, origin.name)
         entry = RemoteTopic(
             peer=peer, wire=source, name=name, node=source.node, origin=origin, type=kind, module=module
         )
@@ -256,7 +283,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         return entry
 
     def _came_again(self, entry: RemoteTopic, now: float) -> None:
-        if not entry.route and entry.until is None:
+        if not entry.number and entry.until is None:
             entry.problem = ""  # the peer was away, and is back
         self.follow(entry, now)
 
@@ -319,7 +346,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             self._list(entry)
         self._judge(entry)
         contract = self._out.context.contracts.of(entry.name, entry.type)
-        if entry.route and not (entry.asked is not None and entry.asked.same_route(contract)):
+        if entry.number and not (entry.asked is not None and entry.asked.same_route(contract)):
             self._close(entry, missed=entry.wanted)
             self.follow(entry, now)
 
@@ -342,7 +369,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             module, relay = self._speaker(entry)
             self._out.context.gate.admits(Access.PUBLISH, module, entry.name, relay=relay)
         if entry.cause == CROWDED != before:
-            self._warn_limit(known.name, "nodes", self._out.context.settings.limits.nodes)
+            self._warn_limit(known.session.name, "nodes", self._out.context.settings.limits.nodes)
 
     def why_hidden(self, entry: RemoteTopic) -> tuple[str, str]:
         """Why a source may not be in the local graph, and the cause (see ``Remote``); empty if it may."""
@@ -374,7 +401,8 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         policy, origin, topic = self._out.context.policy, entry.origin, entry.name
         known = self._peers[entry.peer]
         decision = policy.judge(topic, entry.type, entry.node if origin is None else origin.node)
-        for name in (known.name,) if origin is None else (known.name, origin.name):
+        peer = known.session.name
+        for name in (peer,) if origin is None else (peer, origin.name):
             if decision.allowed:
                 decision = policy.judge_for(name, topic, entry.type, entry.wire.topic)
         if not decision.allowed:
@@ -393,7 +421,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         """
         if entry.origin is not None:
             return "time does not come by a relay", False
-        decision = self._out.context.policy.judge_clock(self._peers[entry.peer].name)
+        decision = self._out.context.policy.judge_clock(self.peer_name(entry.peer))
         if not decision.allowed:
             return decision.rule, False
         if CLOCK in self._local_types:
@@ -401,7 +429,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         for peer, source in self.at(CLOCK):
             other = self._peers[peer].entries[source]
             if other.shown and other is not entry:
-                name = self._peers[peer].name
+                name = self.peer_name(peer)
                 return f"time comes from {source.node} of {name} already, and has one source", True
         return "", False
 
@@ -417,7 +445,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 way.wanted = False
         if carrier is None and best is not None:
             self._peers[best.peer].show(best)
-            self._do.publish(best)
+            self._out.publish(best)
         elif carrier is not None and best is None:
             self._hide(carrier)
         elif carrier is not best and carrier is not None and best is not None:
@@ -432,7 +460,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         return min(free, key=lambda way: self.ways.rank(way.peer, way.origin), default=None)
 
     def _outranked(self, best: RemoteTopic) -> str:
-        module, name = best.module[1], self._peers[best.peer].name
+        module, name = best.module[1], self.peer_name(best.peer)
         return f"{module} has a link of its own" if best.origin is None else f"{module} is reached by way of {name}"
 
     def _move(self, old: RemoteTopic, new: RemoteTopic) -> None:
@@ -440,7 +468,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         self._peers[old.peer].hide(old)
         self._peers[new.peer].show(new)
         wanted, old.wanted = old.wanted, False
-        self._do.moved(old, new)
+        self._out.moved(old, new)
         self._close(old)
         if wanted and not new.open and not new.wanted:
             self._wait(new, -math.inf)
@@ -455,7 +483,6 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
 
     def _hand_all_over(self, peer: int) -> None:
         if (known := self._peers.get(peer)) is not None:
-            known.away = True
             self._ready(peer)
             for entry in list(known.entries.values()):
                 self._hand_over(entry)
@@ -468,7 +495,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     def _retract(self, entry: RemoteTopic) -> None:
         """Take a source out of the local graph, and show those that could not stand beside it."""
         self._peers[entry.peer].hide(entry)
-        self._do.retract(entry)
+        self._out.retract(entry)
         self._show_behind(entry)
 
     def _show_behind(self, entry: RemoteTopic) -> None:
@@ -494,20 +521,20 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 self._close(entry)
             case "lingering" if entry.until is None:
                 self._wait(entry, now + limits.ROUTE_LINGER)
-            case "waiting" if not known.away and (due or entry.until is None):
+            case "waiting" if known.session.linked and (due or entry.until is None):
                 known.last_route += 1
-                entry.route, known.routes[known.last_route] = known.last_route, entry
+                entry.number, known.routes[known.last_route] = known.last_route, entry
                 entry.until = None  # the peer answers once its publisher has, and that may take long
                 entry.asked = self._out.context.contracts.of(entry.name, entry.type)
-                epoch, after = self._do.position(entry) or (0, 0)
-                asked = OpenRoute(entry.route, entry.wire.topic, entry.node, entry.asked, epoch, after)
+                epoch, after = self._out.position(entry) or (0, 0)
+                asked = OpenRoute(entry.number, entry.wire.topic, entry.node, entry.asked, epoch, after)
                 self._out.send(entry.peer, asked)
             case "open" | "idle":
                 entry.until = None
 
-    def demand(self, peer: int, source: Source, now: float, *, wanted: bool) -> None:
+    def demand(self, entry: RemoteTopic, now: float, *, wanted: bool) -> None:
         """Note the first local listener of a source, or that the last one has gone."""
-        if (entry := self.get(peer, source)) is None:
+        if self.get(entry.peer, entry.wire) is not entry:
             return
         if not wanted and entry.state == "waiting":
             self._close(entry)
@@ -533,7 +560,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         entry.description, entry.contract = message.description, message.contract
         if (carrier := self.carrier(entry)) is not None and carrier is not entry:
             self._move(carrier, entry)
-        self._do.describe(entry, message)
+        self._out.describe(entry, message)
 
     def closed(self, peer: int, message: RouteClosed, now: float) -> None:
         """Handle a route that the peer has refused or closed; ignored if it was closed here meanwhile."""
@@ -568,31 +595,25 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
 
     def _close(self, entry: RemoteTopic, *, missed: bool = False) -> None:
         """End a source's route in any state; ``missed``: local nodes still listen, and miss messages from now on."""
-        if entry.route:
-            self._peers[entry.peer].routes.pop(entry.route, None)
-            self._out.send(entry.peer, CloseRoute(entry.route))
-            self._do.detach(entry, missed=missed)
+        if entry.number:
+            self._peers[entry.peer].routes.pop(entry.number, None)
+            self._out.send(entry.peer, CloseRoute(entry.number))
+            self._out.detach(entry, missed=missed)
         elif entry.wanted and entry.until is None:
-            self._do.detach(entry, missed=missed)  # it waited for a new link
-        entry.route, entry.open, entry.until, entry.backoff = 0, False, None, None
+            self._out.detach(entry, missed=missed)  # it waited for a new link
+        entry.number, entry.open, entry.until, entry.backoff = 0, False, None, None
 
     def _fail(self, entry: RemoteTopic, reason: str, now: float, last: int | None = None) -> None:
         """A route is refused or lost: it is opened again after the back-off if a node still listens."""
-        self._peers[entry.peer].routes.pop(entry.route, None)
+        self._peers[entry.peer].routes.pop(entry.number, None)
         if last is None:
             self._hand_over(entry)
         # Where its publisher may be there still, the next route goes on behind what has come.
         keep = last is None and entry.wanted and entry.reliable
-        self._do.detach(entry, keep=keep, missed=entry.wanted, last=last)
-        entry.route, entry.open, entry.until, entry.problem = 0, False, None, reason
+        self._out.detach(entry, keep=keep, missed=entry.wanted, last=last)
+        entry.number, entry.open, entry.until, entry.problem = 0, False, None, reason
         self._choose(entry)
         if entry.wanted:
             if entry.backoff is None:
                 entry.backoff = Backoff(mesh_limits.BACKOFF_FIRST, mesh_limits.BACKOFF_MAX, self._out.rng)
             self._wait(entry, now + entry.backoff.delay())
-
-
-def _freed(entries: dict[Source, RemoteTopic]) -> Iterator[None]:
-    while entries:
-        entries.popitem()
-        yield

@@ -15,7 +15,6 @@ from rmpa.bridge.policy import Needs
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
-from rmpa.core.contract import Reliability
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.identity import OWN_NODE, is_global_name, is_own
 from rmpa.observe import limits as observe_limits
@@ -265,7 +264,7 @@ class WhyService:
             entry = topics.imports.get(number, source)
             if number != session.peer or entry is None or _instance(session, entry.origin) != peer.instance:
                 continue
-            node, publication = source.node, topics.peers[session.peer].publication(source)
+            node, publication = source.node, entry.publication
             proxies, owner = self._bridge.sessions.proxies(session, node, entry.origin)
             name, proxy = proxies.name(owner), proxies.get(owner)
             links = publication.connections() if publication is not None else ()
@@ -278,7 +277,7 @@ class WhyService:
                     cause=entry.cause,
                     permission=self._permission(session.link.name, entry),
                     readers={at.number: (printable(at.other), at.waiting, at.dropped) for at in links},
-                    mismatches=topics.mismatches(source),
+                    mismatches=topics.mismatches.texts(source),
                 ),
             )
 
@@ -360,14 +359,14 @@ class WhyService:
         return [node for node, local in relayed if local and local.origin and local.origin.instance == instance]
 
     def _report(self, session: PeerSession, source: Source) -> PublisherReport:
-        exports, outbound = self._bridge.topics.exports, self._bridge.topics.outbound
-        local, flow = exports.seen.get(source), outbound.flows.get(source)
+        exports = self._bridge.topics.exports
+        local, flow = exports.seen.get(source), exports.flows.get(source)
         kind = local.type if local is not None else self._core.type_of(source.topic)
         decision = exports.decision(session.peer, source)
         if decision is None:  # it has just come, or cannot be reached
             decision = self._bridge.context.policy.judge(source.topic, kind, source.node)
-        sender, contract = outbound.sender_of(source, session.peer), exports.contract(source, session.peer)
-        reliable = contract is not None and contract.reliability is Reliability.RELIABLE
+        route = exports.routes(source).get(session.peer)
+        reliable = route is not None and route.number > 0 and route.reliable
         lost = self._core.unreachable().get(source.node) if flow is None or not flow.messages else None
         figures = {} if flow is None else {n: getattr(flow, n) for n in ("messages", "oversized", "oversized_bytes")}
         return PublisherReport(
@@ -377,9 +376,9 @@ class WhyService:
             crosses=decision.allowed,
             rule=decision.rule,
             offered=exports.offer(session.peer, source) is not None,
-            route="open" if session.peer in exports.flowing(source) else "opening" if contract is not None else "",
+            route="" if route is None or not route.number else "open" if route.flows else "opening",
             dropped=flow.dropped if flow is not None and not reliable else 0,
-            lost=sender.lost if sender is not None else 0,
+            lost=route.sender.lost if route is not None and route.sender is not None else 0,
             beyond=exports.limit if source in exports.beyond else 0,
             unreachable=f"{lost.api}: {lost.problem}" if lost is not None else "",
             **figures,
