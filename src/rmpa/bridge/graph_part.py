@@ -102,8 +102,6 @@ class GraphPart(Part, Effects):
         if self._scan_handle is not None:
             self._scan_handle.cancel()
 
-    # --- effects -------------------------------------------------------------------------------------------------
-
     def send(self, peer: int, message: Message) -> None:
         """As of ``Effects``."""
         session = self._shared.sessions.get(peer)
@@ -143,8 +141,6 @@ class GraphPart(Part, Effects):
     def now(self) -> float:
         """Monotonic seconds."""
         return asyncio.get_running_loop().time()
-
-    # --- peers ---------------------------------------------------------------------------------------------------
 
     def link_up(self, session: PeerSession) -> None:
         """Begin the advertisement to a peer, and wait for the peer's own."""
@@ -214,8 +210,6 @@ class GraphPart(Part, Effects):
             self.imports.take_in(session.peer, wire, offer, self.now())
             yield
 
-    # --- the local graph -----------------------------------------------------------------------------------------
-
     @abstractmethod
     def _look_at(self, name: str) -> None:
         """Take the present state of a name in the local graph."""
@@ -255,8 +249,6 @@ class GraphPart(Part, Effects):
         """Judge by new rules; entries and routes that they do not change go on untouched."""
         self._rejudging = chain(self.exports.reload(), self.imports.reload(self.now()))
         self.schedule()
-
-    # --- a slice of it -------------------------------------------------------------------------------------------
 
     def run(self, steps: Iterator[object]) -> None:
         """Take all items now; data is handled between any two."""

@@ -122,8 +122,6 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         self.beyond: dict[KeyT, None] = {}
         self.peers: dict[int, Told[KeyT, LocalT, OfferT]] = {}
 
-    # --- what an entry is ----------------------------------------------------------------------------------------
-
     @abstractmethod
     def judge(self, key: KeyT, local: LocalT) -> PolicyDecision:
         """Decide whether an entry may cross at all."""
@@ -179,8 +177,6 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         """How many entries are offered."""
         return self._out.context.limit(self.kind)
 
-    # --- entries -------------------------------------------------------------------------------------------------
-
     def put(self, key: KeyT, local: LocalT | None, *, again: bool = False) -> None:
         """Offer what the local graph has under a key, or keep it home; ``advertise`` tells peers what changes.
 
@@ -231,8 +227,6 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
             yield
         for told in self.peers.values():
             told.due |= dict.fromkeys(self.offered)
-
-    # --- peers ---------------------------------------------------------------------------------------------------
 
     def link_up(self, session: Peer) -> None:
         """Begin to tell a peer everything; ``advertise`` goes on with it."""

@@ -87,8 +87,6 @@ class Part:
     async def close(self) -> None:
         """Release everything; all sessions have ended, and the local core still answers."""
 
-    # --- sessions ----------------------------------------------------------------------------------------------
-
     def link_up(self, session: PeerSession) -> None:
         """A link is up, of a new peer or of one whose session waited (after ``link_down``)."""
 
@@ -124,8 +122,6 @@ class Part:
         """
         return False
 
-    # --- messages ----------------------------------------------------------------------------------------------
-
     def message(self, session: PeerSession, message: Message) -> bool:  # noqa: ARG002 - for those that override it
         """Handle a control message from a peer.
 
@@ -143,8 +139,6 @@ class Part:
         Raises:
             LimitExceeded: It is longer than ``limits.ADVERTISEMENT_MAX``; the link is closed.
         """
-
-    # --- the local graph ---------------------------------------------------------------------------------------
 
     def graph_changed(self, change: GraphChange) -> None:
         """Handle a registration in the local graph that was added, changed or removed."""
@@ -263,8 +257,6 @@ class PeerSessions:
         proxies = self._modules[instance, name] = PeerProxies(prefix, self._nodes, kill)
         return proxies
 
-    # --- links ---------------------------------------------------------------------------------------------------
-
     def link_up(self, link: PeerLink) -> None:
         """Attach a link to the session that waits for it, or begin a session.
 
@@ -353,8 +345,6 @@ class PeerSessions:
                 else:
                     self._outlasted(session, now)
 
-    # --- the end -------------------------------------------------------------------------------------------------
-
     def _end(self, session: PeerSession) -> None:
         """Ends a session for good: the rest of the peer is removed from the local graph."""
         session.state, session.wait = PeerState.AWAY, None
@@ -376,8 +366,6 @@ class PeerSessions:
             closing.start(proxies.close(), f"retract {proxies.prefix}")
         if closing:
             await asyncio.wait(closing)
-
-    # --- the rest ------------------------------------------------------------------------------------------------
 
     def lane_lost(self, link: PeerLink) -> None:
         """Notify the parts that a link lost its bulk lane, perhaps in the middle of a message."""

@@ -40,12 +40,13 @@ from rmpa.trust.permissions import TrustReason
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
-    from rmpa.bridge.bridge import Bridge, TwinWatch
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.services.bodies import LocalService
     from rmpa.bridge.services.books import RemoteService
     from rmpa.bridge.services.calls import CallStats
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.twins import TwinWatch
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Identity
     from rmpa.core.statistics import Counters

@@ -100,8 +100,6 @@ class Grants:
                 self._by_node.setdefault((want.name, want.node), []).append((peer, want.user, grant))
         return sorted(self._by_node.get((name, node), ()))
 
-    # --- what subclasses know ---------------------------------------------------------------------------------------
-
     def _unmet(self, session: PeerSession, asked: DirectAsk) -> Unmet | None:
         """The condition that does not hold for a peer by the rules and the graph."""
         raise NotImplementedError
@@ -115,8 +113,6 @@ class Grants:
 
     def _broke(self, want: Want) -> None:
         """A peer's user says that its connection ended by itself."""
-
-    # --- requests ---------------------------------------------------------------------------------------------------
 
     async def _ask(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         asked = read_ask(args)
@@ -190,8 +186,6 @@ class Grants:
     def _released(self, session: PeerSession, args: dict[str, Any]) -> None:
         self._set(session, read_ask(args), None)
 
-    # --- the bridge's part ------------------------------------------------------------------------------------------
-
     def judge_again(self, *, refused: bool = True) -> None:
         """Compare the answers with other rules: connections that are not allowed any more end, others ask again.
 
@@ -246,9 +240,6 @@ class Grants:
         if problem := end_all(connections(local_port=port, remote=(session.address, None))):
             text = "! %s: connections of local nodes to it may hang: they cannot be ended (%s)"
             _log.info(text, session.link.name, problem)
-
-
-# --- where this module's nodes listen -----------------------------------------------------------------------------
 
 
 class NodePorts:
@@ -323,9 +314,6 @@ def end_all(found: list[TcpSocket] | None) -> str:
     return ""
 
 
-# --- topics and services -------------------------------------------------------------------------------------------
-
-
 class TopicGrants(Grants):
     """The direct connections of peers' subscribers to local publishers.
 
@@ -366,8 +354,6 @@ class TopicGrants(Grants):
     def _interrupted(self, session: PeerSession, want: Want, *, lasts: bool) -> None:
         interrupted(self.interruptions, session.link.name, want, asyncio.get_running_loop().time(), lasts=lasts)
 
-    # --- the local graph --------------------------------------------------------------------------------------------
-
     def _changed(self, session: PeerSession, want: Want, *, granted: bool) -> None:
         """Have the proxy of a peer's subscriber stand in the graph while it has a grant for the topic."""
         if granted:
@@ -393,8 +379,6 @@ class TopicGrants(Grants):
             proxy = session.proxies.get(asked.user) if isinstance(found, Grant) else None
             if proxy is not None and proxy.name not in subscribers.get(asked.name, {}):
                 self._register(asked.name, proxy)
-
-    # --- conditions -------------------------------------------------------------------------------------------------
 
     def _uri(self, want: Want) -> str:
         """The slave API of a publisher now; the exports learn a new one a little later."""

@@ -98,8 +98,6 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
             if route.service == service
         ]
 
-    # --- the offers ----------------------------------------------------------------------------------------------
-
     def judge(self, key: str, local: LocalService) -> PolicyDecision:
         """Decide whether a service may cross at all."""
         if not (is_crossing_name(key) and is_crossing_name(local.node)):
@@ -125,8 +123,6 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
                 if why := gate.why_not(Access.CALL, told.session.name, route.service):
                     self._close(peer, number, why)
         return super().reload()
-
-    # --- links and calls -----------------------------------------------------------------------------------------
 
     def link_up(self, session: Peer) -> None:
         """As of ``OfferBook``; the peer has no service open."""
@@ -272,8 +268,6 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         """The peer's service that is in the local graph by this name."""
         return self._shown.get(service)
 
-    # --- links ---------------------------------------------------------------------------------------------------
-
     def link_down(self, peer: int) -> None:
         """Close the routes of a peer whose link is gone; its services stay in the graph until ``gone``."""
         if (known := self._peers.get(peer)) is not None:
@@ -299,8 +293,6 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         if not known.entries:
             del self._peers[peer]
             self._ways_changed(self.ways.unlinked(peer))
-
-    # --- what peers offer ----------------------------------------------------------------------------------------
 
     def _entry(self, peer: int, offer: ServiceOffer) -> RemoteService:
         name = self.name_here(peer, offer.service, offer.origin)
@@ -335,8 +327,6 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         del claims[entry]
         if not claims:
             del self._claims[entry.name]
-
-    # --- which is shown ------------------------------------------------------------------------------------------
 
     def local(self, service: str, node: str | None) -> None:
         """Set the node of this module that provides a service, ``None`` for none; it goes before the peers' ones."""
@@ -444,8 +434,6 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
             return permission.rule, DENIED
         crowd = self._crowd(remote)
         return crowd, CROWDED if crowd else ""
-
-    # --- calling -------------------------------------------------------------------------------------------------
 
     def want(self, remote: RemoteService, now: float) -> None:
         """Open a service that a local node wants to call, or whose type it wants to know.

@@ -129,8 +129,6 @@ class Services(GraphPart):
                     # The next call opens it again, with the new timeout in its request.
                     self.imports.release(shown.remote, "its timeout has changed")
 
-    # --- the bridge's part -------------------------------------------------------------------------------------
-
     def _settled(self) -> None:
         """As of ``GraphPart``; the servers of what is offered now are looked after."""
         self.serving.look_after()
@@ -219,8 +217,6 @@ class Services(GraphPart):
                 self.imports.release(shown.remote, "no node calls it")
         self.serving.close_idle(before)
 
-    # --- the local graph ---------------------------------------------------------------------------------------
-
     def _names(self) -> Iterable[str]:
         return (*self.exports.seen, *self._core.state().services)
 
@@ -244,8 +240,6 @@ class Services(GraphPart):
             if (origin := self._shared.relay.origin(service_place(service, node))) is not None:
                 return LocalService(node, uri, origin)
         return None
-
-    # --- peers' services here ----------------------------------------------------------------------------------
 
     def provide(self, remote: RemoteService) -> None:
         """Register a peer's service in the local graph, at the proxy of the node that provides it."""

@@ -59,9 +59,6 @@ _TWICE: Final = Unmet(
 )
 
 
-# --- what subscribers and the kernel are asked ---------------------------------------------------------------------
-
-
 async def publisher_update(uri: str, topic: str, publishers: Sequence[str]) -> bool:
     """Tell one node the publishers of a topic, as its master does; return whether it took them.
 
@@ -146,9 +143,6 @@ async def end_link(link: BusLink) -> str:
     return ""
 
 
-# --- the paths -----------------------------------------------------------------------------------------------------
-
-
 class TopicPaths(Paths["RemoteTopic"]):
     """Direct connections of local subscribers to nodes of peers.
 
@@ -175,8 +169,6 @@ class TopicPaths(Paths["RemoteTopic"]):
         self._kernel_tells = kernel_tells()
         self._left: set[str] = set()
         self._started = self._now()
-
-    # --- the local graph --------------------------------------------------------------------------------------------
 
     def reload(self) -> None:
         """Judge every subscriber by the new contracts."""
@@ -257,8 +249,6 @@ class TopicPaths(Paths["RemoteTopic"]):
         """The slave API of a path's subscriber; empty if it is not registered."""
         return self._shared.core.subscribers(path.want.name).get(path.want.user, "")
 
-    # --- what subscribers ask ---------------------------------------------------------------------------------------
-
     def request(self, peer: int, source: Source, subscriber: str) -> Awaitable[RosReply | None] | None:
         """Answer a subscriber's ``requestTopic`` at the proxy of a source; see ``PublicationEvents``."""
         want = Want(source.topic, source.node, subscriber)
@@ -302,8 +292,6 @@ class TopicPaths(Paths["RemoteTopic"]):
                 if path.unmet is _TWICE:
                     self.update(path)
 
-    # --- links ------------------------------------------------------------------------------------------------------
-
     def link_up(self, session: PeerSession) -> None:
         """As of ``Paths``."""
         for path in self._of_peer(session):
@@ -343,8 +331,6 @@ class TopicPaths(Paths["RemoteTopic"]):
         if publication is not None:
             publication.hang_up(path.want.user)
         return await self._end_direct(path)
-
-    # --- carrying out -----------------------------------------------------------------------------------------------
 
     async def _probe(self, path: TopicPath, grant: Grant) -> str:
         address, timeout = path.session.address, limits.DIRECT_PROBE_TIMEOUT
@@ -449,8 +435,6 @@ class TopicPaths(Paths["RemoteTopic"]):
             f"its connection is ended, and this agent may not do that ({problem}); see rmpa doctor"
         )
         self._on_warning("direct.stuck", f"{path.session.peer} {source} {user}", text)
-
-    # --- watching direct connections --------------------------------------------------------------------------------
 
     def _watch(self) -> None:
         """Begin to watch direct connections."""
