@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.agent.agent import Agent
-    from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.bridge.topics.import_route import RemoteTopic
     from rmpa.config.settings import Settings
     from rmpa.observe.snapshot import TopicInfo
 
@@ -41,7 +41,7 @@ def info(agent: Agent, topic: str) -> TopicInfo:
 
 def imported(agent: Agent, topic: str) -> RemoteTopic:
     """A topic of the other module."""
-    return next(entry for _, source, entry in agent.bridge.topics.imports if source.topic == topic)
+    return next(entry for entry in agent.bridge.topics.imports if entry.wire.topic == topic)
 
 
 async def test_topics_have_each_sides_names_both_ways(agents: tuple[Agent, Agent]) -> None:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.services.bodies import LocalService
     from rmpa.bridge.services.books import RemoteService
     from rmpa.bridge.topics.exports import LocalSource
-    from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.bridge.topics.import_route import RemoteTopic
     from rmpa.ros.wire.tcpros import ServiceDescription
 
 

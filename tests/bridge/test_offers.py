@@ -202,7 +202,7 @@ def imports(*, nodes: int = 100, topics: int = 100) -> Imports:
 
 
 def shown(made: Imports) -> set[str]:
-    return {source.node for _, source, entry in made if entry.shown}
+    return {entry.node for entry in made if entry.shown}
 
 
 def published(actions: list[Any]) -> list[str]:
@@ -309,7 +309,7 @@ def test_the_limits_hold_and_no_place_stays_empty(
         else:
             there.discard(offer.source)
             made.advertised(1, Advertise(removed=(offer.source,)))
-        known = {source: entry for _, source, entry in made}
+        known = {entry.wire: entry for entry in made}
         assert len(known) == min(topics, len(there))
         assert made.refused(1) == len(there) - len(known)
         standing = {source.node for source, entry in known.items() if entry.shown}

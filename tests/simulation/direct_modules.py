@@ -277,14 +277,14 @@ class SubscriberModule:
 
     # --- as Imports, and as a publication -------------------------------------------------------------------------
 
-    def __iter__(self) -> Iterator[tuple[int, Source, Any]]:
-        return iter([(self.here, source, entry) for source, entry in self.shown.items()])
+    def __iter__(self) -> Iterator[Any]:
+        return iter(list(self.shown.values()))
 
     def get(self, _peer: int, source: Source) -> Any:
         return self.shown.get(source)
 
-    def at(self, topic: str) -> list[tuple[int, Source]]:
-        return [(self.here, source) for source in sorted(self.shown) if source.topic == topic]
+    def at(self, topic: str) -> list[Any]:
+        return [self.shown[source] for source in sorted(self.shown) if source.topic == topic]
 
     def publication(self, source: Source) -> Any:
         """That of a source at its proxy; ``None`` if it is not shown."""

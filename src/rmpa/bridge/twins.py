@@ -137,15 +137,11 @@ class TwinWatch(Part):
         if not self._offered or not self._taken or self._is_decided(name):
             self._set(session, ())
             return
-        imports, rename = self._bridge.topics.imports, self._bridge.context.names.of(name).local_name
-        offers = imports.offered_by(peer)
+        offers, rename = self._bridge.topics.imports.offered_by(peer), self._bridge.context.names.of(name).local_name
         offered_there = frozenset(
             topic
             for topic in (self._offered | self._taken).intersection(offers)
-            if any(
-                (entry := imports.get(peer, source)) is not None and entry.shown and entry.origin is None
-                for source in offers[topic]
-            )
+            if any(entry.shown and entry.origin is None for entry in offers[topic])
         )
         if len(self._offered & offered_there) >= OFFERED_MIN:
             self._say(session)

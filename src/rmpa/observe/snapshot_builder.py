@@ -245,7 +245,7 @@ class SnapshotBuilder:
         ]
         shown = {
             (entry.origin.instance, entry.name)
-            for _, _, entry in yielding_to_data(list(imports))
+            for entry in yielding_to_data(list(imports))
             if entry.origin is not None and entry.shown
         }
         counts, known = Counter(instance for instance, _ in shown), {info.instance: info for info in infos}

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.peer import Peer
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
-    from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.bridge.topics.import_route import RemoteTopic
     from rmpa.ros.core.external import Core
 
 _DEFAULT = Contract()
@@ -138,10 +138,10 @@ class TopicFacts:
         state, topics = self._core.state(), self._bridge.topics
         idle: set[str] = set()
         first, problems = set(state.subscribers), set()
-        for _, source, entry in yielding_to_data(list(topics.imports)):
+        for entry in yielding_to_data(list(topics.imports)):
             if entry.state != "idle" or entry.direct:
                 first.add(entry.name)
-            elif not entry.shown or entry.problem or topics.mismatches.texts(source):
+            elif not entry.shown or entry.problem or topics.mismatches.texts(entry.wire):
                 problems.add(entry.name)
             else:
                 idle.add(entry.name)
@@ -162,18 +162,19 @@ class TopicFacts:
     def _incoming(self, wanted: Collection[str] | None) -> Iterator[tuple[str, RouteInfo, list[str]]]:
         """The topic of each source of a peer with its route, and its mismatches."""
         sessions = {session.peer: session for session in self._bridge.sessions}
-        for peer, source, entry in yielding_to_data(list(self._bridge.topics.imports)):
+        for entry in yielding_to_data(list(self._bridge.topics.imports)):
             if wanted is not None and entry.name not in wanted:
                 continue
             yield_to_data()
-            texts = [f"{sessions[peer].link.name}: {entry.hidden}"] if entry.cause == CONFLICT else []
-            texts += self._bridge.topics.mismatches.texts(source)
-            yield entry.name, self.incoming(sessions[peer], source, entry), texts
+            session = sessions[entry.peer]
+            texts = [f"{session.name}: {entry.hidden}"] if entry.cause == CONFLICT else []
+            texts += self._bridge.topics.mismatches.texts(entry.wire)
+            yield entry.name, self.incoming(session, entry), texts
 
-    def incoming(self, session: PeerSession, source: Source, entry: RemoteTopic) -> RouteInfo:
-        """The route of a peer's source; ``source`` has its wire name."""
+    def incoming(self, session: PeerSession, entry: RemoteTopic) -> RouteInfo:
+        """The route of a peer's source."""
         contracts, flow, publication = self._bridge.context.contracts, entry.flow, entry.publication
-        about, now = entry.description, self._clock.now()
+        source, about, now = entry.wire, entry.description, self._clock.now()
         latched = about.latching if about is not None else False
         proxies, node = self._bridge.sessions.proxies(session, source.node, entry.origin)
         problem = proxies.problems.get(node, "")

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 from rmpa.bridge.data.quality import QosEventKind
 from rmpa.bridge.proxies import PeerProxies, ProxyNodes
 from rmpa.bridge.sessions import PeerSession
-from rmpa.bridge.topics.import_route import ImportRoute
-from rmpa.bridge.topics.imports import RemoteTopic
+from rmpa.bridge.topics.import_route import ImportRoute, RemoteTopic
 from rmpa.core.statistics import Counters
 
 if TYPE_CHECKING:

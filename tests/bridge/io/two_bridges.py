@@ -83,7 +83,7 @@ class Side:
 
     def publications(self, topic: str) -> Iterator[Publication]:
         """What local nodes can connect to."""
-        for _, _, entry in self.bridge.topics.imports:
+        for entry in self.bridge.topics.imports:
             publication = entry.publication
             if publication is None or publication.topic != topic or entry.route is None:
                 continue
@@ -300,7 +300,7 @@ class World:
             assert not bridge.topics.joins._served
             assert not bridge.topics.outbound._parked
             assert not bridge.topics.imports.flowing
-            assert not any(entry.flow for _, _, entry in bridge.topics.imports)
+            assert not any(entry.flow for entry in bridge.topics.imports)
             for attached in side.attached:
                 assert not any(attached.link.routes), "but route 0, which every link has"
         for end in self._ends:

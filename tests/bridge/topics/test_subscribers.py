@@ -337,7 +337,8 @@ class Reports(Mismatches):
         exports = SimpleNamespace(
             offered=self.offered, local=lambda _peer, source: source if source in self.offered else None
         )
-        imports = SimpleNamespace(at=lambda topic: [(BASE, CMD)] if topic == CMD.topic else [], knows=lambda _: False)
+        entry = SimpleNamespace(peer=BASE, wire=CMD, node=CMD.node)
+        imports = SimpleNamespace(at=lambda topic: [entry] if topic == CMD.topic else [], knows=lambda _: False)
         out = SimpleNamespace(
             send=lambda peer, message: self.done.append(Send(peer, message)),
             warn=lambda *args: self.warnings.append(args[2]),

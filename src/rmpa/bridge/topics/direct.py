@@ -44,7 +44,8 @@ if TYPE_CHECKING:
     from rmpa.bridge.messages import Source
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
-    from rmpa.bridge.topics.imports import Imports, RemoteTopic
+    from rmpa.bridge.topics.import_route import RemoteTopic
+    from rmpa.bridge.topics.imports import Imports
     from rmpa.ros.wire.slave_api import BusLink
 
     TopicPath = Path[RemoteTopic]
@@ -172,18 +173,17 @@ class TopicPaths(Paths["RemoteTopic"]):
 
     def reload(self) -> None:
         """Judge every subscriber by the new contracts."""
-        for _, _, entry in yielding_to_data(list(self._imports)):
+        for entry in yielding_to_data(list(self._imports)):
             self.shown(entry)
 
     def graph_changed(self, change: GraphChange) -> None:
         """Judge a local subscriber that came, or forget one that went."""
         if change.kind is not RegistrationKind.SUBSCRIBER or is_own(change.node):
             return
-        for peer, source in list(self._imports.at(change.name)):
-            entry = self._imports.get(peer, source)
-            if change.added and entry is not None:
+        for entry in self._imports.at(change.name):
+            if change.added:
                 self._consider(entry, change.node, change.api)
-            path = self.get(peer, Want(source.topic, source.node, change.node))
+            path = self.get(entry.peer, Want(entry.wire.topic, entry.node, change.node))
             if not change.added and path is not None:
                 self.forget(path)  # it ends its connections itself
 

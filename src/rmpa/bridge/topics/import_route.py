@@ -1,9 +1,10 @@
-"""A peer's source in the local graph: the publication at its proxy, and the flow of its route."""
+"""A peer's source: as a peer offers it, and in the local graph, with its publication and the flow of its route."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from msgspec import UnsetType
@@ -11,7 +12,8 @@ from msgspec import UnsetType
 from rmpa.bridge import limits
 from rmpa.bridge.data.reception import ImportFlow
 from rmpa.bridge.messages import Source
-from rmpa.core.contract import Durability, Reliability
+from rmpa.bridge.peer_offers import Remote
+from rmpa.core.contract import Contract, Durability, Reliability
 from rmpa.core.identity import OWN_NODE, serial_add
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.node.publication import Publication, PublicationEvents
@@ -21,11 +23,11 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
     from rmpa.bridge.data.quality import QosEvent, QosWatch
-    from rmpa.bridge.messages import RouteOpened
+    from rmpa.bridge.messages import Description, RouteOpened
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
-    from rmpa.bridge.topics.imports import RemoteTopic
     from rmpa.bridge.topics.part import Topics
+    from rmpa.core.timers import Backoff
     from rmpa.ros.node.publication import Receiver, SubscriberConnection
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.xmlrpc import RosReply
@@ -35,6 +37,99 @@ _log = logging.getLogger(__name__)
 # What is remembered of the reliable sources of a module that had a flow and have none now, by topic here and node
 # there: the watch, for the next flow, and the topic while a local node listens, so that messages are missed.
 Pasts = dict[Source, tuple["QosWatch", str]]
+
+
+# What a source is, whichever peer offers it: the run and the name of its module, its node there, and its topic here.
+StreamKey = tuple[str, str, str, str]
+
+
+@dataclass(slots=True, eq=False, kw_only=True)
+class RemoteTopic(Remote[Source]):
+    """One source as one peer offers it, and the facts of its route over that peer's link.
+
+    Args:
+        module: The run and the name of the module that publishes it.
+        objection: Why it is not in the local graph, whichever others offer it, or empty.
+        hidden: Why it is not in the local graph: that, or who carries it; or empty.
+        wanted: Whether a local node listens.
+        number: The route's id while it is requested or open, else 0.
+        open: Whether the peer has opened the route.
+        until: When the present state is over, monotonic seconds; ``None``: it lasts. A source without route that is
+            wanted waits for the peer's next link then.
+        asked: The contract that was last requested.
+        contract: The contract of the last open route; ``None`` before the first one.
+        description: The header of the publisher, once known.
+        backoff: Delays between attempts to open a route, after the first one that failed.
+        direct: Whether a local node is connected to its publisher directly, and only the peer's agent has died.
+        route: The publication and the flow, while this peer carries the source; ``None``: another one does, or none.
+    """
+
+    type: str
+    module: tuple[str, str]
+    objection: str = ""
+    hidden: str = ""
+    wanted: bool = False
+    number: int = 0
+    open: bool = False
+    until: float | None = None
+    asked: Contract | None = None
+    contract: Contract | None = None
+    description: Description | None = None
+    backoff: Backoff | None = None
+    direct: bool = False
+    route: ImportRoute | None = None
+
+    @property
+    def publication(self) -> Publication | None:
+        """What local nodes subscribe to; ``None`` if that is not in the local graph, or not by this peer."""
+        return self.route.publication if self.route is not None else None
+
+    @property
+    def flow(self) -> ImportFlow | None:
+        """The flow of its open route, or the one that waits for its peer to come back."""
+        return self.route.flow if self.route is not None else None
+
+    @property
+    def past(self) -> Source:
+        """Its name here, and its node in its module: what is remembered when it is over."""
+        return Source(self.name, self.node if self.origin is None else self.origin.node)
+
+    @property
+    def key(self) -> StreamKey:
+        """What it is, whichever peer offers it."""
+        return *self.module, self.node if self.origin is None else self.origin.node, self.name
+
+    @property
+    def state(self) -> str:
+        """The state of the route, as in the figure above."""
+        if not self.number:
+            return "waiting" if self.wanted else "idle"
+        if not self.open:
+            return "opening"
+        return "open" if self.wanted else "lingering"
+
+    @property
+    def reliable(self) -> bool:
+        """Whether no message is to be lost, as far as its contract is known."""
+        return self.contract is not None and self.contract.reliability is Reliability.RELIABLE
+
+    @property
+    def outage(self) -> float:
+        """For how many seconds it outlives its link: the contract's outage, or the default if it is not reliable."""
+        return (self.contract if self.contract is not None and self.reliable else Contract()).resume_window
+
+    def outlives(self, *, silent: bool) -> bool:
+        """Whether the source stays in the local graph when its peer's link is gone.
+
+        Only a source with a listener does. A reliable one stays, so that no message is lost. A latched one stays if
+        the link fell silent (``silent``): its subscribers stay connected and do not get the same message again when
+        the peer is back, and new subscribers get it meanwhile. A source with direct subscribers stays if only its
+        agent has died: its messages go on.
+        """
+        if self.direct or not self.wanted:
+            return self.direct
+        latching = self.description is not None and self.description.latching
+        return self.reliable or (silent and latching)
 
 
 class ImportRoute(PublicationEvents):

@@ -20,7 +20,6 @@ from __future__ import annotations
 import itertools
 import math
 import sys
-from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import TYPE_CHECKING
 
@@ -29,7 +28,6 @@ from msgspec import UnsetType
 from rmpa.bridge import limits
 from rmpa.bridge.messages import (
     CloseRoute,
-    Description,
     Mismatch,
     OpenRoute,
     RouteClosed,
@@ -38,10 +36,10 @@ from rmpa.bridge.messages import (
     TopicOffer,
     is_crossing_name,
 )
-from rmpa.bridge.peer_offers import CONFLICT, CROWDED, DENIED, ImportBook, Remote
+from rmpa.bridge.peer_offers import CONFLICT, CROWDED, DENIED, ImportBook
+from rmpa.bridge.topics.import_route import RemoteTopic
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
-from rmpa.core.contract import Contract, Reliability
 from rmpa.core.timers import Backoff
 from rmpa.mesh import limits as mesh_limits
 
@@ -49,102 +47,8 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from rmpa.bridge.data.reception import ImportFlow
-    from rmpa.bridge.topics.import_route import ImportRoute
+    from rmpa.bridge.topics.import_route import StreamKey
     from rmpa.bridge.topics.part import Topics
-    from rmpa.ros.node.publication import Publication
-
-
-# What a source is, whichever peer offers it: the run and the name of its module, its node there, and its topic here.
-StreamKey = tuple[str, str, str, str]
-
-
-@dataclass(slots=True, eq=False, kw_only=True)
-class RemoteTopic(Remote[Source]):
-    """One source as one peer offers it, and the facts of its route over that peer's link.
-
-    Args:
-        module: The run and the name of the module that publishes it.
-        objection: Why it is not in the local graph, whichever others offer it, or empty.
-        hidden: Why it is not in the local graph: that, or who carries it; or empty.
-        wanted: Whether a local node listens.
-        number: The route's id while it is requested or open, else 0.
-        open: Whether the peer has opened the route.
-        until: When the present state is over, monotonic seconds; ``None``: it lasts. A source without route that is
-            wanted waits for the peer's next link then.
-        asked: The contract that was last requested.
-        contract: The contract of the last open route; ``None`` before the first one.
-        description: The header of the publisher, once known.
-        backoff: Delays between attempts to open a route, after the first one that failed.
-        direct: Whether a local node is connected to its publisher directly, and only the peer's agent has died.
-        route: The publication and the flow, while this peer carries the source; ``None``: another one does, or none.
-    """
-
-    type: str
-    module: tuple[str, str]
-    objection: str = ""
-    hidden: str = ""
-    wanted: bool = False
-    number: int = 0
-    open: bool = False
-    until: float | None = None
-    asked: Contract | None = None
-    contract: Contract | None = None
-    description: Description | None = None
-    backoff: Backoff | None = None
-    direct: bool = False
-    route: ImportRoute | None = None
-
-    @property
-    def publication(self) -> Publication | None:
-        """What local nodes subscribe to; ``None`` if that is not in the local graph, or not by this peer."""
-        return self.route.publication if self.route is not None else None
-
-    @property
-    def flow(self) -> ImportFlow | None:
-        """The flow of its open route, or the one that waits for its peer to come back."""
-        return self.route.flow if self.route is not None else None
-
-    @property
-    def past(self) -> Source:
-        """Its name here, and its node in its module: what is remembered when it is over."""
-        return Source(self.name, self.node if self.origin is None else self.origin.node)
-
-    @property
-    def key(self) -> StreamKey:
-        """What it is, whichever peer offers it."""
-        return *self.module, self.node if self.origin is None else self.origin.node, self.name
-
-    @property
-    def state(self) -> str:
-        """The state of the route, as in the figure above."""
-        if not self.number:
-            return "waiting" if self.wanted else "idle"
-        if not self.open:
-            return "opening"
-        return "open" if self.wanted else "lingering"
-
-    @property
-    def reliable(self) -> bool:
-        """Whether no message is to be lost, as far as its contract is known."""
-        return self.contract is not None and self.contract.reliability is Reliability.RELIABLE
-
-    @property
-    def outage(self) -> float:
-        """For how many seconds it outlives its link: the contract's outage, or the default if it is not reliable."""
-        return (self.contract if self.contract is not None and self.reliable else Contract()).resume_window
-
-    def outlives(self, *, silent: bool) -> bool:
-        """Whether the source stays in the local graph when its peer's link is gone.
-
-        Only a source with a listener does. A reliable one stays, so that no message is lost. A latched one stays if
-        the link fell silent (``silent``): its subscribers stay connected and do not get the same message again when
-        the peer is back, and new subscribers get it meanwhile. A source with direct subscribers stays if only its
-        agent has died: its messages go on.
-        """
-        if self.direct or not self.wanted:
-            return self.direct
-        latching = self.description is not None and self.description.latching
-        return self.reliable or (silent and latching)
 
 
 class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
@@ -161,17 +65,15 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
 
     def __init__(self, out: Topics) -> None:
         super().__init__(out)
-        self._topics: dict[int, dict[str, dict[Source, None]]] = {}
+        self._topics: dict[int, dict[str, dict[RemoteTopic, None]]] = {}
         self._ways: dict[StreamKey, dict[RemoteTopic, None]] = {}
         self._local_types: dict[str, str] = {}
         self._timers: list[tuple[float, int, RemoteTopic]] = []
         self._serials = itertools.count()
 
-    def __iter__(self) -> Iterator[tuple[int, Source, RemoteTopic]]:
-        """Every known source with its peer; changes during the iteration may be missed."""
-        for peer, known in list(self._peers.items()):
-            for source, entry in list(known.entries.items()):
-                yield peer, source, entry
+    def __iter__(self) -> Iterator[RemoteTopic]:
+        """Every source as a peer offers it; changes during the iteration may be missed."""
+        return iter([entry for known in self._peers.values() for entry in known.entries.values()])
 
     def get(self, peer: int, source: Source) -> RemoteTopic | None:
         """One known source."""
@@ -185,11 +87,11 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         """Whether any peer offers a source."""
         return any(source in known.entries for known in self._peers.values())
 
-    def at(self, topic: str) -> Iterator[tuple[int, Source]]:
-        """The sources that peers offer for a local topic, each with its peer."""
-        return ((peer, source) for peer, topics in self._topics.items() for source in topics.get(topic, ()))
+    def at(self, topic: str) -> list[RemoteTopic]:
+        """The sources that peers offer for a local topic."""
+        return [entry for topics in self._topics.values() for entry in topics.get(topic, ())]
 
-    def offered_by(self, peer: int) -> Mapping[str, Collection[Source]]:
+    def offered_by(self, peer: int) -> Mapping[str, Collection[RemoteTopic]]:
         """The topics that a peer offers, by their local names, each with its sources."""
         return self._topics.get(peer, {})
 
@@ -267,8 +169,8 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         for entry in known.entries.values() if known is not None else ():
             self._forget_way(entry)
         self._ways_changed(self.ways.unlinked(peer))
-        for other, source in list(self.at(CLOCK)):
-            self._judge_at(other, source)
+        for other in self.at(CLOCK):
+            self._judge(other)
         return known.entries if known is not None else {}
 
     def _entry(self, peer: int, offer: TopicOffer) -> RemoteTopic:
@@ -295,7 +197,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             self._retract(entry)
 
     def _list(self, entry: RemoteTopic) -> None:
-        self._topics.setdefault(entry.peer, {}).setdefault(entry.name, {})[entry.wire] = None
+        self._topics.setdefault(entry.peer, {}).setdefault(entry.name, {})[entry] = None
         self._ways.setdefault(entry.key, {})[entry] = None
 
     def _forget_way(self, entry: RemoteTopic) -> None:
@@ -307,7 +209,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     def _unlist(self, entry: RemoteTopic) -> None:
         self._forget_way(entry)
         topics = self._topics[entry.peer]
-        del topics[entry.name][entry.wire]
+        del topics[entry.name][entry]
         if not topics[entry.name]:
             del topics[entry.name]
 
@@ -322,14 +224,14 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             del self._local_types[topic]
         else:
             self._local_types[topic] = type_name
-        for peer, source in list(self.at(topic)):
-            self._judge_at(peer, source)
+        for entry in self.at(topic):
+            self._judge(entry)
 
     def reload(self, now: float) -> Iterator[None]:
         """Judge by new rules, a source with each item; what they do not change goes on untouched."""
         # Shown ones first: what another relay brings from now on has the same proxies.
-        for peer, source, _ in sorted(self, key=lambda one: not one[2].shown):
-            if (entry := self.get(peer, source)) is not None:
+        for entry in sorted(self, key=lambda one: not one.shown):
+            if self.get(entry.peer, entry.wire) is entry:
                 self._rejudge(entry, now)
             yield
         for peer, known in list(self._peers.items()):
@@ -349,10 +251,6 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         if entry.number and not (entry.asked is not None and entry.asked.same_route(contract)):
             self._close(entry, missed=entry.wanted)
             self.follow(entry, now)
-
-    def _judge_at(self, peer: int, source: Source) -> None:
-        if (entry := self.get(peer, source)) is not None:
-            self._judge(entry)
 
     def _judge(self, entry: RemoteTopic) -> None:
         known, before = self._peers[entry.peer], entry.cause
@@ -399,9 +297,8 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     def _why_kept_out(self, entry: RemoteTopic) -> str:
         """Why rules or another source of its node keep a source out, or empty."""
         policy, origin, topic = self._out.context.policy, entry.origin, entry.name
-        known = self._peers[entry.peer]
         decision = policy.judge(topic, entry.type, entry.node if origin is None else origin.node)
-        peer = known.session.name
+        peer = self.peer_name(entry.peer)
         for name in (peer,) if origin is None else (peer, origin.name):
             if decision.allowed:
                 decision = policy.judge_for(name, topic, entry.type, entry.wire.topic)
@@ -410,8 +307,8 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         if not is_crossing_name(topic):
             return f"its name here would be {topic}, which is too long"
         for other in self._topics[entry.peer][topic]:
-            if other.node == entry.node and other != entry.wire and known.entries[other].shown:
-                return f"it would be {topic} here, as {other.topic} of this node is already; rename one"
+            if other.node == entry.node and other is not entry and other.shown:
+                return f"it would be {topic} here, as {other.wire.topic} of this node is already; rename one"
         return ""
 
     def _why_no_time(self, entry: RemoteTopic) -> tuple[str, bool]:
@@ -426,11 +323,10 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             return decision.rule, False
         if CLOCK in self._local_types:
             return "a node of this module publishes /clock, and time has one source: end that one", True
-        for peer, source in self.at(CLOCK):
-            other = self._peers[peer].entries[source]
+        for other in self.at(CLOCK):
             if other.shown and other is not entry:
-                name = self.peer_name(peer)
-                return f"time comes from {source.node} of {name} already, and has one source", True
+                name = self.peer_name(other.peer)
+                return f"time comes from {other.node} of {name} already, and has one source", True
         return "", False
 
     def _choose(self, entry: RemoteTopic) -> None:
@@ -502,12 +398,12 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         """Show what could not stand beside an entry that is shown no more."""
         known = self._peers[entry.peer]
         if entry.name == CLOCK:
-            behind = [(peer, source) for peer, source in self.at(CLOCK) if (peer, source) != (entry.peer, entry.wire)]
+            behind = self.at(CLOCK)
         else:
-            same = self._topics.get(entry.peer, {}).get(entry.name, ())
-            behind = [(entry.peer, s) for s in same if s.node == entry.node and s != entry.wire]
-        for peer, source in behind:
-            self._judge_at(peer, source)
+            behind = [s for s in self._topics.get(entry.peer, {}).get(entry.name, ()) if s.node == entry.node]
+        for other in behind:
+            if other is not entry and self.get(other.peer, other.wire) is other:
+                self._judge(other)
         for waiting in known.admitted(self._out.context.settings.limits.nodes):
             self._judge(waiting)
 

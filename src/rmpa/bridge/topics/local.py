@@ -42,7 +42,8 @@ if TYPE_CHECKING:
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports
-    from rmpa.bridge.topics.imports import Imports, RemoteTopic
+    from rmpa.bridge.topics.import_route import RemoteTopic
+    from rmpa.bridge.topics.imports import Imports
     from rmpa.bridge.topics.part import Topics
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.publication import Publication

@@ -40,8 +40,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.policy import Place
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
-    from rmpa.bridge.topics.import_route import Pasts
-    from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.bridge.topics.import_route import Pasts, RemoteTopic
     from rmpa.ros.node.publication import Publication
 
 _log = logging.getLogger(__name__)
@@ -246,7 +245,7 @@ class Topics(GraphPart):
                 if all(map(is_own, state.subscribers.get(missed_at, ()))):
                     pasts[source] = watch, ""
         self.direct_exports.reconcile(state.subscribers)
-        for _, _, entry in yielding_to_data(list(self.imports)) if compared else ():
+        for entry in yielding_to_data(list(self.imports)) if compared else ():
             if (route := entry.route) is not None and route.is_missing(state.publishers):
                 route.register()
 

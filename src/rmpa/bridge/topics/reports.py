@@ -83,9 +83,9 @@ class Mismatches:
 
     def registration_changed(self, topic: str, subscriber: str) -> None:
         """A local subscriber has gone or has registered again: forget its mismatch, here and at the peers."""
-        for peer, source in list(self._imports.at(topic)) if self._texts else ():
-            if self._texts.get(source, {}).pop(subscriber, None) is not None:
-                self._out.send(peer, Mismatch(source.topic, source.node, subscriber, ""))
+        for entry in self._imports.at(topic) if self._texts else ():
+            if self._texts.get(entry.wire, {}).pop(subscriber, None) is not None:
+                self._out.send(entry.peer, Mismatch(entry.wire.topic, entry.node, subscriber, ""))
 
     def peer_gone(self, name: str) -> None:
         """Forget all subscribers at a peer that is gone."""

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.bridge.topics.import_route import RemoteTopic
     from rmpa.observe.operations import SiteRequests
     from rmpa.observe.peer_info import PeerInfo
     from rmpa.observe.snapshot import Snapshot
@@ -260,24 +260,23 @@ class WhyService:
         topics, facts = self._bridge.topics, self._snapshots.topics
         publishers = self._core.publishers(topic)
         facts.follow_clocks()
-        for number, source in list(topics.imports.at(topic)):
-            entry = topics.imports.get(number, source)
-            if number != session.peer or entry is None or _instance(session, entry.origin) != peer.instance:
+        for entry in topics.imports.at(topic):
+            if entry.peer != session.peer or _instance(session, entry.origin) != peer.instance:
                 continue
-            node, publication = source.node, entry.publication
+            node, publication = entry.node, entry.publication
             proxies, owner = self._bridge.sessions.proxies(session, node, entry.origin)
             name, proxy = proxies.name(owner), proxies.get(owner)
             links = publication.connections() if publication is not None else ()
             yield (
                 node,
                 Arrival(
-                    route=facts.incoming(session, source, entry),
+                    route=facts.incoming(session, entry),
                     proxy=name,
                     registered=proxy is not None and publishers.get(name) == proxy.uri,
                     cause=entry.cause,
                     permission=self._permission(session.link.name, entry),
                     readers={at.number: (printable(at.other), at.waiting, at.dropped) for at in links},
-                    mismatches=topics.mismatches.texts(source),
+                    mismatches=topics.mismatches.texts(entry.wire),
                 ),
             )
 

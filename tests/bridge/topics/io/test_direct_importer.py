@@ -41,14 +41,14 @@ class Imports:
     def __init__(self, module: Module) -> None:
         self._module = module
 
-    def __iter__(self) -> Iterator[tuple[int, Source, Any]]:
-        yield 1, SOURCE, self._module.entry
+    def __iter__(self) -> Iterator[Any]:
+        yield self._module.entry
 
     def get(self, *_: object) -> Any:
         return self._module.entry
 
-    def at(self, _topic: str) -> list[tuple[int, Source]]:
-        return [(1, SOURCE)]
+    def at(self, _topic: str) -> list[Any]:
+        return [self._module.entry] if self._module.entry is not None else []
 
 
 class Module:
