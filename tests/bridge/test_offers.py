@@ -356,8 +356,8 @@ def test_after_reloads_no_place_is_empty_and_the_rest_is_counted(first: list[Top
             message = Advertise(added=(offer,)) if comes else Advertise(removed=(offer.source,))
             made.advertised(1, message)
     assert len(list(islice(under_way, 100))) < 100
-    allowed = {source for _, source, _ in made if source.node not in {f"/n{node}" for node in denied}}
-    visible = {source for _, source, entry in made if entry.shown}
+    allowed = {entry.wire for entry in made if entry.node not in {f"/n{node}" for node in denied}}
+    visible = {entry.wire for entry in made if entry.shown}
     standing = shown(made)
     assert len(standing) >= min(limit, len({source.node for source in allowed}))
     assert visible == {source for source in allowed if source.node in standing}
