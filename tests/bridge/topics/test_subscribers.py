@@ -248,39 +248,63 @@ SOURCE_NAMES = ("/chatter", "/talker")
 SUBSCRIBER = "http://talker:1/"
 
 
+class Subscribed:
+    """A module that sends ``/chatter`` to one peer, over a link that is only noted."""
+
+    def __init__(self) -> None:
+        self.publications = [Publication("/chatter", "/talker", STRING)]
+        self.link, self.out = Link(), cast("Any", Out(context()))
+        self.exports = topic_exports.Exports(self.out)
+        shared: Any = SimpleNamespace(
+            core=SimpleNamespace(call=lambda *_: None, suspect=lambda _: None),
+            node=SimpleNamespace(uri="http://agent:1/", next_number=lambda: 1),
+            rng=lambda: 0.5,
+            sessions={1: SimpleNamespace(link=self.link, linked=False)},
+        )
+        losses = SimpleNamespace(tell_oversized=lambda *_: None)
+        topics: Any = SimpleNamespace(exports=self.exports, losses=losses, look=lambda _: None)
+        self.out.outbound = LocalSubscriptions(shared, topics, lambda *_: self.publications[-1])
+
+    async def flows(self) -> None:
+        """It flows on route 7."""
+        self.exports.put(SOURCE, LocalSource("std_msgs/String", SUBSCRIBER))
+        self.exports.link_up(Peer(peer=1))
+        self.exports.opened(1, OpenRoute(7, *SOURCE_NAMES))
+        await until(lambda: self.exports.senders(1))
+
+    async def ends(self) -> None:
+        """Its publisher ends, and what it has sent is waited for."""
+        self.publications[0].withdraw()
+        await until(lambda: self.link.fences)
+
+
 async def test_a_route_that_is_opened_while_the_end_of_the_last_one_is_told_has_data() -> None:
     """The peer that waited for this one may open it while the end of the last one is told."""
-    publications = [Publication("/chatter", "/talker", STRING)]
-    core = SimpleNamespace(call=lambda *_: None, suspect=lambda _: None)
-    node = SimpleNamespace(uri="http://agent:1/", next_number=lambda: 1)
-    link = Link()
-    session = SimpleNamespace(link=link, linked=False)
-    out: Any = Out(context())
-    exports = topic_exports.Exports(out)
-    topics = SimpleNamespace(
-        exports=exports, losses=SimpleNamespace(tell_oversized=lambda *_: None), look=lambda _: 0
-    )
-    shared: Any = SimpleNamespace(core=core, node=node, rng=lambda: 0.5, sessions={1: session})
-    subscriptions = LocalSubscriptions(shared, cast("Any", topics), lambda *_: publications[-1])
-    out.outbound = subscriptions
+    scene = Subscribed()
+    exports = scene.exports
 
     def send(peer: int, message: object) -> None:
         if isinstance(message, RouteClosed):
-            publications.append(Publication("/chatter", "/talker", STRING))
+            scene.publications.append(Publication("/chatter", "/talker", STRING))
             exports.opened(peer, OpenRoute(8, *SOURCE_NAMES))
 
-    out.send = send
-    exports.put(SOURCE, LocalSource("std_msgs/String", SUBSCRIBER))
-    exports.link_up(Peer(peer=1))
-    exports.opened(1, OpenRoute(7, *SOURCE_NAMES))
-    await until(lambda: exports.senders(1))
-    publications[0].withdraw()
-    await until(lambda: link.fences)
-    exports.senders(1)[0].fenced(link.fences.popleft()[1])
+    scene.out.send = send
+    await scene.flows()
+    await scene.ends()
+    exports.senders(1)[0].fenced(scene.link.fences.popleft()[1])
     await until(lambda: exports.route(1, 8) is not None and exports.senders(1))
     assert [sender.route for sender in exports.senders(1)] == [8]
     exports.closed(1, CloseRoute(8))
-    subscriptions.close()
+    scene.out.outbound.close()
+
+
+async def test_a_peer_may_close_the_last_route_while_the_end_of_its_publisher_is_waited_for() -> None:
+    scene = Subscribed()
+    await scene.flows()
+    await scene.ends()
+    scene.exports.closed(1, CloseRoute(7))
+    assert not scene.exports.flows
+    scene.out.outbound.close()
 
 
 @pytest.mark.parametrize(

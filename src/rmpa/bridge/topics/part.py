@@ -317,7 +317,7 @@ class Topics(GraphPart):
             missed: Local nodes still listen, so they miss what is published before a route is open again.
             last: If the publisher has gone: the sequence of its last message.
         """
-        if (session := self._shared.sessions.get(entry.peer)) is not None:
+        if entry.number and (session := self._shared.sessions.get(entry.peer)) is not None:
             session.link.routes.pop(entry.number, None)
         if not keep and entry.route is not None:
             entry.route.detach(missed=missed, last=last)
