@@ -2,8 +2,8 @@
 
 ``topics.exports`` and ``topics.imports`` decide; this part and its routes carry out what they decide. A message::
 
-    publisher → ExportFlow (of a LocalSubscription) → RouteSender ⇢ link
-         link ⇢ ImportFlow → Publication (of an ImportRoute) → subscribers
+    publisher → ExportFlow → RouteSender (of each ExportRoute) ⇢ link
+         link ⇢ ImportFlow → Publication (of its ImportRoute) → subscribers
 """
 
 from __future__ import annotations
