@@ -127,7 +127,7 @@ async def test_data_crosses_only_with_a_subscriber_and_once_for_many(settings: C
                     async for received in subscriber:
                         assert received.message.data == "x"
                         break
-            [flow] = a.bridge.topics.outbound.flows.values()
+            [flow] = a.bridge.topics.exports.flows.values()
             assert flow.messages == 1
         await until(lambda: publisher.subscribers == 0)
 

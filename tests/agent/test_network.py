@@ -342,9 +342,7 @@ async def test_what_flows_is_not_withdrawn(settings: Callable[..., Settings], re
     async with running(settings("a"), settings("b")) as (a, b), registered_by_name(a), node("hearer", b) as hearer:
         subscriber = await hearer.subscribe("/image", "std_msgs/String")
         await until(lambda: subscriber.publishers)
-        await until(
-            lambda: any(a.bridge.topics.exports.flowing(source) for source in a.bridge.topics.exports.offered)
-        )
+        await until(lambda: any(flow.flowing for flow in a.bridge.topics.exports.flows.values()))
         resolver.knows = False
         await until(lambda: a.core.unreachable() and a.core.unreachable()["/cam"].withdrawn)
         before = resolver.asked

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+from collections import deque
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
 from rmpa.bridge.context import BridgeContext, Names, ServiceRules
-from rmpa.bridge.data.route import RouteBegin
+from rmpa.bridge.data.export import ExportFlow
 from rmpa.bridge.messages import Source
-from rmpa.bridge.offers import Effects
+from rmpa.bridge.peer import Peer, PeerState
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
 from rmpa.bridge.services import books
 from rmpa.bridge.topics import exports as topic_exports
@@ -19,13 +21,15 @@ from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, Contracts
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Collection, Iterator
 
+    from rmpa.bridge.data.export import ExportRoute
+    from rmpa.bridge.data.route import RouteBegin
     from rmpa.bridge.messages import Description, Message, Origin, RouteOpened
     from rmpa.bridge.services.bodies import LocalService
     from rmpa.bridge.services.books import RemoteService
-    from rmpa.bridge.topics.exports import ExportRoute, LocalSource
-    from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.bridge.topics.exports import LocalSource
+    from rmpa.bridge.topics.import_route import RemoteTopic
     from rmpa.ros.wire.tcpros import ServiceDescription
 
 
@@ -173,7 +177,7 @@ class ForgetAbout(NamedTuple):
 
 
 def _detached(entry: RemoteTopic, **how: Any) -> Detach:
-    return Detach(entry.peer, entry.wire, entry.route, **how)
+    return Detach(entry.peer, entry.wire, entry.number, **how)
 
 
 def _described(entry: RemoteTopic, opened: RouteOpened) -> Describe:
@@ -184,13 +188,8 @@ def _described(entry: RemoteTopic, opened: RouteOpened) -> Describe:
 _EFFECTS: Final[dict[str, Callable[..., Any]]] = {
     "send": Send,
     "warn": Warn,
-    "connect": Connect,
-    "disconnect": Disconnect,
-    "add_route": lambda s, peer, r, b: AddRoute(
-        s, peer, r.number, r.contract, b.epoch, r.position[1] if r.position is not None and b.goes_on else None
-    ),
-    "remove_route": RemoveRoute,
-    "suspend_route": SuspendRoute,
+    "disconnect": lambda source, _flow: Disconnect(source),
+    "suspend": lambda r: SuspendRoute(r.source, r.peer, r.outage),
     "publish": lambda e: Publish(e.peer, e.wire, e.type, e.name if e.name != e.wire.topic else "", e.origin),
     "retract": lambda e: Retract(e.peer, e.wire),
     "moved": lambda old, new: Moved(old.peer, old.wire, new.peer, new.wire, new.origin),
@@ -210,7 +209,7 @@ _EFFECTS: Final[dict[str, Callable[..., Any]]] = {
 """What is written down of each effect."""
 
 
-class Out(Effects):
+class Out:
     """What a part of the bridge does for its exports and imports."""
 
     def __init__(
@@ -218,46 +217,44 @@ class Out(Effects):
         context: BridgeContext,
         rng: Callable[[], float] = lambda: 1.0,
         position: Callable[[int, Source], tuple[int, int] | None] = lambda *_: None,
-        numbering: Callable[[Source, int], Any] = lambda *_: None,
+        last: int | None = None,
     ) -> None:
-        self.rules = context
+        self.context = context
         self.rng = rng
-        self._numbering = numbering
         self.outbound = self.serving = self
         self.direct_exports = SimpleNamespace(server_gone=lambda _: None)
         self.done: list[Any] = []
-        self.epochs: dict[Source, int] = {}
+        self._epochs = itertools.count(1)
+        self._last = last
         self._position = position
 
-    @property
-    def context(self) -> BridgeContext:
-        return self.rules
+    def connect(self, source: Source, uri: str) -> ExportFlow:
+        self.done.append(Connect(source, uri))
+        return ExportFlow(uri, lambda: next(self._epochs))
 
-    def last(self, source: Source, peer: int) -> int | None:
-        numbering = self._numbering(source, peer)
-        return numbering.last if numbering is not None else None
+    def begin(self, _flow: ExportFlow, route: ExportRoute, begin: RouteBegin) -> None:
+        after = route.position[1] if route.position is not None and begin.goes_on else None
+        self.done.append(AddRoute(route.source, route.peer, route.number, route.contract, begin.epoch, after))
+        contract, last = route.contract, self._last
+        route.sender = cast("Any", SimpleNamespace(epoch=begin.epoch, contract=contract, following=0, last=last))
 
-    def begins(self, source: Source, peer: int, route: ExportRoute) -> RouteBegin:
-        """Each source has one numbering, which begins when it is connected; suspended senders say where they are."""
-        numbering = self._numbering(source, peer)
-        epoch = self.epochs.setdefault(source, len(self.epochs) + 1)
-        if route.position is None or route.position[0] != epoch:
-            return RouteBegin(epoch, 1)
-        following = numbering.following if numbering is not None else 0
-        return RouteBegin(epoch, max(following, route.position[1] + 1), goes_on=True)
+    def end(self, _flow: ExportFlow, route: ExportRoute) -> None:
+        self.done.append(RemoveRoute(route.source, route.peer, route.number))
+        route.sender = None
 
     def take(self) -> list[Any]:
         """What was done since the last call."""
         done, self.done = self.done, []
         return done
 
+    def arm_timer(self) -> None:
+        """Tests ask for the time."""
+
     def position(self, entry: RemoteTopic) -> tuple[int, int] | None:
         return self._position(entry.peer, entry.wire)
 
-    def __getattribute__(self, name: str) -> Any:
-        effect = _EFFECTS.get(name)
-        if effect is None:
-            return super().__getattribute__(name)
+    def __getattr__(self, name: str) -> Any:
+        effect = _EFFECTS[name]
         return lambda *args, **how: self.done.append(effect(*args, **how))
 
 
@@ -285,11 +282,11 @@ def context(
     return BridgeContext(settings, policy, rules, names, contracts or Contracts(), gate)
 
 
-_STEPS: Final = {"advertise", "link_away", "link_down", "reload", "gone"}
+_STEPS: Final = {"advertise", "link_away", "reload", "gone"}
 """Methods whose work is done as their items are taken; in some books they do it at once."""
 
 
-_QUESTIONS: Final = {"get", "next_timer", "offer", "contract", "description", "source", "shown", "decision"}
+_QUESTIONS: Final = {"get", "next_timer", "offer", "contract", "description", "route", "routes", "shown", "decision"}
 """Methods that may answer ``None``."""
 
 
@@ -297,10 +294,12 @@ class Recorded:
     """A book whose methods return what was done by them; questions are answered."""
 
     questions = _QUESTIONS
+    forgets = "link_down"
 
     def __init__(self, book: Any, out: Out) -> None:
         self.book = book
         self.out = out
+        self.known: dict[int, Peer] = {}
 
     def __iter__(self) -> Iterator[Any]:
         return iter(self.book)
@@ -320,6 +319,26 @@ class Recorded:
 
         return call
 
+    def link_up(self, peer: int, name: str = "", instance: str = "", rank: int = 0) -> list[Any]:
+        """A peer has a link."""
+        known = self.known.setdefault(peer, Peer(peer=peer, name=name, instance=instance))
+        known.name, known.instance, known.rank = name, instance, rank
+        known.state, known.silent = PeerState.LINKED, False
+        self.book.link_up(known)
+        return self.out.take()
+
+    def link_down(self, peer: int) -> list[Any]:
+        """A peer has no link any more."""
+        self.gone_away(peer)
+        if self.forgets == "gone":
+            self.known.pop(peer, None)
+        deque(getattr(self.book, self.forgets)(peer) or (), 0)
+        return self.out.take()
+
+    def gone_away(self, peer: int, *, silent: bool = False) -> None:
+        if (known := self.known.get(peer)) is not None:
+            known.state, known.silent = PeerState.AWAY, known.silent or silent
+
     def entry(self, peer: int, what: Any) -> Any:
         """An entry that is there."""
         found = self.book.get(peer, what)
@@ -334,7 +353,7 @@ class Recorded:
 
     def rejudge(self, rules: BridgeContext, *now: float) -> Iterator[list[Any]]:
         """Take new rules: what is done at once, and with each item."""
-        self.out.rules = rules
+        self.out.context = rules
         steps = self.book.reload(*now)
         yield self.out.take()
         for _ in steps:
@@ -343,7 +362,8 @@ class Recorded:
 
 
 class Exports(Recorded):
-    questions = _QUESTIONS | {"local"}
+    questions = _QUESTIONS | {"local", "of"}
+    forgets = "gone"
 
     def __init__(
         self,
@@ -351,11 +371,11 @@ class Exports(Recorded):
         contracts: Contracts | None = None,
         names: Names | None = None,
         limit_settings: LimitSettings | None = None,
-        numbering: Callable[[Source, int], Any] = lambda *_: None,
+        last: int | None = None,
         gate: PermissionGate = OPEN_GATE,
     ) -> None:
-        out = Out(context(policy, contracts, names, limit_settings, gate), numbering=numbering)
-        super().__init__(topic_exports.Exports(out), out)
+        out = Out(context(policy, contracts, names, limit_settings, gate), last=last)
+        super().__init__(topic_exports.Exports(cast("Any", out)), out)
 
     @property
     def topics(self) -> set[str]:
@@ -371,9 +391,24 @@ class Exports(Recorded):
 
     def link_away(self, peer: int) -> tuple[list[Any], bool]:
         """What is done, and whether a route waits."""
-        for _ in self.book.link_away(peer):
-            pass
+        self.gone_away(peer)
+        deque(self.book.link_away(peer), 0)
         return self.out.take(), self.book.outage(peer) > 0
+
+    def flowing(self, source: Source) -> tuple[int, ...]:
+        """The peers to which a source's data is sent now."""
+        return tuple(peer for peer, route in self.book.routes(source).items() if route.flows)
+
+    def contract(self, source: Source, peer: int) -> Contract:
+        """The contract of a route."""
+        found: Contract = self.book.routes(source)[peer].contract
+        return found
+
+    def given_up(self, source: Source, peer: int) -> list[Any]:
+        """A route is not kept any more."""
+        if (route := self.book.routes(source).get(peer)) is not None:
+            self.book.given_up(route)
+        return self.out.take()
 
     def apply_rules(
         self,
@@ -387,6 +422,8 @@ class Exports(Recorded):
 
 
 class Imports(Recorded):
+    forgets = "gone"
+
     def __init__(
         self,
         policy: Policy | None = None,
@@ -398,13 +435,19 @@ class Imports(Recorded):
         gate: PermissionGate = OPEN_GATE,
     ) -> None:
         out = Out(context(policy, contracts, names, limit_settings, gate), rng, position)
-        super().__init__(topic_imports.Imports(out), out)
+        super().__init__(topic_imports.Imports(cast("Any", out)), out)
 
     def link_away(self, peer: int, *, briefly: bool = False) -> tuple[list[Any], bool]:
         """What is done, and whether a source waits."""
-        for _ in self.book.link_away(peer, briefly=briefly):
-            pass
+        self.gone_away(peer, silent=briefly)
+        deque(self.book.link_away(peer, briefly=briefly), 0)
         return self.out.take(), bool(self.book._peers[peer].entries)
+
+    def demand(self, peer: int, source: Source, now: float, *, wanted: bool) -> list[Any]:
+        """A local node wants a source, or none does."""
+        if (entry := self.book.get(peer, source)) is not None:
+            self.book.demand(entry, now, wanted=wanted)
+        return self.out.take()
 
     def refused_nodes(self, peer: int) -> dict[str, list[Source]]:
         """The sources that wait for a place, by node."""
@@ -428,7 +471,7 @@ class ServiceExports(Recorded):
         self, rules: ServiceRules, limit_settings: LimitSettings | None = None, gate: PermissionGate = OPEN_GATE
     ) -> None:
         out = Out(context(limits=limit_settings, gate=gate, services=rules))
-        super().__init__(books.ServiceExports(out), out)
+        super().__init__(books.ServiceExports(cast("Any", out)), out)
 
     def apply_rules(self, rules: ServiceRules, limits: LimitSettings | None = None) -> Iterator[list[Any]]:
         return self.rejudge(context(limits=limits, gate=self.out.context.gate, services=rules))
@@ -440,11 +483,17 @@ class ServiceExports(Recorded):
 
 
 class ServiceImports(Recorded):
+    def gone(self, peer: int, keep: Collection[str] = ()) -> list[Any]:
+        """A peer does not come back."""
+        self.gone_away(peer)
+        deque(self.book.gone(peer, keep), 0)
+        return self.out.take()
+
     def __init__(
         self, rules: ServiceRules, limit_settings: LimitSettings | None = None, gate: PermissionGate = OPEN_GATE
     ) -> None:
         out = Out(context(limits=limit_settings, gate=gate, services=rules))
-        super().__init__(books.ServiceImports(out), out)
+        super().__init__(books.ServiceImports(cast("Any", out)), out)
 
     def hidden(self, remote: RemoteService) -> str:
         """Why a service is not shown."""

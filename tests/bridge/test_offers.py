@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from rmpa.bridge import limits
 from rmpa.bridge.context import Names
 from rmpa.bridge.messages import Advertise, AdvertiseServices, ServiceOffer, Source, TopicOffer
+from rmpa.bridge.peer import Peer
 from rmpa.bridge.peer_offers import CROWDED, Heard, ImportBook
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.bodies import LocalService
@@ -144,7 +145,7 @@ def test_the_rule_that_decides_is_told_to_whom_asks(topic: str) -> None:
 
 
 def heard(*entries: str) -> Heard[str, Any, str]:
-    made: Heard[str, Any, str] = Heard(name="far")
+    made: Heard[str, Any, str] = Heard(session=Peer(peer=1, name="far"))
     made.entries.update(dict.fromkeys(entries, 1))
     return made
 
@@ -201,7 +202,7 @@ def imports(*, nodes: int = 100, topics: int = 100) -> Imports:
 
 
 def shown(made: Imports) -> set[str]:
-    return {source.node for _, source, entry in made if entry.shown}
+    return {entry.node for entry in made if entry.shown}
 
 
 def published(actions: list[Any]) -> list[str]:
@@ -308,7 +309,7 @@ def test_the_limits_hold_and_no_place_stays_empty(
         else:
             there.discard(offer.source)
             made.advertised(1, Advertise(removed=(offer.source,)))
-        known = {source: entry for _, source, entry in made}
+        known = {entry.wire: entry for entry in made}
         assert len(known) == min(topics, len(there))
         assert made.refused(1) == len(there) - len(known)
         standing = {source.node for source, entry in known.items() if entry.shown}
@@ -355,8 +356,8 @@ def test_after_reloads_no_place_is_empty_and_the_rest_is_counted(first: list[Top
             message = Advertise(added=(offer,)) if comes else Advertise(removed=(offer.source,))
             made.advertised(1, message)
     assert len(list(islice(under_way, 100))) < 100
-    allowed = {source for _, source, _ in made if source.node not in {f"/n{node}" for node in denied}}
-    visible = {source for _, source, entry in made if entry.shown}
+    allowed = {entry.wire for entry in made if entry.node not in {f"/n{node}" for node in denied}}
+    visible = {entry.wire for entry in made if entry.shown}
     standing = shown(made)
     assert len(standing) >= min(limit, len({source.node for source in allowed}))
     assert visible == {source for source in allowed if source.node in standing}

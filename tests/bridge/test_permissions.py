@@ -88,7 +88,7 @@ class Secured:
             self.exports.link_up(number, name)
             self.imports.link_up(number, name)
             self.service_exports.link_up(number, name)
-            self.service_imports.link_up(number, name, number)
+            self.service_imports.link_up(number, name, rank=number)
 
     def publishes(self, *topics: str) -> None:
         for topic in topics:
@@ -113,7 +113,7 @@ class Secured:
         return self.exports.offer(peer, Source(topic, "/n")) is not None
 
     def shown(self) -> list[tuple[int, str]]:
-        return sorted((peer, entry.name) for peer, _, entry in self.imports if entry.shown)
+        return sorted((entry.peer, entry.name) for entry in self.imports if entry.shown)
 
     def reload(self, *rules: PermissionRule, relays: tuple[str, ...] = ()) -> list[Any]:
         self.gate.reload(TrustSettings(rules=rules, relays=relays))
@@ -301,12 +301,13 @@ class SecuredMap(Map):
                     lets = self.allows(there, Access.CALL, here, name)
                     expected = lets and self.allows(here, Access.SERVE, there, name)
                     assert ((name, f"/rmpa/m{there}/n") in module.callable()) is expected, (here, there, name)
-            for peer, source, entry in module.imports:
+            for entry in module.imports:
                 if entry.shown and entry.origin is not None:
-                    relay = next(m for m, number in module.links.items() if number == peer)
-                    self._check_relayed(
-                        here, relay, Access.PUBLISH, Access.SUBSCRIBE, entry.origin.name, source.topic
+                    relay, topic = (
+                        next(m for m, number in module.links.items() if number == entry.peer),
+                        entry.wire.topic,
                     )
+                    self._check_relayed(here, relay, Access.PUBLISH, Access.SUBSCRIBE, entry.origin.name, topic)
             for peer, remote in module.service_imports:
                 if remote.shown and remote.origin is not None:
                     relay = next(m for m, number in module.links.items() if number == peer)

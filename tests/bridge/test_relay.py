@@ -236,7 +236,7 @@ class Map:
             there = self.reachable(here)
             assert module.visible() == sorted((f"/{k}{m}", f"/rmpa/m{m}/n") for m in there for k in "tu"), here
             assert module.callable() == sorted((f"/{k}{m}", f"/rmpa/m{m}/n") for m in there for k in "sv"), here
-            origins = [entry.origin for _, _, entry in module.imports if entry.shown]
+            origins = [entry.origin for entry in module.imports if entry.shown]
             for whose in (*origins, *(remote.origin for _, remote in module.service_imports if remote.shown)):
                 if whose is not None:
                     way = [int(text, 16) for text in (whose.instance, *whose.path)] + [here]
@@ -252,7 +252,7 @@ def test_two_networks_and_two_relays_of_which_one_is_used() -> None:
     world.check()
     b = world.modules[2]
     assert [(whose.name, via) for whose, via in b.imports.ways] == [("m1", "m3")]
-    hidden = [entry.hidden for _, source, entry in b.imports if source.topic == "/t1" and not entry.shown]
+    hidden = [entry.hidden for entry in b.imports if entry.wire.topic == "/t1" and not entry.shown]
     assert hidden == ["m1 is reached by way of m3"]
     world.unlink(2, 3)
     world.settle()

@@ -203,7 +203,7 @@ def test_policy_types_and_contracts_go_by_the_name_here() -> None:
     imports = side.imports()
     imports.link_up(1, "robot1")
     learn(imports, "/odom", "/camera/image", "/private", "/clock")
-    hidden = {source.topic: entry.hidden for _, source, entry in imports}
+    hidden = {entry.wire.topic: entry.hidden for entry in imports}
     assert hidden.pop("/clock").startswith("built in: time does not cross")
     assert hidden == {
         "/odom": "",
@@ -252,7 +252,7 @@ def test_new_names_and_policy_here_leave_all_else_alone() -> None:
     ]
     assert changed(imports, new) == []
     entry = imports.entry(1, Source("/a", "/n"))
-    assert (entry.state, entry.route) == ("open", 1)
+    assert (entry.state, entry.number) == ("open", 1)
     assert changed(imports, Side()) == [Retract(1, b), Publish(1, b, TYPE), Publish(1, c, TYPE)]
 
 

@@ -13,9 +13,10 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.graph_part import GraphPart
 from rmpa.bridge.messages import Advertise, Source, TopicOffer, decode, encode
+from rmpa.bridge.peer import PeerState
 from rmpa.bridge.policy import PermissionGate
 from rmpa.bridge.proxies import PeerProxies, ProxyNodes
-from rmpa.bridge.sessions import AWAY_GRACE, Part, PeerSession, PeerSessions, PeerState
+from rmpa.bridge.sessions import AWAY_GRACE, Part, PeerSession, PeerSessions
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
 from rmpa.config.settings import TrustSettings
@@ -31,7 +32,6 @@ from tests.bridge.recorder import context
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable, Sequence
 
-    from rmpa.bridge.sessions import PeerSession
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.slave_node import SlaveNode
@@ -444,11 +444,11 @@ class OnePart(GraphPart):
             name="far", busy=False, remote_endpoint=("x", 1), send_control=lambda data: self.sent.append(decode(data))
         )
         link.abort = self.sent.append
-        self.session = cast("PeerSession", SimpleNamespace(peer=1, link=link, linked=True))
+        self.session = PeerSession(peer=1, name="far", link=cast("Any", link), proxies=cast("Any", None))
         shared = SimpleNamespace(counters=Counters(), rng=lambda: 0.5, context=context(), sessions={1: self.session})
-        super().__init__(cast("Any", shared), Exports, Imports)
-        self.imports.link_up(1, "far")
-        self.exports.link_up(1, "far")
+        super().__init__(cast("Any", shared), cast("Any", Exports), cast("Any", Imports))
+        self.imports.link_up(self.session)
+        self.exports.link_up(self.session)
 
     def _look_at(self, name: str) -> None:
         if name in self.failing:
@@ -457,6 +457,9 @@ class OnePart(GraphPart):
 
     def _names(self) -> Iterable[str]:
         return ()
+
+    def _relayed(self, entry: Any, proxy: str) -> Any:
+        raise NotImplementedError
 
     def _settled(self) -> None:
         self.settled += 1

@@ -7,7 +7,7 @@ from typing import Final
 
 import pytest
 
-from rmpa.bridge.bridge import telling, twin_names, twin_text
+from rmpa.bridge.twins import telling, twin_names, twin_text
 
 Module = tuple[set[str], set[str]]
 """What its nodes publish, and what they subscribe to."""

@@ -8,26 +8,21 @@ import logging
 import signal
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import pytest
 
 from lab.bed.processes import eventually
 from rmpa.bridge.messages import Description as About
 from rmpa.bridge.messages import RouteOpened, Source
-from rmpa.bridge.proxies import PeerProxies, ProxyNodes
-from rmpa.bridge.sessions import PeerSession
-from rmpa.bridge.topics.imports import RemoteTopic
-from rmpa.bridge.topics.peer_topics import Pasts, PeerTopics, TopicEvents
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.core.statistics import Counters
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import encode_header, frame_message, subscriber_header
+from tests.bridge.io.proxied import Proxied
 from tests.interop.conftest import framed, until
 from tests.interop.modules import flows, whole
 from tests.interop.nodes.payload import Pattern
@@ -39,8 +34,6 @@ if TYPE_CHECKING:
 
     from lab.bed.agents import Agent
     from lab.bed.processes import Process
-    from rmpa.bridge.shared import Shared
-    from rmpa.mesh.io.link import PeerLink
     from tests.interop.conftest import AgentFactory, ShellFactory
     from tests.interop.ros import Ros
 
@@ -161,7 +154,7 @@ async def test_listeners_follow_a_remote_publisher_with_a_new_header(
     inbound, listener = await proxied(core, ros.node(library, "listener", each=True), closing)
     for route, latching in ((1, False), (2, True)):
         describe(inbound, route, latching=latching)
-        await heard(inbound, route, listener, str(route))
+        await heard(inbound, listener, str(route))
 
 
 @pytest.mark.trap(14)
@@ -172,10 +165,10 @@ async def test_listeners_cut_off_within_a_message_come_back(
     """A remote publisher was killed in the middle of an image: TCPROS cannot take half of it back."""
     inbound, listener = await proxied(core, ros.node(library, "listener", each=True), closing)
     describe(inbound, 1)
-    sequence = await heard(inbound, 1, listener, "1")
-    publication = inbound.publication(SOURCE)
+    sequence = await heard(inbound, listener, "1")
+    publication = inbound.route.publication
     assert publication is not None
-    flow, wire = inbound.flows[1], frame_message(framed(Pattern(1_000_000).payload(2, 1)))
+    flow, wire = inbound.flow, frame_message(framed(Pattern(1_000_000).payload(2, 1)))
     for end in (LAST | ABORT, 0):
         flow.part(sequence + 1, 0, FIRST, memoryview(wire)[:500_000])
         if end:
@@ -185,7 +178,7 @@ async def test_listeners_cut_off_within_a_message_come_back(
         assert publication.subscribers == 0
         await until(lambda: publication.subscribers)
         before = len(listener.events("report"))
-        sequence = await heard(inbound, 1, listener, "1", first=sequence + 2, after=before)
+        sequence = await heard(inbound, listener, "1", first=sequence + 2, after=before)
     report = listener.events("report")[-1]
     assert (report["bad"], list(report["sources"])) == (0, ["1"])  # type: ignore[call-overload]
 
@@ -193,37 +186,28 @@ async def test_listeners_cut_off_within_a_message_come_back(
 SOURCE = Source("/chatter", "/speaker")
 
 
-async def proxied(core: RosCore, listener: Process, closing: AsyncExitStack) -> tuple[PeerTopics, Process]:
-    """A peer's side with one source, and a listener of that source that is connected to its proxy."""
-    proxies = PeerProxies("/rmpa/peer", ProxyNodes(core))
-    closing.push_async_callback(proxies.close)
-    shared = SimpleNamespace(core=core, counters=Counters(), relay=SimpleNamespace(enabled=False))
-    session = PeerSession(1, cast("PeerLink", SimpleNamespace(routes={})), proxies)
-    pasts: Pasts = {}
-    inbound = PeerTopics(cast("Shared", shared), TopicEvents(), session, lambda _: pasts)
-    closing.callback(inbound.close)
-    entry = RemoteTopic(peer=1, wire=SOURCE, name=SOURCE.topic, node=SOURCE.node, type=BYTES, module=("", "peer"))
-    inbound.publish(entry, proxies, SOURCE.node)
-    await until(lambda: (p := inbound.publication(SOURCE)) is not None and p.subscribers)
+async def proxied(core: RosCore, listener: Process, closing: AsyncExitStack) -> tuple[Proxied, Process]:
+    """A peer's source, and a listener of it that is connected to its proxy."""
+    inbound = Proxied(core, SOURCE, BYTES)
+    closing.push_async_callback(inbound.close)
+    publication = await inbound.publish()
+    await until(lambda: publication.subscribers)
     return inbound, listener
 
 
-def describe(inbound: PeerTopics, route: int, *, latching: bool = False) -> None:
+def describe(inbound: Proxied, route: int, *, latching: bool = False) -> None:
     """A route of the source is open."""
     kind = MessageType(BYTES)
-    about = About(BYTES, kind.md5sum, kind.definition, latching)
-    inbound.describe(SOURCE, RouteOpened(route, about))
+    inbound.opened(RouteOpened(route, About(BYTES, kind.md5sum, kind.definition, latching)))
 
 
-async def heard(
-    inbound: PeerTopics, route: int, listener: Process, source: str, *, first: int = 1, after: int = 0
-) -> int:
+async def heard(inbound: Proxied, listener: Process, source: str, *, first: int = 1, after: int = 0) -> int:
     """Send messages on a route until the listener has heard one; return the last one's number."""
     sequence = first - 1
     while not any(source in str(report["sources"]) for report in listener.events("report")[after:]):
         sequence += 1
         message = frame_message(framed(Pattern(64).payload(int(source), sequence)))
-        inbound.flows[route].message(sequence, 0, memoryview(message))
+        inbound.flow.message(sequence, 0, memoryview(message))
         await asyncio.sleep(0.02)
     return sequence
 

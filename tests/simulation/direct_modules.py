@@ -152,8 +152,17 @@ class Proxies:
 
 def session(peer: int, name: str, address: str) -> Any:
     """The double of one run of a peer."""
-    link = SimpleNamespace(name=name, silent=True, crashed=False)
-    return SimpleNamespace(peer=peer, link=link, linked=True, same_machine=False, address=address, proxies=Proxies())
+    link, proxies = SimpleNamespace(name=name, crashed=False), Proxies()
+    facts = {"peer": peer, "linked": True, "silent": True, "same_machine": False, "address": address}
+    return SimpleNamespace(link=link, proxies=proxies, **facts)
+
+
+class Entry(SimpleNamespace):
+    """The double of a source as the publishers' module offers it."""
+
+    @property
+    def publication(self) -> Any:
+        return self.module.publication(self.wire)
 
 
 def sessions(of: dict[int, Any]) -> Any:
@@ -264,21 +273,21 @@ class SubscriberModule:
         shared = SimpleNamespace(
             core=core, sessions=sessions(self.peers), rpc=self.rpc, counters=Counters(), context=Rules(self)
         )
-        topics = SimpleNamespace(get=lambda _peer: SimpleNamespace(publication=self._publication))
-        self.importer = TopicPaths(cast("Any", shared), lambda *_: None, cast("Any", self), cast("Any", topics))
+        self.importer = TopicPaths(cast("Any", shared), lambda *_: None, cast("Any", self))
 
     # --- as Imports, and as a publication -------------------------------------------------------------------------
 
-    def __iter__(self) -> Iterator[tuple[int, Source, Any]]:
-        return iter([(self.here, source, entry) for source, entry in self.shown.items()])
+    def __iter__(self) -> Iterator[Any]:
+        return iter(list(self.shown.values()))
 
     def get(self, _peer: int, source: Source) -> Any:
         return self.shown.get(source)
 
-    def at(self, topic: str) -> list[tuple[int, Source]]:
-        return [(self.here, source) for source in sorted(self.shown) if source.topic == topic]
+    def at(self, topic: str) -> list[Any]:
+        return [self.shown[source] for source in sorted(self.shown) if source.topic == topic]
 
-    def _publication(self, source: Source) -> Any:
+    def publication(self, source: Source) -> Any:
+        """That of a source at its proxy; ``None`` if it is not shown."""
         callers = frozenset(name for name in self.listeners if "relay" in self.paths(source, name))
 
         def hang_up(name: str) -> bool:
@@ -327,7 +336,8 @@ class SubscriberModule:
         """A source appears in the graph here, or leaves it."""
         if shown and source not in self.shown:
             latched = SimpleNamespace(latching=self.there.talkers[source].latched)
-            entry = self.shown[source] = SimpleNamespace(
+            entry = self.shown[source] = Entry(
+                module=self,
                 peer=self.here,
                 wire=source,
                 name=source.topic,

@@ -9,10 +9,12 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from rmpa.bridge.data.export import ExportFlow
+from rmpa.bridge.data.export import ExportFlow, ExportRoute
 from rmpa.bridge.data.reception import ImportFlow, LinkTime
 from rmpa.bridge.data.route import RouteBegin
 from rmpa.bridge.data.route_sender import ReliableRouteSender
+from rmpa.bridge.messages import Source
+from rmpa.bridge.peer import Peer
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.identity import serial_add
 from rmpa.core.statistics import Counters
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 
 _RING: Final = bytes(range(256))
 _SIZES: Final = (20, 300, 300, 5000, 9000, 40_000, 150_000, 400_000)
+_SOURCE: Final = Source("/t", "/n")
 _CUT_THROUGH: Final = 131_072
 _HEAD: Final = 12
 """Bytes in front: the length, as in TCPROS, and the message's number."""
@@ -161,7 +164,7 @@ class TrafficPeer(MeshPeer):
         super().link_up(link)
         instance = link.identity.instance
         for other in [i for i in self.inboxes if i != instance and self._place[i] == link.guid.place]:
-            self.exports.remove(self._peers.pop(other))
+            self._remove(self._peers.pop(other))
             if (flow := self.inboxes.pop(other).flow) is not None:
                 flow.close()
         self._peers.setdefault(instance, len(self._place) + 1)
@@ -189,7 +192,7 @@ class TrafficPeer(MeshPeer):
             if isinstance(sender, ReliableRouteSender):
                 sender.suspend()
             else:
-                self.exports.remove(peer)
+                self._remove(peer)
 
     def lane_lost(self, link: PeerLink) -> None:
         """Do what the bridge does."""
@@ -233,7 +236,8 @@ class TrafficPeer(MeshPeer):
     def _opened(self, link: PeerLink, epoch: int, after: int) -> None:
         """A peer opens the only route of this link."""
         peer = self._peers[link.identity.instance]
-        sender = self.exports.by_peer.get(peer)
+        route = self.exports.routes.get(peer)
+        sender = route.sender if route is not None else None
         contract = {"reliability": self.contract.reliability, "priority": self.contract.priority}
         if epoch and isinstance(sender, ReliableRouteSender) and sender.sender.epoch == epoch:
             self._send_message(link, op="opened", epoch=epoch, first=sender.sender.first, **contract)
@@ -243,8 +247,14 @@ class TrafficPeer(MeshPeer):
             self.first[link.identity.instance] = self._next + 1
             begin = RouteBegin(self._epoch, serial_add(self.exports.number, 1))
             self._send_message(link, op="opened", epoch=begin.epoch, first=begin.first, **contract)
-            sender = self.exports.add(peer, link, 1, self.contract, begin)
+            self._remove(peer)
+            route = self.exports.routes[peer] = ExportRoute(Peer(peer=peer), _SOURCE, 1, self.contract)
+            sender = self.exports.add(route, link, begin)
         self.senders[link, 1] = sender
+
+    def _remove(self, peer: int) -> None:
+        if (route := self.exports.routes.pop(peer, None)) is not None:
+            self.exports.remove(route)
 
     def _begin(self, link: PeerLink, said: dict[str, Any]) -> None:
         inbox = self.inboxes[link.identity.instance]

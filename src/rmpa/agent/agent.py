@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.agent.process import Reloader, WebProcess, run_process, serve
 from rmpa.agent.trust import AgentTrust, TrustCommands, open_membership, restart_to_join
-from rmpa.bridge.bridge import Bridge, TwinWatch
+from rmpa.bridge.bridge import Bridge
 from rmpa.bridge.facts import BridgeFacts
 from rmpa.bridge.nodes import Nodes
 from rmpa.bridge.params.follower import Params
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.services.part import Services
+from rmpa.bridge.twins import TwinWatch
 from rmpa.config.module_name import core_file
 from rmpa.core import limits
 from rmpa.core.contract import Transport

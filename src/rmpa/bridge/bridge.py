@@ -1,43 +1,36 @@
-"""The bridge of one agent, and its watch over peers of the same kind, which drive each other by equal names.
-
-The bridge of one agent: its parts connect the local core with the links of the mesh.
-"""
+"""The bridge of one agent: its parts connect the local core with the links of the mesh."""
 
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
 from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.messages import decode, op_of
 from rmpa.bridge.nodes import ProxyKills
-from rmpa.bridge.policy import Needs, PermissionGate, Relay
+from rmpa.bridge.policy import PermissionGate, Relay
 from rmpa.bridge.proxies import ProxyNodes
 from rmpa.bridge.rpc import PeerRpc
 from rmpa.bridge.sessions import Part, PeerSessions, call_each, guarded
 from rmpa.bridge.shared import Shared
 from rmpa.bridge.topics.part import Topics
-from rmpa.config.peer_rules import Access
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.identity import OWN_NODE, is_global_name, is_own, matches
-from rmpa.core.log import RefusalLog
+from rmpa.core.identity import OWN_NODE
 from rmpa.core.statistics import Counters
 from rmpa.mesh.frames import FrameKind
 from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.runtime.loop import SystemClock, call_at_tick, yield_to_data
+from rmpa.runtime.loop import call_at_tick, yield_to_data
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Callable, Iterable, Mapping
-    from collections.abc import Set as AbstractSet
+    from collections.abc import Callable
 
-    from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Identity
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.core.external import Core
-    from rmpa.ros.master.parameters import GraphChange, GraphState
+    from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.trust.permissions import Permissions
 
@@ -129,8 +122,6 @@ class Bridge(Shared):
         await self.proxy_nodes.close()
         await self.node.close()
 
-    # --- the mesh's side ---------------------------------------------------------------------------------------
-
     def control(self, link: PeerLink, payload: bytes | bytearray | memoryview) -> None:
         """Pass a control frame of a link to the part that it belongs to.
 
@@ -154,15 +145,13 @@ class Bridge(Shared):
     def mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
         """Pass an acknowledgement, or the answer to a fence, to the route's sender."""
         session = self.sessions.of(link)
-        sender = self.topics.outbound.senders.get((session.peer, route)) if session is not None else None
+        sender = self.topics.sender(session.peer, route) if session is not None else None
         if sender is None:
             return
         if kind is FrameKind.ACK:
             sender.acknowledged(sequence)
         elif kind is FrameKind.FENCED:
             sender.fenced(sequence)
-
-    # --- the local graph's side --------------------------------------------------------------------------------
 
     def _graph_changed(self, change: GraphChange) -> None:
         call_each(self._parts, lambda part: part.graph_changed(change))
@@ -180,178 +169,3 @@ class Bridge(Shared):
             yield_to_data()
             with guarded(part):
                 part.reconcile()
-
-
-# --- Decides whether a peer is a *twin* -----------------------------------------------------------------------------
-#
-# A module of the same kind, each of which drives the other by equal names. Pure.
-#
-# Two identical robots offer the same topics (``/odom``, ``/scan``) and take the same commands (``/cmd_vel``). By
-# default one name is one topic in the whole mesh, so the command of one reaches both. In one robot that is split over
-# several modules a name is offered by one module, and taken by others.
-
-
-# Names in common that make two modules twins.
-_NAMES_MIN: Final = 3
-# Of these, names that both offer: a driver and its driven have none, whatever passes between them.
-OFFERED_MIN: Final = 2
-_NAMES_SHOWN: Final = 4
-# Names that modules of every kind may share: transforms, diagnostics, time, logs, and those of common tools.
-_COMMON: Final = frozenset({
-    "/tf", "/tf_static", "/diagnostics", "/diagnostics_agg", "/diagnostics_toplevel_state", "/statistics",
-    "/client_count", "/connected_clients", "/clock", "/rosout", "/rosout_agg",
-})  # fmt: skip
-# Ends of names of nodes' own interfaces: dynamic_reconfigure, nodelets, Smart Resources.
-_COMMON_ENDINGS: Final = (
-    "/parameter_updates", "/parameter_descriptions", "/bond",
-    "/quality", "/requirements", "/responses", "/observed", "/alarms", "/profile", "/context", "/state", "/decision",
-    "/descriptor", "/set_context",
-)  # fmt: skip
-
-
-def telling(names: Iterable[str]) -> frozenset[str]:
-    """The names that tell something of the kind of a module: not those that all modules may share."""
-    return frozenset(name for name in names if name not in _COMMON and not name.endswith(_COMMON_ENDINGS))
-
-
-def twin_names(
-    offered: AbstractSet[str], taken: AbstractSet[str], offered_there: AbstractSet[str], taken_there: AbstractSet[str]
-) -> tuple[str, ...]:
-    """The names that make a peer a twin, those first by which one drives the other; empty: it is none.
-
-    All by their names here, and only telling ones.
-
-    Args:
-        offered: What this module's own nodes publish.
-        taken: What they subscribe to.
-        offered_there: What the peer's own nodes publish here.
-        taken_there: What they subscribe to, as far as the peer said.
-    """
-    both = offered & offered_there
-    driven = taken & (taken_there | offered_there)
-    if len(both) < OFFERED_MIN or not driven or len(both | driven) < _NAMES_MIN:
-        return ()
-    return (*sorted(driven), *sorted(both - driven))
-
-
-def twin_text(peer: str, names: tuple[str, ...]) -> str:
-    """What the user is told of a twin, with what to do behind the semicolon."""
-    more = len(names) - _NAMES_SHOWN
-    shown = ", ".join(names[:_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
-    return (
-        f"its nodes offer and take the same names as ours ({shown}), so each module drives the other; start both "
-        f'with rmpa up --prefix-peers, or write in rmpa.toml below [[peer]]: name = "{peer}" and prefix = "/{{peer}}"'
-    )
-
-
-# --- Finds twins among the peers, and tells each that may be one what this module's nodes take ----------------------
-
-
-# The notification ``{"names": [...]}`` to a peer that offers what we do: the topics that nodes here subscribe to.
-TAKEN: Final = "names.taken"
-
-
-class TwinWatch(Part):
-    """The part of the bridge that knows which peers are twins; it looks each ``limits.RECONCILE_INTERVAL``.
-
-    Args:
-        bridge: The local graph, the sessions, topics and requests.
-
-    Attributes:
-        _said: By peer: the names that it was told last.
-        _taken_there: By peer: what its nodes take, by wire names, as it said last.
-    """
-
-    def __init__(self, bridge: Bridge) -> None:
-        self._bridge = bridge
-        self._clock = SystemClock()
-        self._told = RefusalLog(_log, bridge.counters)
-        self._state: GraphState | None = None
-        self._offered: frozenset[str] = frozenset()
-        self._taken: frozenset[str] = frozenset()
-        self._said: dict[int, tuple[str, ...]] = {}
-        self._taken_there: dict[int, tuple[str, ...]] = {}
-        self._twins: dict[int, tuple[str, ...]] = {}
-        bridge.rpc.on_notification(TAKEN, self._told_by_peer, Needs((), "names of the peer's own graph"))
-
-    def problem(self, session: PeerSession) -> str:
-        """What the user is told of a peer, while it is a twin; else empty."""
-        names = self._twins.get(session.peer)
-        return twin_text(session.link.name, names) if names else ""
-
-    def reconcile(self) -> None:
-        """Judge all peers again."""
-        state = self._bridge.core.state()
-        if state is not self._state:
-            self._state = state
-            self._offered, self._taken = telling(_own(state.publishers)), telling(_own(state.subscribers))
-        for session in self._bridge.sessions.linked():
-            yield_to_data()
-            self._judge(session)
-
-    def link_up(self, session: PeerSession) -> None:
-        """Forget what was said over an earlier link."""
-        self._said.pop(session.peer, None)
-
-    def gone(self, session: PeerSession) -> None:
-        """Forget a peer."""
-        for known in (self._said, self._taken_there, self._twins):
-            known.pop(session.peer, None)
-
-    def _judge(self, session: PeerSession) -> None:
-        peer, name = session.peer, session.link.name
-        if not self._offered or not self._taken or self._is_decided(name):
-            self._set(session, ())
-            return
-        imports, rename = self._bridge.topics.imports, self._bridge.context.names.of(name).local_name
-        offers = imports.offered_by(peer)
-        offered_there = frozenset(
-            topic
-            for topic in (self._offered | self._taken).intersection(offers)
-            if any(
-                (entry := imports.get(peer, source)) is not None and entry.shown and entry.origin is None
-                for source in offers[topic]
-            )
-        )
-        if len(self._offered & offered_there) >= OFFERED_MIN:
-            self._say(session)
-        taken_there = frozenset(map(rename, self._taken_there.get(peer, ())))
-        self._set(session, twin_names(self._offered, self._taken, offered_there, taken_there))
-
-    def _is_decided(self, name: str) -> bool:
-        """Whether the user has decided about a peer: a ``[[peer]]`` table names it."""
-        rules = self._bridge.context.settings.peers
-        return any(rule.name != "*" and matches(rule.name, name) for rule in rules)
-
-    def _set(self, session: PeerSession, names: tuple[str, ...]) -> None:
-        before = self._twins.pop(session.peer, ())
-        if names:
-            self._twins[session.peer] = names
-        name = session.link.name
-        if names and not before:
-            self._told.refuse(self._clock.now(), "peer.twin", name, f"{name}: {twin_text(name, names)}")
-        elif before and not names:
-            _log.info("= %s and this module share no commands any more", name)
-
-    def _say(self, session: PeerSession) -> None:
-        """Tell a peer what nodes here take of what it may publish here, if that has changed."""
-        name = session.link.name
-        wire, judge = self._bridge.context.names.of(name).wire_name, self._bridge.gate.judge
-        allowed = (each for each in sorted(self._taken) if judge(Access.PUBLISH, name, each).allowed)
-        names = tuple(map(wire, allowed))[: limits.TWIN_NAMES_MAX]
-        if session.linked and names != self._said.get(session.peer):
-            self._said[session.peer] = names
-            self._bridge.rpc.notify(session, TAKEN, {"names": names})
-
-    def _told_by_peer(self, session: PeerSession, args: dict[str, Any]) -> None:
-        names = args.get("names")
-        found = names[: limits.TWIN_NAMES_MAX] if isinstance(names, list) else ()
-        self._taken_there[session.peer] = tuple(
-            name for name in found if isinstance(name, str) and is_global_name(name)
-        )
-        self._judge(session)
-
-
-def _own(table: Mapping[str, Mapping[str, str]]) -> list[str]:
-    """The topics of a table of the graph that have a node of this module."""
-    return [topic for topic, nodes in table.items() if not all(map(is_own, nodes))]

@@ -13,13 +13,14 @@ from rmpa.runtime.loop import yield_to_data, yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from rmpa.bridge.bridge import Bridge, TwinWatch
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.services.bodies import LocalService
     from rmpa.bridge.services.books import RemoteService
     from rmpa.bridge.services.calls import CallStats
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.twins import TwinWatch
 
 
 class ServiceFacts:
@@ -187,7 +188,7 @@ class BridgeFacts:
         imports = self.bridge.topics.imports
         shown = {
             (entry.origin.instance, entry.name)
-            for _, _, entry in yielding_to_data(list(imports))
+            for entry in yielding_to_data(list(imports))
             if entry.origin is not None and entry.shown
         }
         counts = Counter(instance for instance, _ in shown)

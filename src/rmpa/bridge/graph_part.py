@@ -23,9 +23,10 @@ if TYPE_CHECKING:
     from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.direct.grants import Grants
     from rmpa.bridge.direct.paths import Paths
-    from rmpa.bridge.messages import Message
+    from rmpa.bridge.messages import Message, Source
     from rmpa.bridge.offers import OfferBook
-    from rmpa.bridge.peer_offers import ImportBook
+    from rmpa.bridge.peer_offers import ImportBook, Remote
+    from rmpa.bridge.policy import Place
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
     from rmpa.ros.master.parameters import GraphState
@@ -101,8 +102,6 @@ class GraphPart(Part, Effects):
         if self._scan_handle is not None:
             self._scan_handle.cancel()
 
-    # --- effects -------------------------------------------------------------------------------------------------
-
     def send(self, peer: int, message: Message) -> None:
         """As of ``Effects``."""
         session = self._shared.sessions.get(peer)
@@ -117,6 +116,22 @@ class GraphPart(Part, Effects):
         """As of ``Effects``."""
         self._timer.arm()
 
+    def path_changed(self, entry: Remote[Any]) -> None:
+        """As of ``Effects``."""
+        if entry.shown:
+            self.pass_on(entry)
+            self.look((entry.name,))
+
+    def pass_on(self, entry: Remote[Any]) -> None:
+        """Have what a peer offers relayed to others, if this module relays."""
+        if (session := self._shared.sessions.get(entry.peer)) is not None:
+            source, place = self._relayed(entry, self._shared.sessions.proxy_name(session, entry.node, entry.origin))
+            self._shared.relay.pass_on(entry.peer, session.link.identity, source, place, entry.origin)
+
+    @abstractmethod
+    def _relayed(self, entry: Remote[Any], proxy: str) -> tuple[Source, Place]:
+        """What ``policy.Relay`` knows an entry by: its source, and its place at its proxy."""
+
     def refuse(self, session: PeerSession, error: RemoteProtocolError) -> None:
         """Log that a peer broke the protocol, and close its link."""
         text = f"{session.link.name} broke the protocol: {error}"
@@ -127,15 +142,11 @@ class GraphPart(Part, Effects):
         """Monotonic seconds."""
         return asyncio.get_running_loop().time()
 
-    # --- peers ---------------------------------------------------------------------------------------------------
-
     def link_up(self, session: PeerSession) -> None:
         """Begin the advertisement to a peer, and wait for the peer's own."""
-        peer, identity = session.peer, session.link.identity
-        instance = identity.instance.hex()
         self.imports.ways.instance = self._shared.relay.instance
-        self.imports.link_up(peer, identity.name, instance, identity.guid.value)
-        self.exports.link_up(peer, identity.name, instance)
+        self.imports.link_up(session)
+        self.exports.link_up(session)
         self.direct_imports.link_up(session)
         self.direct_exports.link_up(session)
         self.schedule()
@@ -199,8 +210,6 @@ class GraphPart(Part, Effects):
             self.imports.take_in(session.peer, wire, offer, self.now())
             yield
 
-    # --- the local graph -----------------------------------------------------------------------------------------
-
     @abstractmethod
     def _look_at(self, name: str) -> None:
         """Take the present state of a name in the local graph."""
@@ -240,8 +249,6 @@ class GraphPart(Part, Effects):
         """Judge by new rules; entries and routes that they do not change go on untouched."""
         self._rejudging = chain(self.exports.reload(), self.imports.reload(self.now()))
         self.schedule()
-
-    # --- a slice of it -------------------------------------------------------------------------------------------
 
     def run(self, steps: Iterator[object]) -> None:
         """Take all items now; data is handled between any two."""

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.messages import Message
+    from rmpa.bridge.peer import Peer
+    from rmpa.bridge.peer_offers import Remote
     from rmpa.config.peer_rules import Access
 
 
@@ -31,7 +33,7 @@ def wire_of(offer: Any) -> Any:
 
 
 class Effects:
-    """What a part of the bridge does for its books; for subclasses. An effect calls no book back in the same turn.
+    """What a part of the bridge does for its books, at once and without calling back; ``GraphPart`` overrides it.
 
     Attributes:
         rng: Uniform numbers in [0, 1), for the jitter of a back-off.
@@ -40,9 +42,9 @@ class Effects:
     rng: Callable[[], float]
 
     @property
+    @abstractmethod
     def context(self) -> BridgeContext:
         """The rules that hold now."""
-        raise NotImplementedError
 
     def send(self, peer: int, message: Message) -> None:
         """Send a control message to a peer, if it has a link."""
@@ -52,6 +54,9 @@ class Effects:
 
     def arm_timer(self) -> None:
         """Look at ``ImportBook.next_timer`` again."""
+
+    def path_changed(self, entry: Remote[Any]) -> None:
+        """Offer what is relayed with the path that it has now."""
 
 
 KeyT = TypeVar("KeyT", bound="Hashable")
@@ -64,8 +69,7 @@ class Told(Generic[KeyT, LocalT, OfferT]):
     """One linked peer, and what it was told over this link.
 
     Args:
-        name: The peer's name, by which the rules for it are found.
-        instance: The peer's run, as 32 hexadecimal digits; nothing that came from this run is relayed back to it.
+        session: The peer. Nothing that came from its run is relayed back to it.
         due: The entries to examine for this peer: they may have changed (a dict, for its order).
         offers: By key: the offer that the peer was told, and the local entry that it was made of.
         by_wire: The keys of ``offers``, by name on the wire.
@@ -75,8 +79,7 @@ class Told(Generic[KeyT, LocalT, OfferT]):
         told_at: When the last portion was told, monotonic seconds.
     """
 
-    name: str
-    instance: str
+    session: Peer
     due: dict[KeyT, None]
     offers: dict[KeyT, tuple[OfferT, LocalT]] = field(default_factory=dict)
     by_wire: dict[KeyT, KeyT] = field(default_factory=dict)
@@ -92,7 +95,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
     Keys are local names; a subclass says what an entry is, whether it may cross, and what its peers are told.
 
     Args:
-        out: Has the rules, sends messages and warns; the part itself, which also does what the kind of entry needs.
+        out: The part, which has the rules, and does what is decided here: at once, without calling back.
 
     Attributes:
         kind: The setting that limits the offered entries: ``topics`` or ``services``.
@@ -114,13 +117,10 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
 
     def __init__(self, out: Effects) -> None:
         self._out = out
-        self._do: Any = out
         self.seen: dict[KeyT, LocalT] = {}
         self.offered: dict[KeyT, LocalT] = {}
         self.beyond: dict[KeyT, None] = {}
         self.peers: dict[int, Told[KeyT, LocalT, OfferT]] = {}
-
-    # --- what an entry is ----------------------------------------------------------------------------------------
 
     @abstractmethod
     def judge(self, key: KeyT, local: LocalT) -> PolicyDecision:
@@ -150,14 +150,14 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
     ) -> PolicyDecision | PermissionDecision:
         """Decide whether an entry that may cross may cross to one peer."""
         context, origin = self._out.context, local.origin
-        if origin is not None and not may_have(told.instance, origin):
-            return PolicyDecision(False, f"it comes from {told.name}")
-        name = self.name_of(key)
-        wire = context.names.of(told.name).wire_name(name)
+        name, peer = self.name_of(key), told.session.name
+        if origin is not None and not may_have(told.session.instance, origin):
+            return PolicyDecision(False, f"it comes from {peer}")
+        wire = context.names.of(peer).wire_name(name)
         if not is_crossing_name(wire):
             return PolicyDecision(False, f"its name there would be {wire!r}")
-        decision = context.policy.judge_for(told.name, name, local.type, wire)
-        permission = context.gate.judge(self.access, told.name, name)
+        decision = context.policy.judge_for(peer, name, local.type, wire)
+        permission = context.gate.judge(self.access, peer, name)
         return decision if permission.allowed or not decision.allowed else permission
 
     def _offer(self, told: Told[KeyT, LocalT, OfferT], key: KeyT) -> OfferT | None:
@@ -165,19 +165,17 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         local, context, name = self.offered.get(key), self._out.context, self.name_of(key)
         if local is None:
             return None
-        decision = self.judge_for(told, key, local)
+        decision, peer = self.judge_for(told, key, local), told.session.name
         if decision.allowed:
-            return self.offer_for(key, local, context.names.of(told.name).wire_name(name))
+            return self.offer_for(key, local, context.names.of(peer).wire_name(name))
         if isinstance(decision, PermissionDecision):
-            context.gate.refused(self.access, told.name, name, decision)
+            context.gate.refused(self.access, peer, name, decision)
         return None
 
     @property
     def limit(self) -> int:
         """How many entries are offered."""
         return self._out.context.limit(self.kind)
-
-    # --- entries -------------------------------------------------------------------------------------------------
 
     def put(self, key: KeyT, local: LocalT | None, *, again: bool = False) -> None:
         """Offer what the local graph has under a key, or keep it home; ``advertise`` tells peers what changes.
@@ -230,18 +228,10 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         for told in self.peers.values():
             told.due |= dict.fromkeys(self.offered)
 
-    # --- peers ---------------------------------------------------------------------------------------------------
-
-    def link_up(self, peer: int, name: str = "", instance: str = "") -> None:
-        """Begin to tell a peer everything; ``advertise`` goes on with it.
-
-        Args:
-            peer: The peer's number.
-            name: The peer's name, which selects the rules for it.
-            instance: The peer's run, as 32 hexadecimal digits; what came from it is not offered to it.
-        """
-        self.peers[peer] = Told(name, instance, dict.fromkeys(self.offered))
-        self._portion(peer, self.peers[peer])
+    def link_up(self, session: Peer) -> None:
+        """Begin to tell a peer everything; ``advertise`` goes on with it."""
+        told = self.peers[session.peer] = Told(session, dict.fromkeys(self.offered))
+        self._portion(session.peer, told)
 
     def link_down(self, peer: int) -> None:
         """Forget what a peer was told."""
@@ -262,7 +252,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         # Judged anew: after new rules the peer is told a little later.
         if local is None or not self.judge_for(told, key, local).allowed:
             return None
-        name = self._out.context.names.of(told.name).wire_name(self.name_of(key))
+        name = self._out.context.names.of(told.session.name).wire_name(self.name_of(key))
         return key if wire_of(self.offer_for(key, local, name)) == wire else None
 
     def decision(self, peer: int, key: KeyT) -> PolicyDecision | PermissionDecision | None:
@@ -326,7 +316,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
             if holder != key:
                 told.behind.setdefault(wire_of(offer), []).append(key)
                 name, other = self.name_of(wire_of(offer)), self.name_of(holder)
-                text = f"{key} would be {name} at {told.name}, as {other} is already: rename one"
+                text = f"{key} would be {name} at {told.session.name}, as {other} is already: rename one"
                 self._out.warn("names.taken", f"{peer} {key}", text)
                 continue
             told.offers[key] = (offer, self.offered[key])
@@ -340,5 +330,5 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         """Report what a peer asks for without permission; it is answered as if there were none."""
         told, context = self.peers.get(peer), self._out.context
         if told is not None and context.gate.on:
-            local = next(iter(context.names.of(told.name).locals_of(wire)), wire)
-            context.gate.admits(self.access, told.name, local)
+            name = told.session.name
+            context.gate.admits(self.access, name, next(iter(context.names.of(name).locals_of(wire)), wire))

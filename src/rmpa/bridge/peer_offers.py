@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin
     from rmpa.bridge.offers import Effects
+    from rmpa.bridge.peer import Peer
 
 
 # Causes for which an entry is hidden: another type here, a permission, ``limits.nodes``.
@@ -62,8 +63,7 @@ class Heard(Generic[KeyT, EntryT, OfferT]):
     nothing that is shown: it holds for the nodes that come.
 
     Args:
-        name: The peer's name.
-        instance: Its run, as 32 hexadecimal digits.
+        session: The peer.
         entries: What is taken of its offers, by name on the wire.
         refused: The offers beyond the limit, at most ``limits.REFUSED_MAX``; further ones come with its next link.
         doubtful: What was offered over the last link and is not confirmed over the present one.
@@ -71,24 +71,17 @@ class Heard(Generic[KeyT, EntryT, OfferT]):
         crowded: The nodes without a place, and the entries of each that wait for one (ordered: taking the first item
             of a plain dict passes over all that were taken before it).
         complete: Whether it has told all that it offers.
-        away: Whether the peer has no link but may come back.
-        silent: Whether its last link ended by silence.
-        rank: The value of its GUID.
         routes: The routes that are asked for or open, by number.
         last_route: The number of the last one.
     """
 
-    name: str
-    instance: str = ""
+    session: Peer
     entries: dict[KeyT, EntryT] = field(default_factory=dict)
     refused: OrderedDict[KeyT, OfferT] = field(default_factory=OrderedDict)
     doubtful: set[KeyT] = field(default_factory=set)
     shown: Counter[str] = field(default_factory=Counter)
     crowded: OrderedDict[str, dict[EntryT, None]] = field(default_factory=OrderedDict)
     complete: bool = False
-    away: bool = False
-    silent: bool = False
-    rank: int = 0
     routes: dict[int, EntryT] = field(default_factory=dict)
     last_route: int = 0
 
@@ -143,7 +136,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
     """What peers offer, and what of it is in the local graph.
 
     Args:
-        out: Has the rules, sends messages and warns; the part itself, which also changes the local graph.
+        out: The part, which has the rules, and does what is decided here: at once, without calling back.
 
     Attributes:
         kind: The setting that limits the entries of one peer: ``topics`` or ``services``.
@@ -154,7 +147,6 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
 
     def __init__(self, out: Effects) -> None:
         self._out = out
-        self._do: Any = out
         self._peers: dict[int, Heard[KeyT, EntryT, OfferT]] = {}
         self.ways = RelayPaths(out.context.gate.may_relay)
 
@@ -201,20 +193,17 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
 
     def peer_name(self, peer: int) -> str:
         """The name of a peer, for texts."""
-        return known.name if (known := self._peers.get(peer)) is not None else "a peer that is gone"
+        return known.session.name if (known := self._peers.get(peer)) is not None else "a peer that is gone"
 
-    def link_up(self, peer: int, name: str = "", instance: str = "", rank: int = 0) -> None:
+    def link_up(self, session: Peer) -> None:
         """Register a link, of a new peer or of one that was away; its first message begins a full advertisement.
 
-        Args:
-            peer: The peer's number.
-            name: The peer's name, which selects the rules for it.
-            instance: Its run, as 32 hexadecimal digits: what relays offer of it is hidden while it has a link.
-            rank: The value of its GUID.
+        What relays offer of the peer is hidden while it has a link.
         """
-        known = self._peers.setdefault(peer, Heard(name=name, instance=instance))
-        known.away, known.silent, known.rank, known.routes, known.last_route = False, False, rank, {}, 0
-        self._ways_changed(self.ways.linked(peer, name, instance, rank))
+        peer = session.peer
+        known = self._peers.setdefault(peer, Heard(session=session))
+        known.routes, known.last_route = {}, 0
+        self._ways_changed(self.ways.linked(peer, session.name, session.instance, session.rank))
         self._ready(peer)
 
     def changes(self, peer: int, message: Advertise | AdvertiseServices) -> Iterator[tuple[KeyT, OfferT | None]]:
@@ -241,7 +230,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
     def _ready(self, peer: int) -> None:
         """Judge again what other peers bring, if a peer has become a way or is none any more."""
         known = self._peers[peer]
-        self._ways_changed(self.ways.ready(peer, ready=known.complete and not known.away))
+        self._ways_changed(self.ways.ready(peer, ready=known.complete and known.session.linked))
 
     def take_in(self, peer: int, wire: KeyT, offer: OfferT | None, now: float) -> None:
         """Apply one change of an advertisement: an offer, or ``None`` for what is offered no more."""
@@ -253,7 +242,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
             return
         known.refused.pop(wire, None)
         if (entry := known.entries.get(wire)) is not None:
-            self._drop(entry, f"its server at {known.name} has gone")
+            self._drop(entry, f"its server at {known.session.name} has gone")
         self._admit(peer, known, now)
 
     def _admit(self, peer: int, known: Heard[KeyT, EntryT, OfferT], now: float) -> bool:
@@ -271,11 +260,11 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
             self._came_again(entry, now)
             return
         if entry is not None:
-            self._drop(entry, f"another node of {known.name} provides it now")
+            self._drop(entry, f"another node of {known.session.name} provides it now")
         elif len(known.entries) >= self.limit:
             if wire in known.refused or len(known.refused) < limits.REFUSED_MAX:
                 known.refused[wire] = offer
-            self._warn_limit(known.name, self.kind, self.limit)
+            self._warn_limit(known.session.name, self.kind, self.limit)
             return
         entry = known.entries[wire] = self._entry(peer, offer)
         if entry.origin is not None and self.ways.count(peer, entry.origin, 1):
@@ -291,7 +280,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         entry.origin = origin
         self.ways.count(entry.peer, origin, 1)
         self._ways_changed({origin.instance})
-        self._do.path_changed(entry)
+        self._out.path_changed(entry)
 
     def _warn_limit(self, peer: str, kind: str, limit: int) -> None:
         text = f"{peer} has more than limits.{kind} = {limit} of this module; the rest is refused until there is "
@@ -314,16 +303,16 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         known, most = self._peers[entry.peer], self._out.context.settings.limits.nodes
         if known.free(entry.node, most):
             return ""
-        return f"{known.name} has more nodes than limits.nodes = {most} of this module"
+        return f"{known.session.name} has more nodes than limits.nodes = {most} of this module"
 
     def name_here(self, peer: int, wire: str, origin: Origin | None) -> str:
         """The name here of a topic or service, by the rules for its own module, not by those for the relay."""
-        module = self._peers[peer].name if origin is None else origin.name
+        module = self._peers[peer].session.name if origin is None else origin.name
         return self._out.context.names.of(module).local_name(wire)
 
     def _speaker(self, entry: EntryT) -> tuple[str, str]:
         """The module that permissions are asked for, and the peer that relays its entry, or empty."""
-        name = self._peers[entry.peer].name
+        name = self._peers[entry.peer].session.name
         return (name, "") if entry.origin is None else (entry.origin.name, name)
 
     def _ways_changed(self, instances: Collection[str]) -> None:

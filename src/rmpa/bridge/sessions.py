@@ -6,10 +6,10 @@ import asyncio
 import itertools
 import logging
 from dataclasses import dataclass, field
-from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.data.reception import LinkTime
+from rmpa.bridge.peer import Peer, PeerState
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.bridge.proxies import PeerProxies, ProxyNamespaces
 from rmpa.core.log import logged_failure
@@ -27,63 +27,31 @@ if TYPE_CHECKING:
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.master.parameters import GraphChange
 
+_log = logging.getLogger(__name__)
+
 # A peer whose agent died keeps its proxies in the local graph for this long: it may be started again at once.
 AWAY_GRACE: Final = 0.5
 
 
-# --- The state that the bridge keeps for one run of a peer, across its links ----------------------------------------
-
-
-class PeerState(Enum):
-    """The state of a session.
-
-    ::
-
-    LINKED ──silence──► SILENT ──SILENT_GRACE► AWAY ──nothing waits any more──► (gone)
-      ▲  ├──closed in order──────────────────►  │
-      ├──┼────────────── a new link ────────────┘   (from SILENT, too)
-
-    Attributes:
-        LINKED: The peer has a link.
-        SILENT: Its link ended by silence; most peers are back within ``mesh.limits.SILENT_GRACE``.
-        AWAY: It has no link, and a part of the bridge keeps something for it.
-    """
-
-    LINKED = auto()
-    SILENT = auto()
-    AWAY = auto()
-
-
-@dataclass(slots=True, eq=False)
-class PeerSession:
-    """One run of a peer.
+@dataclass(slots=True, eq=False, kw_only=True)
+class PeerSession(Peer):
+    """What the bridge keeps for one run of a peer, across its links.
 
     Args:
-        peer: Its number in this agent; never used again for another run.
         link: Its link, or the last one while it has none.
         proxies: The nodes that stand for its nodes in the local graph; those of the module, whichever peers bring it.
         time: The time base of its link: the offset between its clock and the local one.
-        state: Whether it has a link.
-        away_since: When its last link ended, monotonic seconds.
         wait: Seconds from ``away_since`` to ``due``; ``None`` while it has a link.
     """
 
-    peer: int
     link: PeerLink
     proxies: PeerProxies
     time: LinkTime = field(default_factory=LinkTime)
-    state: PeerState = PeerState.LINKED
-    away_since: float = 0.0
     wait: float | None = None
-
-    @property
-    def linked(self) -> bool:
-        """Whether the peer has a link now."""
-        return self.state is PeerState.LINKED
 
     def instance_of(self, origin: Origin | None) -> str:
         """The run of a module that the link brings, 32 hexadecimal digits: the peer's own without an ``origin``."""
-        return self.link.identity.instance.hex() if origin is None else origin.instance
+        return self.instance if origin is None else origin.instance
 
     @property
     def same_machine(self) -> bool:
@@ -106,16 +74,8 @@ class PeerSession:
         return None if self.wait is None else self.away_since + self.wait
 
 
-# --- The base class of the bridge's parts ---------------------------------------------------------------------------
-#
-# Topics, services, parameters and others.
-
-
-_log = logging.getLogger(__name__)
-
-
 class Part:
-    """Ignores every event of the bridge; parts override the methods that they need.
+    """A part of the bridge: topics, services, parameters and others. It overrides the events that it needs.
 
     All methods are called from the event loop.
 
@@ -130,8 +90,6 @@ class Part:
 
     async def close(self) -> None:
         """Release everything; all sessions have ended, and the local core still answers."""
-
-    # --- sessions ----------------------------------------------------------------------------------------------
 
     def link_up(self, session: PeerSession) -> None:
         """A link is up, of a new peer or of one whose session waited (after ``link_down``)."""
@@ -168,8 +126,6 @@ class Part:
         """
         return False
 
-    # --- messages ----------------------------------------------------------------------------------------------
-
     def message(self, session: PeerSession, message: Message) -> bool:  # noqa: ARG002 - for those that override it
         """Handle a control message from a peer.
 
@@ -187,8 +143,6 @@ class Part:
         Raises:
             LimitExceeded: It is longer than ``limits.ADVERTISEMENT_MAX``; the link is closed.
         """
-
-    # --- the local graph ---------------------------------------------------------------------------------------
 
     def graph_changed(self, change: GraphChange) -> None:
         """Handle a registration in the local graph that was added, changed or removed."""
@@ -307,8 +261,6 @@ class PeerSessions:
         proxies = self._modules[instance, name] = PeerProxies(prefix, self._nodes, kill)
         return proxies
 
-    # --- links ---------------------------------------------------------------------------------------------------
-
     def link_up(self, link: PeerLink) -> None:
         """Attach a link to the session that waits for it, or begin a session.
 
@@ -321,7 +273,8 @@ class PeerSessions:
             old.close(f"{link.name} has another address")
         session = self._waiting_for(link)
         if session is not None:
-            session.link, session.state, session.wait = link, PeerState.LINKED, None
+            session.link, session.rank, session.wait = link, link.identity.guid.value, None
+            session.state, session.silent = PeerState.LINKED, False
             self._timer.arm()
         else:
             session = self._begin(link)
@@ -330,10 +283,11 @@ class PeerSessions:
         call_each(self._parts, lambda part: part.link_up(session))
 
     def _begin(self, link: PeerLink) -> PeerSession:
-        peer = next(self._numbers)
-        prefix = self._namespaces.add(peer, link.identity)
-        proxies = self._proxies_of(link.identity.instance.hex(), link.identity.name, prefix)
-        session = self._by_number[peer] = PeerSession(peer, link, proxies)
+        peer, identity = next(self._numbers), link.identity
+        name, instance, rank = identity.name, identity.instance.hex(), identity.guid.value
+        proxies = self._proxies_of(instance, name, self._namespaces.add(peer, identity))
+        session = PeerSession(peer=peer, name=name, instance=instance, rank=rank, link=link, proxies=proxies)
+        self._by_number[peer] = session
         return session
 
     def _waiting_for(self, link: PeerLink) -> PeerSession | None:
@@ -353,10 +307,10 @@ class PeerSessions:
         if session is None:
             return
         session.away_since = asyncio.get_running_loop().time()
-        session.state = PeerState.SILENT
+        session.state, session.silent = PeerState.SILENT, link.silent
         call_each(self._parts, lambda part: part.link_down(session))
         session.link.routes.clear()
-        if link.silent:
+        if session.silent:
             session.wait = AWAY_GRACE if link.crashed else mesh_limits.SILENT_GRACE
             self._timer.arm()
         else:
@@ -395,15 +349,14 @@ class PeerSessions:
                 else:
                     self._outlasted(session, now)
 
-    # --- the end -------------------------------------------------------------------------------------------------
-
     def _end(self, session: PeerSession) -> None:
         """Ends a session for good: the rest of the peer is removed from the local graph."""
-        session.wait = None
+        session.state, session.wait = PeerState.AWAY, None
         self._timer.arm()
         self._by_number.pop(session.peer, None)
         if self._by_link.pop(session.link, None) is not None:
             call_each(self._parts, lambda part: part.link_down(session))
+            session.link.routes.clear()
         call_each(self._parts, lambda part: part.gone(session))
         self._namespaces.remove(session.peer)
 
@@ -417,8 +370,6 @@ class PeerSessions:
             closing.start(proxies.close(), f"retract {proxies.prefix}")
         if closing:
             await asyncio.wait(closing)
-
-    # --- the rest ------------------------------------------------------------------------------------------------
 
     def lane_lost(self, link: PeerLink) -> None:
         """Notify the parts that a link lost its bulk lane, perhaps in the middle of a message."""

@@ -11,10 +11,16 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, cast
 from unittest import mock
 
+from rmpa.bridge.data.export import ExportFlow, ExportRoute
+from rmpa.bridge.messages import Source
+from rmpa.bridge.peer import Peer
 from rmpa.core.outbox import QueuedMessage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
+    from rmpa.bridge.data.route_sender import RouteSender
+    from rmpa.core.contract import Contract
 
 WALL: Final = 1_700_000_000_000_000_000
 """The wall clock, in ns, when the other one says 0."""
@@ -91,6 +97,19 @@ def running(clock: Clock) -> Iterator[Clock]:
             yield clock
     finally:
         asyncio._set_running_loop(None)
+
+
+def add(flow: ExportFlow, peer: int, link: Link, number: int, contract: Contract) -> RouteSender:
+    """Begin to send to a peer."""
+    remove(flow, peer)
+    route = flow.routes[peer] = ExportRoute(Peer(peer=peer), Source("/t", "/n"), number, contract)
+    return flow.add(route, link)
+
+
+def remove(flow: ExportFlow, peer: int) -> None:
+    """Send to a peer no more."""
+    if (route := flow.routes.pop(peer, None)) is not None:
+        flow.remove(route)
 
 
 class Lane:

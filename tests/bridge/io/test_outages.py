@@ -9,6 +9,7 @@ import pytest
 
 from rmpa.bridge import graph_part, limits
 from rmpa.bridge.data.quality import QosEventKind
+from rmpa.bridge.data.route_sender import ReliableRouteSender
 from rmpa.bridge.messages import Source
 from rmpa.core.contract import ContractRule, History, Reliability
 from rmpa.mesh import limits as mesh_limits
@@ -43,22 +44,25 @@ def play(seed: int, scene: Callable[[World], Coroutine[object, object, None]], *
 def lost_at_receiver(side: Side) -> int:
     """What the receiving module says is lost."""
     (attached,) = side.attached
-    watch = side.bridge.topics.peers[attached.peer].watch(SURE)
+    entry = side.bridge.topics.imports.get(attached.peer, SURE)
+    past = side.bridge.topics.pasts(attached.name).get(SURE)
+    watch = side.bridge.topics.watch(entry) if entry is not None else past[0] if past is not None else None
     return watch.counts[QosEventKind.MESSAGES_LOST] if watch is not None else 0
 
 
 def unknown_at_receiver(side: Side) -> int:
     """How often it says that nobody knows how many."""
     (attached,) = side.attached
-    flow = side.bridge.topics.peers[attached.peer].flow(SURE)
+    entry = side.bridge.topics.imports.get(attached.peer, SURE)
+    flow = entry.flow if entry is not None else None
     return flow.watch.counts[QosEventKind.LOSS_UNKNOWN] if flow is not None else 0
 
 
 def lost_at_sender(side: Side) -> int:
     """What the sending module says is lost to its peer."""
     (attached,) = side.attached
-    numbering = side.bridge.topics.outbound.sender_of(SURE, attached.peer)
-    return numbering.lost if numbering is not None else 0
+    route = side.bridge.topics.exports.routes(SURE).get(attached.peer)
+    return route.sender.lost if route is not None and route.sender is not None else 0
 
 
 async def talk(world: World, speaker: Speaker, seconds: float, *, linked: bool = True) -> None:
@@ -89,7 +93,12 @@ async def settled(world: World) -> None:
     """Let all come that is kept: a few messages for each acknowledgement."""
     await world.rest(5.0)
     for side in world.sides:
-        while any(leg.reliable and leg.sender.pending for leg in side.bridge.topics.outbound.senders.values()):  # type: ignore[attr-defined] # reliable
+        exports = side.bridge.topics.exports
+        while any(
+            isinstance(sender, ReliableRouteSender) and sender.sender.pending
+            for attached in side.attached
+            for sender in exports.senders(attached.peer)
+        ):
             await world.rest(1.0)
 
 

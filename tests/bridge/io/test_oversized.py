@@ -23,9 +23,10 @@ def there(world: World) -> ImportFlow:
     """The flow at the receiver."""
     side = world.sides[1]
     (attached,) = side.attached
-    flow = side.bridge.topics.peers[attached.peer].flow(BIG)
-    assert flow is not None
-    return flow
+    entry = side.bridge.topics.imports.get(attached.peer, BIG)
+    assert entry is not None
+    assert entry.flow is not None
+    return entry.flow
 
 
 def test_both_ends_say_it_and_smaller_ones_go_on(
@@ -42,7 +43,7 @@ def test_both_ends_say_it_and_smaller_ones_go_on(
             speaker.say(size)
             await world.rest(0.2)
         assert [number for _, number in listener.got[speaker.number]] == [1, 3, 5]
-        flow = a.bridge.topics.outbound.flows[BIG]
+        flow = a.bridge.topics.exports.flows[BIG]
         assert (flow.messages, flow.oversized, flow.oversized_bytes) == (3, 2, 1001)
         assert (there(world).oversized, there(world).oversized_bytes, there(world).counts["lost"]) == (2, 1001, 0)
         assert a.bridge.counters["message.oversized"] == b.bridge.counters["message.oversized_there"] == 2

@@ -138,7 +138,9 @@ async def an_owed_acknowledgement(world: World) -> None:
     for _ in range(20):
         await asyncio.sleep(0.001)
         world.carry(1, "express", 1 << 20)
-        if not a.bridge.topics.outbound.senders:  # the answer to what it asked for takes its time
+        if not any(
+            a.bridge.topics.exports.senders(one.peer) for one in a.attached
+        ):  # the answer to what it asked for takes its time
             world.carry(0, "express", 1 << 20)
     await world.rest(1.0)
     for speaker in (first, second):
@@ -164,7 +166,7 @@ async def a_lie(world: World) -> None:
     world.link()
     end = a.link
     assert end is not None
-    epoch = a.bridge.topics.outbound.flows[Source("/sure", "/one")].epoch
+    epoch = a.bridge.topics.exports.flows[Source("/sure", "/one")].epoch
     lie = OpenRoute(1, "/sure", "/one", Contract(reliability=Reliability.RELIABLE), epoch=epoch, after=99)
     end.receive(Frame(FrameKind.CONTROL, encode(lie)))
     world.link()

@@ -83,10 +83,12 @@ class Side:
 
     def publications(self, topic: str) -> Iterator[Publication]:
         """What local nodes can connect to."""
-        for attached in self.attached:
-            for published in self.bridge.topics.peers[attached.peer].topics.values():
-                if published.publication.topic == topic and self.core.publishers(topic).get(published.node.name):
-                    yield published.publication
+        for entry in self.bridge.topics.imports:
+            publication = entry.publication
+            if publication is None or publication.topic != topic or entry.route is None:
+                continue
+            if not entry.route.is_missing({topic: self.core.publishers(topic)}):
+                yield publication
 
     def named(self, topic: str) -> None:
         """The master has named a topic's publishers."""
@@ -293,14 +295,13 @@ class World:
         """Nobody listens: nothing is connected, nothing flows, nothing is remembered of it."""
         for side in self.sides:
             bridge = side.bridge
-            assert not bridge.topics.exports._flows
-            assert not bridge.topics.outbound.flows
-            assert not bridge.topics.outbound.senders
+            assert not bridge.topics.exports.flows
+            assert not any(bridge.topics.exports._routes.values())
+            assert not bridge.topics.joins._served
             assert not bridge.topics.outbound._parked
+            assert not bridge.topics.imports.flowing
+            assert not any(entry.flow for entry in bridge.topics.imports)
             for attached in side.attached:
-                topics = bridge.topics.peers[attached.peer]
-                assert not topics.flows
-                assert not any(topic.flow for topic in topics.topics.values())
                 assert not any(attached.link.routes), "but route 0, which every link has"
         for end in self._ends:
             for lane in (end.express, end.bulk):

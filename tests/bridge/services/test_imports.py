@@ -201,7 +201,7 @@ def test_a_name_that_all_modules_have_costs_one_judgement_each(monkeypatch: pyte
     assert hidden(made, peers, "/start") == "arm3 provides it too, and is shown: its GUID is lower"
     made.local("/start", "/mine")
     judged.clear()
-    made.link_up(peers + 1, "leg", peers + 1)
+    made.link_up(peers + 1, "leg", rank=peers + 1)
     assert made.advertised(peers + 1, offer("/start", full=True)) == []
     assert hidden(made, peers + 1, "/start") == "/mine of this module provides it itself"
     assert judged == []

@@ -22,7 +22,6 @@ from rmpa.bridge.topics.exports import LocalSource
 from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.settings import LimitSettings
 from rmpa.core.contract import Contract, ContractRule, Contracts, Durability, Priority, Reliability, Transport
-from rmpa.mesh.reliable import ReliableSender
 from tests.bridge.recorder import AddRoute, Connect, Disconnect, Exports, RemoveRoute, Send, SuspendRoute, Warn
 
 CMD = Source("/cmd", "/joy")
@@ -111,6 +110,7 @@ def test_a_lost_publisher_closes_every_route_and_forgets_them(offering: Exports)
     offering.described(CMD, ABOUT)
     assert offering.lost(CMD, "it closed the connection") == [
         RemoveRoute(CMD, 1, 7),
+        Disconnect(CMD),
         Send(1, RouteClosed(7, "it closed the connection")),
     ]
     assert offering.lost(CMD, "it closed the connection") == []
@@ -123,8 +123,8 @@ def test_a_restarted_node_is_left_at_its_old_address(offering: Exports) -> None:
     offering.described(CMD, ABOUT)
     assert graph(offering, {CMD: LocalSource(JOY.type, "http://127.0.0.1:5000/")}) == [
         RemoveRoute(CMD, 1, 7),
-        Send(1, RouteClosed(7, "the node has restarted")),
         Disconnect(CMD),
+        Send(1, RouteClosed(7, "the node has restarted")),
     ]
 
 
@@ -337,13 +337,11 @@ def test_another_run_of_a_peer_is_told_once_that_messages_may_be_lost(exports: E
 
 
 def test_the_last_message_of_a_publisher_that_has_gone_is_told() -> None:
-    numbering = ReliableSender(10, 1000, 10, 1000, 1)
-    exports = Exports(Policy(PolicySettings()), numbering=lambda *_: numbering)
+    exports = Exports(Policy(PolicySettings()), last=1)
     graph(exports, {CMD: JOY})
     exports.link_up(1)
     exports.opened(1, SURE)
     exports.described(CMD, ABOUT)
-    numbering.offer(b"one", 0)
     ended = graph(exports, {})
     assert Send(1, RouteClosed(7, "the node has gone", 1)) in ended
 
@@ -367,6 +365,7 @@ def test_a_publisher_that_goes_takes_suspended_routes_along(flowing: Exports) ->
     assert flowing.lost(CMD, "it died") == [
         RemoveRoute(CMD, 1, 0),
         RemoveRoute(CMD, 2, 7),
+        Disconnect(CMD),
         Send(2, RouteClosed(7, "it died")),
     ]
     flowing.link_up(1)

@@ -159,13 +159,14 @@ def test_many_timers_are_dealt_with_a_few_at_a_time(imports: Imports) -> None:
         assert len(imports.handle_timer(6.0)) <= 48
         rounds += 1
     assert rounds > 3
-    assert {entry.state for _, _, entry in imports} == {"opening"}
+    assert {entry.state for entry in imports} == {"opening"}
 
 
 def test_what_changes_while_somebody_looks_does_no_harm(imports: Imports) -> None:
     imports.advertised(1, Advertise(added=many(3)))
     seen = []
-    for _, source, _ in imports:
+    for entry in imports:
+        source = entry.wire
         seen.append(source)
         imports.advertised(1, Advertise(added=(OFFER,), removed=(source,)))
     assert len(seen) == 3
@@ -178,7 +179,7 @@ def test_a_peer_that_nothing_waits_for_leaves_what_was_open(imports: Imports) ->
     assert not imports.waits_for(1)
     assert imports.detached(1) == [Detach(1, CMD, 1, missed=True)]
     assert imports.detached(1) == []
-    assert len(list(imports.book.link_down(1))) >= 21
+    assert len(imports.book.gone(1)) >= 21
 
 
 # --- contracts, and links that come back --------------------------------------------------------------------------

@@ -20,26 +20,26 @@ from rmpa.bridge.messages import (
     RouteOpened,
     Source,
     TopicOffer,
-    decode,
 )
+from rmpa.bridge.peer import Peer
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
+from rmpa.bridge.topics import exports as topic_exports
 from rmpa.bridge.topics import local as module
-from rmpa.bridge.topics.exports import ExportRoute, LocalSource
+from rmpa.bridge.topics.exports import LocalSource
 from rmpa.bridge.topics.local import (
     LocalSubscriptions,
-    Mismatches,
     RemoteSubscribers,
     audience,
     compares_names,
     is_watched,
 )
+from rmpa.bridge.topics.reports import Mismatches
 from rmpa.config.peer_rules import PermissionRule, PolicySettings
 from rmpa.config.settings import TrustSettings
-from rmpa.core.contract import Contract
 from rmpa.ros.node.publication import Publication
 from rmpa.trust.permissions import Permissions
 from tests.bridge.io.doubles import Link
-from tests.bridge.recorder import Exports, Imports, Send
+from tests.bridge.recorder import Exports, Imports, Out, Send, context
 from tests.ros.node.peers import STRING, until
 
 if TYPE_CHECKING:
@@ -103,33 +103,31 @@ class World:
         self.exports, self.imports = Exports(policy, gate=gate), Imports(policy, lambda: 0.5, gate=gate)
         self.sent: list[object] = []
         self.warned: list[str] = []
-        self.listeners: dict[Source, tuple[str, ...]] = {}
-        link = SimpleNamespace(name="base", send_control=lambda payload: self.sent.append(decode(payload)))
+        link = SimpleNamespace(name="base")
         proxies = SimpleNamespace(prefix="/rmpa/base")
         self.peer = cast("PeerSession", SimpleNamespace(peer=1, link=link, proxies=proxies))
-        self.flows: dict[int, SimpleNamespace] = {}
-        topics = SimpleNamespace(get=self._topic)
-        peers: Any = {1: SimpleNamespace(session=self.peer, flows=self.flows, topics=topics)}
-        out: Any = SimpleNamespace(warn=lambda kind, _who, _text: self.warned.append(kind))
+        out: Any = SimpleNamespace(
+            warn=lambda kind, _who, _text: self.warned.append(kind),
+            send=lambda _peer, message: self.sent.append(message),
+        )
         exports, imports = cast("Any", self.exports), cast("Any", self.imports)
-        shared = SimpleNamespace(sessions={1: self.peer}, context=SimpleNamespace(gate=gate))
-        self.presence = RemoteSubscribers(cast("Any", shared), out, exports, imports, peers)
+        shared = SimpleNamespace(context=SimpleNamespace(gate=gate))
+        self.presence = RemoteSubscribers(cast("Any", shared), out, exports, imports)
         self.exports.link_up(1, "base" if gate.on else "")
         self.imports.link_up(1)
 
-    def _topic(self, source: Source) -> object:
-        """The source at its proxy, with a flow of its own for each route."""
-        entry = self.imports.get(1, source)
-        open_states = {"open", "lingering"}
-        if source not in self.listeners or entry is None or entry.state not in open_states:
-            return None
-        flow = self.flows.setdefault(entry.route, SimpleNamespace(route=entry.route, told=()))
-        return SimpleNamespace(publication=SimpleNamespace(listeners=self.listeners[source]), flow=flow)
+    def change(self, source: Source, *listeners: str) -> None:
+        """These listen to a source of the peer now."""
+        if (entry := self.imports.get(1, source)) is not None:
+            before = entry.route.flow if entry.route is not None else None
+            flow = before if before is not None and before.route == entry.number else None
+            flow = flow or SimpleNamespace(route=entry.number, told=())
+            entry.route = SimpleNamespace(publication=SimpleNamespace(listeners=listeners), flow=flow)
+            self.presence.changed(entry)
 
     async def changed(self, source: Source, *listeners: str) -> list[object]:
-        """These listen to a source of the peer now; return what it was told."""
-        self.listeners[source] = listeners
-        self.presence.changed(1, source)
+        """Likewise; return what the peer was told."""
+        self.change(source, *listeners)
         await asyncio.sleep(0)
         sent, self.sent = self.sent, []
         return sent
@@ -143,7 +141,7 @@ class World:
 
     def told(self, route: int, *nodes: str) -> list[str]:
         """The peer says who listens; return under which names we are connected then."""
-        assert self.presence.message(self.peer, Audience(route, nodes))
+        self.presence.named(self.peer, Audience(route, nodes))
         return connected()
 
 
@@ -180,8 +178,7 @@ async def test_of_several_changes_at_once_the_last_is_told(world: World) -> None
     world.imports.demand(1, GOAL, 0.0, wanted=True)
     world.imports.opened(1, RouteOpened(1, Description(TYPE, MD5, "", False)), 0.0)
     for listeners in (("/one",), ("/one", "/two"), ("/two",)):
-        world.listeners[GOAL] = listeners
-        world.presence.changed(1, GOAL)
+        world.change(GOAL, *listeners)
     await asyncio.sleep(0)
     assert world.sent == [Audience(1, ("/two",))]
 
@@ -202,25 +199,9 @@ async def test_each_is_connected_under_its_name_here_until_it_leaves(world: Worl
     assert world.told(7, "/server", "/echo") == ["/rmpa/base/echo", "/rmpa/base/server"]
     assert [one.what[:2] for one in Connection.made] == [("/count/goal", URI)] * 2
     assert world.told(7, "/server") == ["/rmpa/base/server"]
-    assert list(world.presence._shown[1, GOAL]) == ["/rmpa/base/server"]
+    assert list(world.exports.routes(GOAL)[1].audience) == ["/rmpa/base/server"]
     assert len(Connection.made) == 2, "who stays is not connected anew"
     assert world.told(7) == []
-    assert not world.presence._shown
-
-
-async def test_nobody_stays_behind_a_route_a_link_or_the_end(world: World) -> None:
-    world.publish(GOAL, TYPE, 7)
-    ends: list[Callable[[], None]] = [
-        lambda: world.presence.route_over(1, GOAL),
-        lambda: world.presence.link_down(world.peer.peer),
-    ]
-    for end in ends:
-        assert world.told(7, "/server") == ["/rmpa/base/server"]
-        end()
-        assert connected() == []
-    world.told(7, "/server")
-    world.presence.close()
-    assert connected() == []
 
 
 async def test_what_does_not_belong_is_left_alone(world: World) -> None:
@@ -230,7 +211,6 @@ async def test_what_does_not_belong_is_left_alone(world: World) -> None:
     world.publish(GOAL, TYPE, 7)
     world.exports.closed(1, CloseRoute(7))
     assert world.told(7, "/server") == [], "closed meanwhile"
-    assert not world.presence.message(world.peer, CloseRoute(7))
 
 
 async def test_a_peer_can_make_us_connect_so_often_and_no_more(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -262,35 +242,69 @@ def test_listeners_behind_a_relay_are_named_only_if_both_may(world: World) -> No
 SOURCE = Source("/chatter", "/talker")
 
 
+SOURCE_NAMES = ("/chatter", "/talker")
+
+
 SUBSCRIBER = "http://talker:1/"
+
+
+class Subscribed:
+    """A module that sends ``/chatter`` to one peer, over a link that is only noted."""
+
+    def __init__(self) -> None:
+        self.publications = [Publication("/chatter", "/talker", STRING)]
+        self.link, self.out = Link(), cast("Any", Out(context()))
+        self.exports = topic_exports.Exports(self.out)
+        shared: Any = SimpleNamespace(
+            core=SimpleNamespace(call=lambda *_: None, suspect=lambda _: None),
+            node=SimpleNamespace(uri="http://agent:1/", next_number=lambda: 1),
+            rng=lambda: 0.5,
+            sessions={1: SimpleNamespace(link=self.link, linked=False)},
+        )
+        losses = SimpleNamespace(tell_oversized=lambda *_: None)
+        topics: Any = SimpleNamespace(exports=self.exports, losses=losses, look=lambda _: None)
+        self.out.outbound = LocalSubscriptions(shared, topics, lambda *_: self.publications[-1])
+
+    async def flows(self) -> None:
+        """It flows on route 7."""
+        self.exports.put(SOURCE, LocalSource("std_msgs/String", SUBSCRIBER))
+        self.exports.link_up(Peer(peer=1))
+        self.exports.opened(1, OpenRoute(7, *SOURCE_NAMES))
+        await until(lambda: self.exports.senders(1))
+
+    async def ends(self) -> None:
+        """Its publisher ends, and what it has sent is waited for."""
+        self.publications[0].withdraw()
+        await until(lambda: self.link.fences)
 
 
 async def test_a_route_that_is_opened_while_the_end_of_the_last_one_is_told_has_data() -> None:
     """The peer that waited for this one may open it while the end of the last one is told."""
-    publications = [Publication("/chatter", "/talker", STRING)]
-    core = SimpleNamespace(call=lambda *_: None, suspend=None, suspect=lambda _: None)
-    node = SimpleNamespace(uri="http://agent:1/", next_number=lambda: 1)
-    described: list[Description] = []
-    link = Link()
+    scene = Subscribed()
+    exports = scene.exports
 
-    def lost(source: Source, _reason: str, _lasts: object) -> None:
-        publications.append(Publication("/chatter", "/talker", STRING))
-        subscriptions.connect(SOURCE, SUBSCRIBER)
-        route = ExportRoute(7, Contract(), Contract(), "", "")
-        begin = subscriptions.begins(source, 1, route)
-        subscriptions.add_route(source, 1, route, begin, cast("Any", link))
+    def send(peer: int, message: object) -> None:
+        if isinstance(message, RouteClosed):
+            scene.publications.append(Publication("/chatter", "/talker", STRING))
+            exports.opened(peer, OpenRoute(8, *SOURCE_NAMES))
 
-    exports = SimpleNamespace(described=lambda _, description: described.append(description), lost=lost)
-    shared: Any = SimpleNamespace(core=core, node=node, rng=lambda: 0.5)
-    unused = cast("Any", None)
-    subscriptions = LocalSubscriptions(shared, cast("Any", exports), unused, unused, lambda *_: publications[-1])
-    subscriptions.connect(SOURCE, SUBSCRIBER)
-    await until(lambda: described)
-    publications[0].withdraw()
-    await until(lambda: len(described) == 2)
-    assert subscriptions.flows[SOURCE].by_peer[1].route == 7
-    assert subscriptions.senders[1, 7] is subscriptions.flows[SOURCE].by_peer[1]
-    subscriptions.close()
+    scene.out.send = send
+    await scene.flows()
+    await scene.ends()
+    exports.senders(1)[0].fenced(scene.link.fences.popleft()[1])
+    await until(lambda: exports.route(1, 8) is not None and exports.senders(1))
+    assert [sender.route for sender in exports.senders(1)] == [8]
+    exports.closed(1, CloseRoute(8))
+    scene.out.outbound.close()
+
+
+async def test_a_peer_may_close_the_last_route_while_the_end_of_its_publisher_is_waited_for() -> None:
+    scene = Subscribed()
+    await scene.flows()
+    await scene.ends()
+    scene.exports.closed(1, CloseRoute(7))
+    assert not scene.exports.flows
+    scene.out.outbound.close()
 
 
 @pytest.mark.parametrize(
@@ -347,7 +361,8 @@ class Reports(Mismatches):
         exports = SimpleNamespace(
             offered=self.offered, local=lambda _peer, source: source if source in self.offered else None
         )
-        imports = SimpleNamespace(at=lambda topic: [(BASE, CMD)] if topic == CMD.topic else [], knows=lambda _: False)
+        entry = SimpleNamespace(peer=BASE, wire=CMD, node=CMD.node)
+        imports = SimpleNamespace(at=lambda topic: [entry] if topic == CMD.topic else [], knows=lambda _: False)
         out = SimpleNamespace(
             send=lambda peer, message: self.done.append(Send(peer, message)),
             warn=lambda *args: self.warnings.append(args[2]),

@@ -1,34 +1,38 @@
 """The data path from one local publisher to the peers; only what each message needs is done here.
 
 An ``ExportFlow`` is called from a socket's read callback with a view of its buffer, and passes it on with one system
-call for each receiver, a large message in parts while it still arrives. It takes routes as commands and shares no
-state with the planning side.
+call for each receiver, a large message in parts while it still arrives. An ``ExportRoute`` is all that is known of
+its route to one peer; which there are is decided in ``topics.exports``.
 """
 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.bridge.data.route import RouteBegin, kept_for
 from rmpa.bridge.data.route_sender import ReliableRouteSender, RouteSender
 from rmpa.core.contract import Contract, Durability, Reliability
 from rmpa.core.identity import SERIAL_MASK, is_later, serial_add
+from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import HistoryCache
 from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Callable, Container, Sequence
+    from collections.abc import Callable, Sequence
 
     from rmpa.bridge.data.reception import ImportFlow
+    from rmpa.bridge.messages import Description, OpenRoute, Source
+    from rmpa.bridge.peer import Peer
     from rmpa.core.outbox import QueuedMessage
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.node.subscription import TopicConnection
-    from rmpa.runtime.tls import Buffer
 
-    Keep = Callable[[bytes, int], object]
+
+_DEFAULT: Final = Contract()
 
 
 class FlowSender(Protocol):
@@ -36,11 +40,72 @@ class FlowSender(Protocol):
 
     @property
     def drained(self) -> bool: ...  # noqa: D102 - as of RouteSender
-    def message(self, stamp_ns: int, framed: Buffer) -> int: ...  # noqa: D102
+    def message(self, stamp_ns: int, framed: bytes) -> int: ...  # noqa: D102
     def skip(self, sequence: int) -> None: ...  # noqa: D102
     def begin(self, stamp_ns: int, size: int) -> tuple[LaneSender, QueuedMessage] | None: ...  # noqa: D102
     def drain(self, done: Callable[[], None]) -> None: ...  # noqa: D102
     def close(self) -> None: ...  # noqa: D102
+
+
+@dataclass(slots=True, eq=False)
+class ExportRoute:
+    """A source on its way to one peer.
+
+    Args:
+        session: The peer.
+        source: The source.
+        number: The route's id; 0 while it is suspended: its peer has no link.
+        contract: The contract in force: the stronger terms of both ends.
+        asked: The contract that the peer asked for.
+        position: Epoch and last message that the peer has of the source, by this or another path; ``None``: nothing.
+        unknown: Whether an earlier run of the peer's module may have missed messages.
+        shared: Whether the publisher was connected before.
+        sender: Sends the messages, and keeps those that the peer does not have; ``None`` until the publisher answers.
+        audience: The connections to the publisher that stand for the peer's listeners, by their names here.
+    """
+
+    session: Peer
+    source: Source
+    number: int = 0
+    contract: Contract = _DEFAULT
+    asked: Contract = _DEFAULT
+    position: tuple[int, int] | None = None
+    unknown: bool = False
+    shared: bool = False
+    sender: RouteSender | None = None
+    audience: dict[str, TopicConnection] = field(default_factory=dict)
+
+    @property
+    def peer(self) -> int:
+        """The peer's number."""
+        return self.session.peer
+
+    @property
+    def flows(self) -> bool:
+        """Whether data is sent on it now."""
+        return self.sender is not None and self.number > 0
+
+    @property
+    def reliable(self) -> bool:
+        """Whether each message is kept until the peer has it."""
+        return self.contract.reliability is Reliability.RELIABLE
+
+    @property
+    def outage(self) -> float:
+        """For how many seconds its messages are kept without a link."""
+        return self.contract.resume_window if self.reliable else mesh_limits.SILENT_GRACE
+
+    def open(self, message: OpenRoute, contract: Contract, *, unknown: bool, shared: bool) -> None:
+        """Take what the peer asks for, over its present link."""
+        self.number, self.contract, self.asked = message.route, contract, message.contract
+        self.position = (message.epoch, message.after) if message.epoch else None
+        self.unknown, self.shared = unknown, shared
+
+    def dismiss(self) -> None:
+        """Close the connections for the peer's listeners."""
+        for connection in self.audience.values():
+            connection.close()
+        self.audience.clear()
 
 
 class ExportFlow:
@@ -50,10 +115,13 @@ class ExportFlow:
     ``max_rate``, whose peer gets some of them, has numbers of its own.
 
     Args:
+        uri: The publisher's slave API.
         new_epoch: Returns the epoch of a new numbering.
 
     Attributes:
         connection: To the publisher.
+        description: The publisher's header, once it has answered.
+        routes: Its routes by peer, with the suspended ones.
         history: The last messages, for routes that are opened later.
         _streaming: The senders that pass on the present message in parts, each with its lane.
         _whole: The present message so far, where a sender or the history needs it whole.
@@ -66,10 +134,12 @@ class ExportFlow:
 
     connection: TopicConnection
 
-    def __init__(self, new_epoch: Callable[[], int] = int) -> None:
+    def __init__(self, uri: str = "", new_epoch: Callable[[], int] = int) -> None:
+        self.uri = uri
         self._new_epoch = new_epoch
         self.epoch = new_epoch()
-        self.by_peer: dict[int, RouteSender] = {}
+        self.description: Description | None = None
+        self.routes: dict[int, ExportRoute] = {}
         self._senders: tuple[FlowSender, ...] = ()
         self._joins: list[tuple[RouteSender, FlowSender]] = []
         self.history = HistoryCache()
@@ -96,6 +166,11 @@ class ExportFlow:
         """Whether the last message is the publisher's last one, if the publisher has gone."""
         return True
 
+    @property
+    def flowing(self) -> list[ExportRoute]:
+        """Its routes on which data is sent now."""
+        return [route for route in self.routes.values() if route.flows]
+
     def latch(self) -> None:
         """Keep the last message: the publisher latches."""
         self.latching = True
@@ -112,16 +187,10 @@ class ExportFlow:
         self.history.latched = max(self.history.latched, min(latched, ros_limits.LATCHED_MAX))
         self.history.depth = max(self.history.depth, depth)
 
-    def begins(self, peer: int, contract: Contract, position: tuple[int, int] | None) -> RouteBegin:
-        """Where a route to a peer begins: behind what the peer has, else with what late subscribers get.
-
-        Args:
-            peer: The peer.
-            contract: The route's.
-            position: The epoch and the last message that the peer has of this source.
-        """
-        sender, reliable = self.by_peer.get(peer), contract.reliability is Reliability.RELIABLE
-        epoch, after = position or (0, 0)
+    def begins(self, route: ExportRoute) -> RouteBegin:
+        """Where a route begins: behind what the peer has, else with what late subscribers get."""
+        sender, contract = route.sender, route.contract
+        epoch, after = route.position or (0, 0)
         if sender is not None and sender.epoch == epoch != 0 and sender.contract.same_route(contract):
             # The peer may have kept messages whose acknowledgement was lost; these are not sent again.
             first = sender.following if is_later(sender.following, after) else serial_add(after, 1)
@@ -134,34 +203,35 @@ class ExportFlow:
         goes_on = epoch == self.epoch != 0
         if goes_on:
             behind = self.history.after(after)
-            kept = behind if reliable else behind[max(0, len(behind) - late) :]
+            kept = behind if route.reliable else behind[max(0, len(behind) - late) :]
         first = kept[0].sequence if kept else serial_add(self.number, 1)
         return RouteBegin(self.epoch, first, goes_on=goes_on, kept=tuple(kept))
 
-    def add(
-        self, peer: int, link: PeerLink, route: int, contract: Contract, begin: RouteBegin | None = None
-    ) -> RouteSender:
-        """Send to one more peer, first the kept messages; ``begin`` is what ``begins`` has said."""
-        self.remove(peer)
-        begin = begin or self.begins(peer, contract, None)
-        sender: RouteSender
-        if contract.reliability is Reliability.RELIABLE:
-            sender = ReliableRouteSender(link, route, contract, begin.epoch, begin.first, large=self.large)
+    def last(self, route: ExportRoute) -> int | None:
+        """The last message of a route, if the publisher has gone; ``None``: others may have been lost."""
+        return route.sender.last if route.sender is not None and self.complete else None
+
+    def add(self, route: ExportRoute, link: PeerLink, begin: RouteBegin | None = None) -> RouteSender:
+        """Send on a route, first the kept messages; ``begin`` is what ``begins`` has said."""
+        self.remove(route)
+        begin, contract = begin or self.begins(route), route.contract
+        kind = ReliableRouteSender if route.reliable else RouteSender
+        sender = kind(link, route.number, contract, begin.epoch, begin.first, large=self.large)
+        if route.reliable:
             self.keep(0, kept_for(contract))
-        else:
-            sender = RouteSender(link, route, contract, begin.epoch, begin.first, large=self.large)
         if contract.durability is Durability.TRANSIENT_LOCAL:
             self.keep(contract.kept)
         for message in begin.kept:
             sender.skip(message.sequence)
             sender.message(message.stamp_ns, message.payload)
-        self.by_peer[peer] = sender
+        route.sender = sender
         self._list_senders()
         return sender
 
-    def remove(self, peer: int) -> None:
-        """Stop sending to a peer."""
-        sender = self.by_peer.pop(peer, None)
+    def remove(self, route: ExportRoute) -> None:
+        """Send on a route no more, and drop its waiting messages."""
+        route.dismiss()
+        sender, route.sender = route.sender, None
         if sender is not None:
             sender.close()
             self._list_senders()
@@ -189,7 +259,8 @@ class ExportFlow:
         self._look_drained()
 
     def _list_senders(self) -> None:
-        self._senders = (*self.by_peer.values(), *(join for _, join in self._joins))
+        own = (route.sender for route in self.routes.values() if route.sender is not None)
+        self._senders = (*own, *(join for _, join in self._joins))
 
     def drain(self, over: Callable[[], None]) -> None:
         """Call ``over`` once all peers have all messages, for the publisher has ended; perhaps at once."""
@@ -210,25 +281,22 @@ class ExportFlow:
             over()
 
     def close(self) -> None:
-        """Remove all peers, and free the kept messages, which may be large."""
+        """Free the kept messages, which may be large; its routes have ended."""
         self.ended()
-        for peer in tuple(self.by_peer):
-            self.remove(peer)
         self.history.clear()
         self._whole = None
 
     def message(self, framed: memoryview) -> None:
         """Pass one message on; ``framed`` has its length in front and is valid during the call only."""
-        stamp = time.time_ns()
+        stamp, whole = time.time_ns(), bytes(framed)  # one copy for all, which they may keep
         self.messages += 1
-        self.bytes += len(framed)
-        if self._keeping:
-            self._keep(stamp, bytes(framed))
-            return
+        self.bytes += len(whole)
         for sender in self._senders:
-            dropped = sender.message(stamp, framed)
+            dropped = sender.message(stamp, whole)
             if dropped:
                 self.dropped += dropped
+        if self._keeping:
+            self.history.append(self.number, stamp, whole)
 
     def begin(self, size: int) -> None:
         """Begin a message of ``size`` bytes, length field included, that comes in parts."""
@@ -260,20 +328,16 @@ class ExportFlow:
         self.bytes += self._size
         streamed, self._streaming = self._streaming, {}
         whole, self._whole = self._whole, None
-        if whole is not None:
-            self._keep(self._stamp, bytes(whole), streamed)
-            return
+        framed = bytes(whole) if whole is not None else None
         for sender in self._senders:
-            if sender not in streamed:  # it came during the message
+            if sender in streamed:
+                continue
+            if framed is not None:
+                self.dropped += sender.message(self._stamp, framed)
+            else:  # it came during the message
                 sender.skip(serial_add(self.number, 1))
-
-    def _keep(self, stamp: int, framed: bytes, streamed: Container[FlowSender] = ()) -> None:
-        """Sends a complete message to those that have not got it in parts, and keeps it for others."""
-        for sender in self._senders:
-            if sender not in streamed:
-                self.dropped += sender.message(stamp, framed)
-        if self._keeping:
-            self.history.append(self.number, stamp, framed)
+        if self._keeping and framed is not None:
+            self.history.append(self.number, self._stamp, framed)
 
 
 class RelayedFlow(ExportFlow):
@@ -282,11 +346,12 @@ class RelayedFlow(ExportFlow):
     What the proxy says first to a new subscriber is known already, by the numbers.
 
     Args:
+        uri: As of ``ExportFlow``.
         new_epoch: As of ``ExportFlow``.
     """
 
-    def __init__(self, new_epoch: Callable[[], int]) -> None:
-        super().__init__(new_epoch)
+    def __init__(self, uri: str, new_epoch: Callable[[], int]) -> None:
+        super().__init__(uri, new_epoch)
         self._source: ImportFlow | None = None
         self._number = 0
         self._ignoring = False

@@ -274,8 +274,6 @@ class ImportFlow:
         self._stop_ack_timer()
         self._watch_timer.close()
 
-    # --- whether a message is delivered --------------------------------------------------------------------------
-
     def _judge(self) -> None:
         """Whether nothing but the number and the age of the next message has to be looked at."""
         usual = self._replay is None and self._sequence is None and self._held is None
@@ -380,8 +378,6 @@ class ImportFlow:
         if (sequence := self.numbering.due_ack(now)) is not None:
             self._link.mark(FrameKind.ACK, self.route, sequence)
 
-    # --- messages in parts -----------------------------------------------------------------------------------------
-
     def _begin(self, sequence: int, stamp_ns: int, part: memoryview) -> None:
         """Takes the first part of a message, which begins with the message's length."""
         if len(part) < _PREFIX_SIZE:
@@ -421,8 +417,6 @@ class ImportFlow:
         if is_new and not self._is_expired(stamp_ns, now_ns) and not self._is_replay(whole):
             self._deliver(whole, stamp_ns)
         self._judge()
-
-    # --- what it leads to ------------------------------------------------------------------------------------------
 
     def _deliver(self, framed: bytes | bytearray, stamp_ns: int) -> None:
         self._output.publish_framed(framed)

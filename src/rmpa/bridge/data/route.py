@@ -122,9 +122,6 @@ class LaneSwitch:
         self.lane = EXPRESS
 
 
-# --- Down-sampling to a contract's ``max_rate``, at a steady period -------------------------------------------------
-
-
 class Downsampler:
     """Admits at most ``rate`` messages a second of one route; pure.
 

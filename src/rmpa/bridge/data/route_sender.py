@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from rmpa.core.outbox import QueuedMessage
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.runtime.tls import Buffer
 
     Keep = Callable[[bytes, int], object]
 
@@ -100,13 +99,13 @@ class RouteSender:
         """The present lane, ``express`` or ``bulk``, to show."""
         return self._switch.lane.name.lower()
 
-    def message(self, stamp_ns: int, framed: Buffer) -> int:
-        """Send one message; return how many older ones were dropped for it."""
+    def message(self, stamp_ns: int, framed: bytes) -> int:
+        """Send one message, which may be kept; return how many older ones were dropped for it."""
         if self._direct and len(framed) <= _SMALL:
             self.sequence = sequence = self.sequence + 1 & SERIAL_MASK
             return self._transmit(sequence, stamp_ns, framed)
         if self._downsampler is not None and not self._downsampler.admit(self._loop.time()):
-            self._newest = (stamp_ns, bytes(framed))  # in place of an older one, until the rate allows it
+            self._newest = (stamp_ns, framed)  # in place of an older one, until the rate allows it
             if self._timer is None:
                 self._timer = self._loop.call_at(self._downsampler.due, self._send_newest, self._downsampler)
             return 0
@@ -198,16 +197,16 @@ class RouteSender:
             if timer is not None:
                 timer.cancel()
 
-    def _send(self, stamp_ns: int, framed: Buffer) -> int:
+    def _send(self, stamp_ns: int, framed: bytes) -> int:
         self.sequence = sequence = self.sequence + 1 & SERIAL_MASK
         if self._lane_for(len(framed)):
             return self._transmit(sequence, stamp_ns, framed)
-        return self._hold(sequence, stamp_ns, bytes(framed))
+        return self._hold(sequence, stamp_ns, framed)
 
-    def _transmit(self, sequence: int, stamp_ns: int, framed: Buffer, now_ns: int | None = None) -> int:
+    def _transmit(self, sequence: int, stamp_ns: int, framed: bytes, now_ns: int | None = None) -> int:
         """Sends a message, at its stamp or now, and keeps it while the link may prove to have been silent."""
         sent, now_ns = self._sent, stamp_ns if now_ns is None else now_ns
-        sent.append((now_ns, (sequence, stamp_ns, bytes(framed))))
+        sent.append((now_ns, (sequence, stamp_ns, framed)))
         self._sent_bytes += len(framed)
         while (
             sent[0][0] < now_ns - _RESENT_NS
@@ -404,12 +403,12 @@ class ReliableRouteSender(RouteSender):
         missed, self._reported = self.sender.lost - self._reported, self.sender.lost
         return missed
 
-    def _send(self, stamp_ns: int, framed: Buffer) -> int:
+    def _send(self, stamp_ns: int, framed: bytes) -> int:
         before = self.sender.overflowed
         if self._keep is not None:
-            self._keep(bytes(framed), stamp_ns)
+            self._keep(framed, stamp_ns)
         else:
-            self.sender.offer(bytes(framed), stamp_ns)
+            self.sender.offer(framed, stamp_ns)
             self._go_on()
         return self.sender.overflowed - before
 

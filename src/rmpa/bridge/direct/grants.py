@@ -101,8 +101,6 @@ class Grants(ABC):
                 self._by_node.setdefault((want.name, want.node), []).append((peer, want.user, grant))
         return sorted(self._by_node.get((name, node), ()))
 
-    # --- what subclasses know ---------------------------------------------------------------------------------------
-
     @abstractmethod
     def _unmet(self, session: PeerSession, asked: DirectAsk) -> Unmet | None:
         """The condition that does not hold for a peer by the rules and the graph."""
@@ -116,8 +114,6 @@ class Grants(ABC):
 
     def _broke(self, want: Want) -> None:  # noqa: B027 - likewise
         """A peer's user says that its connection ended by itself."""
-
-    # --- requests ---------------------------------------------------------------------------------------------------
 
     async def _ask(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         asked = read_ask(args)
@@ -191,8 +187,6 @@ class Grants(ABC):
     def _released(self, session: PeerSession, args: dict[str, Any]) -> None:
         self._set(session, read_ask(args), None)
 
-    # --- the bridge's part ------------------------------------------------------------------------------------------
-
     def judge_again(self, *, refused: bool = True) -> None:
         """Compare the answers with other rules: connections that are not allowed any more end, others ask again.
 
@@ -230,7 +224,7 @@ class Grants(ABC):
         shared = any(
             other.address == session.address for other in self._shared.sessions.linked() if other is not session
         )
-        if session.link.silent and not shared:
+        if session.silent and not shared:
             for port in {grant.port for peer, _, grant in self if peer == session.peer}:
                 self._end(session, port)
         self.gone(session)
@@ -247,9 +241,6 @@ class Grants(ABC):
         if problem := end_all(connections(local_port=port, remote=(session.address, None))):
             text = "! %s: connections of local nodes to it may hang: they cannot be ended (%s)"
             _log.info(text, session.link.name, problem)
-
-
-# --- where this module's nodes listen -----------------------------------------------------------------------------
 
 
 class NodePorts:
@@ -324,9 +315,6 @@ def end_all(found: list[TcpSocket] | None) -> str:
     return ""
 
 
-# --- topics and services -------------------------------------------------------------------------------------------
-
-
 class TopicGrants(Grants):
     """The direct connections of peers' subscribers to local publishers.
 
@@ -367,8 +355,6 @@ class TopicGrants(Grants):
     def _interrupted(self, session: PeerSession, want: Want, *, lasts: bool) -> None:
         interrupted(self.interruptions, session.link.name, want, asyncio.get_running_loop().time(), lasts=lasts)
 
-    # --- the local graph --------------------------------------------------------------------------------------------
-
     def _changed(self, session: PeerSession, want: Want, *, granted: bool) -> None:
         """Have the proxy of a peer's subscriber stand in the graph while it has a grant for the topic."""
         if granted:
@@ -394,8 +380,6 @@ class TopicGrants(Grants):
             proxy = session.proxies.get(asked.user) if isinstance(found, Grant) else None
             if proxy is not None and proxy.name not in subscribers.get(asked.name, {}):
                 self._register(asked.name, proxy)
-
-    # --- conditions -------------------------------------------------------------------------------------------------
 
     def _uri(self, want: Want) -> str:
         """The slave API of a publisher now; the exports learn a new one a little later."""

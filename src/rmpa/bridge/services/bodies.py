@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import ServiceDescription
     from rmpa.runtime.tls import Buffer
 
+_log = logging.getLogger(__name__)
+
 _LENGTH: Final = 4
 # Bytes of a large body that are copied at once, in some 50 microseconds; then other tasks run.
 _PORTION: Final = 256 * KIB
@@ -261,13 +263,6 @@ class LocalService(Local):
     type = None
 
 
-# --- Connections to one local server for the calls of all peers -----------------------------------------------------
-#
-# A few are kept open, each with one call at a time.
-
-
-_log = logging.getLogger(__name__)
-
 # Called with ``(ok, body)``: the response, or the text of the error.
 Done = Callable[[bool, "Buffer"], None]
 
@@ -350,8 +345,6 @@ class ServicePool:
     async def closed(self) -> None:
         """Wait until attempts to connect have ended; call after ``close``."""
         await self._opening.close()
-
-    # --- inside ---------------------------------------------------------------------------------------------
 
     def _text(self, reason: str) -> bytes:
         return f"service [{self.service}]: {reason}".encode(errors="replace")

@@ -35,7 +35,7 @@ from rmpa.bridge.messages import (
     ServiceOpened,
     is_crossing_name,
 )
-from rmpa.bridge.offers import Effects, OfferBook
+from rmpa.bridge.offers import OfferBook
 from rmpa.bridge.peer_offers import CROWDED, DENIED, ImportBook, Remote
 from rmpa.bridge.policy import PolicyDecision, is_outside
 from rmpa.bridge.services.bodies import LocalService
@@ -45,6 +45,9 @@ from rmpa.ros.wire.tcpros import ServiceDescription
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
+
+    from rmpa.bridge.peer import Peer
+    from rmpa.bridge.services.part import Services
 
 
 @dataclass(slots=True)
@@ -74,8 +77,9 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
 
     kind, warning, access, owner = "services", "services.too_many", Access.CALL, "its server"
     renews = True  # behind another server what peers know of a service may not be true any more
+    _out: Services
 
-    def __init__(self, out: Effects) -> None:
+    def __init__(self, out: Services) -> None:
         super().__init__(out)
         self.about: dict[str, ServiceDescription] = {}
         self._routes: dict[int, dict[int, ServiceRoute]] = {}
@@ -93,8 +97,6 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
             for number, route in routes.items()
             if route.service == service
         ]
-
-    # --- the offers ----------------------------------------------------------------------------------------------
 
     def judge(self, key: str, local: LocalService) -> PolicyDecision:
         """Decide whether a service may cross at all."""
@@ -118,23 +120,21 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
         gate = self._out.context.gate
         for peer, told in self.peers.items():
             for number, route in list(self._routes[peer].items()):
-                if why := gate.why_not(Access.CALL, told.name, route.service):
+                if why := gate.why_not(Access.CALL, told.session.name, route.service):
                     self._close(peer, number, why)
         return super().reload()
 
-    # --- links and calls -----------------------------------------------------------------------------------------
-
-    def link_up(self, peer: int, name: str = "", instance: str = "") -> None:
+    def link_up(self, session: Peer) -> None:
         """As of ``OfferBook``; the peer has no service open."""
-        self._routes[peer] = {}
-        super().link_up(peer, name, instance)
+        self._routes[session.peer] = {}
+        super().link_up(session)
 
     def link_down(self, peer: int) -> None:
         """End all routes of a peer whose link is gone."""
         super().link_down(peer)
         for route in self._routes.pop(peer, {}).values():
             if route.requests:
-                self._do.serving.end_route(peer, route.requests)
+                self._out.serving.end_route(peer, route.requests)
 
     def opened(self, peer: int, message: OpenService) -> None:
         """Open a service for a peer, or answer with ``ServiceClosed`` and the reason.
@@ -157,7 +157,7 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
             if service in self.about:
                 self._start(service)
             elif not probing:
-                self._do.serving.probe(service, self.offered[service])
+                self._out.serving.probe(service, self.offered[service])
             return
         self._out.send(peer, ServiceClosed(number, why))
 
@@ -168,7 +168,7 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
         """
         route = self._routes[peer].pop(message.route, None)
         if route is not None and route.requests:
-            self._do.serving.end_route(peer, route.requests)
+            self._out.serving.end_route(peer, route.requests)
 
     def described(self, service: str, server: LocalService, about: ServiceDescription) -> None:
         """Store what a server said of its service, and open the routes that waited for it.
@@ -192,7 +192,7 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
             if not route.requests:
                 self._serial += 2
                 route.requests = limits.SERVICE_ROUTES + self._serial
-                self._do.serving.serve(peer, number, route, self.offered[service])
+                self._out.serving.serve(peer, number, route, self.offered[service])
                 types = (about.type, about.md5sum, about.request_type, about.response_type)
                 self._out.send(peer, ServiceOpened(number, route.requests, *types))
 
@@ -200,13 +200,13 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
         self.about.pop(key, None)
         for peer, number, _ in self._of(key):
             self._close(peer, number, f"{key}: {reason}")
-        self._do.serving.server_gone(key)
-        self._do.direct_exports.server_gone(key)
+        self._out.serving.server_gone(key)
+        self._out.direct_exports.server_gone(key)
 
     def _close(self, peer: int, number: int, reason: str) -> None:
         route = self._routes[peer].pop(number)
         if route.requests:
-            self._do.serving.end_route(peer, route.requests)
+            self._out.serving.end_route(peer, route.requests)
         self._out.send(peer, ServiceClosed(number, reason[: limits.CONTROL_TEXT_MAX]))
 
 
@@ -243,8 +243,9 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
     """
 
     kind = "services"
+    _out: Services
 
-    def __init__(self, out: Effects) -> None:
+    def __init__(self, out: Services) -> None:
         super().__init__(out)
         self._local: dict[str, str] = {}
         self._claims: dict[str, dict[RemoteService, None]] = {}
@@ -267,15 +268,12 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         """The peer's service that is in the local graph by this name."""
         return self._shown.get(service)
 
-    # --- links ---------------------------------------------------------------------------------------------------
-
     def link_down(self, peer: int) -> None:
         """Close the routes of a peer whose link is gone; its services stay in the graph until ``gone``."""
         if (known := self._peers.get(peer)) is not None:
-            known.away = True
             self._ready(peer)
             for remote in list(known.routes.values()):
-                self._end(remote, f"the link to {known.name} was lost")
+                self._end(remote, f"the link to {known.session.name} was lost")
 
     def gone(self, peer: int, keep: Collection[str] = ()) -> Iterator[None]:
         """Take the services of a peer that does not come back, or not soon, out of the local graph, one by one.
@@ -290,13 +288,11 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         known.give_up()
         for remote in list(known.entries.values()):
             if not remote.shown or remote.name not in keep:
-                self._drop(remote, f"{known.name} is gone")
+                self._drop(remote, f"{known.session.name} is gone")
                 yield
         if not known.entries:
             del self._peers[peer]
             self._ways_changed(self.ways.unlinked(peer))
-
-    # --- what peers offer ----------------------------------------------------------------------------------------
 
     def _entry(self, peer: int, offer: ServiceOffer) -> RemoteService:
         name = self.name_here(peer, offer.service, offer.origin)
@@ -308,7 +304,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         """The server was replaced, or the link is a new one: the type may have changed."""
         entry.about = None
         if entry.shown:
-            self._do.forget_about(entry)
+            self._out.forget_about(entry)
 
     def _judge(self, entry: RemoteService) -> None:
         """As of ``ImportBook``; a thousand modules may have a name, so only if it may go first."""
@@ -331,8 +327,6 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         del claims[entry]
         if not claims:
             del self._claims[entry.name]
-
-    # --- which is shown ------------------------------------------------------------------------------------------
 
     def local(self, service: str, node: str | None) -> None:
         """Set the node of this module that provides a service, ``None`` for none; it goes before the peers' ones."""
@@ -382,7 +376,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         if chosen is not None and not chosen.shown:
             self._peers[chosen.peer].show(chosen)
             self._shown[service] = chosen
-            self._do.provide(chosen)
+            self._out.provide(chosen)
         if shown is not None and left:
             # Only now: the services that this chooses could take the place that was found free above.
             self._next_in(shown.peer)
@@ -390,7 +384,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
     def _hide(self, remote: RemoteService, reason: str) -> None:
         del self._shown[remote.name]
         self._peers[remote.peer].hide(remote)
-        self._do.withdraw(remote, reason)
+        self._out.withdraw(remote, reason)
 
     def _next_in(self, peer: int) -> None:
         """Choose again among the services that wait for a place of their node, as far as places are free."""
@@ -400,14 +394,14 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
     def _rank(self, remote: RemoteService) -> tuple[bool, bool, int, int]:
         """Sorts the claims to a name: modules of this mesh go first, then links that work, then by GUID."""
         known, outside = self._peers[remote.peer], remote.origin is not None and is_outside(remote.origin)
-        return outside, known.away, known.rank, remote.peer
+        return outside, not known.session.linked, known.session.rank, remote.peer
 
     def _own_first(self, service: str) -> str:
         node = self._local.get(service)
         return f"{node} of this module provides it itself" if node is not None else ""
 
     def _outranked(self, first: RemoteService) -> str:
-        return f"{self._peers[first.peer].name} provides it too, and is shown: its GUID is lower"
+        return f"{self._peers[first.peer].session.name} provides it too, and is shown: its GUID is lower"
 
     def why_hidden(self, remote: RemoteService) -> tuple[str, str]:
         """Why a service is not in the local graph, and the cause (see ``Remote``); empty if it may be."""
@@ -429,7 +423,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         if not is_crossing_name(service):
             return f"the rules of names make {service!r} of it", ""
         decision = context.services.judge(service, remote.node if origin is None else origin.node)
-        for name in (self._peers[remote.peer].name, *([origin.name] if origin is not None else ())):
+        for name in (self._peers[remote.peer].session.name, *([origin.name] if origin is not None else ())):
             if decision.allowed:
                 decision = context.policy.judge_for(name, service, wire=remote.wire)
         if not decision.allowed:
@@ -441,8 +435,6 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         crowd = self._crowd(remote)
         return crowd, CROWDED if crowd else ""
 
-    # --- calling -------------------------------------------------------------------------------------------------
-
     def want(self, remote: RemoteService, now: float) -> None:
         """Open a service that a local node wants to call, or whose type it wants to know.
 
@@ -452,7 +444,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
             LocalProtocolError: The service is not shown, or its peer has no link: check before the call.
         """
         known = self._peers.get(remote.peer)
-        if known is None or not remote.shown or known.away:
+        if known is None or not remote.shown or not known.session.linked:
             raise LocalProtocolError(f"{remote.name} of peer {remote.peer} cannot be opened")
         if not remote.route:
             known.last_route += 1
@@ -484,7 +476,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         del self._opening[remote]
         remote.requests, remote.problem = message.requests, ""
         remote.about = ServiceDescription(message.type, message.md5, message.request_type, message.response_type)
-        self._do.opened(remote)
+        self._out.opened(remote)
 
     def closed(self, peer: int, message: ServiceClosed) -> None:
         """Handle a peer's message that a service cannot be called, or no longer; unknown routes are ignored."""
@@ -504,7 +496,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
     def release(self, remote: RemoteService, reason: str) -> None:
         """Close the route of a service that is not needed now; the next call opens it again."""
         if remote.route:
-            if not self._peers[remote.peer].away:
+            if self._peers[remote.peer].session.linked:
                 self._out.send(remote.peer, CloseService(remote.route))
             self._end(remote, reason)
 
@@ -513,4 +505,4 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         del self._peers[remote.peer].routes[route]
         self._opening.pop(remote, None)
         remote.route, remote.requests, remote.problem = 0, 0, reason
-        self._do.ended(remote, route, reason)
+        self._out.ended(remote, route, reason)

@@ -293,11 +293,6 @@ class Server(BodyReceiver):
         self._sender.send(sequence, text.encode(), _FAILED)
 
 
-# --- Serves services of this module to peers ------------------------------------------------------------------------
-#
-# A pool of connections to each server, and checks that servers live.
-
-
 _MD5_LENGTH: Final = 32
 
 
@@ -380,8 +375,6 @@ class Serving:
                 del self._pools[service]
         for service in [one for one in self.stats if one not in self._exports.seen]:
             del self.stats[service]
-
-    # --- inside ---------------------------------------------------------------------------------------------
 
     def _pool(self, service: str, server: LocalService) -> ServicePool:
         pool = self._pools.get(service)

@@ -65,8 +65,6 @@ class ServicePaths(Paths["RemoteService"]):
         self._used: dict[str, set[tuple[str, int]]] = {}
         self._able = shared.core.on_lookup(self._lookup)
 
-    # --- lookups -------------------------------------------------------------------------------------------------
-
     def _lookup(self, service: str, uri: str, caller: str, api: str) -> str:
         """Answer a lookup; see ``Core.on_lookup``. It is called for each of them."""
         path = self.answers.get(service)
@@ -129,8 +127,6 @@ class ServicePaths(Paths["RemoteService"]):
         contract = Contract(transport=self._shared.context.services.transport(remote.name))
         return unmet_by_contract(contract, "this module")  # nothing is kept of what is relayed by rule
 
-    # --- the local graph -----------------------------------------------------------------------------------------
-
     def shown(self, remote: RemoteService) -> None:
         """Judge a service that is in the local graph, or to which other rules apply."""
         session, want = self._shared.sessions.get(remote.peer), Want(remote.name, remote.node)
@@ -179,8 +175,6 @@ class ServicePaths(Paths["RemoteService"]):
             return Unmet(Condition.CONTRACT, text)
         return None
 
-    # --- links ---------------------------------------------------------------------------------------------------
-
     def link_down(self, session: PeerSession) -> None:
         """Stop direct calls to a peer that cannot be reached, those under way too; unless only its agent has died."""
         super().link_down(session)
@@ -203,8 +197,6 @@ class ServicePaths(Paths["RemoteService"]):
             if problem := end_all(connections(remote=endpoint)):
                 text = "! %s: calls to %s:%d may hang: they cannot be ended (%s); see rmpa doctor [stale-connections]"
                 _log.warning(text, session.link.name, *endpoint, problem)
-
-    # --- carrying out --------------------------------------------------------------------------------------------
 
     async def _probe(self, path: ServicePath, grant: Grant) -> str:
         address = f"rosrpc://{path.session.address}:{grant.port}"

@@ -17,13 +17,13 @@ from rmpa.bridge import limits
 from rmpa.bridge.direct.grants import ServiceGrants
 from rmpa.bridge.graph_part import GraphPart
 from rmpa.bridge.messages import CloseService, OpenService, ServiceClosed, ServiceOpened, Source
+from rmpa.bridge.peer import PeerState
 from rmpa.bridge.peer_offers import DENIED
 from rmpa.bridge.policy import Needs, service_place
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.services.books import ServiceExports, ServiceImports
 from rmpa.bridge.services.calls import Budgets, Caller, CallStats, Serving
 from rmpa.bridge.services.direct import ServicePaths
-from rmpa.bridge.sessions import PeerState
 from rmpa.core.identity import is_own
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rmpa.bridge.messages import Message
+    from rmpa.bridge.peer_offers import Remote
+    from rmpa.bridge.policy import Place
     from rmpa.bridge.services.books import RemoteService
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
@@ -127,8 +129,6 @@ class Services(GraphPart):
                     # The next call opens it again, with the new timeout in its request.
                     self.imports.release(shown.remote, "its timeout has changed")
 
-    # --- the bridge's part -------------------------------------------------------------------------------------
-
     def _settled(self) -> None:
         """As of ``GraphPart``; the servers of what is offered now are looked after."""
         self.serving.look_after()
@@ -217,8 +217,6 @@ class Services(GraphPart):
                 self.imports.release(shown.remote, "no node calls it")
         self.serving.close_idle(before)
 
-    # --- the local graph ---------------------------------------------------------------------------------------
-
     def _names(self) -> Iterable[str]:
         return (*self.exports.seen, *self._core.state().services)
 
@@ -243,8 +241,6 @@ class Services(GraphPart):
                 return LocalService(node, uri, origin)
         return None
 
-    # --- peers' services here ----------------------------------------------------------------------------------
-
     def provide(self, remote: RemoteService) -> None:
         """Register a peer's service in the local graph, at the proxy of the node that provides it."""
         peer, service, node = remote.peer, remote.name, remote.node
@@ -252,21 +248,13 @@ class Services(GraphPart):
         if session is None:
             return
         proxies, owner = self._shared.sessions.proxies(session, node, remote.origin)
-        self._pass_on(remote, session)
+        self.pass_on(remote)
         shown = self._shown[remote] = ShownService(remote, session)
         proxies.hold(owner, f"service {service}", lambda proxy: self._expose(shown, proxy))
         self.direct_imports.shown(remote)
 
-    def path_changed(self, remote: RemoteService) -> None:
-        """Offer what is relayed with the path that it has now."""
-        if remote.shown and (session := self._shared.sessions.get(remote.peer)) is not None:
-            self._pass_on(remote, session)
-            self.look((remote.name,))
-
-    def _pass_on(self, remote: RemoteService, session: PeerSession) -> None:
-        name = self._shared.sessions.proxy_name(session, remote.node, remote.origin)
-        source, place = Source(f"service {remote.name}", remote.node), service_place(remote.name, name)
-        self._shared.relay.pass_on(session.peer, session.link.identity, source, place, remote.origin)
+    def _relayed(self, entry: Remote[Any], proxy: str) -> tuple[Source, Place]:
+        return Source(f"service {entry.name}", entry.node), service_place(entry.name, proxy)
 
     def _expose(self, shown: ShownService, proxy: SlaveNode) -> None:
         """Register a service at its proxy, which exists now; do nothing if the service was withdrawn meanwhile."""

@@ -39,14 +39,13 @@ from rmpa.runtime.kernel_tcp import connections
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Sequence
 
     from rmpa.bridge.messages import Source
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
-    from rmpa.bridge.topics.imports import Imports, RemoteTopic
-    from rmpa.bridge.topics.peer_topics import PeerTopics
-    from rmpa.ros.node.publication import Publication
+    from rmpa.bridge.topics.import_route import RemoteTopic
+    from rmpa.bridge.topics.imports import Imports
     from rmpa.ros.wire.slave_api import BusLink
 
     TopicPath = Path[RemoteTopic]
@@ -59,9 +58,6 @@ MEASURING: Final = "/rmpa_topic_"
 _TWICE: Final = Unmet(
     Condition.LATCHED, "it latches, and a move would deliver its last message twice: subscribe again"
 )
-
-
-# --- what subscribers and the kernel are asked ---------------------------------------------------------------------
 
 
 async def publisher_update(uri: str, topic: str, publishers: Sequence[str]) -> bool:
@@ -148,9 +144,6 @@ async def end_link(link: BusLink) -> str:
     return ""
 
 
-# --- the paths -----------------------------------------------------------------------------------------------------
-
-
 class TopicPaths(Paths["RemoteTopic"]):
     """Direct connections of local subscribers to nodes of peers.
 
@@ -158,7 +151,6 @@ class TopicPaths(Paths["RemoteTopic"]):
         shared: As of ``Paths``.
         on_warning: As of ``Paths``.
         imports: The remote sources.
-        topics: The peers' topics in the local graph, by the numbers of their sessions.
 
     Attributes:
         interruptions: When subscribers were without their path.
@@ -168,40 +160,30 @@ class TopicPaths(Paths["RemoteTopic"]):
 
     kind = "topic"
 
-    def __init__(
-        self,
-        shared: Shared,
-        on_warning: Callable[[str, str, str], None],
-        imports: Imports,
-        topics: Mapping[int, PeerTopics],
-    ) -> None:
+    def __init__(self, shared: Shared, on_warning: Callable[[str, str, str], None], imports: Imports) -> None:
         super().__init__(shared, on_warning)
         own = Needs((), "the peer's own topics that come directly")
         shared.rpc.on_notification("direct.topic_again", self._asked_again, own)
         self._imports = imports
-        self._topics = topics
         self.interruptions: Interruptions = {}
         self._checking: asyncio.TimerHandle | None = None
         self._kernel_tells = kernel_tells()
         self._left: set[str] = set()
         self._started = self._now()
 
-    # --- the local graph --------------------------------------------------------------------------------------------
-
     def reload(self) -> None:
         """Judge every subscriber by the new contracts."""
-        for _, _, entry in yielding_to_data(list(self._imports)):
+        for entry in yielding_to_data(list(self._imports)):
             self.shown(entry)
 
     def graph_changed(self, change: GraphChange) -> None:
         """Judge a local subscriber that came, or forget one that went."""
         if change.kind is not RegistrationKind.SUBSCRIBER or is_own(change.node):
             return
-        for peer, source in list(self._imports.at(change.name)):
-            entry = self._imports.get(peer, source)
-            if change.added and entry is not None:
+        for entry in self._imports.at(change.name):
+            if change.added:
                 self._consider(entry, change.node, change.api)
-            path = self.get(peer, Want(source.topic, source.node, change.node))
+            path = self.get(entry.peer, Want(entry.wire.topic, entry.node, change.node))
             if not change.added and path is not None:
                 self.forget(path)  # it ends its connections itself
 
@@ -260,18 +242,12 @@ class TopicPaths(Paths["RemoteTopic"]):
         return _TWICE if description is not None and description.latching else None
 
     def _is_relayed(self, path: TopicPath) -> bool:
-        publication = self._publication(path)
+        publication = path.entry.publication
         return publication is not None and path.want.user in publication.callers
-
-    def _publication(self, path: TopicPath) -> Publication | None:
-        topics = self._topics.get(path.session.peer)
-        return topics.publication(path.entry.wire) if topics is not None else None
 
     def _uri(self, path: TopicPath) -> str:
         """The slave API of a path's subscriber; empty if it is not registered."""
         return self._shared.core.subscribers(path.want.name).get(path.want.user, "")
-
-    # --- what subscribers ask ---------------------------------------------------------------------------------------
 
     def request(self, peer: int, source: Source, subscriber: str) -> Awaitable[RosReply | None] | None:
         """Answer a subscriber's ``requestTopic`` at the proxy of a source; see ``PublicationEvents``."""
@@ -316,8 +292,6 @@ class TopicPaths(Paths["RemoteTopic"]):
                 if path.unmet is _TWICE:
                     self.update(path)
 
-    # --- links ------------------------------------------------------------------------------------------------------
-
     def link_up(self, session: PeerSession) -> None:
         """As of ``Paths``."""
         for path in self._of_peer(session):
@@ -352,13 +326,11 @@ class TopicPaths(Paths["RemoteTopic"]):
 
     async def _leave(self, path: TopicPath) -> tuple[str, int] | None:
         """Make a subscriber leave all of its connections to a node; return a direct one that stays."""
-        proxy, publication = path.session.proxies.get(path.want.node), self._publication(path)
+        proxy, publication = path.session.proxies.get(path.want.node), path.entry.publication
         await self._list(path, without=proxy.uri if proxy is not None else "")
         if publication is not None:
             publication.hang_up(path.want.user)
         return await self._end_direct(path)
-
-    # --- carrying out -----------------------------------------------------------------------------------------------
 
     async def _probe(self, path: TopicPath, grant: Grant) -> str:
         address, timeout = path.session.address, limits.DIRECT_PROBE_TIMEOUT
@@ -397,7 +369,7 @@ class TopicPaths(Paths["RemoteTopic"]):
     async def _renew(self, path: TopicPath) -> bool:
         """List without the proxy, end the connection, list with it; return whether that was done."""
         uri, proxy = self._uri(path), path.session.proxies.get(path.want.node)
-        if not uri or proxy is None or self._publication(path) is None:
+        if not uri or proxy is None or path.entry.publication is None:
             return False
         if (stays := await self._leave(path)) is not None:
             self._put(path, stays)
@@ -463,8 +435,6 @@ class TopicPaths(Paths["RemoteTopic"]):
             f"its connection is ended, and this agent may not do that ({problem}); see rmpa doctor"
         )
         self._on_warning("direct.stuck", f"{path.session.peer} {source} {user}", text)
-
-    # --- watching direct connections --------------------------------------------------------------------------------
 
     def _watch(self) -> None:
         """Begin to watch direct connections."""

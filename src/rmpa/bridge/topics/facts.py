@@ -13,7 +13,7 @@ from rmpa.bridge.peer_offers import CONFLICT, CROWDED
 from rmpa.bridge.policy import PolicyDecision
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
-from rmpa.core.contract import KEYS, Contract, Reliability, Transport
+from rmpa.core.contract import KEYS, Contract, Transport
 from rmpa.core.facts import (
     Arrival,
     ContractTerm,
@@ -31,11 +31,13 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from rmpa.bridge.bridge import Bridge
+    from rmpa.bridge.data.export import ExportRoute
     from rmpa.bridge.data.quality import QosWatch, QualitySummary
     from rmpa.bridge.messages import Source
+    from rmpa.bridge.peer import Peer
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
-    from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.bridge.topics.import_route import RemoteTopic
 
 _DEFAULT = Contract()
 
@@ -120,10 +122,10 @@ class TopicFacts:
         state, topics = self._core.state(), self._bridge.topics
         idle: set[str] = set()
         first, problems = set(state.subscribers), set()
-        for _, source, entry in yielding_to_data(list(topics.imports)):
+        for entry in yielding_to_data(list(topics.imports)):
             if entry.state != "idle" or entry.direct:
                 first.add(entry.name)
-            elif not entry.shown or entry.problem or topics.mismatches(source):
+            elif not entry.shown or entry.problem or topics.mismatches.texts(entry.wire):
                 problems.add(entry.name)
             else:
                 idle.add(entry.name)
@@ -144,19 +146,19 @@ class TopicFacts:
     def _incoming(self, wanted: Collection[str] | None) -> Iterator[tuple[str, RouteInfo, list[str]]]:
         """The topic of each source of a peer with its route, and its mismatches."""
         sessions = {session.peer: session for session in self._bridge.sessions}
-        for peer, source, entry in yielding_to_data(list(self._bridge.topics.imports)):
+        for entry in yielding_to_data(list(self._bridge.topics.imports)):
             if wanted is not None and entry.name not in wanted:
                 continue
             yield_to_data()
-            texts = [f"{sessions[peer].link.name}: {entry.hidden}"] if entry.cause == CONFLICT else []
-            texts += self._bridge.topics.mismatches(source)
-            yield entry.name, self._incoming_route(sessions[peer], source, entry), texts
+            session = sessions[entry.peer]
+            texts = [f"{session.name}: {entry.hidden}"] if entry.cause == CONFLICT else []
+            texts += self._bridge.topics.mismatches.texts(entry.wire)
+            yield entry.name, self._incoming_route(session, entry), texts
 
-    def _incoming_route(self, session: PeerSession, source: Source, entry: RemoteTopic) -> RouteInfo:
-        """The route of a peer's source; ``source`` has its wire name."""
-        topics, contracts = self._bridge.topics.peers[session.peer], self._bridge.context.contracts
-        flow, publication = topics.flow(source), topics.publication(source)
-        about, now = entry.description, self._clock.now()
+    def _incoming_route(self, session: PeerSession, entry: RemoteTopic) -> RouteInfo:
+        """The route of a peer's source."""
+        contracts, flow, publication = self._bridge.context.contracts, entry.flow, entry.publication
+        source, about, now = entry.wire, entry.description, self._clock.now()
         latched = about.latching if about is not None else False
         proxies, node = self._bridge.sessions.proxies(session, source.node, entry.origin)
         problem = proxies.problems.get(node, "")
@@ -186,23 +188,23 @@ class TopicFacts:
             contract=_terms(entry.contract or contracts.of(source.topic, entry.type)),
             problem=entry.hidden or problem,
             limit="nodes" if entry.cause == CROWDED else "",
-            **_events(topics.watch(source), now),
-            **self._transport(session, source, contracts.of(entry.name, entry.type), now),
+            **_events(self._bridge.topics.watch(entry), now),
+            **self._transport(session, entry, contracts.of(entry.name, entry.type), now),
             **figures,
         )
 
-    def _transport(self, session: PeerSession, source: Source, contract: Contract, now: float) -> dict[str, Any]:
+    def _transport(self, session: PeerSession, entry: RemoteTopic, contract: Contract, now: float) -> dict[str, Any]:
         """The fields of a peer's route that say which subscribers are direct, and why others are relayed.
 
         Args:
             session: The peer.
-            source: The source, by its wire name.
+            entry: The source.
             contract: This module's for the topic.
             now: Monotonic seconds.
         """
         paths = self._bridge.topics.direct_imports
         subscribers = []
-        for path in paths.of(session.peer, source.topic, source.node):
+        for path in paths.of(session.peer, entry.wire.topic, entry.node):
             endpoint, unmet = path.endpoint, path.unmet
             one = SubscriberTransport(
                 node=path.want.user,
@@ -220,7 +222,7 @@ class TopicFacts:
         relayed = [one for one in subscribers if one.state == "relayed"]
         reason = min(relayed, key=lambda one: one.condition == Condition.MEASURES, default=None)
         condition, text = (reason.condition, reason.text) if reason is not None else ("", "")
-        publication = self._bridge.topics.peers[session.peer].publication(source)
+        publication = entry.publication
         carried = publication is not None and publication.subscribers > 0
         if (
             carried
@@ -243,42 +245,42 @@ class TopicFacts:
 
         A route is ``open``, ``idle`` (the peer's subscribers are connected directly) or ``away``.
         """
-        exports, sessions = self._bridge.topics.exports, self._bridge.sessions
-        names = {session.peer: session.link.name for session in sessions.linked()}
-        for source, local in yielding_to_data(list(exports.offered.items())):
+        topics, sessions = self._bridge.topics, self._bridge.sessions
+        for source, local in yielding_to_data(list(topics.exports.offered.items())):
             if wanted is not None and source.topic not in wanted:
                 continue
             yield_to_data()
-            yield source.topic, None, list(self._bridge.topics.mismatches(source))
-            flowing = dict.fromkeys(exports.flowing(source), "open")
-            grants = self._bridge.topics.direct_exports.of(source.topic, source.node)
-            idle = {peer: "idle" for peer, _, _ in grants if peer not in flowing}
-            for peer, state in (flowing | idle).items():
-                if (session := sessions.get(peer)) is not None:
-                    contract = exports.contract(source, peer)
-                    yield source.topic, self._route_to(peer, session.link.name, source, local, state, contract), []
-            for peer, contract in exports.absent(source).items():
-                if peer not in names or exports.contract(source, peer) is None:
-                    name, seconds = self._bridge.topics.losses.away(peer)
-                    kept = shown_seconds(exports.routes(source)[peer].outage)
-                    text = f"{name} is away for {shown_seconds(seconds)}; messages are kept for {kept}"
-                    yield source.topic, self._route_to(peer, name, source, local, "away", contract, text), []
+            yield source.topic, None, list(topics.mismatches.texts(source))
+            routes = list(topics.exports.routes(source).values())
+            flowing = {route.peer for route in routes if route.flows}
+            for route in routes:
+                if route.flows:
+                    yield source.topic, self._route_to(route.session, source, local, "open", route), []
+            grants = topics.direct_exports.of(source.topic, source.node)
+            for peer in dict.fromkeys(peer for peer, _, _ in grants):
+                session = sessions.get(peer)
+                if peer not in flowing and session is not None:
+                    yield source.topic, self._route_to(session, source, local, "idle"), []
+            for route in routes:
+                if not route.number:
+                    yield source.topic, self._route_to(route.session, source, local, "away", route), []
 
     def _route_to(
         self,
-        peer: int,
-        name: str,
+        session: Peer,
         source: Source,
         local: LocalSource,
         state: str,
-        contract: Contract | None = None,
-        problem: str = "",
+        used: ExportRoute | None = None,
     ) -> RouteInfo:
-        topics = self._bridge.topics
-        about, offer = topics.exports.description(source), topics.exports.offer(peer, source)
-        flow = topics.outbound.flows.get(source)
-        route = flow.by_peer.get(peer) if flow is not None else None
-        kept = route.sender if isinstance(route, ReliableRouteSender) else None
+        exports, peer, name = self._bridge.topics.exports, session.peer, session.name
+        about, offer = exports.description(source), exports.offer(peer, source)
+        flow, route = exports.flows.get(source), exports.routes(source).get(peer)
+        sender, problem = route.sender if route is not None else None, ""
+        kept = sender.sender if isinstance(sender, ReliableRouteSender) else None
+        if state == "away" and used is not None:
+            seconds = shown_seconds(self._clock.now() - session.away_since)
+            problem = f"{name} is away for {seconds}; messages are kept for {shown_seconds(used.outage)}"
         subscribers = self._granted(peer, name, source) if state != "away" else ()
         figures = {}
         if flow is not None:
@@ -295,8 +297,10 @@ class TopicFacts:
             kept=kept.pending if kept is not None else 0,
             latched=about.latching if about is not None else False,
             wire=offer.topic if offer is not None and offer.topic != source.topic else "",
-            lane=route.lane if route is not None else "",
-            contract=_terms(contract or self._bridge.context.contracts.of(source.topic, local.type)),
+            lane=sender.lane if sender is not None else "",
+            contract=_terms(
+                used.contract if used is not None else self._bridge.context.contracts.of(source.topic, local.type)
+            ),
             problem=problem,
             transport=_transport_name(direct=bool(subscribers), relayed=state == "open"),
             subscribers=subscribers,
@@ -330,24 +334,23 @@ class TopicFacts:
         """
         topics, publishers = self._bridge.topics, self._core.publishers(topic)
         self.follow_clocks()
-        for number, source in list(topics.imports.at(topic)):
-            entry = topics.imports.get(number, source)
-            if number != session.peer or entry is None or session.instance_of(entry.origin) != instance:
+        for entry in topics.imports.at(topic):
+            if entry.peer != session.peer or session.instance_of(entry.origin) != instance:
                 continue
-            publication = topics.peers[session.peer].publication(source)
-            proxies, owner = self._bridge.sessions.proxies(session, source.node, entry.origin)
+            node, publication = entry.node, entry.publication
+            proxies, owner = self._bridge.sessions.proxies(session, node, entry.origin)
             name, proxy = proxies.name(owner), proxies.get(owner)
             links = publication.connections() if publication is not None else ()
             arrival = Arrival(
-                route=self._incoming_route(session, source, entry),
+                route=self._incoming_route(session, entry),
                 proxy=name,
                 registered=proxy is not None and publishers.get(name) == proxy.uri,
                 cause=entry.cause,
                 permission=self._permission(session.link.name, entry),
                 readers={at.number: (printable(at.other), at.waiting, at.dropped) for at in links},
-                mismatches=topics.mismatches(source),
+                mismatches=topics.mismatches.texts(entry.wire),
             )
-            yield source.node, arrival
+            yield node, arrival
 
     def _permission(self, peer: str, entry: RemoteTopic) -> str:
         """The rule about which modules may publish a peer's topic; empty if trust is off."""
@@ -358,14 +361,14 @@ class TopicFacts:
 
     def report(self, session: PeerSession, source: Source) -> PublisherReport:
         """What a peer is told of a publisher here."""
-        exports, outbound = self._bridge.topics.exports, self._bridge.topics.outbound
-        local, flow = exports.seen.get(source), outbound.flows.get(source)
+        exports = self._bridge.topics.exports
+        local, flow = exports.seen.get(source), exports.flows.get(source)
         kind = local.type if local is not None else self._core.type_of(source.topic)
         decision = exports.decision(session.peer, source)
         if decision is None:  # it has just come, or cannot be reached
             decision = self._bridge.context.policy.judge(source.topic, kind, source.node)
-        sender, contract = outbound.sender_of(source, session.peer), exports.contract(source, session.peer)
-        reliable = contract is not None and contract.reliability is Reliability.RELIABLE
+        route = exports.routes(source).get(session.peer)
+        reliable = route is not None and route.number > 0 and route.reliable
         lost = self._core.unreachable().get(source.node) if flow is None or not flow.messages else None
         figures = {} if flow is None else {n: getattr(flow, n) for n in ("messages", "oversized", "oversized_bytes")}
         return PublisherReport(
@@ -375,9 +378,9 @@ class TopicFacts:
             crosses=decision.allowed,
             rule=decision.rule,
             offered=exports.offer(session.peer, source) is not None,
-            route="open" if session.peer in exports.flowing(source) else "opening" if contract is not None else "",
+            route="" if route is None or not route.number else "open" if route.flows else "opening",
             dropped=flow.dropped if flow is not None and not reliable else 0,
-            lost=sender.lost if sender is not None else 0,
+            lost=route.sender.lost if route is not None and route.sender is not None else 0,
             beyond=exports.limit if source in exports.beyond else 0,
             unreachable=f"{lost.api}: {lost.problem}" if lost is not None else "",
             **figures,

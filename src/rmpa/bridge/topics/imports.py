@@ -20,7 +20,6 @@ from __future__ import annotations
 import itertools
 import math
 import sys
-from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import TYPE_CHECKING
 
@@ -29,7 +28,6 @@ from msgspec import UnsetType
 from rmpa.bridge import limits
 from rmpa.bridge.messages import (
     CloseRoute,
-    Description,
     Mismatch,
     OpenRoute,
     RouteClosed,
@@ -38,93 +36,19 @@ from rmpa.bridge.messages import (
     TopicOffer,
     is_crossing_name,
 )
-from rmpa.bridge.peer_offers import CONFLICT, CROWDED, DENIED, ImportBook, Remote
+from rmpa.bridge.peer_offers import CONFLICT, CROWDED, DENIED, ImportBook
+from rmpa.bridge.topics.import_route import RemoteTopic
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
-from rmpa.core.contract import Contract, Reliability
 from rmpa.core.timers import Backoff
 from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
-    from rmpa.bridge.offers import Effects
-
-
-# What a source is, whichever peer offers it: the run and the name of its module, its node there, and its topic here.
-StreamKey = tuple[str, str, str, str]
-
-
-@dataclass(slots=True, eq=False, kw_only=True)
-class RemoteTopic(Remote[Source]):
-    """One source as one peer offers it.
-
-    Args:
-        module: The run and the name of the module that publishes it.
-        objection: Why it is not in the local graph, whichever others offer it, or empty.
-        hidden: Why it is not in the local graph: that, or who carries it; or empty.
-        wanted: Whether a local node listens.
-        route: The route's id while it is requested or open, else 0.
-        open: Whether the peer has opened the route.
-        until: When the present state is over, monotonic seconds; ``None``: it lasts. A source without route that is
-            wanted waits for the peer's next link then.
-        asked: The contract that was last requested.
-        contract: The contract of the last open route; ``None`` before the first one.
-        description: The header of the publisher, once known.
-        backoff: Delays between attempts to open a route, after the first one that failed.
-        direct: Whether a local node is connected to its publisher directly, and only the peer's agent has died.
-    """
-
-    type: str
-    module: tuple[str, str]
-    objection: str = ""
-    hidden: str = ""
-    wanted: bool = False
-    route: int = 0
-    open: bool = False
-    until: float | None = None
-    asked: Contract | None = None
-    contract: Contract | None = None
-    description: Description | None = None
-    backoff: Backoff | None = None
-    direct: bool = False
-
-    @property
-    def key(self) -> StreamKey:
-        """What it is, whichever peer offers it."""
-        return *self.module, self.node if self.origin is None else self.origin.node, self.name
-
-    @property
-    def state(self) -> str:
-        """The state of the route, as in the figure above."""
-        if not self.route:
-            return "waiting" if self.wanted else "idle"
-        if not self.open:
-            return "opening"
-        return "open" if self.wanted else "lingering"
-
-    @property
-    def reliable(self) -> bool:
-        """Whether no message is to be lost, as far as its contract is known."""
-        return self.contract is not None and self.contract.reliability is Reliability.RELIABLE
-
-    @property
-    def outage(self) -> float:
-        """For how many seconds it outlives its link: the contract's outage, or the default if it is not reliable."""
-        return (self.contract if self.contract is not None and self.reliable else Contract()).resume_window
-
-    def outlives(self, *, silent: bool) -> bool:
-        """Whether the source stays in the local graph when its peer's link is gone.
-
-        Only a source with a listener does. A reliable one stays, so that no message is lost. A latched one stays if
-        the link fell silent (``silent``): its subscribers stay connected and do not get the same message again when
-        the peer is back, and new subscribers get it meanwhile. A source with direct subscribers stays if only its
-        agent has died: its messages go on.
-        """
-        if self.direct or not self.wanted:
-            return self.direct
-        latching = self.description is not None and self.description.latching
-        return self.reliable or (silent and latching)
+    from rmpa.bridge.data.reception import ImportFlow
+    from rmpa.bridge.topics.import_route import StreamKey
+    from rmpa.bridge.topics.part import Topics
 
 
 class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
@@ -137,20 +61,19 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     """
 
     kind = "topics"
+    _out: Topics
 
-    def __init__(self, out: Effects) -> None:
+    def __init__(self, out: Topics) -> None:
         super().__init__(out)
-        self._topics: dict[int, dict[str, dict[Source, None]]] = {}
+        self._topics: dict[int, dict[str, dict[RemoteTopic, None]]] = {}
         self._ways: dict[StreamKey, dict[RemoteTopic, None]] = {}
         self._local_types: dict[str, str] = {}
         self._timers: list[tuple[float, int, RemoteTopic]] = []
         self._serials = itertools.count()
 
-    def __iter__(self) -> Iterator[tuple[int, Source, RemoteTopic]]:
-        """Every known source with its peer; changes during the iteration may be missed."""
-        for peer, known in list(self._peers.items()):
-            for source, entry in list(known.entries.items()):
-                yield peer, source, entry
+    def __iter__(self) -> Iterator[RemoteTopic]:
+        """Every source as a peer offers it; changes during the iteration may be missed."""
+        return iter([entry for known in self._peers.values() for entry in known.entries.values()])
 
     def get(self, peer: int, source: Source) -> RemoteTopic | None:
         """One known source."""
@@ -164,15 +87,24 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         """Whether any peer offers a source."""
         return any(source in known.entries for known in self._peers.values())
 
-    def at(self, topic: str) -> Iterator[tuple[int, Source]]:
-        """The sources that peers offer for a local topic, each with its peer."""
-        return ((peer, source) for peer, topics in self._topics.items() for source in topics.get(topic, ()))
+    def at(self, topic: str) -> list[RemoteTopic]:
+        """The sources that peers offer for a local topic."""
+        return [entry for topics in self._topics.values() for entry in topics.get(topic, ())]
 
-    def offered_by(self, peer: int) -> Mapping[str, Collection[Source]]:
+    def offered_by(self, peer: int) -> Mapping[str, Collection[RemoteTopic]]:
         """The topics that a peer offers, by their local names, each with its sources."""
         return self._topics.get(peer, {})
 
-    # --- links ---------------------------------------------------------------------------------------------------
+    def flows(self, peer: int) -> list[ImportFlow]:
+        """The flows of a peer's open routes."""
+        known = self._peers.get(peer)
+        entries = known.routes.values() if known is not None else ()
+        return [entry.flow for entry in entries if entry.open and entry.flow is not None]
+
+    @property
+    def flowing(self) -> bool:
+        """Whether any route is open."""
+        return any(entry.open for known in self._peers.values() for entry in known.routes.values())
 
     def link_away(self, peer: int, *, briefly: bool = False) -> Iterator[None]:
         """Suspend the routes of a peer that may come back, and drop what does not outlive the link, one by one.
@@ -183,18 +115,18 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 called again without it if the peer is not.
         """
         known = self._peers[peer]
-        known.away, known.silent, known.routes = True, known.silent or briefly, {}
+        known.routes = {}
         if not briefly:
             known.give_up()
         self._ready(peer)
         for entry in list(known.entries.values()):
-            keep = briefly or entry.outlives(silent=known.silent)
+            keep = briefly or entry.outlives(silent=known.session.silent)
             if not keep:
                 self._hand_over(entry)
-            if entry.route:
+            if entry.number:
                 # A lingering route has no listener, so it is not continued.
-                self._do.detach(entry, keep=keep and entry.wanted, missed=entry.wanted and not keep)
-            entry.route, entry.open, entry.until, entry.problem = 0, False, None, "its peer is away"
+                self._out.detach(entry, keep=keep and entry.wanted, missed=entry.wanted and not keep)
+            entry.number, entry.open, entry.until, entry.problem = 0, False, None, "its peer is away"
             if not keep:
                 self._outlived(entry)
             yield
@@ -202,7 +134,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     def waits_for(self, peer: int) -> bool:
         """Whether a source outlives the peer's link: one with a local listener that is reliable or latched."""
         known = self._peers[peer]
-        return any(entry.outlives(silent=known.silent) for entry in known.entries.values())
+        return any(entry.outlives(silent=known.session.silent) for entry in known.entries.values())
 
     def outages(self, peer: int) -> set[float]:
         """The outages, in seconds, of the sources that are kept for a peer."""
@@ -223,14 +155,13 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         known = self._peers[peer]
         self._hand_all_over(peer)
         for entry in known.routes.values():
-            self._do.detach(entry, missed=entry.wanted)
+            self._out.detach(entry, missed=entry.wanted)
         known.routes = {}
 
-    def link_down(self, peer: int) -> Iterator[None]:
+    def gone(self, peer: int) -> dict[Source, RemoteTopic]:
         """Forget a peer for good; other relays may now bring its sources, and those that it relayed.
 
-        The peer is unknown as soon as this returns; closing its proxies takes its sources out of the local graph. Its
-        entries are freed as the items are taken, because freeing thousands at once takes long.
+        The peer is unknown when this returns; the caller takes the returned sources out of the local graph.
         """
         self._hand_all_over(peer)
         known = self._peers.pop(peer, None)
@@ -238,17 +169,15 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         for entry in known.entries.values() if known is not None else ():
             self._forget_way(entry)
         self._ways_changed(self.ways.unlinked(peer))
-        for other, source in list(self.at(CLOCK)):
-            self._judge_at(other, source)
-        return _freed(known.entries if known is not None else {})
-
-    # --- what peers offer ----------------------------------------------------------------------------------------
+        for other in self.at(CLOCK):
+            self._judge(other)
+        return known.entries if known is not None else {}
 
     def _entry(self, peer: int, offer: TopicOffer) -> RemoteTopic:
         # Many sources share the names of nodes and types, and each is kept once.
         source, kind = Source(offer.topic, sys.intern(offer.node)), sys.intern(offer.type)
         name, origin, known = self.name_here(peer, source.topic, offer.origin), offer.origin, self._peers[peer]
-        module = (known.instance, known.name) if origin is None else (origin.instance, origin.name)
+        module = (known.session.instance, known.session.name) if origin is None else (origin.instance, origin.name)
         entry = RemoteTopic(
             peer=peer, wire=source, name=name, node=source.node, origin=origin, type=kind, module=module
         )
@@ -256,7 +185,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         return entry
 
     def _came_again(self, entry: RemoteTopic, now: float) -> None:
-        if not entry.route and entry.until is None:
+        if not entry.number and entry.until is None:
             entry.problem = ""  # the peer was away, and is back
         self.follow(entry, now)
 
@@ -268,7 +197,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             self._retract(entry)
 
     def _list(self, entry: RemoteTopic) -> None:
-        self._topics.setdefault(entry.peer, {}).setdefault(entry.name, {})[entry.wire] = None
+        self._topics.setdefault(entry.peer, {}).setdefault(entry.name, {})[entry] = None
         self._ways.setdefault(entry.key, {})[entry] = None
 
     def _forget_way(self, entry: RemoteTopic) -> None:
@@ -280,7 +209,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     def _unlist(self, entry: RemoteTopic) -> None:
         self._forget_way(entry)
         topics = self._topics[entry.peer]
-        del topics[entry.name][entry.wire]
+        del topics[entry.name][entry]
         if not topics[entry.name]:
             del topics[entry.name]
 
@@ -295,14 +224,14 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             del self._local_types[topic]
         else:
             self._local_types[topic] = type_name
-        for peer, source in list(self.at(topic)):
-            self._judge_at(peer, source)
+        for entry in self.at(topic):
+            self._judge(entry)
 
     def reload(self, now: float) -> Iterator[None]:
         """Judge by new rules, a source with each item; what they do not change goes on untouched."""
         # Shown ones first: what another relay brings from now on has the same proxies.
-        for peer, source, _ in sorted(self, key=lambda one: not one[2].shown):
-            if (entry := self.get(peer, source)) is not None:
+        for entry in sorted(self, key=lambda one: not one.shown):
+            if self.get(entry.peer, entry.wire) is entry:
                 self._rejudge(entry, now)
             yield
         for peer, known in list(self._peers.items()):
@@ -319,13 +248,9 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             self._list(entry)
         self._judge(entry)
         contract = self._out.context.contracts.of(entry.name, entry.type)
-        if entry.route and not (entry.asked is not None and entry.asked.same_route(contract)):
+        if entry.number and not (entry.asked is not None and entry.asked.same_route(contract)):
             self._close(entry, missed=entry.wanted)
             self.follow(entry, now)
-
-    def _judge_at(self, peer: int, source: Source) -> None:
-        if (entry := self.get(peer, source)) is not None:
-            self._judge(entry)
 
     def _judge(self, entry: RemoteTopic) -> None:
         known, before = self._peers[entry.peer], entry.cause
@@ -342,7 +267,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             module, relay = self._speaker(entry)
             self._out.context.gate.admits(Access.PUBLISH, module, entry.name, relay=relay)
         if entry.cause == CROWDED != before:
-            self._warn_limit(known.name, "nodes", self._out.context.settings.limits.nodes)
+            self._warn_limit(known.session.name, "nodes", self._out.context.settings.limits.nodes)
 
     def why_hidden(self, entry: RemoteTopic) -> tuple[str, str]:
         """Why a source may not be in the local graph, and the cause (see ``Remote``); empty if it may."""
@@ -372,9 +297,9 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     def _why_kept_out(self, entry: RemoteTopic) -> str:
         """Why rules or another source of its node keep a source out, or empty."""
         policy, origin, topic = self._out.context.policy, entry.origin, entry.name
-        known = self._peers[entry.peer]
         decision = policy.judge(topic, entry.type, entry.node if origin is None else origin.node)
-        for name in (known.name,) if origin is None else (known.name, origin.name):
+        peer = self.peer_name(entry.peer)
+        for name in (peer,) if origin is None else (peer, origin.name):
             if decision.allowed:
                 decision = policy.judge_for(name, topic, entry.type, entry.wire.topic)
         if not decision.allowed:
@@ -382,8 +307,8 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         if not is_crossing_name(topic):
             return f"its name here would be {topic}, which is too long"
         for other in self._topics[entry.peer][topic]:
-            if other.node == entry.node and other != entry.wire and known.entries[other].shown:
-                return f"it would be {topic} here, as {other.topic} of this node is already; rename one"
+            if other.node == entry.node and other is not entry and other.shown:
+                return f"it would be {topic} here, as {other.wire.topic} of this node is already; rename one"
         return ""
 
     def _why_no_time(self, entry: RemoteTopic) -> tuple[str, bool]:
@@ -393,16 +318,15 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         """
         if entry.origin is not None:
             return "time does not come by a relay", False
-        decision = self._out.context.policy.judge_clock(self._peers[entry.peer].name)
+        decision = self._out.context.policy.judge_clock(self.peer_name(entry.peer))
         if not decision.allowed:
             return decision.rule, False
         if CLOCK in self._local_types:
             return "a node of this module publishes /clock, and time has one source: end that one", True
-        for peer, source in self.at(CLOCK):
-            other = self._peers[peer].entries[source]
+        for other in self.at(CLOCK):
             if other.shown and other is not entry:
-                name = self._peers[peer].name
-                return f"time comes from {source.node} of {name} already, and has one source", True
+                name = self.peer_name(other.peer)
+                return f"time comes from {other.node} of {name} already, and has one source", True
         return "", False
 
     def _choose(self, entry: RemoteTopic) -> None:
@@ -417,7 +341,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 way.wanted = False
         if carrier is None and best is not None:
             self._peers[best.peer].show(best)
-            self._do.publish(best)
+            self._out.publish(best)
         elif carrier is not None and best is None:
             self._hide(carrier)
         elif carrier is not best and carrier is not None and best is not None:
@@ -432,7 +356,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         return min(free, key=lambda way: self.ways.rank(way.peer, way.origin), default=None)
 
     def _outranked(self, best: RemoteTopic) -> str:
-        module, name = best.module[1], self._peers[best.peer].name
+        module, name = best.module[1], self.peer_name(best.peer)
         return f"{module} has a link of its own" if best.origin is None else f"{module} is reached by way of {name}"
 
     def _move(self, old: RemoteTopic, new: RemoteTopic) -> None:
@@ -440,7 +364,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         self._peers[old.peer].hide(old)
         self._peers[new.peer].show(new)
         wanted, old.wanted = old.wanted, False
-        self._do.moved(old, new)
+        self._out.moved(old, new)
         self._close(old)
         if wanted and not new.open and not new.wanted:
             self._wait(new, -math.inf)
@@ -455,7 +379,6 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
 
     def _hand_all_over(self, peer: int) -> None:
         if (known := self._peers.get(peer)) is not None:
-            known.away = True
             self._ready(peer)
             for entry in list(known.entries.values()):
                 self._hand_over(entry)
@@ -468,19 +391,19 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     def _retract(self, entry: RemoteTopic) -> None:
         """Take a source out of the local graph, and show those that could not stand beside it."""
         self._peers[entry.peer].hide(entry)
-        self._do.retract(entry)
+        self._out.retract(entry)
         self._show_behind(entry)
 
     def _show_behind(self, entry: RemoteTopic) -> None:
         """Show what could not stand beside an entry that is shown no more."""
         known = self._peers[entry.peer]
         if entry.name == CLOCK:
-            behind = [(peer, source) for peer, source in self.at(CLOCK) if (peer, source) != (entry.peer, entry.wire)]
+            behind = self.at(CLOCK)
         else:
-            same = self._topics.get(entry.peer, {}).get(entry.name, ())
-            behind = [(entry.peer, s) for s in same if s.node == entry.node and s != entry.wire]
-        for peer, source in behind:
-            self._judge_at(peer, source)
+            behind = [s for s in self._topics.get(entry.peer, {}).get(entry.name, ()) if s.node == entry.node]
+        for other in behind:
+            if other is not entry and self.get(other.peer, other.wire) is other:
+                self._judge(other)
         for waiting in known.admitted(self._out.context.settings.limits.nodes):
             self._judge(waiting)
 
@@ -494,20 +417,20 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 self._close(entry)
             case "lingering" if entry.until is None:
                 self._wait(entry, now + limits.ROUTE_LINGER)
-            case "waiting" if not known.away and (due or entry.until is None):
+            case "waiting" if known.session.linked and (due or entry.until is None):
                 known.last_route += 1
-                entry.route, known.routes[known.last_route] = known.last_route, entry
+                entry.number, known.routes[known.last_route] = known.last_route, entry
                 entry.until = None  # the peer answers once its publisher has, and that may take long
                 entry.asked = self._out.context.contracts.of(entry.name, entry.type)
-                epoch, after = self._do.position(entry) or (0, 0)
-                asked = OpenRoute(entry.route, entry.wire.topic, entry.node, entry.asked, epoch, after)
+                epoch, after = self._out.position(entry) or (0, 0)
+                asked = OpenRoute(entry.number, entry.wire.topic, entry.node, entry.asked, epoch, after)
                 self._out.send(entry.peer, asked)
             case "open" | "idle":
                 entry.until = None
 
-    def demand(self, peer: int, source: Source, now: float, *, wanted: bool) -> None:
+    def demand(self, entry: RemoteTopic, now: float, *, wanted: bool) -> None:
         """Note the first local listener of a source, or that the last one has gone."""
-        if (entry := self.get(peer, source)) is None:
+        if self.get(entry.peer, entry.wire) is not entry:
             return
         if not wanted and entry.state == "waiting":
             self._close(entry)
@@ -533,7 +456,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         entry.description, entry.contract = message.description, message.contract
         if (carrier := self.carrier(entry)) is not None and carrier is not entry:
             self._move(carrier, entry)
-        self._do.describe(entry, message)
+        self._out.describe(entry, message)
 
     def closed(self, peer: int, message: RouteClosed, now: float) -> None:
         """Handle a route that the peer has refused or closed; ignored if it was closed here meanwhile."""
@@ -568,31 +491,25 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
 
     def _close(self, entry: RemoteTopic, *, missed: bool = False) -> None:
         """End a source's route in any state; ``missed``: local nodes still listen, and miss messages from now on."""
-        if entry.route:
-            self._peers[entry.peer].routes.pop(entry.route, None)
-            self._out.send(entry.peer, CloseRoute(entry.route))
-            self._do.detach(entry, missed=missed)
+        if entry.number:
+            self._peers[entry.peer].routes.pop(entry.number, None)
+            self._out.send(entry.peer, CloseRoute(entry.number))
+            self._out.detach(entry, missed=missed)
         elif entry.wanted and entry.until is None:
-            self._do.detach(entry, missed=missed)  # it waited for a new link
-        entry.route, entry.open, entry.until, entry.backoff = 0, False, None, None
+            self._out.detach(entry, missed=missed)  # it waited for a new link
+        entry.number, entry.open, entry.until, entry.backoff = 0, False, None, None
 
     def _fail(self, entry: RemoteTopic, reason: str, now: float, last: int | None = None) -> None:
         """A route is refused or lost: it is opened again after the back-off if a node still listens."""
-        self._peers[entry.peer].routes.pop(entry.route, None)
+        self._peers[entry.peer].routes.pop(entry.number, None)
         if last is None:
             self._hand_over(entry)
         # Where its publisher may be there still, the next route goes on behind what has come.
         keep = last is None and entry.wanted and entry.reliable
-        self._do.detach(entry, keep=keep, missed=entry.wanted, last=last)
-        entry.route, entry.open, entry.until, entry.problem = 0, False, None, reason
+        self._out.detach(entry, keep=keep, missed=entry.wanted, last=last)
+        entry.number, entry.open, entry.until, entry.problem = 0, False, None, reason
         self._choose(entry)
         if entry.wanted:
             if entry.backoff is None:
                 entry.backoff = Backoff(mesh_limits.BACKOFF_FIRST, mesh_limits.BACKOFF_MAX, self._out.rng)
             self._wait(entry, now + entry.backoff.delay())
-
-
-def _freed(entries: dict[Source, RemoteTopic]) -> Iterator[None]:
-    while entries:
-        entries.popitem()
-        yield

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.bridge import limits, messages
 from rmpa.bridge.data.route_sender import RouteSender
 from rmpa.bridge.policy import Needs
+from rmpa.bridge.topics.local import compares_names
 from rmpa.core.contract import Contract, History
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_later, serial_add
@@ -37,15 +38,14 @@ from rmpa.runtime.tasks import OwnedTasks
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rmpa.bridge.data.export import ExportFlow
+    from rmpa.bridge.data.export import ExportFlow, ExportRoute
     from rmpa.bridge.data.reception import ImportFlow
-    from rmpa.bridge.messages import Source
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports
+    from rmpa.bridge.topics.import_route import ImportRoute
     from rmpa.bridge.topics.imports import Imports
     from rmpa.bridge.topics.local import LocalSubscriptions, RemoteSubscribers
-    from rmpa.bridge.topics.peer_topics import PeerTopic
     from rmpa.ros.node.publication import SubscriberConnection
     from rmpa.ros.node.subscription import TopicConnection
     from rmpa.runtime.tls import Buffer
@@ -63,9 +63,6 @@ def _digest(framed: Buffer) -> bytes:
     return hashlib.blake2b(framed, digest_size=16).digest()
 
 
-# --- At the publisher's agent ---------------------------------------------------------------------------------------
-
-
 class ServedJoin:
     """The further connection to a publisher for one joining subscriber of a peer.
 
@@ -81,7 +78,7 @@ class ServedJoin:
     """
 
     def __init__(self, flow: ExportFlow, common: RouteSender, own: RouteSender, over: Callable[[], None]) -> None:
-        self._flow, self._common, self.own, self._over = flow, common, own, over
+        self._flow, self.common, self.own, self._over = flow, common, own, over
         self.connection: TopicConnection | None = None
         self._loop = asyncio.get_running_loop()
         self._last = common.last
@@ -102,13 +99,11 @@ class ServedJoin:
         self.drained = False
         self._end = self._loop.call_later(limits.JOIN_WINDOW, self.finish)
 
-    # --- as a sender of the flow
-
     def message(self, _stamp_ns: int, framed: Buffer) -> int:
         """Note what all get."""
         if self._ended:
             return 0
-        digest, number, self._busy = _digest(framed), self._common.last, False
+        digest, number, self._busy = _digest(framed), self.common.last, False
         self._came = self._loop.time()
         if self._flow.latching:
             self._latched.append(digest)
@@ -149,8 +144,6 @@ class ServedJoin:
             self._over()
             self._flow.leave(self)
 
-    # --- the further connection
-
     def connected(self, _fields: object) -> None:
         """The publisher has answered: it has ``limits.JOIN_WINDOW`` to say what it has to say."""
         self._end.cancel()
@@ -176,8 +169,6 @@ class ServedJoin:
         self._disconnect()
         self._end = self._loop.call_later(limits.JOIN_WINDOW, lambda: self._flush(all_of_it=True))
         self._flush()
-
-    # --- inside
 
     def _disconnect(self) -> None:
         self._end.cancel()
@@ -220,9 +211,6 @@ class ServedJoin:
         self.own.message(time.time_ns(), _MARK.pack(UINT32_MAX, kind, number))
 
 
-# --- At the subscriber's agent --------------------------------------------------------------------------------------
-
-
 class JoiningSubscriber:
     """A subscriber that gets the messages of its own connection to the publisher, until it gets what all get.
 
@@ -246,8 +234,6 @@ class JoiningSubscriber:
         self._after: int | None = None
         self.ended = False
         self._timer = asyncio.get_running_loop().call_later(3 * limits.JOIN_WINDOW, self.release)
-
-    # --- as a subscriber of the publication
 
     def send(self, parts: Sequence[Buffer], _key: int) -> int:
         """Hold one message."""
@@ -290,8 +276,6 @@ class JoiningSubscriber:
         for number in [number for number in self._held if not is_later(number, after)]:
             self._connection.send((self._held.pop(number),), _MESSAGES)
         self._give()
-
-    # --- as the route of its own
 
     def message(self, _sequence: int, _stamp_ns: int, framed: memoryview) -> None:
         """Take a message of the subscriber's own connection, or what is said of those of all."""
@@ -356,9 +340,9 @@ class Joins:
 
     Args:
         shared: The peers.
-        exports: Finds the source of a peer's route.
+        exports: Finds a peer's route.
         imports: Numbers the routes.
-        outbound: The flows of the sources.
+        outbound: Connects to publishers.
         subscribers: Names a peer's subscribers.
     """
 
@@ -377,14 +361,24 @@ class Joins:
         self._tasks = OwnedTasks()
         shared.rpc.on_request(JOIN, self._asked, Needs((), "a route that the peer has open"))
 
-    # --- subscribers here
+    def sender(self, peer: int, number: int) -> RouteSender | None:
+        """What sends to a peer's joining subscriber on this route."""
+        join = self._served.get((peer, number))
+        return join.own if join is not None else None
 
-    def join(
-        self, session: PeerSession, topic: PeerTopic, connection: SubscriberConnection
-    ) -> JoiningSubscriber | None:
-        """Let the publisher see a new subscriber of an open route; ``None`` if that is not possible."""
-        flow = topic.flow
-        if flow is None or not session.linked or flow.contract.max_rate is not None:
+    def senders(self, peer: int) -> list[RouteSender]:
+        """What sends to the joining subscribers of a peer."""
+        return [join.own for (owner, _), join in self._served.items() if owner == peer]
+
+    def join(self, topic: ImportRoute, connection: SubscriberConnection) -> JoiningSubscriber | None:
+        """Let the publisher see a new subscriber of an open route here; ``None`` if that is not possible.
+
+        Clients of actions are seen by their names.
+        """
+        flow, session, publication = topic.flow, topic.session, topic.publication
+        if flow is None or publication is None or not session.linked or compares_names(topic.entry.type):
+            return None
+        if flow.contract.max_rate is not None:
             return None
         own = self._imports.next_route(session.peer)
         key = session.peer, own
@@ -392,7 +386,7 @@ class Joins:
         def over() -> None:
             del self._joining[key]
             session.link.routes.pop(own, None)
-            topic.publication.joined(connection)
+            publication.joined(connection)
 
         joining = self._joining[key] = session.link.routes[own] = JoiningSubscriber(connection, flow, over)
         args = {"route": flow.route, "own": own, "node": connection.caller_id}
@@ -409,53 +403,47 @@ class Joins:
             _log.debug("= %s: a subscriber joins unseen: %s", session.link.name, error)
             joining.release()
 
-    # --- those of peers
-
     def _asked(self, session: PeerSession, args: dict[str, Any]) -> int:
-        """Connects to a publisher for a peer's subscriber; returns the number of the last message that all got.
+        """Connects to a publisher for a subscriber of a peer; returns the number of the last message that all got.
 
         Raises:
             RmpaError: That is not possible.
         """
         match args:
-            case {"route": int(route), "own": int(own), "node": str(node)} if 0 < own < limits.SERVICE_ROUTES:
+            case {"route": int(number), "own": int(own), "node": str(node)} if 0 < own < limits.SERVICE_ROUTES:
                 key = session.peer, own
             case _:
                 raise RemoteProtocolError(f"{JOIN} names no route")
-        source = self._exports.source(session.peer, route)
-        flow = self._outbound.flows.get(source) if source is not None else None
-        common = flow.by_peer.get(session.peer) if flow is not None else None
-        if source is None or flow is None or common is None or key in self._outbound.senders:
-            raise RmpaError(f"route {route} is not open")
+        route = self._exports.route(session.peer, number)
+        if route is None or route.sender is None or key in self._served or self._exports.route(*key) is not None:
+            raise RmpaError(f"route {number} is not open")
+        flow = self._exports.flows[route.source]
         if sum(peer == session.peer for peer, _ in self._served) >= limits.JOINS_MAX:
             raise LimitExceeded("joining subscribers", limits.JOINS_MAX + 1, limits.JOINS_MAX)
         sender = RouteSender(session.link, own, Contract(history=History.KEEP_ALL), large=flow.large)
 
         def over() -> None:
-            del self._served[key], self._outbound.senders[key]
+            del self._served[key]
             session.link.close_route(own)
 
-        join = self._served[key] = ServedJoin(flow, common, sender, over)
-        self._outbound.senders[key] = sender
-        caller = self._subscribers.name(session, node, source.topic) or f"{session.proxies.prefix}/joins"
-        self._connect(source, flow, common, join, caller)
-        return common.last
+        join = self._served[key] = ServedJoin(flow, route.sender, sender, over)
+        caller = self._subscribers.name(session, node, route.source.topic) or f"{session.proxies.prefix}/joins"
+        self._connect(route, flow, join, caller)
+        return route.sender.last
 
-    def _connect(self, source: Source, flow: ExportFlow, common: RouteSender, join: ServedJoin, caller: str) -> None:
-        _log.debug("> %s: %s joins", source, caller)
+    def _connect(self, route: ExportRoute, flow: ExportFlow, join: ServedJoin, caller: str) -> None:
+        _log.debug("> %s: %s joins", route.source, caller)
         join.connection = self._outbound.connection(
-            source,
-            flow.connection.uri,
+            route.source,
+            flow.uri,
             caller,
             on_message=join.came,
             on_header=join.connected,
             on_refused=join.finish,
             on_lost=join.finish,
         )
-        flow.join(common, join)
+        flow.join(join.common, join)
         join.connection.start()
-
-    # --- links
 
     def link_down(self, peer: int) -> None:
         """The peer has no link: what is held goes to the subscribers."""

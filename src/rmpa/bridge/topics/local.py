@@ -19,11 +19,10 @@ from typing import TYPE_CHECKING, Any
 from rmpa.bridge import limits
 from rmpa.bridge.data.export import ExportFlow, RelayedFlow
 from rmpa.bridge.data.route_sender import ReliableRouteSender
-from rmpa.bridge.messages import Audience, Description, Mismatch, Source, encode, is_crossing_name
+from rmpa.bridge.messages import Audience, Description, Source, is_crossing_name
 from rmpa.bridge.topics.exports import LocalSource
-from rmpa.bridge.topics.peer_topics import PeerTopic
+from rmpa.bridge.topics.import_route import ImportRoute
 from rmpa.config.peer_rules import Access
-from rmpa.config.rules import CLOCK
 from rmpa.core.identity import OWN_NODE, is_own, is_type_name, proxied_node, proxy_name
 from rmpa.core.limits import UINT32_MAX
 from rmpa.mesh import limits as mesh_limits
@@ -37,17 +36,15 @@ from rmpa.runtime.loop import MachineTimer
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
+    from rmpa.bridge.data.export import ExportRoute
     from rmpa.bridge.data.route import RouteBegin
-    from rmpa.bridge.data.route_sender import RouteSender
-    from rmpa.bridge.messages import Message
-    from rmpa.bridge.offers import Effects
     from rmpa.bridge.policy import Relay
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
-    from rmpa.bridge.topics.exports import ExportRoute, Exports
+    from rmpa.bridge.topics.exports import Exports
+    from rmpa.bridge.topics.import_route import RemoteTopic
     from rmpa.bridge.topics.imports import Imports
-    from rmpa.bridge.topics.peer_topics import LossReports, PeerTopics
-    from rmpa.mesh.io.link import PeerLink
+    from rmpa.bridge.topics.part import Topics
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.subscription import TopicConnection
@@ -111,64 +108,51 @@ class LocalSubscriptions:
 
     Args:
         shared: The local core and the agent's node; its subscriptions are registered, so that ROS tools show them.
-        exports: Is told what publishers say.
-        losses: Reports what peers miss.
-        out: Warns of publishers that break TCPROS.
+        topics: The part: its exports are told what publishers say; losses are reported.
         find: ``(node, slave API, topic)``: the topic of a proxy of this process, which is subscribed to without a
             socket; ``None`` for others.
-        on_over: Called once a publisher has gone, and all that it has published has crossed.
-
-    Attributes:
-        flows: The flow of each source that the agent is connected to, for snapshots.
-        senders: The sender of each open route, by its peer and its id.
     """
 
     def __init__(
         self,
         shared: Shared,
-        exports: Exports,
-        losses: LossReports,
-        out: Effects,
+        topics: Topics,
         find: Callable[[str, str, str], Publication | None] = lambda *_: None,
-        on_over: Callable[[Source], None] = lambda _: None,
     ) -> None:
-        self._core = shared.core
-        self._node = shared.node
-        self._exports, self._losses, self._out = exports, losses, out
-        self._find, self._on_over = find, on_over
+        self._core, self._node, self._sessions = shared.core, shared.node, shared.sessions
+        self._topics, self._find = topics, find
         # Random, so that no earlier run of this agent, and no other agent, is likely to have had it.
         self._epoch = int(shared.rng() * UINT32_MAX)
-        self.flows: dict[Source, ExportFlow] = {}
-        self.senders: dict[tuple[int, int], RouteSender] = {}
-        self._parked: ResumeTable[tuple[int, Source]] = ResumeTable()
+        self._parked: ResumeTable[ExportRoute] = ResumeTable()
         # Kept messages are dropped when their outage is over.
         self._timer = MachineTimer(self._parked.next_timer, lambda now: self._give_up(self._parked.expire(now)))
 
     @property
     def connections(self) -> Iterable[TopicConnection]:
         """The connections to local publishers."""
-        return [flow.connection for flow in self.flows.values()]
+        return [flow.connection for flow in self._topics.exports.flows.values()]
 
-    def connect(self, source: Source, uri: str) -> None:
+    def connect(self, source: Source, uri: str) -> ExportFlow:
         """Subscribe to a publisher at its slave API; the exports are told its header later, or that it is lost."""
-        if not any(one.topic == source.topic for one in self.flows):
+        if not self._subscribes(source.topic):
             self._core.call("registerSubscriber", OWN_NODE, source.topic, "*", self._node.uri)
         _log.debug("> subscribe to %s at %s", source, uri)
         publication = self._find(source.node, uri, source.topic)
-        relayed = publication is not None and isinstance(publication.events, PeerTopic)
-        flow = self.flows[source] = (RelayedFlow if relayed else ExportFlow)(self._new_epoch)
+        relayed = publication is not None and isinstance(publication.events, ImportRoute)
+        flow = (RelayedFlow if relayed else ExportFlow)(uri, self._new_epoch)
         flow.connection = self.connection(
             source,
             uri,
             OWN_NODE,
             on_message=flow.message,
             on_parts=flow,
-            on_header=lambda fields: self._header(source, fields),
+            on_header=lambda fields: self._header(source, flow, fields),
             on_refused=lambda text: self._gone(source, flow, f"its publisher refuses: {text}"),
             on_lost=lambda reason: self._gone(source, flow, reason),
-            on_oversized=lambda size: self._losses.oversized(source, flow, size),
+            on_oversized=lambda size: self._topics.losses.oversized(source, flow, size),
         )
         flow.connection.start()
+        return flow
 
     def connection(self, source: Source, uri: str, caller: str, **callbacks: Any) -> TopicConnection:
         """A connection to a publisher, by a socket or within this process; see ``TopicConnection``."""
@@ -180,22 +164,23 @@ class LocalSubscriptions:
         kind = PublisherConnection if find() is None else InProcessConnection
         return kind(source.topic, uri, caller, number=self._node.next_number(), find=find, **callbacks)
 
+    def _subscribes(self, topic: str) -> bool:
+        return any(source.topic == topic for source in self._topics.exports.flows)
+
+    def _is_over(self, source: Source, flow: ExportFlow) -> bool:
+        return self._topics.exports.flows.get(source) is not flow
+
     def _new_epoch(self) -> int:
         """A number that identifies a numbering; not 0."""
         self._epoch = self._epoch % UINT32_MAX + 1
         return self._epoch
 
-    def disconnect(self, source: Source) -> None:
-        """Disconnect one publisher, and drop its routes."""
-        if (flow := self.flows.get(source)) is not None:
-            flow.connection.close()
-            flow.ended()
-            for peer in list(flow.by_peer):
-                self.remove_route(source, peer)
-            flow.close()
-            del self.flows[source]
-            if not any(one.topic == source.topic for one in self.flows):
-                self._core.call("unregisterSubscriber", OWN_NODE, source.topic, self._node.uri)
+    def disconnect(self, source: Source, flow: ExportFlow) -> None:
+        """Disconnect a publisher, whose routes have ended."""
+        flow.connection.close()
+        flow.close()
+        if not self._subscribes(source.topic):
+            self._core.call("unregisterSubscriber", OWN_NODE, source.topic, self._node.uri)
 
     def leave(self, source: Source) -> bool:
         """Let a publisher that has unregistered end its connection by itself, so that all that it has sent is read.
@@ -203,144 +188,113 @@ class LocalSubscriptions:
         Returns:
             Whether the source is still connected, and sent to a peer; the exports are told when it is lost.
         """
-        flow = self.flows.get(source)
-        if flow is None or not flow.by_peer:
+        flow = self._topics.exports.flows.get(source)
+        if flow is None or all(route.sender is None for route in flow.routes.values()):
             return False
         if flow.leaving is None:
             gone = lambda: self._gone(source, flow, "its publisher has gone")  # noqa: E731
             flow.leaving = asyncio.get_running_loop().call_later(limits.ROUTE_END, gone)
         return True
 
-    def begins(self, source: Source, peer: int, route: ExportRoute) -> RouteBegin:
-        """Where a route to a peer begins."""
-        return self.flows[source].begins(peer, route.contract, route.position)
-
-    def add_route(self, source: Source, peer: int, route: ExportRoute, begin: RouteBegin, link: PeerLink) -> None:
-        """Send a source to one more peer, or resume its suspended route."""
-        flow = self.flows[source]
-        sender = flow.by_peer.get(peer)
-        if begin.resumed and sender is not None and route.position is not None:
-            self._parked.claim((peer, source))
-            self._timer.arm()
-            sender.resume(link, route.number, route.position[1])
-            if isinstance(sender, ReliableRouteSender) and (missed := sender.missed()):
-                self._losses.missed(source, peer, missed)
+    def begin(self, flow: ExportFlow, route: ExportRoute, begin: RouteBegin) -> None:
+        """Send on one more route, or resume a suspended one."""
+        if (session := self._sessions.get(route.peer)) is None:
+            return
+        self._parked.claim(route)
+        self._timer.arm()
+        if begin.resumed and route.sender is not None and route.position is not None:
+            route.sender.resume(session.link, route.number, route.position[1])
+            if isinstance(route.sender, ReliableRouteSender) and (missed := route.sender.missed()):
+                self._topics.losses.missed(route, missed)
         else:
-            self.remove_route(source, peer)
-            sender = flow.add(peer, link, route.number, route.contract, begin)
-        self.senders[peer, route.number] = sender
+            flow.add(route, session.link, begin)
+        self._topics.losses.tell_oversized(route, flow)
 
-    def suspend_route(self, source: Source, peer: int, outage: float) -> None:
-        """Keep a source's messages for an absent peer, for a time in seconds."""
-        sender = self.sender_of(source, peer)
-        self._forget(peer, sender)
+    def suspend(self, route: ExportRoute) -> None:
+        """Keep the unacknowledged and all further messages of a route for an absent peer, for its outage."""
+        route.dismiss()
+        sender, loop = route.sender, asyncio.get_running_loop()
         if isinstance(sender, ReliableRouteSender):
-            key = (peer, source)
-            sender.suspend(lambda payload, stamp: self._give_up(self._parked.offer(key, payload, stamp)))
-            loop = asyncio.get_running_loop()
-            if full := self._parked.park(key, sender.sender, loop.time() + outage):
+            sender.suspend(lambda payload, stamp: self._give_up(self._parked.offer(route, payload, stamp)))
+            if full := self._parked.park(route, sender.sender, loop.time() + route.outage):
                 loop.call_soon(self._give_up, full)  # later: the exports are at work on these routes now
             self._timer.arm()
         elif sender is not None:
             sender.suspend()
-            give_up = self._exports.given_up
-            sender.lapse = asyncio.get_running_loop().call_later(outage, give_up, source, peer)
+            sender.lapse = loop.call_later(route.outage, self._topics.exports.given_up, route)
 
     def back(self, peer: int) -> None:
         """Give a peer that has a link again ``mesh.limits.RESUME_CLAIM`` to open its suspended routes."""
         until = asyncio.get_running_loop().time() + mesh_limits.RESUME_CLAIM
-        self._parked.limit([(peer, source) for source in self.flows], until)
+        self._parked.limit(self._topics.exports.of(peer), until)
         self._timer.arm()
 
     def gone(self, peer: int) -> None:
         """Give up the messages that are kept for a peer that will not come back."""
-        keys = [(peer, source) for source in self.flows]
-        self._give_up([key for key in keys if self._parked.claim(key) is not None])
+        self._give_up([route for route in self._topics.exports.of(peer) if self._parked.claim(route) is not None])
 
-    def remove_route(self, source: Source, peer: int) -> None:
-        """End a source's route to a peer, if there is one, suspended or not."""
-        self._parked.claim((peer, source))
+    def end(self, flow: ExportFlow, route: ExportRoute) -> None:
+        """End a route, suspended or not, and drop its waiting messages."""
+        self._parked.claim(route)
         self._timer.arm()
-        if (sender := self.sender_of(source, peer)) is not None:
-            self._forget(peer, sender)
-            self.flows[source].remove(peer)
+        flow.remove(route)
+        if route.number and (session := self._sessions.get(route.peer)) is not None and session.linked:
+            session.link.close_route(route.number)
 
-    def last(self, source: Source, peer: int) -> int | None:
-        """The last message of a route whose publisher has gone; ``None``: others may have been lost."""
-        sender = self.sender_of(source, peer)
-        return sender.last if sender is not None and self.flows[source].complete else None
-
-    def sender_of(self, source: Source, peer: int) -> RouteSender | None:
-        """The sender of a source's route to a peer, suspended or not; ``None`` if there is none."""
-        flow = self.flows.get(source)
-        return flow.by_peer.get(peer) if flow is not None else None
-
-    def _give_up(self, keys: list[tuple[int, Source]]) -> None:
+    def _give_up(self, routes: list[ExportRoute]) -> None:
         """Reports routes whose messages are not kept any more for absent peers.
 
         What a relay does not keep is not lost yet: the peer may get it by another path, and counts what it misses.
         """
-        for peer in dict.fromkeys(peer for peer, _ in keys):
-            counts = {}
-            for source in (source for one, source in keys if one == peer):
-                sender = self.sender_of(source, peer)
-                if isinstance(sender, ReliableRouteSender):
-                    counts[source] = sender.missed() + sender.sender.pending
-            own = {one: count for one, count in counts.items() if not isinstance(self.flows[one], RelayedFlow)}
-            self._losses.given_up(peer, own)
-            for source in counts:
-                self._exports.given_up(source, peer)
-
-    def lane_lost(self, peer: int) -> None:
-        """Report the loss of a peer's bulk lane to its routes."""
-        for (owner, _), route_sender in list(self.senders.items()):
-            if owner == peer:
-                route_sender.lane_lost()
-
-    def _forget(self, peer: int, sender: RouteSender | None) -> None:
-        """Takes no marks of a route any more; of a suspended one another route may have the id since."""
-        if sender is not None and self.senders.get((peer, sender.route)) is sender:
-            del self.senders[peer, sender.route]
+        exports = self._topics.exports
+        for session in dict.fromkeys(route.session for route in routes):
+            counts = {
+                route.source: route.sender.missed() + route.sender.sender.pending
+                for route in routes
+                if route.session is session
+                and isinstance(route.sender, ReliableRouteSender)
+                and not isinstance(exports.flows[route.source], RelayedFlow)
+            }
+            self._topics.losses.given_up(session, counts)
+        for route in routes:
+            exports.given_up(route)
 
     def close(self) -> None:
-        """Disconnect all publishers."""
-        for source in list(self.flows):
-            self.disconnect(source)
+        """Keep nothing any more; all routes have ended."""
         self._timer.close()
 
-    def _header(self, source: Source, fields: Mapping[str, str]) -> None:
+    def _header(self, source: Source, flow: ExportFlow, fields: Mapping[str, str]) -> None:
         about = TcprosDescription.from_header(fields)
         text = about.definition.encode(errors="surrogateescape").decode("latin-1")
         description = Description(about.type, about.md5sum, text, about.latching)
         if description.problem:
-            self._gone(source, self.flows[source], description.problem)
+            self._gone(source, flow, description.problem)
             return
-        flow = self.flows[source]
         if isinstance(flow, RelayedFlow) and not self._follows(flow, source, fields):
             return
         if description.latching:
             flow.latch()
-        self._exports.described(source, description)
+        self._topics.exports.described(source, description)
 
     def _follows(self, flow: RelayedFlow, source: Source, fields: Mapping[str, str]) -> bool:
         """Whether the route that a relayed source comes by gives it its numbers; else it does when it is open."""
-        publication = self._find(source.node, flow.connection.uri, source.topic)
-        topic = publication.events if publication is not None else None
-        if publication is None or not isinstance(topic, PeerTopic):
+        publication = self._find(source.node, flow.uri, source.topic)
+        route = publication.events if publication is not None else None
+        if publication is None or not isinstance(route, ImportRoute):
             return False
-        if topic.flow is None:
-            topic.on_open = lambda: self._header(source, fields) if self.flows.get(source) is flow else None
+        if route.flow is None:
+            route.on_open = lambda: None if self._is_over(source, flow) else self._header(source, flow, fields)
             return False
-        flow.follow(topic.flow, publication.latched)
+        flow.follow(route.flow, publication.latched)
         return True
 
     def _gone(self, source: Source, flow: ExportFlow, reason: str) -> None:
-        if self.flows.get(source) is not flow:
+        if self._is_over(source, flow):
             return
         short = DESCRIPTORS.problem  # reported once for the process; the node itself may be well
         _log.log(logging.DEBUG if short else logging.INFO, "= %s: %s", source, reason)
         if flow.connection.malformed:
-            self._out.warn("publisher.malformed", str(source), f"{source}: {reason}")
+            self._topics.warn("publisher.malformed", str(source), f"{source}: {reason}")
         flow.connection.close()
         flow.ended()
         if isinstance(flow, RelayedFlow):  # nothing waits: the peers may have what follows by another path
@@ -354,12 +308,9 @@ class LocalSubscriptions:
 
     def _over(self, source: Source, flow: ExportFlow, reason: str) -> None:
         """Ends a source whose publisher has gone, and whose messages have crossed."""
-        if self.flows.get(source) is not flow:
-            return
-        lasts = {peer: last for peer in flow.by_peer if (last := self.last(source, peer)) is not None}
-        self.disconnect(source)  # first: what follows may connect the source anew
-        self._exports.lost(source, reason[: limits.CONTROL_TEXT_MAX], lasts)
-        self._on_over(source)
+        if not self._is_over(source, flow):
+            self._topics.exports.lost(source, reason)
+            self._topics.look((source.topic,))
 
 
 def is_watched(type_name: str) -> bool:
@@ -386,101 +337,27 @@ def audience(caller_ids: Iterable[str]) -> tuple[str, ...]:
     return tuple(sorted(names)[: limits.AUDIENCE_MAX])
 
 
-class Mismatches:
-    """Subscribers whose type or definition does not fit a source: local ones of peers' sources, and peers' of ours.
-
-    A subscriber is given by its name: ``/viewer`` here, ``base/viewer`` at the peer ``base``.
-
-    Args:
-        out: Sends messages and warns.
-        exports: Finds the local source that a peer means.
-        imports: Knows the peers that have a source.
-    """
-
-    def __init__(self, out: Effects, exports: Exports, imports: Imports) -> None:
-        self._out, self._exports, self._imports = out, exports, imports
-        self._texts: dict[Source, dict[str, str]] = {}
-
-    def texts(self, source: Source) -> tuple[str, ...]:
-        """The texts about one source, for ``rmpa topic info`` and the diagnostics."""
-        return tuple(self._texts.get(source, {}).values())
-
-    def _add(self, source: Source, subscriber: str, text: str) -> None:
-        """Remembers a mismatch, or replaces its text; dropped beyond ``limits.MISMATCHES_MAX`` for one source."""
-        known = self._texts.setdefault(source, {})
-        if subscriber in known or len(known) < limits.MISMATCHES_MAX:
-            known[subscriber] = text
-
-    def refused(self, peer: int, source: Source, subscriber: str, text: str) -> None:
-        """A local subscriber does not fit a peer's source: remember it, and tell the peer."""
-        self._add(source, subscriber, text)
-        self._out.warn("mismatch.md5", str(source), text)
-        self._out.send(peer, Mismatch(source.topic, source.node, subscriber, text))
-
-    def reported(self, peer: int, name: str, message: Mismatch) -> None:
-        """A peer reports that a subscriber there does not fit a local source; an empty text: that it fits now."""
-        source = self._exports.local(peer, Source(message.topic, message.node))
-        if source is None:
-            return  # it went meanwhile
-        subscriber = f"{name}{message.subscriber}"
-        if not message.text:
-            self._texts.get(source, {}).pop(subscriber, None)
-            return
-        self._add(source, subscriber, message.text)
-        where = f"{name}: {source}"
-        counter = "clock.second" if source.topic == CLOCK else "mismatch.remote"
-        self._out.warn(counter, where, f"{where}: {message.text}")
-
-    def registration_changed(self, topic: str, subscriber: str) -> None:
-        """A local subscriber has gone or has registered again: forget its mismatch, here and at the peers."""
-        for peer, source in list(self._imports.at(topic)) if self._texts else ():
-            if self._texts.get(source, {}).pop(subscriber, None) is not None:
-                self._out.send(peer, Mismatch(source.topic, source.node, subscriber, ""))
-
-    def peer_gone(self, name: str) -> None:
-        """Forget all subscribers at a peer that is gone."""
-        for known in self._texts.values():
-            for subscriber in [one for one in known if one.startswith(f"{name}/")]:
-                del known[subscriber]
-
-    def forget_gone(self) -> None:
-        """Forget the mismatches of sources that are gone."""
-        for source in list(self._texts):
-            if source not in self._exports.offered and not self._imports.knows(source):
-                del self._texts[source]
-
-
 class RemoteSubscribers:
     """The names of listeners, sent and received, for all peers.
 
     Args:
-        shared: The peers, and the rules about modules behind a relay.
+        shared: The rules about modules behind a relay.
         out: Warns of too many.
-        exports: Finds the source of a peer's route.
-        imports: Finds the route of a peer's source.
-        peers: The peers' topics in the local graph, by the numbers of their sessions.
-
-    Attributes:
-        _shown: The connections that stand for a peer's listeners, by the listeners' local names.
+        exports: Finds the routes of peers.
+        imports: Knows the modules behind relays.
     """
 
-    def __init__(
-        self, shared: Shared, out: Effects, exports: Exports, imports: Imports, peers: Mapping[int, PeerTopics]
-    ) -> None:
+    def __init__(self, shared: Shared, out: Topics, exports: Exports, imports: Imports) -> None:
         self._shared, self._out = shared, out
-        self._exports, self._imports, self._peers = exports, imports, peers
-        self._changed: dict[tuple[int, Source], None] = {}
+        self._exports, self._imports = exports, imports
+        self._changed: dict[RemoteTopic, None] = {}
         self._soon: asyncio.Handle | None = None
-        self._shown: dict[tuple[int, Source], dict[str, PublisherConnection]] = {}
 
-    # --- our listeners, to the peer that publishes ------------------------------------------------------------------
-
-    def changed(self, peer: int, source: Source) -> None:
-        """Send the listeners of a peer's source again soon: they have changed, or its route was opened."""
-        entry = self._imports.get(peer, source)
-        if entry is None or not is_watched(entry.type):
+    def changed(self, entry: RemoteTopic) -> None:
+        """Send our listeners of a peer's source again soon: they have changed, or its route was opened."""
+        if not is_watched(entry.type):
             return
-        self._changed[peer, source] = None
+        self._changed[entry] = None
         if self._soon is None:
             # In the next turn: several changes become one message, and a listener's header is answered first.
             self._soon = asyncio.get_running_loop().call_soon(self._tell)
@@ -488,42 +365,34 @@ class RemoteSubscribers:
     def _tell(self) -> None:
         self._soon = None
         changed, self._changed = self._changed, {}
-        for peer, source in changed:
-            topic = topics.topics.get(source) if (topics := self._peers.get(peer)) is not None else None
-            if topics is None or topic is None or (flow := topic.flow) is None:
+        for entry in changed:
+            if (flow := entry.flow) is None or entry.publication is None:
                 continue
-            names = audience(topic.publication.listeners)
-            if names != flow.told and topics.flows.get(flow.route) is flow:
+            names = audience(entry.publication.listeners)
+            if names != flow.told and entry.open:
                 flow.told = names
-                topics.session.link.send_control(encode(Audience(flow.route, names)))
+                self._out.send(entry.peer, Audience(entry.number, names))
 
-    # --- the peer's listeners, to our publisher ---------------------------------------------------------------------
-
-    def message(self, session: PeerSession, message: Message) -> bool:
+    def named(self, session: PeerSession, message: Audience) -> None:
         """Takes the listeners that a peer names for a route; ignored if the route was closed meanwhile."""
-        if not isinstance(message, Audience):
-            return False
-        source = self._exports.source(session.peer, message.route)
-        if source is None or (local := self._exports.offered.get(source)) is None or not is_watched(local.type):
-            return True
-        if self._exports.description(source) is None:
-            return True  # its publisher is not connected
-        names = {name for node in message.nodes if (name := self.name(session, node, source.topic))}
-        shown, most = self._shown.setdefault((session.peer, source), {}), limits.AUDIENCES_MAX
+        route = self._exports.route(session.peer, message.route)
+        if route is None or (local := self._exports.offered.get(route.source)) is None or not is_watched(local.type):
+            return
+        if self._exports.description(route.source) is None:
+            return  # its publisher is not connected
+        topic, shown, most = route.source.topic, route.audience, limits.AUDIENCES_MAX
+        names = {name for node in message.nodes if (name := self.name(session, node, topic))}
         for name in shown.keys() - names:
             shown.pop(name).close()
         for name in sorted(names - shown.keys()):
-            if sum(len(names) for (peer, _), names in self._shown.items() if peer == session.peer) >= most:
+            if sum(len(one.audience) for one in self._exports.of(session.peer)) >= most:
                 text = f"{session.link.name}: more than {most} of its nodes listen to actions here"
                 self._out.warn("audience.too_many", session.link.name, text)
                 break
-            _log.debug("> %s: %s listens", source, name)
+            _log.debug("> %s: %s listens", route.source, name)
             sink = ExportFlow()  # to no peer: the bridge gets the messages by its own connection
-            shown[name] = PublisherConnection(source.topic, local.uri, name, on_message=sink.message, on_parts=sink)
+            shown[name] = PublisherConnection(topic, local.uri, name, on_message=sink.message, on_parts=sink)
             shown[name].start()
-        if not shown:
-            del self._shown[session.peer, source]
-        return True
 
     def name(self, session: PeerSession, node: str, topic: str) -> str:
         """The local name of a peer's listener; empty for a proxy of a module that the peer may not speak for."""
@@ -535,19 +404,7 @@ class RemoteSubscribers:
             return ""
         return node if self._shared.context.gate.admits(Access.SUBSCRIBE, whose[0], topic, relay=relay) else ""
 
-    def route_over(self, peer: int, source: Source) -> None:
-        """Close the connections for a source's listeners at a peer, since its route has ended."""
-        for connection in self._shown.pop((peer, source), {}).values():
-            connection.close()
-
-    def link_down(self, peer: int) -> None:
-        """Close the connections for all listeners of a peer whose link is gone."""
-        for owner, source in [key for key in self._shown if key[0] == peer]:
-            self.route_over(owner, source)
-
     def close(self) -> None:
-        """Close all connections."""
+        """Tell nothing any more."""
         if self._soon is not None:
             self._soon.cancel()
-        for peer, source in list(self._shown):
-            self.route_over(peer, source)

@@ -22,7 +22,7 @@ from rmpa.mesh.frames import FrameKind
 from rmpa.mesh.reliable import ACK_DELAY
 from rmpa.ros import limits as ros_limits
 from rmpa.runtime import limits as runtime_limits
-from tests.bridge.io.doubles import WALL, Clock, Link, Outlet, running
+from tests.bridge.io.doubles import WALL, Clock, Link, Outlet, add, remove, running
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -65,9 +65,9 @@ def got(link: Link) -> list[tuple[int, bytes]]:
 
 def test_each_peer_gets_one_copy_with_the_number_that_all_know(clock: Clock) -> None:
     flow, one, two = ExportFlow(), Link(), Link()
-    flow.add(1, one, 7, BEST)
+    add(flow, 1, one, 7, BEST)
     flow.message(memoryview(b"a"))
-    flow.add(2, two, 9, BEST)
+    add(flow, 2, two, 9, BEST)
     clock.advance(1.0)
     flow.message(memoryview(b"b"))
     assert got(one) == [(1, b"a"), (2, b"b")]
@@ -79,26 +79,26 @@ def test_each_peer_gets_one_copy_with_the_number_that_all_know(clock: Clock) -> 
 
 def test_a_peer_has_one_leg_and_the_newer_one_counts() -> None:
     flow, link = ExportFlow(), Link()
-    old = flow.add(1, link, 7, BEST)
-    flow.add(1, link, 8, BEST)
+    old = add(flow, 1, link, 7, BEST)
+    add(flow, 1, link, 8, BEST)
     flow.message(memoryview(b"a"))
     assert link.routes == [8]
     assert old.link is None
-    flow.remove(1)
-    flow.remove(1)
+    remove(flow, 1)
+    remove(flow, 1)
     flow.message(memoryview(b"b"))
     assert link.routes == [8]
-    assert flow.by_peer == {}
+    assert flow.routes == {}
 
 
 def test_late_peer_gets_the_latched_message_first() -> None:
     flow, one, two = ExportFlow(), Link(), Link()
     flow.latch()
-    flow.add(1, one, 7, BEST)
+    add(flow, 1, one, 7, BEST)
     buffer = bytearray(b"map")
     flow.message(memoryview(buffer))
     buffer[:] = b"xxx"  # the stream's buffer is used again
-    flow.add(2, two, 9, BEST)
+    add(flow, 2, two, 9, BEST)
     flow.message(memoryview(b"new"))
     assert got(two) == [(1, b"map"), (2, b"new")]
     assert got(one) == [(1, b"map"), (2, b"new")]
@@ -108,38 +108,39 @@ def test_late_peer_gets_the_latched_message_first() -> None:
 def test_a_source_that_is_left_keeps_nothing() -> None:
     flow, one, late = ExportFlow(), Link(), Link()
     flow.latch()
-    flow.add(1, one, 7, BEST)
+    add(flow, 1, one, 7, BEST)
     flow.message(memoryview(b"map"))
+    remove(flow, 1)
     flow.close()
     flow.message(memoryview(b"new"))
     assert got(one) == [(1, b"map")]
-    assert flow.by_peer == {}
+    assert flow.routes == {}
     flow = ExportFlow()
     flow.latch()
     flow.message(memoryview(b"map"))
     flow.close()
-    flow.add(2, late, 9, BEST)
+    add(flow, 2, late, 9, BEST)
     assert late.sent == []
 
 
 def test_contract_says_how_many_kept_messages_a_peer_gets() -> None:
     flow = ExportFlow()
-    flow.add(1, Link(), 7, KEPT)
+    add(flow, 1, Link(), 7, KEPT)
     for n in range(3):
         flow.message(memoryview(bytes([n])))
     deep, deeper, plain = Link(), Link(), Link()
-    flow.add(2, deep, 7, Contract(durability=Durability.TRANSIENT_LOCAL, depth=3))
+    add(flow, 2, deep, 7, Contract(durability=Durability.TRANSIENT_LOCAL, depth=3))
     assert got(deep) == [(3, b"\2")], "nobody had asked for more in time"
     for n in range(3, 6):
         flow.message(memoryview(bytes([n])))
-    flow.add(3, deeper, 7, Contract(durability=Durability.TRANSIENT_LOCAL, depth=2))
+    add(flow, 3, deeper, 7, Contract(durability=Durability.TRANSIENT_LOCAL, depth=2))
     assert got(deeper) == [(5, b"\4"), (6, b"\5")]
-    flow.add(4, deep, 8, Contract(durability=Durability.TRANSIENT_LOCAL, depth=3))
+    add(flow, 4, deep, 8, Contract(durability=Durability.TRANSIENT_LOCAL, depth=3))
     assert [payload for _, _, payload in deep.sent[-3:]] == [b"\3", b"\4", b"\5"]
-    flow.add(5, plain, 7, BEST)
+    add(flow, 5, plain, 7, BEST)
     assert plain.sent == [], "an old command is not for who asked for no history"
     flow.latch()
-    flow.add(5, plain, 7, BEST)
+    add(flow, 5, plain, 7, BEST)
     assert got(plain) == [(6, b"\5")], "but a latching publisher's is for everybody"
 
 
@@ -147,16 +148,16 @@ def test_no_contract_keeps_more_than_the_limit(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(ros_limits, "LATCHED_MAX", 5)
     flow, late = ExportFlow(), Link()
     deep = Contract(durability=Durability.TRANSIENT_LOCAL, depth=100)
-    flow.add(1, Link(), 7, deep)
+    add(flow, 1, Link(), 7, deep)
     for n in range(20):
         flow.message(memoryview(bytes([n])))
-    flow.add(2, late, 7, deep)
+    add(flow, 2, late, 7, deep)
     assert [payload[0] for _, _, payload in late.sent] == [15, 16, 17, 18, 19]
 
 
 def test_drops_are_counted() -> None:
     flow, link = ExportFlow(), Link()
-    flow.add(1, link, 7, BULKY)
+    add(flow, 1, link, 7, BULKY)
     link.drops.extend([3, 0, 1, 1])
     flow.message(memoryview(b"a"))
     flow.message(memoryview(b"b"))
@@ -166,9 +167,9 @@ def test_drops_are_counted() -> None:
 
 def test_parts_or_the_whole_go_to_each_sender() -> None:
     flow, streams, whole, slow = ExportFlow(), Link(), Link(), Link()
-    flow.add(1, streams, 7, BULKY)
-    flow.add(2, whole, 7, RELIABLE)
-    flow.add(3, slow, 7, Contract(max_rate=1.0))
+    add(flow, 1, streams, 7, BULKY)
+    add(flow, 2, whole, 7, RELIABLE)
+    add(flow, 3, slow, 7, Contract(max_rate=1.0))
     flow.message(memoryview(b"small"))
     payload = bytes(range(256)) * 1000
     flow.begin(len(payload))
@@ -177,7 +178,8 @@ def test_parts_or_the_whole_go_to_each_sender() -> None:
     flow.part(memoryview(payload)[100:])
     assert got(streams) == [(1, b"small"), (2, payload)]
     assert got(whole) == [(1, b"small")]
-    sender = flow.by_peer[2]
+    sender = flow.routes[2].sender
+    assert sender is not None
     sender.fenced(whole.fences.popleft()[1])
     assert got(whole) == [(1, b"small"), (2, payload)]
     assert got(slow) == [(1, b"small")]
@@ -190,10 +192,10 @@ def test_peer_added_in_the_middle_gets_no_half_message(latching: bool) -> None:
     flow, early, late = ExportFlow(), Link(), Link()
     if latching:
         flow.latch()
-    flow.add(1, early, 7, BULKY)
+    add(flow, 1, early, 7, BULKY)
     flow.begin(BIG)
     flow.part(memoryview(bytes(1000)))
-    flow.add(2, late, 7, BULKY)
+    add(flow, 2, late, 7, BULKY)
     flow.part(memoryview(bytes(BIG - 1000)))
     assert got(early) == [(1, bytes(BIG))]
     assert got(late) == ([(1, bytes(BIG))] if latching else [])
@@ -203,13 +205,13 @@ def test_peer_added_in_the_middle_gets_no_half_message(latching: bool) -> None:
 
 def test_peer_removed_in_the_middle_gets_no_more_parts() -> None:
     flow, stays, leaves, whole = ExportFlow(), Link(), Link(), Link()
-    flow.add(1, stays, 7, BULKY)
-    flow.add(2, leaves, 7, BULKY)
-    flow.add(3, whole, 7, RELIABLE)
+    add(flow, 1, stays, 7, BULKY)
+    add(flow, 2, leaves, 7, BULKY)
+    add(flow, 3, whole, 7, RELIABLE)
     flow.begin(BIG)
     flow.part(memoryview(bytes(1000)))
-    flow.remove(2)
-    flow.remove(3)
+    remove(flow, 2)
+    remove(flow, 3)
     flow.part(memoryview(bytes(BIG - 1000)))
     assert got(stays) == [(1, bytes(BIG))]
     assert leaves.parcels[0].sent == 1000
@@ -221,14 +223,14 @@ def test_dead_publisher_leaves_no_partial_message(latching: bool) -> None:
     flow, streams, whole, late = ExportFlow(), Link(), Link(), Link()
     if latching:
         flow.latch()
-    flow.add(1, streams, 7, BULKY)
-    flow.add(2, whole, 7, RELIABLE)
+    add(flow, 1, streams, 7, BULKY)
+    add(flow, 2, whole, 7, RELIABLE)
     flow.begin(BIG)
     flow.part(memoryview(bytes(1000)))
     flow.abort()
     assert streams.log[-1] == ("express", "abandon", 7, 1)
     assert flow._whole is None
-    flow.add(3, late, 7, BULKY)
+    add(flow, 3, late, 7, BULKY)
     assert (whole.sent, late.sent, flow.messages) == ([], [], 0)
     give(flow, b"n" * BIG)
     assert got(streams) == [(2, b"n" * BIG)]

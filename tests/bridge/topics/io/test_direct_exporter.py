@@ -115,11 +115,12 @@ class Module:
 
     @staticmethod
     def _session(number: int) -> Any:
-        link = SimpleNamespace(name=f"peer{number}", silent=True, crashed=False)
+        link = SimpleNamespace(name=f"peer{number}", crashed=False)
         return SimpleNamespace(
             peer=number,
             link=link,
             linked=True,
+            silent=True,
             same_machine=False,
             address=f"10.0.0.{number}",
             proxies=Proxies(f"/rmpa/peer{number}"),
@@ -268,7 +269,7 @@ async def test_connections_end_where_a_host_may_have_vanished(
 ) -> None:
     await module.open()
     module.sessions[1].same_machine = same
-    module.sessions[1].link.silent = silent
+    module.sessions[1].silent = silent
     if shared:
         module.sessions[2].address = module.sessions[1].address
     module.sessions[1].link.crashed = crashed

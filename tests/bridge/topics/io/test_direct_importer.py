@@ -41,14 +41,14 @@ class Imports:
     def __init__(self, module: Module) -> None:
         self._module = module
 
-    def __iter__(self) -> Iterator[tuple[int, Source, Any]]:
-        yield 1, SOURCE, self._module.entry
+    def __iter__(self) -> Iterator[Any]:
+        yield self._module.entry
 
     def get(self, *_: object) -> Any:
         return self._module.entry
 
-    def at(self, _topic: str) -> list[tuple[int, Source]]:
-        return [(1, SOURCE)]
+    def at(self, _topic: str) -> list[Any]:
+        return [self._module.entry] if self._module.entry is not None else []
 
 
 class Module:
@@ -78,8 +78,6 @@ class Module:
             address="10.0.0.1",
             proxies=SimpleNamespace(get=lambda _: None),
         )
-        self.callers: frozenset[str] = frozenset()
-        publication = SimpleNamespace(callers=self.callers, listeners=(), hang_up=lambda _: None)
         monkeypatch.setattr(direct_importer, "probe", self._probe)
         monkeypatch.setattr(direct_importer, "standing", lambda *_: {45225: {40_000}} if self.connected else {})
         monkeypatch.setattr(direct_importer, "bus_links", self._bus_links)
@@ -105,7 +103,6 @@ class Module:
             cast("Any", shared),
             lambda _kind, _subject, text: self.warned.append(text),
             cast("Any", self.imports),
-            cast("Any", {1: SimpleNamespace(publication=lambda _: publication)}),
         )
         monkeypatch.setattr(self.sut, "_renew", self._renew)
 
@@ -125,6 +122,7 @@ class Module:
             origin=None,
             description=None,
             direct=False,
+            publication=SimpleNamespace(callers=frozenset(), listeners=(), hang_up=lambda _: None),
         )
 
     async def _request(self, *_: object) -> object:

@@ -12,21 +12,17 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.data.quality import QosEventKind
 from rmpa.bridge.messages import Description, RouteOpened, Source
-from rmpa.bridge.proxies import PeerProxies, ProxyNodes
-from rmpa.bridge.sessions import AWAY_GRACE, PeerSession
-from rmpa.bridge.topics.imports import RemoteTopic
-from rmpa.bridge.topics.peer_topics import Pasts, PeerTopics
+from rmpa.bridge.sessions import AWAY_GRACE
 from rmpa.core.contract import Contract, Durability, Reliability, Transport
 from rmpa.core.outbox import FIRST
-from rmpa.core.statistics import Counters
 from tests.bridge.io.nodes import MD5, Core, Ear, stages
+from tests.bridge.io.proxied import Proxied
 from tests.bridge.io.two_bridges import made_up
 from tests.bridge.io.virtual import VirtualLoop, run
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
-    from rmpa.bridge.data.quality import QosEvent
     from rmpa.bridge.data.reception import ImportFlow
     from rmpa.ros.core.embedded import RosCore
     from rmpa.ros.node.publication import Publication
@@ -69,40 +65,13 @@ class Heard:
         return self.ear.closed
 
 
-class Proxied:
-    """The proxies of one peer, and what was said of them."""
+class Scene(Proxied):
+    """The source ``/cmd`` in a local graph of its own."""
 
     def __init__(self) -> None:
         self.named: list[str] = []
-        self.demands: list[bool] = []
-        self.occurred: list[tuple[float, QosEvent]] = []
-        self.acks: list[int] = []
-        self.loop = asyncio.get_running_loop()
         self.core = Core(cast("Any", SimpleNamespace(name="a", named=self.named.append)))
-        core = cast("RosCore", self.core)
-        self.proxies = PeerProxies("/rmpa/b", ProxyNodes(core))
-        link = SimpleNamespace(routes={}, mark=lambda _kind, _route, sequence: self.acks.append(sequence))
-        self.link = link
-        part = SimpleNamespace(
-            demand=lambda _peer, _source, wanted: self.demands.append(wanted),
-            mismatched=lambda _peer, _source, _who, text: pytest.fail(text),
-            occurred=lambda _peer, _source, occurred: self.occurred.append((self.loop.time(), occurred)),
-            listeners_changed=lambda _peer, _source: None,
-            join=lambda _topic, _connection: None,
-            request=lambda *_: None,
-        )
-        shared = SimpleNamespace(core=core, counters=Counters(), relay=SimpleNamespace(enabled=False))
-        session = PeerSession(1, cast("Any", link), self.proxies)
-        pasts: Pasts = {}
-        self.topics = PeerTopics(cast("Any", shared), cast("Any", part), session, lambda _: pasts)
-
-    async def publish(self) -> Publication:
-        entry = RemoteTopic(peer=1, wire=CMD, name=CMD.topic, node=CMD.node, type="a/B", module=("", "b"))
-        self.topics.publish(entry, self.proxies, CMD.node)
-        await asyncio.sleep(0.01)
-        publication = self.topics.publication(CMD)
-        assert publication is not None
-        return publication
+        super().__init__(cast("RosCore", self.core), CMD, "a/B")
 
     def describe(
         self,
@@ -116,21 +85,19 @@ class Proxied:
         **told: Any,
     ) -> ImportFlow:
         about = Description("a/B", MD5, definition, latching)
-        self.topics.describe(CMD, RouteOpened(route, about, contract, epoch, first, **told))
-        return self.topics.flows[route]
+        return self.opened(RouteOpened(route, about, contract, epoch, first, **told))
 
     def kinds(self) -> list[QosEventKind]:
-        return [occurred.kind for _, occurred in self.occurred]
+        return [kind for _, kind in self.occurred]
 
 
 def played(scene: Callable[..., Coroutine[object, object, None]]) -> Callable[..., None]:
     """The test that plays a scene in made-up time."""
 
     async def main(values: dict[str, Any]) -> None:
-        proxied = Proxied()
+        proxied = Scene()
         await scene(proxied, **values)
-        proxied.topics.close()
-        await proxied.proxies.close()
+        await proxied.close()
         assert proxied.core.publishers("/cmd") == {}
 
     def test(**values: Any) -> None:
@@ -145,16 +112,16 @@ def played(scene: Callable[..., Coroutine[object, object, None]]) -> Callable[..
 
 
 @played
-async def test_a_source_appears_flows_and_disappears(proxied: Proxied) -> None:
+async def test_a_source_appears_flows_and_disappears(proxied: Scene) -> None:
     publication = await proxied.publish()
     assert set(proxied.core.publishers("/cmd")) == {"/rmpa/b/joy"}
     listener = Heard(publication)
     assert proxied.demands == [True]
     flow = proxied.describe(Contract())
     flow.message(1, 0, framed("one"))
-    proxied.topics.detach(CMD, 1)
-    assert proxied.topics.flows == {}
-    proxied.topics.retract(CMD)
+    proxied.detach()
+    proxied.route.end(missed=True)
+    proxied.route.release()
     await asyncio.sleep(0.01)
     assert listener.texts == ["one"]
     assert listener.closed
@@ -162,29 +129,22 @@ async def test_a_source_appears_flows_and_disappears(proxied: Proxied) -> None:
 
 
 @played
-async def test_a_description_without_a_proxy_has_no_effect(proxied: Proxied) -> None:
-    about = Description("a/B", MD5, "", False)
-    proxied.topics.describe(CMD, RouteOpened(1, about))
-    assert proxied.topics.flows == {}
-
-
-@played
-async def test_the_contract_bounds_the_queue_and_the_latched_messages(proxied: Proxied) -> None:
+async def test_the_contract_bounds_the_queue_and_the_latched_messages(proxied: Scene) -> None:
     publication = await proxied.publish()
     proxied.describe(Contract(durability=Durability.TRANSIENT_LOCAL, depth=2), latching=True)
     for number, text in enumerate("abc", 1):
-        proxied.topics.flows[1].message(number, 0, framed(text))
+        proxied.flow.message(number, 0, framed(text))
     assert publication._queue_messages == 2
     assert Heard(publication).texts == ["b", "c"]
 
 
 @played
-async def test_subscribers_cut_off_in_a_message_are_called_back_later(proxied: Proxied) -> None:
+async def test_subscribers_cut_off_in_a_message_are_called_back_later(proxied: Scene) -> None:
     listener = Heard(await proxied.publish())
     flow = proxied.describe(Contract())
     proxied.named.clear()
     flow.part(1, 0, FIRST, framed("half", 1000)[:500])
-    proxied.topics.link_down()
+    proxied.flow.link_down()
     assert listener.closed
     assert proxied.named == [], "rospy has not noticed yet"
     for delay in limits.CALL_BACK_DELAYS:
@@ -196,12 +156,11 @@ async def test_subscribers_cut_off_in_a_message_are_called_back_later(proxied: P
 
 
 @played
-async def test_a_changed_header_reconnects_the_subscribers(proxied: Proxied) -> None:
+async def test_a_changed_header_reconnects_the_subscribers(proxied: Scene) -> None:
     publication = await proxied.publish()
     listener = Heard(publication)
     proxied.describe(Contract(), latching=True)
-    proxied.topics.flows[1].message(1, 0, framed("map"))
-    proxied.topics.detach(CMD, 1, keep=True)
+    proxied.flow.message(1, 0, framed("map"))
     proxied.named.clear()
     flow = proxied.describe(Contract(), route=2, latching=True, definition="string data")
     assert listener.closed
@@ -216,12 +175,11 @@ async def test_a_changed_header_reconnects_the_subscribers(proxied: Proxied) -> 
 
 
 @played
-async def test_a_sender_that_began_anew_is_said_and_brings_nothing_again(proxied: Proxied) -> None:
+async def test_a_sender_that_began_anew_is_said_and_brings_nothing_again(proxied: Scene) -> None:
     listener = Heard(await proxied.publish())
     flow = proxied.describe(SURE, epoch=5, latching=True)
     flow.message(1, 0, framed("map"))
-    proxied.topics.link_down()
-    proxied.topics.detach(CMD, 1, keep=True)
+    proxied.flow.link_down()
     assert proxied.describe(SURE, epoch=6, latching=True) is flow
     flow.message(1, 0, framed("map"))
     flow.message(2, 0, framed("new map"))
@@ -232,23 +190,22 @@ async def test_a_sender_that_began_anew_is_said_and_brings_nothing_again(proxied
 @pytest.mark.parametrize(("told", "count", "kinds"), TOLD)
 @played
 async def test_what_a_sender_says_that_it_has_given_up_is_lost(
-    proxied: Proxied, told: dict[str, Any], count: int, kinds: list[QosEventKind]
+    proxied: Scene, told: dict[str, Any], count: int, kinds: list[QosEventKind]
 ) -> None:
     await proxied.publish()
     flow = proxied.describe(SURE, epoch=5)
     flow.message(1, 0, framed("one"))
-    proxied.topics.link_down()
-    proxied.topics.detach(CMD, 1, keep=True)
+    proxied.flow.link_down()
     assert proxied.describe(SURE, route=2, **told) is flow
     assert (lost(flow), proxied.kinds()) == (count, kinds)
 
 
 @pytest.mark.parametrize("last", [1, 3])
 @played
-async def test_what_had_not_come_of_a_publisher_that_has_gone_is_lost(proxied: Proxied, last: int) -> None:
+async def test_what_had_not_come_of_a_publisher_that_has_gone_is_lost(proxied: Scene, last: int) -> None:
     await proxied.publish()
     proxied.describe(SURE, epoch=5).message(1, 0, framed("one"))
-    proxied.topics.detach(CMD, 1, missed=True, last=last)
+    proxied.detach(missed=True, last=last)
     new = proxied.describe(SURE, route=2, epoch=6)
     assert (lost(new), proxied.kinds()) == (
         last - 1,
@@ -257,23 +214,21 @@ async def test_what_had_not_come_of_a_publisher_that_has_gone_is_lost(proxied: P
 
 
 @played
-async def test_another_transport_continues_the_flow(proxied: Proxied) -> None:
+async def test_another_transport_continues_the_flow(proxied: Scene) -> None:
     await proxied.publish()
     old = proxied.describe(SURE, epoch=5)
-    proxied.topics.link_down()
-    proxied.topics.detach(CMD, 1, keep=True)
+    proxied.flow.link_down()
     changed = Contract(reliability=Reliability.RELIABLE, transport=Transport.AUTO)
     assert proxied.describe(changed, epoch=5) is old
     assert old.contract == changed
 
 
 @played
-async def test_a_changed_contract_makes_a_new_flow(proxied: Proxied) -> None:
+async def test_a_changed_contract_makes_a_new_flow(proxied: Scene) -> None:
     listener = Heard(await proxied.publish())
     old = proxied.describe(SURE, epoch=5)
     old.message(1, 0, framed("one"))
-    proxied.topics.link_down()
-    proxied.topics.detach(CMD, 1, keep=True)
+    proxied.flow.link_down()
     new = proxied.describe(Contract(reliability=Reliability.RELIABLE, depth=7), epoch=6)
     assert new is not old
     new.message(1, 0, framed("two"))
@@ -282,12 +237,11 @@ async def test_a_changed_contract_makes_a_new_flow(proxied: Proxied) -> None:
 
 
 @played
-async def test_a_short_silence_repeats_no_latched_message(proxied: Proxied) -> None:
+async def test_a_short_silence_repeats_no_latched_message(proxied: Scene) -> None:
     publication = await proxied.publish()
     listener = Heard(publication)
     proxied.describe(Contract(), latching=True).message(1, 0, framed("map"))
-    proxied.topics.link_down()
-    proxied.topics.detach(CMD, 1, keep=True)
+    proxied.flow.link_down()
     late = Heard(publication)
     flow = proxied.describe(Contract(), latching=True)
     flow.message(1, 0, framed("map"))
@@ -301,59 +255,56 @@ async def test_a_short_silence_repeats_no_latched_message(proxied: Proxied) -> N
 
 
 @played
-async def test_a_missed_deadline_is_said_when_it_is_missed(proxied: Proxied) -> None:
+async def test_a_missed_deadline_is_said_when_it_is_missed(proxied: Scene) -> None:
     await proxied.publish()
     began = proxied.loop.time()
     flow = proxied.describe(Contract(deadline=1.0))
     await asyncio.sleep(0.9)
     flow.message(1, 0, framed("one"))
     await asyncio.sleep(1.5)
-    assert [(round(now - began, 3), occurred.kind) for now, occurred in proxied.occurred] == [
-        (1.9, QosEventKind.DEADLINE_MISSED)
-    ]
-    proxied.topics.detach(CMD, 1)
+    assert [(round(now - began, 3), kind) for now, kind in proxied.occurred] == [(1.9, QosEventKind.DEADLINE_MISSED)]
+    proxied.detach()
     await asyncio.sleep(60.0)
     assert len(proxied.occurred) == 1, "nobody waits for it any more"
 
 
 @pytest.mark.parametrize("silent", [False, True])
 @played
-async def test_a_source_that_leaves_with_its_peer_is_lost_at_once(proxied: Proxied, silent: bool) -> None:
+async def test_a_source_that_leaves_with_its_peer_is_lost_at_once(proxied: Scene, silent: bool) -> None:
     await proxied.publish()
     proxied.describe(ALIVE)
-    proxied.topics.link_down()
+    proxied.flow.link_down()
     if silent:
-        proxied.topics.detach(CMD, 1, keep=True)
         await asyncio.sleep(AWAY_GRACE)
         assert proxied.occurred == []
     else:
-        proxied.topics.detach(CMD, 1)
-    proxied.topics.retract(CMD)
+        proxied.detach()
+    proxied.route.end(missed=True)
+    proxied.route.release()
     assert proxied.kinds() == [QosEventKind.LIVELINESS_LOST]
     await asyncio.sleep(60.0)
     assert len(proxied.occurred) == 1
 
 
 @played
-async def test_a_source_whose_peer_stays_away_is_lost_when_its_lease_is_over(proxied: Proxied) -> None:
+async def test_a_source_whose_peer_stays_away_is_lost_when_its_lease_is_over(proxied: Scene) -> None:
     await proxied.publish()
     proxied.describe(Contract(reliability=Reliability.RELIABLE, liveliness_lease=5.0), epoch=5)
     await asyncio.sleep(10.0)
     began = proxied.loop.time()
-    proxied.topics.link_down()
-    proxied.topics.detach(CMD, 1, keep=True)
+    proxied.flow.link_down()
     await asyncio.sleep(20.0)
-    [(lost, occurred)] = proxied.occurred
-    assert occurred.kind is QosEventKind.LIVELINESS_LOST
+    [(lost, kind)] = proxied.occurred
+    assert kind is QosEventKind.LIVELINESS_LOST
     assert 5.0 <= lost - began <= 5.5
 
 
 @played
-async def test_all_is_registered_again_that_the_core_has_lost(proxied: Proxied) -> None:
+async def test_all_is_registered_again_that_the_core_has_lost(proxied: Scene) -> None:
     await proxied.publish()
     registered = proxied.core.publishers("/cmd")
-    proxied.named.clear()
-    proxied.topics.reconcile({"/cmd": dict(registered)})
-    assert not proxied.named
-    proxied.topics.reconcile({})
-    assert proxied.named
+    assert not proxied.route.is_missing({"/cmd": dict(registered)})
+    assert proxied.route.is_missing({})
+    proxied.core.call("unregisterPublisher", "/rmpa/b/joy", "/cmd", registered["/rmpa/b/joy"])
+    proxied.route.register()
+    assert proxied.core.publishers("/cmd") == registered
