@@ -34,6 +34,55 @@ def numbers(machine: ReliableSender, most: int | None = None) -> list[int]:
 # --- the sender -----------------------------------------------------------------------------------------------
 
 
+def test_messages_are_numbered_and_sent_in_order() -> None:
+    machine = sender()
+    machine.offer(b"a", 5)
+    machine.offer(b"b", 6)
+    assert taken(machine) == [(1, 5, b"a"), (2, 6, b"b")]
+    assert taken(machine) == []
+    assert (machine.epoch, machine.first, machine.last) == (7, 1, 2)
+    assert (machine.pending, machine.pending_bytes, machine.in_flight) == (2, 2, 2)
+
+
+def test_window_bounds_messages_in_flight() -> None:
+    machine = sender(window=3)
+    fill(machine, 5)
+    assert numbers(machine) == [0, 1, 2]
+    machine.acknowledged(2)
+    assert numbers(machine, 1) == [3]
+    assert numbers(machine) == [4]
+    assert machine.in_flight == 3
+
+
+def test_one_large_message_passes_the_byte_window() -> None:
+    machine = sender(window_bytes=100)
+    fill(machine, 3, size=36)
+    machine.offer(payload(3, 500), 0)
+    assert numbers(machine) == [0, 1]
+    machine.acknowledged(2)
+    assert numbers(machine) == [2]
+    machine.acknowledged(3)
+    assert numbers(machine) == [3]
+    machine.offer(b"", 0)
+    assert taken(machine) == []
+    machine.acknowledged(4)
+    assert len(taken(machine)) == 1
+
+
+def test_acknowledged_messages_are_dropped() -> None:
+    machine = sender()
+    fill(machine, 5)
+    taken(machine)
+    machine.acknowledged(3)
+    assert (machine.pending, machine.pending_bytes, machine.in_flight) == (2, 8, 2)
+    machine.acknowledged(3)
+    machine.acknowledged(1)
+    assert (machine.pending, machine.idle) == (2, False)
+    machine.acknowledged(5)
+    assert (machine.pending, machine.idle) == (0, True)
+    assert machine.pending_bytes == machine.overflowed == 0
+
+
 @pytest.mark.parametrize("sequence", [3, 4, 1000, (1 << 31) - 1])
 def test_what_a_receiver_has_by_another_path_is_not_sent_here_yet(sequence: int) -> None:
     machine = sender()
@@ -41,6 +90,30 @@ def test_what_a_receiver_has_by_another_path_is_not_sent_here_yet(sequence: int)
     taken(machine, 2)
     machine.acknowledged(sequence)
     assert (machine.pending, machine.confirmed) == (3, 2)
+
+
+def test_a_suspended_sender_keeps_all_and_sends_nothing() -> None:
+    machine = sender()
+    fill(machine, 3)
+    taken(machine, 2)
+    machine.suspend()
+    machine.suspend()
+    machine.acknowledged(2)
+    assert taken(machine) == []
+    assert (machine.pending, machine.in_flight) == (3, 0)
+
+
+@pytest.mark.parametrize("suspended", [True, False])
+@pytest.mark.parametrize(("after", "again"), [(0, [0, 1, 2, 3]), (2, [2, 3]), (3, [3])])
+def test_a_new_link_begins_behind_what_the_receiver_has(after: int, again: list[int], *, suspended: bool) -> None:
+    machine = sender()
+    fill(machine, 4)
+    taken(machine, 3)
+    if suspended:
+        machine.suspend()
+    machine.resume(after)
+    assert numbers(machine) == again
+    assert machine.pending == len(again)
 
 
 @pytest.mark.parametrize(("after", "left"), [(0, 3), (1, 3), (3, 2), (5, 0), (6, 0), (1000, 0), ((1 << 31) + 2, 3)])
@@ -119,6 +192,28 @@ def test_messages_dropped_in_flight_fill_the_window(window: int, window_bytes: i
     assert machine.overflowed == 7
 
 
+def test_acknowledgement_may_be_ahead_of_the_new_link() -> None:
+    machine = sender()
+    fill(machine, 5)
+    taken(machine)
+    machine.resume(1)
+    assert numbers(machine, 1) == [1]
+    machine.acknowledged(4)  # the old link brought three more behind the position that it was opened with
+    assert numbers(machine) == [4]
+    assert machine.pending == 1
+
+
+def test_what_cannot_go_after_all_is_the_next_one_again() -> None:
+    machine = sender(window_bytes=8)
+    fill(machine, 3)
+    assert numbers(machine) == [0, 1]
+    machine.put_back()
+    assert machine.in_flight == 1
+    assert numbers(machine) == [1]
+    machine.acknowledged(2)
+    assert machine.in_flight == 0
+
+
 def test_lost_lane_is_replayed_from_the_acknowledgement() -> None:
     machine = sender(depth=4)
     fill(machine, 4)
@@ -164,6 +259,54 @@ def test_a_message_costs_the_same_however_many_wait(dropping: bool) -> None:
 # --- the receiver ---------------------------------------------------------------------------------------------
 
 
+def test_a_gap_is_counted_exactly() -> None:
+    receiver = ReliableReceiver(7, first=1)
+    assert receiver.accept(4, 7, 0.0) == 3
+    assert receiver.accept(5, 7, 0.0) == 0
+    assert receiver.accept(1000, 7, 0.0) == 994
+    assert receiver.accept(999, 7, 0.0) is None
+
+
+def test_without_a_first_sequence_no_gap_is_claimed() -> None:
+    receiver = ReliableReceiver()
+    assert receiver.gap(500, 7) == 0
+    assert receiver.position() is None
+    assert receiver.accept(500, 7, 0.0) == 0
+    assert receiver.accept(502, 7, 0.0) == 1
+    assert receiver.position() == (7, 502)
+
+
+def test_another_epoch_begins_where_its_sender_says() -> None:
+    receiver = ReliableReceiver(7, first=1)
+    receiver.accept(1, 7, 0.0)
+    receiver.begin(8, 1)
+    assert receiver.position() == (8, 0)
+    assert receiver.next_timer() is None, "nobody waits for the old epoch's acknowledgement"
+    assert receiver.accept(2, 7, 0.0) is None
+    assert receiver.gap(2, 7) is None
+    assert receiver.next_timer() is None
+    assert receiver.accept(2, 8, 0.0) == 1
+
+
+def test_the_same_epoch_goes_on() -> None:
+    receiver = ReliableReceiver()
+    receiver.begin(7)
+    assert receiver.position() is None
+    receiver.begin(7, 1)
+    receiver.accept(1, 7, 0.0)
+    receiver.begin(7, 1)
+    assert receiver.position() == (7, 1)
+
+
+def test_message_counts_with_its_last_fragment() -> None:
+    receiver = ReliableReceiver(7, first=1)
+    assert receiver.gap(1, 7) == 0
+    assert receiver.gap(3, 7) == 2
+    assert receiver.position() == (7, 0)
+    receiver.accept(1, 7, 0.0)
+    assert receiver.gap(1, 7) is None
+
+
 def test_it_acknowledges_after_a_delay() -> None:
     receiver = ReliableReceiver(7, first=1)
     assert receiver.next_timer() is None
@@ -190,6 +333,14 @@ def test_many_messages_or_bytes_are_acknowledged_at_once() -> None:
     assert receiver.due_ack(0.0) == 34
     receiver.accept(35, 7, 0.0, 1)
     assert receiver.due_ack(0.0) is None
+
+
+def test_a_duplicate_is_acknowledged_again() -> None:
+    receiver = ReliableReceiver(7, first=1)
+    receiver.accept(1, 7, 0.0)
+    assert receiver.due_ack(1.0) == 1
+    receiver.accept(1, 7, 2.0)
+    assert receiver.due_ack(3.0) == 1
 
 
 # --- parked senders -------------------------------------------------------------------------------------------

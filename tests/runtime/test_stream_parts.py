@@ -248,6 +248,23 @@ async def drain_zeros(sock: socket.socket, count: int) -> None:
         count -= len(got)
 
 
+@pytest.mark.parametrize("sizes", [[10, 20, 300, 30, 400, 40], [300, 20], [10, 300], [10, 70_000, 5], [70_000, 5]])
+async def test_small_messages_stay_in_front_of_a_large_one_of_the_same_read(
+    sockets: Sockets, sizes: list[int]
+) -> None:
+    zeros = stuff(sockets[0])
+    source, inbound = socket.socketpair()
+    inbound.setblocking(False)
+    bridge = CutThrough(inbound, Sender(sockets[0]), whole_up_to=50)
+    source.send(b"".join(b"\1" + n.to_bytes(4, "big") + payload(i, n) for i, n in enumerate(sizes, 1)))
+    await until(lambda: bridge.sender.stream.pending_bytes > sum(sizes))
+    await drain_zeros(sockets[1], zeros)
+    receiver = Receiver(sockets[1])
+    await until(lambda: len(receiver.got) == len(sizes), receiver)
+    assert receiver.got == [(1, n) for n in range(1, len(sizes) + 1)]
+    source.close()
+
+
 async def half_sent(sockets: Sockets) -> tuple[Sender, Receiver, Opened]:
     """A message of route 1 whose first 10,000 bytes had to wait, and have left; 30,000 are to come."""
     sender = Sender(sockets[0])
@@ -303,6 +320,20 @@ async def test_corked_messages_follow_what_the_outbox_sends(sockets: Sockets) ->
     assert by_key(receiver.got) == by_key(sender.sent)
 
 
+async def test_route_closed_during_a_read_keeps_corked_messages(sockets: Sockets) -> None:
+    sender, receiver, _ = await half_sent(sockets)
+
+    def action() -> None:
+        sender.send(2, 90_000)
+        assert sender.stream.outbox.discard(1) == 1
+        sender.stream.pump()
+        sender.send(2, 9000)
+
+    await Corked(action).run()
+    await until(lambda: len(receiver.got) == 2, receiver)
+    assert "data 1:1 aborted" in receiver.said
+
+
 async def test_a_mark_stays_behind_what_is_corked(sockets: Sockets) -> None:
     sender, receiver = Sender(sockets[0]), Receiver(sockets[1])
 
@@ -333,7 +364,73 @@ async def test_a_mark_that_has_to_wait_is_not_dropped(sockets: Sockets) -> None:
     assert box.dropped[1] >= 3
 
 
+async def test_parts_of_one_read_leave_in_one_call(sockets: Sockets) -> None:
+    sizes: list[int] = []
+    sender, receiver = Sender(sockets[0]), Receiver(sockets[1])
+    real = sender.stream._sock
+
+    class Counting:
+        def sendmsg(self, parts: list[memoryview]) -> int:
+            sizes.append(sum(map(len, parts)))
+            return real.sendmsg(parts)
+
+        def close(self) -> None:
+            real.close()
+
+    sender.stream._sock = Counting()  # type: ignore[assignment]
+    opened = sender.open(1, 900)
+
+    def action() -> None:
+        sender.send(2, 50)
+        for _ in range(3):
+            opened.extend(300)
+        sender.send(1, 50)
+        assert sizes == []
+
+    await Corked(action).run()
+    assert sizes == [5 * 24 + 1000]
+    await until(lambda: len(receiver.got) == 3, receiver)
+
+
 # --- the end of a message that never comes ------------------------------------------------------------------------
+
+
+async def test_abandoned_where_the_other_side_has_a_part_it_is_told(sockets: Sockets) -> None:
+    sender, receiver = Sender(sockets[0]), Receiver(sockets[1])
+    opened = sender.open(1, 900)
+    opened.extend(300)
+    assert sender.stream.abandon(opened.parcel) is False
+    assert sender.stream.abandon(opened.parcel) is False
+    opened.extend(300)
+    sender.send(1, 10)
+    await until(lambda: receiver.got == [(1, 2)], receiver)
+    assert receiver.said == ["data 1:1 part", "data 1:1 aborted", "data 1:2 whole"]
+
+
+async def test_abandoned_message_leaves_the_outbox(sockets: Sockets) -> None:
+    """Its key was silent for ever: the dead message stood in front of all that followed."""
+    sender, receiver, opened = await half_sent(sockets)
+    assert sender.stream.abandon(opened.parcel) is False
+    assert sender.stream.outbox.waiting(1) == 0
+    for _ in range(50):
+        sender.send(1, 4000)  # some of them have to wait
+    await until(lambda: len(receiver.got) == 50, receiver)
+    assert receiver.said[-51] == "data 1:1 aborted"
+    assert by_key(receiver.got) == by_key(sender.sent)
+
+
+async def test_one_whose_rest_waits_is_abandoned_behind_it(sockets: Sockets) -> None:
+    sender = Sender(sockets[0])
+    zeros = stuff(sockets[0])
+    opened = sender.open(1, 900)
+    for _ in range(2):
+        opened.extend(300)
+    assert sender.stream.abandon(opened.parcel) is False
+    sender.send(1, 10)
+    await drain_zeros(sockets[1], zeros)
+    receiver = Receiver(sockets[1])
+    await until(lambda: receiver.got == [(1, 2)], receiver)
+    assert receiver.said[-2:] == ["data 1:1 aborted", "data 1:2 whole"]
 
 
 @pytest.mark.parametrize("began", [0, 300])
@@ -383,6 +480,21 @@ async def test_adopted_outbox_is_sent_behind_the_connections_own_bytes(sockets: 
     assert receiver.said[:2] == ["hello 0:0 whole", "ping 0:0 whole"]
     assert by_key(receiver.got[2:]) == {7: [1, 2, 4], 8: [3]}
     assert receiver.said.index("data 7:4 whole") < receiver.said.index("data 8:3 whole"), "in turns"
+
+
+async def test_outbox_adopted_during_a_read_is_sent_behind_it(sockets: Sockets) -> None:
+    """As a welcome, which the lane's messages must not overtake."""
+    sender, receiver = Sender(sockets[0], Outbox(1, 1)), Receiver(sockets[1])
+    box = large_outbox()
+    box.push(whole(7, 1, 100), 7)
+
+    def action() -> None:
+        sender.stream.send([Frame(FrameKind.HELLO, b"hello").serialize()], URGENT)
+        sender.stream.adopt(box, pack_fragment_header)
+
+    await Corked(action).run()
+    await until(lambda: len(receiver.got) == 2, receiver)
+    assert receiver.said == ["hello 0:0 whole", "data 7:1 whole"]
 
 
 async def test_whole_entries_are_sent_by_the_next_connection(sockets: Sockets) -> None:

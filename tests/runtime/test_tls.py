@@ -304,3 +304,19 @@ async def test_drained_waits_for_ciphertext(tls: SecurePairs) -> None:
     one.send(b"x" * 5000)
     await one.stream.drained(20)
     await until(lambda: other.got == [b"x" * 5000])
+
+
+async def test_bytes_behind_the_handshake_are_read(tls: SecurePairs) -> None:
+    """They are in OpenSSL already when the stream is made, so the loop does not report them."""
+    one, other = tls.secured()
+    one.sendmsg((b"\0\0\0\5hello",))
+    ciphertext = b""
+    while not ciphertext:
+        try:
+            ciphertext = tls.sockets[1].recv(65536)
+        except BlockingIOError:
+            await asyncio.sleep(0)
+    other._incoming.write(ciphertext)
+    other.readable = True
+    end = End(tls.sockets[1], secure=other)
+    await until(lambda: end.got == [b"hello"])

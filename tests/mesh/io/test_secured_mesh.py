@@ -318,3 +318,18 @@ async def test_one_certificate_has_a_bounded_number_of_connections(
         await until(lambda: crane.both_lanes(base), "another module links")
         await arms[0].mesh.close()
         await until(lambda: arms[2].both_lanes(base), "there is room again")
+
+
+@pytest.mark.parametrize("dialler", [True, False])
+async def test_a_revoked_module_is_gone_at_once_at_both_ends(lab: Authority, dialler: bool) -> None:
+    members = Member(lab, "arm"), Member(lab, "base")
+    async with meshes(*members) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        judge, other = (arm, base) if dialler else (base, arm)
+        members[not dialler].revoke(other.mesh.identity.name)
+        assert not judge.linked(other), "without waiting for the other side"
+        assert judge.downs[0][1].startswith("revoked:")
+        await until(lambda: bool(other.downs), "the other side sees it")
+        assert "revoked" in other.downs[0][1]
+        await until(lambda: status(other, judge).last_error.startswith("revoked"), "it is shown there")
+        await until(lambda: not judge.mesh.connections(), "both lanes ended")

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from rmpa.runtime.tls import TlsHandshake
+
 pytest.importorskip("cryptography")
 
 from rmpa.core.errors import RemoteProtocolError, StartError
@@ -19,6 +21,7 @@ from tests.trust.authority import WALL
 from tests.trust.io.member_files import KEYS, SecuredMesh
 
 if TYPE_CHECKING:
+    import ssl
     from pathlib import Path
 
 DAY = 86_400.0
@@ -185,3 +188,36 @@ def test_no_secret_is_in_a_repr(mesh: SecuredMesh) -> None:
     assert repr(base) == "Membership('base', deny=0, keys=1)"
     assert "PRIVATE" not in repr(base.files) + repr(base.ring)
     assert "kkkk" not in repr(base.ring) + repr(base.files)
+
+
+def shake(dialler: Membership, acceptor: Membership) -> tuple[ssl.SSLObject, ssl.SSLObject]:
+    """Both ends of a TLS connection; an error of either end is raised."""
+    ends = (
+        TlsHandshake(dialler.client_context, server_side=False),
+        TlsHandshake(acceptor.server_context, server_side=True),
+    )
+    client, server = ends
+    client.receive(b"")
+    while not (client.done and server.done):
+        server.receive(client.take_output())
+        client.receive(server.take_output())
+    return client.tls, server.tls
+
+
+def seen_by(tls: ssl.SSLObject) -> dict[str, Any]:
+    found = tls.getpeercert()
+    assert found
+    return dict(found)
+
+
+def test_two_members_link_and_know_each_other_by_name(mesh: SecuredMesh) -> None:
+    arm, base = mesh.member("arm"), mesh.member("base")
+    # OpenSSL judges times by this machine's clock; the test's certificates are of another year.
+    mesh.clock.wall_seconds = 0.0
+    at_arm, at_base = shake(arm, base)
+    mesh.clock.wall_seconds = WALL
+    assert at_arm.version() == "TLSv1.3"
+    assert at_arm.selected_alpn_protocol() == at_base.selected_alpn_protocol() == "rmpa/1"
+    arm.judge_member(seen_by(at_arm), "base")
+    base.judge_member(seen_by(at_base), "arm")
+    assert reason_of(base, seen_by(at_base), "joystick") is TrustReason.NAME

@@ -14,10 +14,13 @@ from rmpa.ros.types.definitions import SEPARATOR, known_text, parse_definition
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 from rmpa.web import limits
+from rmpa.web.hub.node_link import CONTROL_REMEDY, READ_ONLY, READ_REMEDY
 from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
 from tests.web.hub.client import FakeClient, listen, node, running_hub
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rmpa.ros.core.embedded import RosCore
     from rmpa.ros.node.node import Node
     from rmpa.web.hub.hub import Hub
@@ -472,3 +475,22 @@ async def test_clock_gives_the_time_where_the_parameter_says_so(hub: Hub, talker
 
 
 # --- rights ---
+
+
+@pytest.mark.parametrize(
+    ("act", "remedy"),
+    [
+        (lambda client: client.talk("/t"), CONTROL_REMEDY),
+        (lambda client: client.call("/set", SET_BOOL, b"\x01"), CONTROL_REMEDY),
+        (lambda client: client.serve("/s", SET_BOOL, print, print), CONTROL_REMEDY),
+        (lambda client: client.set_param("/p", 1), CONTROL_REMEDY),
+        (lambda client: client.delete_param("/p"), CONTROL_REMEDY),
+        (lambda client: client.get_params(), READ_REMEDY),
+        (lambda client: client.follow_params((), print), READ_REMEDY),
+        (lambda client: client.fetch_asset("package://a/b", 10), READ_REMEDY),
+    ],
+)
+async def test_a_read_only_client_changes_nothing(hub: Hub, act: Callable[[FakeClient], Any], remedy: str) -> None:
+    with pytest.raises(PeerRefused, match="may not") as refused:
+        await act(FakeClient(hub, READ_ONLY))
+    assert refused.value.remedy == remedy
