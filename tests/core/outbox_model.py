@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from rmpa.core import limits
 from rmpa.core.outbox import ABORT, FIRST, LAST, Outbox, QueuedMessage
 from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pack_fragment_header, unpack_header
 
@@ -141,6 +142,7 @@ class Model:
         self.consumed = 0
         self.in_flight: list[tuple[int, Entry]] = []
         """Entries whose last byte was committed, with the place of their end on this connection."""
+        self.asked_at = self.standstill_end = 0.0
         self.newest = 0
         self.served: dict[int, set[int]] = {}
         self.drops = dict(box.dropped)
@@ -207,6 +209,15 @@ class Model:
 
     # --- taking out -----------------------------------------------------------------------------------------
 
+    def asked(self, now: float) -> None:
+        """The driver asks for the head: ages begin anew behind a standstill."""
+        if now - self.asked_at > limits.STANDSTILL:
+            self.standstill_end = now
+        self.asked_at = now
+
+    def age(self, entry: Entry, now: float, *, strict: bool) -> float:
+        return now - (entry.born if strict else max(entry.born, self.standstill_end))
+
     def look(self, now: float) -> None:
         """The outbox was asked for its head: what it has committed since the last time."""
         committed = b"".join(self.box._committed)
@@ -266,7 +277,7 @@ class Model:
         entry.begun = True
         _, max_age, strict = self.bounds(entry.key)
         if max_age is not None and not entry.pinned and (strict or len(self.flows[entry.key]) > 1):
-            assert now - entry.born <= max_age, "too old to leave"
+            assert self.age(entry, now, strict=strict) <= max_age, "too old to leave"
 
     def budget(self) -> dict[int, int]:
         """How many entries the outbox says were too old, by key, and are not known here."""
@@ -281,7 +292,7 @@ class Model:
         _, max_age, strict = self.bounds(key)
         assert entry.counts, "what was begun, and marks, are never too old"
         assert max_age is not None
-        assert now - entry.born > max_age, "not yet too old"
+        assert self.age(entry, now, strict=strict) > max_age, "not yet too old"
         assert strict or self.flows[key], "the newest leaves, however old"
         entry.fate = "expired"
         self.expiries[key] = self.expiries.get(key, 0) + 1

@@ -168,12 +168,13 @@ class AgainstModel(RuleBasedStateMachine):
 
     @rule(count=st.integers(0, 500), parts=st.integers(1, 8))
     def send(self, count: int, parts: int) -> None:
+        self.model.asked(self.now)
         head = b"".join(self.box.head(parts, self.now))[:count]
         self.model.look(self.now)
         self.box.consumed(len(head))
         self.model.sent(len(head))
 
-    @rule(seconds=st.sampled_from([0.1, 0.6, 3.0]))
+    @rule(seconds=st.sampled_from([0.1, 0.25, 0.6, 3.0]))
     def wait(self, seconds: float) -> None:
         self.now += seconds
 

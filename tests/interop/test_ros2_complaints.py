@@ -181,7 +181,7 @@ def test_a_half_that_is_killed_is_started_again(hall: Hall, node: OtherEnd) -> N
         for _ in range(3):
             gateway = hall.gateway.process.pid
             halves = [pid for each in (gateway, *children_of(gateway)) for pid in children_of(each)]
-            half = next(p for p in halves if b"rclpy_child" in Path(f"/proc/{p}/cmdline").read_bytes())
+            half = next(p for p in halves if b"half.child" in Path(f"/proc/{p}/cmdline").read_bytes())
             os.kill(half, signal.SIGKILL)
             since = node.process.mark_events()
             node.process.wait_event("heard", LONG, where=lambda e: e["topic"] == "/on", since=since)

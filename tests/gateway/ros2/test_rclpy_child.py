@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import StartError
-from rmpa.gateway.ros2 import rclpy_child
+from rmpa.gateway.ros2 import half
 from rmpa.gateway.ros2.format import (
     EntityKind,
     Ros2Attachment,
@@ -25,7 +25,8 @@ from rmpa.gateway.ros2.format import (
     qos_of_fields,
 )
 from rmpa.gateway.ros2.graph import gid_of
-from rmpa.gateway.ros2.rclpy_session import RclpySession, pythons
+from rmpa.gateway.ros2.link import pythons
+from rmpa.gateway.ros2.rclpy_session import RclpySession
 from rmpa.gateway.zenoh.threads import ZenohQos
 
 if TYPE_CHECKING:
@@ -33,31 +34,34 @@ if TYPE_CHECKING:
 
 STAND_IN = """
 import json, os, socket, struct, sys
-sock = socket.socket(fileno=int(sys.argv[-1]))
-HEAD = struct.Struct("<IBI")
-def say(operation, number, body):
-    sock.sendall(HEAD.pack(len(body) + 5, ord(operation), number) + body)
-def read():
-    size, operation, number = HEAD.unpack(sock.recv(9, socket.MSG_WAITALL))
-    return chr(operation), number, sock.recv(size - 5, socket.MSG_WAITALL) if size > 5 else b""
-assert read()[0] == "H"
-say("H", 0, json.dumps({"protocol": 1, "distribution": "jazzy", "rmw": "stand-in", "prefix": "0" * 24}).encode())
-row = {"gid": "f" * 32, "kind": "MS", "node": "/there", "name": "/x", "type": "std_msgs/msg/String"}
-row |= {"hash": "", "qos": {}}
-say("G", 0, json.dumps({"nodes": ["/there"], "added": [row], "removed": []}).encode())
-while True:
-    operation, number, body = read()
-    if operation == "M":  # what is published comes back as if another node had sent it
-        if body == b"die":
-            os._exit(1)
-        say("M", number, bytes([16]) + b"g" * 16 + struct.pack("<qq", 7, 9) + body)
-    elif operation == "Q":
-        say("A", number, body[:8] + b"\\1" + body[8:].upper())
+
+def main():
+    sock = socket.socket(fileno=int(sys.argv[-1]))
+    HEAD = struct.Struct("<IBI")
+    def say(operation, number, body):
+        sock.sendall(HEAD.pack(len(body) + 5, ord(operation), number) + body)
+    def read():
+        size, operation, number = HEAD.unpack(sock.recv(9, socket.MSG_WAITALL))
+        return chr(operation), number, sock.recv(size - 5, socket.MSG_WAITALL) if size > 5 else b""
+    assert read()[0] == "H"
+    say("H", 0, json.dumps({"protocol": 1, "distribution": "jazzy", "rmw": "stand-in", "prefix": "0" * 24}).encode())
+    row = {"gid": "f" * 32, "kind": "MS", "node": "/there", "name": "/x", "type": "std_msgs/msg/String"}
+    row |= {"hash": "", "qos": {}}
+    say("G", 0, json.dumps({"nodes": ["/there"], "added": [row], "removed": []}).encode())
+    while True:
+        operation, number, body = read()
+        if operation == "M":  # what is published comes back as if another node had sent it
+            if body == b"die":
+                os._exit(1)
+            say("M", number, bytes([16]) + b"g" * 16 + struct.pack("<qq", 7, 9) + body)
+        elif operation == "Q":
+            say("A", number, body[:8] + b"\\1" + body[8:].upper())
 """
 
 
-def test_it_is_of_the_grammar_of_python_3_8_and_imports_nothing_of_ours() -> None:
-    tree = ast.parse(Path(rclpy_child.__file__).read_text("utf-8"), feature_version=(3, 8))
+@pytest.mark.parametrize("file", sorted(Path(half.__file__).parent.glob("*.py")), ids=lambda file: file.name)
+def test_it_is_of_the_grammar_of_python_3_8_and_imports_nothing_of_ours(file: Path) -> None:
+    tree = ast.parse(file.read_text("utf-8"), feature_version=(3, 8))
     named = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
     named |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     assert not {name for name in named if name.startswith(("rmpa", "numpy", "msgspec"))}
@@ -92,8 +96,9 @@ def test_the_python_is_the_chosen_one_or_each_of_the_path(tmp_path: Path) -> Non
 
 @pytest.fixture
 async def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[RclpySession]:
-    (tmp_path / "half.py").write_text(STAND_IN)
-    monkeypatch.setattr("rmpa.gateway.ros2.rclpy_session._CHILD", tmp_path / "half.py")
+    (tmp_path / "half").mkdir()
+    (tmp_path / "half" / "child.py").write_text(STAND_IN)
+    monkeypatch.setattr("rmpa.gateway.ros2.rclpy_session._HALF", tmp_path / "half")
     session = RclpySession(sys.executable, 0, "gate", {})
     await session.start()
     yield session

@@ -2,7 +2,7 @@
 
 To the parts of the neighbour it is what a Zenoh session is: tokens declare endpoints and tell of those of ROS 2,
 messages and calls go by keys, and each has an attachment. So everything above exists once. The child
-(``rclpy_child``) runs under ROS 2's own Python, with the user's RMW, domain, security and installed types.
+(``half``) runs under ROS 2's own Python, with the user's RMW, domain, security and installed types.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ import struct
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.agent.trust import trust_store
 from rmpa.core.errors import StartError
 from rmpa.core.outbox import URGENT, Outbox
 from rmpa.core.timers import Backoff
@@ -42,10 +41,9 @@ from rmpa.runtime.stream import Stream
 from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from rmpa.bridge.policy import Needs
-    from rmpa.config.settings import Settings
     from rmpa.gateway.zenoh.threads import ZenohPriority, ZenohQos
     from rmpa.runtime.tls import Buffer
 
@@ -64,11 +62,11 @@ _RESTART_MAX: Final = 5.0
 _PREFIX: Final = 24
 # What stands for the session of ROS 2's nodes: no gateway has it.
 _FOREIGN: Final = "f" * 32
-_CHILD: Final = Path(__file__).with_name("rclpy_child.py")
-# The script's folder is not on the path, since its modules would hide some of the standard library.
+_HALF: Final = Path(__file__).with_name("half")
+# Its folder is searched last: modules beside it have names of the standard library.
 _RUN: Final = (
-    "import sys; sys.path[:] = [p for p in sys.path if p]; f = sys.argv.pop(1); "
-    "exec(compile(open(f).read(), f, 'exec'), {'__name__': '__main__', '__file__': f})"
+    "import sys; sys.path[:] = [p for p in sys.path if p] + [sys.argv.pop(1)]; "
+    "from importlib import import_module; sys.exit(import_module(sys.argv.pop(1)).main())"
 )
 
 
@@ -243,7 +241,8 @@ class RclpySession:
                 self._python,
                 "-c",
                 _RUN,
-                str(_CHILD),
+                str(_HALF.parent),
+                f"{_HALF.name}.child",
                 str(there.fileno()),
                 pass_fds=(there.fileno(),),
                 env=self._environ,
@@ -587,39 +586,3 @@ class RclpySession:
     def take_refused() -> dict[str, int]:
         """Nothing is refused before ROS 2 has it."""
         return {}
-
-
-def pythons(chosen: str, environ: Mapping[str, str]) -> list[str]:
-    """The Pythons that may be ROS 2's: the chosen one alone, else each ``python3`` of PATH, then the system's."""
-    if chosen:
-        return [chosen]
-    folders = [*environ.get("PATH", "").split(os.pathsep), "/usr/bin"]
-    found = dict.fromkeys(Path(folder).resolve() / "python3" for folder in folders if folder.startswith("/"))
-    return [str(each) for each in found if os.access(each, os.X_OK)]
-
-
-async def open_rclpy_session(settings: Settings) -> RclpySession:
-    """Start ROS 2's half by the first Python that has rclpy.
-
-    Raises:
-        StartError: None has it; or the mesh is secured and ROS 2 is not, and ``gateway.insecure`` is not set.
-    """
-    gateway, environ = settings.gateway, dict(os.environ)
-    store = trust_store(settings)
-    secured = store is not None and store.exists
-    if secured and not gateway.insecure and environ.get("ROS_SECURITY_ENABLE", "").lower() != "true":
-        problem = "is not secured, and this module is in a secured mesh"
-        remedy = "set ROS_SECURITY_ENABLE=true and its keystore (SROS 2), or say --insecure"
-        raise StartError("ROS 2", problem, remedy, code="no-rclpy")
-    asked: list[str] = []
-    for python in pythons(gateway.ros2.python, environ):
-        session = RclpySession(python, gateway.ros2.domain, settings.name, environ)
-        try:
-            await session.start()
-        except StartError as error:
-            asked.append(str(error.problem))
-            continue
-        return session
-    problem = "; ".join(asked) or "no python3 was found"
-    remedy = "source ROS 2 (source /opt/ros/<distribution>/setup.bash), or name its Python with --ros2-python"
-    raise StartError("ROS 2", problem, remedy, code="no-rclpy")

@@ -32,7 +32,6 @@ To the gateway:
 from __future__ import annotations
 
 import collections
-import ctypes
 import importlib
 import json
 import os
@@ -43,6 +42,9 @@ import threading
 import time
 from typing import Any
 
+from .graph import Watcher, read_qos
+from .taker import Taker, ignore
+
 PROTOCOL = 1
 _HEAD = struct.Struct("<IBI")
 _CALL = struct.Struct("<Q")
@@ -50,26 +52,12 @@ _STAMPS = struct.Struct("<qq")
 _SHORT = 5
 # Seconds between two looks at ROS 2's graph, and between two that ask for the endpoints of every topic.
 _LOOK_PERIOD = 0.25
-_WHOLE_PERIOD = 5.0
 # The namespace of the nodes that gateways show.
 _OWN = "/rmpa/"
-# The name of a node of which an endpoint was heard before the node (rcl's graph).
-_UNKNOWN = "_NODE_NAME_UNKNOWN_"
 # The distributions by the first release of rclpy that is of a later one.
 _RCLPY_BELOW = (("foxy", 2), ("humble", 4), ("iron", 5), ("jazzy", 8), ("kilted", 10))
-_INFINITE = 2**63 - 1
-# Bytes of a GUID of DDS that its participant has (DDSI-RTPS 9.3.1).
-_PARTICIPANT = 12
 # Messages of which it is known that their echo has not come; for rclpys that do not tell a message's publisher.
 _ECHOES = 10000
-# The fields of rcutils_allocator_t, pointers all.
-_ALLOCATOR = ("allocate", "deallocate", "reallocate", "zero_allocate", "state")
-_POLICIES = {
-    "reliability": {1: "RELIABLE", 2: "BEST_EFFORT"},
-    "durability": {1: "TRANSIENT_LOCAL", 2: "VOLATILE"},
-    "history": {1: "KEEP_LAST", 2: "KEEP_ALL"},
-    "liveliness": {1: "AUTOMATIC", 2: "AUTOMATIC", 3: "MANUAL_BY_TOPIC"},
-}
 
 
 class Pipe:
@@ -107,147 +95,6 @@ class Pipe:
                 raise EOFError
             view = view[count:]
         return bytes(data)
-
-
-class _ByteArray(ctypes.Structure):
-    """rcutils/types/uint8_array.h, with its allocator."""
-
-    _fields_ = [
-        ("buffer", ctypes.POINTER(ctypes.c_uint8)),
-        ("length", ctypes.c_size_t),
-        ("capacity", ctypes.c_size_t),
-        *[(name, ctypes.c_void_p) for name in _ALLOCATOR],
-    ]
-
-
-def _message_info(gid_size: int, numbered: bool) -> Any:
-    """rmw_message_info_t of rmw/types.h: Foxy has no numbers, and GIDs have 24 bytes before Iron."""
-    numbers = [("sequence", ctypes.c_uint64), ("reception", ctypes.c_uint64)] if numbered else []
-    fields = [
-        ("source_stamp", ctypes.c_int64),
-        ("received_stamp", ctypes.c_int64),
-        *numbers,
-        ("implementation", ctypes.c_char_p),
-        ("gid", ctypes.c_uint8 * gid_size),
-        ("from_intra_process", ctypes.c_bool),
-        ("reserve", ctypes.c_uint8 * 64),
-    ]
-    return type("MessageInfo", (ctypes.Structure,), {"_fields_": fields})
-
-
-class Taker:
-    """Takes serialized messages with the GID of their publisher.
-
-    From Kilted on rclpy has it. Before, rcl is called by ctypes, with the structure that the check at the start has
-    found to be right. Where neither does it, ``gids`` is false.
-    """
-
-    def __init__(self) -> None:
-        self.gids = False
-        # Of DDS: the first bytes of the GIDs of all endpoints of this process.
-        self.prefix = b""
-        self._info: Any = None
-        self._rcl: Any = None
-        self._array: Any = None
-
-    def check(self, node: Any, message_type: Any, qos: Any) -> None:
-        """Publish to ourselves, and see which way gives the publisher's GID."""
-        name = "/rmpa/_gid_check_%d" % os.getpid()
-        subscription = node.create_subscription(message_type, name, _ignore, qos, raw=True)
-        publisher = node.create_publisher(message_type, name, qos)
-        try:
-            own = self._own_gid(node, name)
-            for layout in (None, (16, True), (24, True), (24, False)):
-                if layout is not None and not self._use(layout):
-                    return
-                for _ in range(20):
-                    publisher.publish(b"\0\1\0\0\0\0\0\0")
-                    time.sleep(0.02)
-                    taken = self.take(subscription, message_type)
-                    if taken is not None:
-                        self.gids = bool(own) and taken[1][: len(own)] == own
-                        break
-                if self.gids:
-                    self.prefix = own[:_PARTICIPANT]
-                    return
-            self._info = None
-        finally:
-            node.destroy_publisher(publisher)
-            node.destroy_subscription(subscription)
-
-    @staticmethod
-    def _own_gid(node: Any, name: str) -> bytes:
-        for _ in range(50):
-            for info in node.get_publishers_info_by_topic(name):
-                return bytes(info.endpoint_gid)
-            time.sleep(0.02)
-        return b""
-
-    def _use(self, layout: tuple[int, bool]) -> bool:
-        try:
-            # rclpy has loaded it; where wheels have it elsewhere the symbols are in the process.
-            rcl = ctypes.CDLL(_loaded("librcl.so"))
-            self._rcl = rcl.rcl_take_serialized_message
-        except (OSError, AttributeError):
-            return False
-        self._rcl.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p]
-        self._info = _message_info(*layout)()
-        utils = ctypes.CDLL(_loaded("librcutils.so"))
-        utils.rcutils_get_default_allocator.restype = _Allocator
-        allocator = utils.rcutils_get_default_allocator()
-        self._array = _ByteArray()
-        for field in _ALLOCATOR:
-            setattr(self._array, field, getattr(allocator, field))
-        return True
-
-    def take(self, subscription: Any, message_type: Any) -> tuple[bytes, bytes, int, int] | None:
-        """The next message of a subscription with GID, source stamp (ns) and number; ``None``: there is none."""
-        handle = subscription.handle
-        if self._info is None:
-            taken = handle.take_message(message_type, True)
-            if taken is None:
-                return None
-            data, info = taken
-            gid = info.get("publisher_gid") if isinstance(info, dict) else None
-            number = info.get("publication_sequence_number") if isinstance(info, dict) else 0
-            stamp = info["source_timestamp"] if isinstance(info, dict) else 0
-            return data, _gid_bytes(gid), stamp, number or 0
-        pointer = handle.pointer
-        if self._rcl(pointer, ctypes.byref(self._array), ctypes.byref(self._info), None):
-            return None
-        info = self._info
-        data = ctypes.string_at(self._array.buffer, self._array.length)
-        return data, bytes(info.gid), info.source_stamp, getattr(info, "sequence", 0)
-
-
-class _Allocator(ctypes.Structure):
-    """rcutils_allocator_t."""
-
-    _fields_ = [
-        (name, ctypes.c_void_p) for name in ("allocate", "deallocate", "reallocate", "zero_allocate", "state")
-    ]
-
-
-def _gid_bytes(gid: Any) -> bytes:
-    if gid is None:
-        return b""
-    return bytes(gid["data"] if isinstance(gid, dict) else gid)
-
-
-def _loaded(name: str) -> str:
-    """The path of a library that this process has loaded: in wheels its name has a hash behind."""
-    stem = name.split(".", maxsplit=1)[0]
-    with open("/proc/self/maps") as maps:
-        for line in maps:
-            path = line.split(None, 5)[5].strip() if line.count("/") else ""
-            base = os.path.basename(path)
-            if base.startswith((stem + ".", stem + "-")):
-                return path
-    return name
-
-
-def _ignore(_message: Any) -> None:
-    pass
 
 
 def load_type(name: str) -> Any:
@@ -307,7 +154,7 @@ class Half:
         self._wake = rclpy.guard_condition.GuardCondition(None, None, context=self._context)
         self._wait_set: Any = None
         self.taker = Taker()
-        self._graph = Watcher(self._own, link)
+        self._graph = Watcher(self._own, link.say)
         self._requests = 0
         # Messages of our own that have not come back yet, by topic and hash.
         self._echoes: collections.Counter[tuple[str, int]] = collections.Counter()
@@ -316,7 +163,7 @@ class Half:
         """Say what this is."""
         from std_msgs.msg import String
 
-        self.taker.check(self._own, String, _qos({}))
+        self.taker.check(self._own, String, read_qos({}))
         self._link.say(
             "H",
             0,
@@ -364,7 +211,7 @@ class Half:
             if name not in self._nodes:
                 self._nodes[name] = self._make_node(name), []
             node, users = self._nodes[name]
-            qos = _qos(asked["qos"])
+            qos = read_qos(asked["qos"])
             if kind == "MP":
                 entity = node.create_publisher(
                     kind_of, asked["name"], qos, event_callbacks=self._events(number, True)
@@ -372,10 +219,10 @@ class Half:
             elif kind == "MS":
                 events = self._events(number, False)
                 entity = node.create_subscription(
-                    kind_of, asked["name"], _ignore, qos, raw=True, event_callbacks=events
+                    kind_of, asked["name"], ignore, qos, raw=True, event_callbacks=events
                 )
             elif kind == "SS":
-                entity = node.create_service(kind_of, asked["name"], _ignore)
+                entity = node.create_service(kind_of, asked["name"], ignore)
             else:
                 entity = node.create_client(kind_of, asked["name"])
         except Exception as error:  # of rcl, rmw, the DDS library, or the type
@@ -499,7 +346,7 @@ class Half:
 
     def _is_own(self, name: str, gid: bytes, data: bytes) -> bool:
         if self.taker.gids:
-            return gid[:_PARTICIPANT] == self.taker.prefix
+            return self.taker.is_own(gid)
         key = name, hash(data)
         if not self._echoes[key]:
             return False
@@ -559,146 +406,6 @@ def _distribution() -> str:
     return next((name for name, below in _RCLPY_BELOW if release[0] < below), "")
 
 
-def _qos(given: dict[str, Any]) -> Any:
-    """The QoS as the gateway writes it: the fields of rmw that differ from its defaults; times in nanoseconds."""
-    from rclpy import qos
-    from rclpy.duration import Duration
-
-    fields: dict[str, Any] = {"depth": given.get("depth", 10)}
-    kinds = (
-        ("reliability", qos.ReliabilityPolicy),
-        ("durability", qos.DurabilityPolicy),
-        ("history", qos.HistoryPolicy),
-        ("liveliness", qos.LivelinessPolicy),
-    )
-    for name, policy in kinds:
-        if name in given:
-            fields[name] = getattr(policy, given[name])
-    for name, field in (("deadline", "deadline"), ("lifespan", "lifespan"), ("lease", "liveliness_lease_duration")):
-        if name in given:
-            fields[field] = Duration(nanoseconds=given[name])
-    return qos.QoSProfile(**fields)
-
-
-class Watcher:
-    """What ROS 2 has, looked at again and again: rclpy tells of no change."""
-
-    def __init__(self, node: Any, link: Pipe) -> None:
-        self._node = node
-        self._link = link
-        self._names: Any = None
-        self._known: dict[str, dict[str, Any]] = {}
-        self._nodes: Any = None
-        self._whole_at = 0.0
-
-    def look(self, now: float) -> None:
-        """Tell the gateway what has changed."""
-        node = self._node
-        nodes = sorted(set(node.get_node_names_and_namespaces()))
-        topics = sorted((name, tuple(types)) for name, types in node.get_topic_names_and_types())
-        by_node = []
-        for base, namespace in nodes:
-            try:
-                by_node.append(
-                    (
-                        namespace.rstrip("/") + "/" + base,
-                        tuple(map(_row, node.get_publisher_names_and_types_by_node(base, namespace))),
-                        tuple(map(_row, node.get_subscriber_names_and_types_by_node(base, namespace))),
-                        tuple(map(_row, node.get_service_names_and_types_by_node(base, namespace))),
-                    )
-                )
-            except Exception:  # the node has just gone
-                continue
-        names = (topics, by_node)
-        if names == self._names and now < self._whole_at:
-            return
-        self._names, self._whole_at = names, now + _WHOLE_PERIOD
-        found: dict[str, dict[str, Any]] = {}
-        for name, _ in topics:
-            for kind, infos in (
-                ("MP", node.get_publishers_info_by_topic(name)),
-                ("MS", node.get_subscriptions_info_by_topic(name)),
-            ):
-                for info in infos:
-                    if info.node_name.startswith(_UNKNOWN):
-                        self._whole_at = 0.0  # what names its node is still on its way
-                        continue
-                    gid = bytes(info.endpoint_gid).hex()
-                    owner = info.node_namespace.rstrip("/") + "/" + info.node_name
-                    found[gid] = {
-                        "gid": gid,
-                        "kind": kind,
-                        "node": owner,
-                        "name": name,
-                        "type": info.topic_type,
-                        "hash": str(getattr(info, "topic_type_hash", "") or ""),
-                        "qos": _told_qos(info.qos_profile),
-                    }
-        for owner, _, _, services in by_node:
-            for name, types in services:
-                for kind_of in types:
-                    key = "%s %s %s" % (owner, name, kind_of)
-                    found[key] = {
-                        "gid": key,
-                        "kind": "SS",
-                        "node": owner,
-                        "name": name,
-                        "type": kind_of,
-                        "hash": _service_hash(kind_of),
-                        "qos": {},
-                    }
-        added = [each for key, each in found.items() if key not in self._known]
-        removed = [key for key in self._known if key not in found]
-        self._known = found
-        shown = [owner for owner, _, _, _ in by_node]
-        if added or removed or shown != self._nodes:
-            self._nodes = shown
-            self._link.say("G", 0, nodes=shown, added=added, removed=removed)
-
-
-def _row(pair: tuple[str, list[str]]) -> tuple[str, tuple[str, ...]]:
-    return pair[0], tuple(pair[1])
-
-
-def _told_qos(profile: Any) -> dict[str, Any]:
-    told: dict[str, Any] = {}
-    for name, words in _POLICIES.items():
-        word = words.get(int(getattr(profile, name)))
-        if word is not None:
-            told[name] = word
-    if profile.depth:
-        told["depth"] = profile.depth
-    for name, field in (("deadline", "deadline"), ("lifespan", "lifespan"), ("lease", "liveliness_lease_duration")):
-        value = getattr(profile, field).nanoseconds
-        if 0 < value < _INFINITE:
-            told[name] = value
-    return told
-
-
-_HASHES: dict[str, str] = {}
-
-
-def _service_hash(name: str) -> str:
-    """The hash of a service type, from the description that its package has installed; empty: there is none."""
-    if name not in _HASHES:
-        _HASHES[name] = ""
-        package, kind, base = name.split("/")
-        file_name = (base.rpartition("_")[0] if kind == "action" else base) + ".json"
-        try:
-            folder = os.path.dirname(importlib.import_module(package).__file__ or "")
-            while not os.path.isdir(os.path.join(folder, "share", package)):
-                if folder == os.path.dirname(folder):
-                    return ""
-                folder = os.path.dirname(folder)
-            with open(os.path.join(folder, "share", package, kind, file_name)) as file:
-                for each in json.load(file)["type_hashes"]:
-                    if each["type_name"] == name:
-                        _HASHES[name] = each["hash_string"]
-        except (ImportError, OSError, ValueError, KeyError):  # before Iron, or a package that is not installed here
-            pass
-    return _HASHES[name]
-
-
 def main() -> int:
     """Serve the gateway until it ends."""
     link = Pipe(socket.socket(fileno=int(sys.argv[1])))
@@ -728,7 +435,3 @@ def main() -> int:
     threading.Thread(target=read, daemon=True).start()
     half.spin()
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
