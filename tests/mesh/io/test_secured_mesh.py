@@ -333,3 +333,41 @@ async def test_a_revoked_module_is_gone_at_once_at_both_ends(lab: Authority, dia
         assert "revoked" in other.downs[0][1]
         await until(lambda: status(other, judge).last_error.startswith("revoked"), "it is shown there")
         await until(lambda: not judge.mesh.connections(), "both lanes ended")
+
+
+async def test_a_plain_module_learns_that_the_mesh_is_secured(lab: Authority) -> None:
+    async with meshes(None, Member(lab, "base")) as (plain, secured):
+        await until(lambda: status(plain, secured).state == "refused", "refused")
+        assert "plain" in status(plain, secured).last_error
+        assert "rmpa trust join" in status(plain, secured).last_error
+        assert secured.mesh.counters["link.refused.plain"] > 0
+        assert not plain.ups
+
+
+async def test_a_member_never_falls_back_to_plain(lab: Authority) -> None:
+    async with meshes(Member(lab, "arm"), None) as (secured, plain):
+        await until(lambda: status(secured, plain).state == "refused", "refused")
+        assert "unsecured" in status(secured, plain).last_error
+        assert plain.mesh.counters["link.refused.unsecured"] > 0
+        assert not secured.ups
+        assert not plain.ups
+
+
+async def test_silent_connections_leave_room_for_members(lab: Authority, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest ones of the busiest address are closed, so that a member need not wait until they are given up."""
+    monkeypatch.setattr("rmpa.mesh.io.securing.SECURING_TIMEOUT", 1000.0)
+    monkeypatch.setattr(limits, "PENDING_CONNECTIONS_MAX", limits.PENDING_PER_ADDRESS + 2)
+    members = Member(lab, "arm"), Member(lab, "base")
+    async with meshes(*members, found=False) as (arm, base):
+        silent = [await _dial(base) for _ in range(limits.PENDING_PER_ADDRESS + 4)]
+        await until(lambda: base.mesh.counters["link.pending_full"] == 4, "four closed")
+        assert unproven(base) == limits.PENDING_PER_ADDRESS
+        silent += [await _dial(base, "127.0.0.2") for _ in range(6)]
+        await until(lambda: base.mesh.counters["link.pending_full"] == 8, "the place is shared")
+        for sock in silent[:8]:
+            assert await asyncio.wait_for(asyncio.get_running_loop().sock_recv(sock, 1), DEADLINE) == b""
+        introduce([arm, base])
+        await until(lambda: base.both_lanes(arm), "linked at once")
+        assert base.mesh.counters["link.unfinished"] == 0
+        for sock in silent:
+            sock.close()
