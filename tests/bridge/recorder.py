@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 from rmpa.bridge.context import BridgeContext, Names, ServiceRules
 from rmpa.bridge.data.export import ExportFlow
 from rmpa.bridge.messages import Source
-from rmpa.bridge.peer import Peer, PeerState
+from rmpa.bridge.peer import PeerRun, PeerState
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
 from rmpa.bridge.services import books
 from rmpa.bridge.topics import exports as topic_exports
@@ -299,7 +299,7 @@ class Recorded:
     def __init__(self, book: Any, out: Out) -> None:
         self.book = book
         self.out = out
-        self.known: dict[int, Peer] = {}
+        self.known: dict[int, PeerRun] = {}
 
     def __iter__(self) -> Iterator[Any]:
         return iter(self.book)
@@ -321,7 +321,7 @@ class Recorded:
 
     def link_up(self, peer: int, name: str = "", instance: str = "", rank: int = 0) -> list[Any]:
         """A peer has a link."""
-        known = self.known.setdefault(peer, Peer(peer=peer, name=name, instance=instance))
+        known = self.known.setdefault(peer, PeerRun(peer=peer, name=name, instance=instance))
         known.name, known.instance, known.rank = name, instance, rank
         known.state, known.silent = PeerState.LINKED, False
         self.book.link_up(known)

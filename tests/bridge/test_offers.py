@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rmpa.bridge import limits
 from rmpa.bridge.context import Names
 from rmpa.bridge.messages import Advertise, AdvertiseServices, ServiceOffer, Source, TopicOffer
-from rmpa.bridge.peer import Peer
+from rmpa.bridge.peer import PeerRun
 from rmpa.bridge.peer_offers import CROWDED, Heard, ImportBook
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.bodies import LocalService
@@ -145,7 +145,7 @@ def test_the_rule_that_decides_is_told_to_whom_asks(topic: str) -> None:
 
 
 def heard(*entries: str) -> Heard[str, Any, str]:
-    made: Heard[str, Any, str] = Heard(session=Peer(peer=1, name="far"))
+    made: Heard[str, Any, str] = Heard(session=PeerRun(peer=1, name="far"))
     made.entries.update(dict.fromkeys(entries, 1))
     return made
 

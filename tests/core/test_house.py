@@ -218,6 +218,8 @@ def test_no_modules_import_each_other() -> None:
     for name, tree in modules.items():
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("rmpa"):
+                if node.module == f"{name.rpartition('.')[0]}.part":
+                    continue  # a member names the part that holds it, for its type
                 found = {f"{node.module}.{alias.name}" for alias in node.names} & modules.keys()
                 imports[name] |= found or {node.module}
     assert sum(map(len, imports.values())) > len(modules), "too few imports were found to prove anything"

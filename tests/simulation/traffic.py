@@ -14,7 +14,7 @@ from rmpa.bridge.data.reception import ImportFlow, LinkTime
 from rmpa.bridge.data.route import RouteBegin
 from rmpa.bridge.data.route_sender import ReliableRouteSender
 from rmpa.bridge.messages import Source
-from rmpa.bridge.peer import Peer
+from rmpa.bridge.peer import PeerRun
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.identity import serial_add
 from rmpa.core.statistics import Counters
@@ -248,7 +248,7 @@ class TrafficPeer(MeshPeer):
             begin = RouteBegin(self._epoch, serial_add(self.exports.number, 1))
             self._send_message(link, op="opened", epoch=begin.epoch, first=begin.first, **contract)
             self._remove(peer)
-            route = self.exports.routes[peer] = ExportRoute(Peer(peer=peer), _SOURCE, 1, self.contract)
+            route = self.exports.routes[peer] = ExportRoute(PeerRun(peer=peer), _SOURCE, 1, self.contract)
             sender = self.exports.add(route, link, begin)
         self.senders[link, 1] = sender
 

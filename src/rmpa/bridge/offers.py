@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.messages import Message
-    from rmpa.bridge.peer import Peer
-    from rmpa.bridge.peer_offers import Remote
+    from rmpa.bridge.peer import PeerRun
     from rmpa.config.peer_rules import Access
 
 
@@ -52,12 +51,6 @@ class Effects:
     def warn(self, kind: str, who: str, text: str) -> None:
         """Log a warning about ``who`` and count it as ``kind``; repeated ones are only counted."""
 
-    def arm_timer(self) -> None:
-        """Look at ``ImportBook.next_timer`` again."""
-
-    def path_changed(self, entry: Remote[Any]) -> None:
-        """Offer what is relayed with the path that it has now."""
-
 
 KeyT = TypeVar("KeyT", bound="Hashable")
 LocalT = TypeVar("LocalT", bound=Local)
@@ -79,7 +72,7 @@ class Told(Generic[KeyT, LocalT, OfferT]):
         told_at: When the last portion was told, monotonic seconds.
     """
 
-    session: Peer
+    session: PeerRun
     due: dict[KeyT, None]
     offers: dict[KeyT, tuple[OfferT, LocalT]] = field(default_factory=dict)
     by_wire: dict[KeyT, KeyT] = field(default_factory=dict)
@@ -228,7 +221,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         for told in self.peers.values():
             told.due |= dict.fromkeys(self.offered)
 
-    def link_up(self, session: Peer) -> None:
+    def link_up(self, session: PeerRun) -> None:
         """Begin to tell a peer everything; ``advertise`` goes on with it."""
         told = self.peers[session.peer] = Told(session, dict.fromkeys(self.offered))
         self._portion(session.peer, told)

@@ -27,7 +27,7 @@ class PeerState(Enum):
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
-class Peer:
+class PeerRun:
     """One run of a peer, across its links.
 
     Args:

@@ -10,15 +10,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge.offers import KeyT, OfferT, wire_of
+from rmpa.bridge.offers import Effects, KeyT, OfferT, wire_of
 from rmpa.bridge.policy import RelayPaths
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
     from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin
-    from rmpa.bridge.offers import Effects
-    from rmpa.bridge.peer import Peer
+    from rmpa.bridge.peer import PeerRun
 
 
 # Causes for which an entry is hidden: another type here, a permission, ``limits.nodes``.
@@ -75,7 +74,7 @@ class Heard(Generic[KeyT, EntryT, OfferT]):
         last_route: The number of the last one.
     """
 
-    session: Peer
+    session: PeerRun
     entries: dict[KeyT, EntryT] = field(default_factory=dict)
     refused: OrderedDict[KeyT, OfferT] = field(default_factory=OrderedDict)
     doubtful: set[KeyT] = field(default_factory=set)
@@ -132,6 +131,16 @@ def _is_same(entry: Remote[Any], offer: Any) -> bool:
     return entry.node == offer.node and one == other and entry.type == getattr(offer, "type", None)
 
 
+class ImportEffects(Effects):
+    """What a part does for what peers offer, likewise."""
+
+    def arm_timer(self) -> None:
+        """Look at ``ImportBook.next_timer`` again."""
+
+    def path_changed(self, entry: Remote[Any]) -> None:
+        """Offer what is relayed with the path that it has now."""
+
+
 class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
     """What peers offer, and what of it is in the local graph.
 
@@ -145,7 +154,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
 
     kind: ClassVar[str]
 
-    def __init__(self, out: Effects) -> None:
+    def __init__(self, out: ImportEffects) -> None:
         self._out = out
         self._peers: dict[int, Heard[KeyT, EntryT, OfferT]] = {}
         self.ways = RelayPaths(out.context.gate.may_relay)
@@ -195,7 +204,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         """The name of a peer, for texts."""
         return known.session.name if (known := self._peers.get(peer)) is not None else "a peer that is gone"
 
-    def link_up(self, session: Peer) -> None:
+    def link_up(self, session: PeerRun) -> None:
         """Register a link, of a new peer or of one that was away; its first message begins a full advertisement.
 
         What relays offer of the peer is hidden while it has a link.

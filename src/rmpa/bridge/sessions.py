@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.data.reception import LinkTime
-from rmpa.bridge.peer import Peer, PeerState
+from rmpa.bridge.peer import PeerRun, PeerState
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.bridge.proxies import PeerProxies, ProxyNamespaces
 from rmpa.core.log import logged_failure
@@ -34,7 +34,7 @@ AWAY_GRACE: Final = 0.5
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
-class PeerSession(Peer):
+class PeerSession(PeerRun):
     """What the bridge keeps for one run of a peer, across its links.
 
     Args:

@@ -127,7 +127,7 @@ class Gateway:
     async def _open(self) -> OpenSession | RclpySession:
         gateway = self._settings.gateway
         if gateway.via_rclpy and self.ros2 is None:
-            from rmpa.gateway.ros2.link import open_rclpy_session  # noqa: PLC0415 - not every gateway needs it
+            from rmpa.gateway.ros2.ros2 import open_rclpy_session  # noqa: PLC0415 - not every gateway needs it
 
             self.ros2 = await open_rclpy_session(self._settings)
         if self.ros2 is not None and not (gateway.site or gateway.router):

@@ -13,7 +13,7 @@ from unittest import mock
 
 from rmpa.bridge.data.export import ExportFlow, ExportRoute
 from rmpa.bridge.messages import Source
-from rmpa.bridge.peer import Peer
+from rmpa.bridge.peer import PeerRun
 from rmpa.core.outbox import QueuedMessage
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def running(clock: Clock) -> Iterator[Clock]:
 def add(flow: ExportFlow, peer: int, link: Link, number: int, contract: Contract) -> RouteSender:
     """Begin to send to a peer."""
     remove(flow, peer)
-    route = flow.routes[peer] = ExportRoute(Peer(peer=peer), Source("/t", "/n"), number, contract)
+    route = flow.routes[peer] = ExportRoute(PeerRun(peer=peer), Source("/t", "/n"), number, contract)
     return flow.add(route, link)
 
 

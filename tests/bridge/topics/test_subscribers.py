@@ -21,7 +21,7 @@ from rmpa.bridge.messages import (
     Source,
     TopicOffer,
 )
-from rmpa.bridge.peer import Peer
+from rmpa.bridge.peer import PeerRun
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
 from rmpa.bridge.topics import exports as topic_exports
 from rmpa.bridge.topics import local as module
@@ -268,7 +268,7 @@ class Subscribed:
     async def flows(self) -> None:
         """It flows on route 7."""
         self.exports.put(SOURCE, LocalSource("std_msgs/String", SUBSCRIBER))
-        self.exports.link_up(Peer(peer=1))
+        self.exports.link_up(PeerRun(peer=1))
         self.exports.opened(1, OpenRoute(7, *SOURCE_NAMES))
         await until(lambda: self.exports.senders(1))
 

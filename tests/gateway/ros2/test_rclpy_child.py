@@ -25,8 +25,8 @@ from rmpa.gateway.ros2.format import (
     qos_of_fields,
 )
 from rmpa.gateway.ros2.graph import gid_of
-from rmpa.gateway.ros2.link import pythons
 from rmpa.gateway.ros2.rclpy_session import RclpySession
+from rmpa.gateway.ros2.ros2 import pythons
 from rmpa.gateway.zenoh.threads import ZenohQos
 
 if TYPE_CHECKING:

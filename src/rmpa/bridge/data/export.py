@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.data.reception import ImportFlow
     from rmpa.bridge.messages import Description, OpenRoute, Source
-    from rmpa.bridge.peer import Peer
+    from rmpa.bridge.peer import PeerRun
     from rmpa.core.outbox import QueuedMessage
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
@@ -64,7 +64,7 @@ class ExportRoute:
         audience: The connections to the publisher that stand for the peer's listeners, by their names here.
     """
 
-    session: Peer
+    session: PeerRun
     source: Source
     number: int = 0
     contract: Contract = _DEFAULT

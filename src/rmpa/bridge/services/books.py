@@ -46,7 +46,7 @@ from rmpa.ros.wire.tcpros import ServiceDescription
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from rmpa.bridge.peer import Peer
+    from rmpa.bridge.peer import PeerRun
     from rmpa.bridge.services.part import Services
 
 
@@ -124,7 +124,7 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
                     self._close(peer, number, why)
         return super().reload()
 
-    def link_up(self, session: Peer) -> None:
+    def link_up(self, session: PeerRun) -> None:
         """As of ``OfferBook``; the peer has no service open."""
         self._routes[session.peer] = {}
         super().link_up(session)

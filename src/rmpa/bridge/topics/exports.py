@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.export import ExportFlow
     from rmpa.bridge.data.route_sender import RouteSender
     from rmpa.bridge.messages import Description, Origin
-    from rmpa.bridge.peer import Peer
+    from rmpa.bridge.peer import PeerRun
     from rmpa.bridge.topics.part import Topics
 
 
@@ -137,7 +137,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
                     route.contract = contract
         return super().reload()
 
-    def link_up(self, session: Peer) -> None:
+    def link_up(self, session: PeerRun) -> None:
         """As of ``OfferBook``; the routes of the new link have numbers of their own."""
         self._routes[session.peer] = {}
         super().link_up(session)

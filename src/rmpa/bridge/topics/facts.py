@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.export import ExportRoute
     from rmpa.bridge.data.quality import QosWatch, QualitySummary
     from rmpa.bridge.messages import Source
-    from rmpa.bridge.peer import Peer
+    from rmpa.bridge.peer import PeerRun
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
     from rmpa.bridge.topics.import_route import RemoteTopic
@@ -267,7 +267,7 @@ class TopicFacts:
 
     def _route_to(
         self,
-        session: Peer,
+        session: PeerRun,
         source: Source,
         local: LocalSource,
         state: str,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rmpa.bridge.data.export import ExportFlow, ExportRoute
-    from rmpa.bridge.peer import Peer
+    from rmpa.bridge.peer import PeerRun
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports
@@ -113,7 +113,7 @@ class LossReports:
         needs = Needs((), "the peer's own topics; a text for the log")
         shared.rpc.on_notification(OVERSIZED, self._oversized_there, needs)
 
-    def given_up(self, peer: Peer, counts: Mapping[Source, int]) -> None:
+    def given_up(self, peer: PeerRun, counts: Mapping[Source, int]) -> None:
         """Report that messages are not kept any more for an absent peer.
 
         Args:

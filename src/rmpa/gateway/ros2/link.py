@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from rmpa.agent.trust import trust_store
-from rmpa.core.errors import StartError
-from rmpa.gateway.ros2.rclpy_session import RclpySession
-
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from rmpa.bridge.policy import Needs
-    from rmpa.config.settings import Settings
     from rmpa.gateway.zenoh.threads import ZenohQos, ZenohReply, ZenohSample
     from rmpa.runtime.tls import Buffer
 
@@ -108,39 +101,3 @@ class Ros2Link(Protocol):
         all_complete: bool = False,
     ) -> list[ZenohReply]:
         """Call a service; an empty list: no answer came within ``timeout`` seconds."""
-
-
-def pythons(chosen: str, environ: Mapping[str, str]) -> list[str]:
-    """The Pythons that may be ROS 2's: the chosen one alone, else each ``python3`` of PATH, then the system's."""
-    if chosen:
-        return [chosen]
-    folders = [*environ.get("PATH", "").split(os.pathsep), "/usr/bin"]
-    found = dict.fromkeys(Path(folder).resolve() / "python3" for folder in folders if folder.startswith("/"))
-    return [str(each) for each in found if os.access(each, os.X_OK)]
-
-
-async def open_rclpy_session(settings: Settings) -> RclpySession:
-    """Start ROS 2's half by the first Python that has rclpy.
-
-    Raises:
-        StartError: None has it; or the mesh is secured and ROS 2 is not, and ``gateway.insecure`` is not set.
-    """
-    gateway, environ = settings.gateway, dict(os.environ)
-    store = trust_store(settings)
-    secured = store is not None and store.exists
-    if secured and not gateway.insecure and environ.get("ROS_SECURITY_ENABLE", "").lower() != "true":
-        problem = "is not secured, and this module is in a secured mesh"
-        remedy = "set ROS_SECURITY_ENABLE=true and its keystore (SROS 2), or say --insecure"
-        raise StartError("ROS 2", problem, remedy, code="no-rclpy")
-    asked: list[str] = []
-    for python in pythons(gateway.ros2.python, environ):
-        session = RclpySession(python, gateway.ros2.domain, settings.name, environ)
-        try:
-            await session.start()
-        except StartError as error:
-            asked.append(str(error.problem))
-            continue
-        return session
-    problem = "; ".join(asked) or "no python3 was found"
-    remedy = "source ROS 2 (source /opt/ros/<distribution>/setup.bash), or name its Python with --ros2-python"
-    raise StartError("ROS 2", problem, remedy, code="no-rclpy")
