@@ -65,7 +65,7 @@ def test_without_a_name_it_is_the_hosts(tmp_path: Path) -> None:
     [
         ((), "there is nothing to join; say --site NAME"),
         (("--site", "a"), "there is no connection to other sites; add --connect, such as tls/fleet.example:7447"),
-        (("--ros2",), "add --connect, such as tcp/localhost:7447 for rmw_zenohd here"),
+        (("--ros2", "--ros2-via", "zenoh"), "add --connect, such as tcp/localhost:7447 for rmw_zenohd here"),
         (("--router",), "a router that listens nowhere; add --listen"),
         (("--site", "ros2", "--connect", "tcp/a:1"), "--site: ros2 is reserved"),
         (("--site", "a", "zenoh-config"), "--site: must come after zenoh-config"),

@@ -31,7 +31,7 @@ ROOMS: Final = {
 }
 # Tests that compare the whole tree with its pages and lists; and this one.
 OF_THE_WHOLE: Final = (
-    *("api/test_names.py", "api/test_typing.py", "cli/test_one_name.py", "cli/test_pictures.py"),
+    *("api/test_names.py", "cli/test_one_name.py", "cli/test_pictures.py"),
     *("config/test_reference.py", "core/test_house.py", "core/test_pages.py", "core/test_rooms.py"),
 )
 NO_SYSTEM: Final = "not (alone or long or ros or netns or nat or pty or git or packages)"

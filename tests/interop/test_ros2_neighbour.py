@@ -289,7 +289,7 @@ def test_a_client_of_rclpy_uses_a_server_of_ros1(ros2: World) -> None:
     ended = client.process.wait_event("ended", LONG)
     assert (ended["status"], ended["result"]) == (4, 5)
     since = client.process.mark_events()
-    client.do("send", goal=100000)
+    assert client.ask("send", "accepted", goal=100000)["ok"]
     client.process.wait_event("feedback", LONG, since=since)
     assert client.ask("cancel", "cancelling")["code"] == 0
     assert client.process.wait_event("ended", LONG, since=since)["status"] == 5
