@@ -151,6 +151,9 @@ class Half:
         self._own = self._make_node(_OWN + name)
         self._endpoints: dict[int, Made] = {}
         self._tasks: collections.deque[tuple[str, int, bytes]] = collections.deque()
+        # What waits in it, by endpoint.
+        self._waiting: collections.Counter[int] = collections.Counter()
+        self._lock = threading.Lock()
         self._wake = rclpy.guard_condition.GuardCondition(None, None, context=self._context)
         self._wait_set: Any = None
         self.taker = Taker()
@@ -179,18 +182,31 @@ class Half:
         """Handle frames until the gateway ends; what changes the wait set is done by the loop."""
         while True:
             operation, number, body = self._link.read()
-            if operation == "M":
-                endpoint = self._endpoints.get(number)
-                if endpoint is not None:
-                    if not self.taker.gids and len(self._echoes) < _ECHOES:
-                        self._echoes[endpoint.name, hash(body)] += 1
-                    endpoint.entity.publish(body)
-            else:
-                self._tasks.append((operation, number, body))
-                self._wake.trigger()
+            # A message goes at once, but not before its publisher is made, nor before earlier ones that wait for it.
+            if operation == "M" and number in self._endpoints and not self._waiting[number]:
+                self._publish(number, body)
+                continue
+            with self._lock:
+                self._waiting[number] += 1
+            self._tasks.append((operation, number, body))
+            self._wake.trigger()
+
+    def _publish(self, number: int, body: bytes) -> None:
+        endpoint = self._endpoints.get(number)
+        if endpoint is None:
+            return  # it could not be made, or is taken back
+        if not self.taker.gids and len(self._echoes) < _ECHOES:
+            self._echoes[endpoint.name, hash(body)] += 1
+        try:
+            endpoint.entity.publish(body)
+        except Exception:
+            if number in self._endpoints:  # else it was taken back in this moment
+                raise
 
     def _do(self, operation: str, number: int, body: bytes) -> None:
-        if operation == "+":
+        if operation == "M":
+            self._publish(number, body)
+        elif operation == "+":
             self._create(number, json.loads(body))
         elif operation == "-":
             self._destroy(number)
@@ -303,7 +319,12 @@ class Half:
                 self._look_at_events()
             self._wait(due - now)
             while self._tasks:
-                self._do(*self._tasks.popleft())
+                operation, number, body = self._tasks.popleft()
+                self._do(operation, number, body)
+                with self._lock:
+                    self._waiting[number] -= 1
+                    if not self._waiting[number]:
+                        del self._waiting[number]
 
     def _wait(self, timeout: float) -> None:
         kinds: dict[str, list[Made]] = {"MS": [], "SS": [], "SC": []}
