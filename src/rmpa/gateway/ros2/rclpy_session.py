@@ -15,6 +15,7 @@ import os
 import random
 import socket
 import struct
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -75,6 +76,10 @@ def shown_in_ros2(name: str, node: str) -> str:
     return f"{name} of {node} in ROS 2"
 
 
+def _without_hash(key: str) -> str:
+    return key.rpartition("/")[0]
+
+
 class _Closer:
     """Something that is taken back once; the other declarations of a session have more to do."""
 
@@ -101,12 +106,14 @@ class RclpyPublisher:
         self._qos = qos
         self._matching = matching
         self._matched = False
+        # The endpoints that have sent, and whose queues are bounded.
+        self._used: set[int] = set()
         self.dropped = 0
 
     @property
     def waiting(self) -> int:
         """Messages in its queue."""
-        return sum(self._session.outbox.waiting(number) for number in self._session.numbers_of(self._key))
+        return sum(map(self._session.outbox.waiting, self._used))
 
     def put(self, payload: Buffer, attachment: bytes = b"") -> int:
         """Queue one message; return how many older ones were dropped."""
@@ -118,7 +125,9 @@ class RclpyPublisher:
         for payload, attachment in messages:
             number = self._session.number_of(Ros2Attachment.parse(attachment).gid)
             if number is not None:
-                self._session.outbox.set_terms(number, self._qos.messages)
+                if number not in self._used:
+                    self._used.add(number)
+                    self._session.outbox.set_terms(number, self._qos.messages)
                 dropped += self._session.write("M", number, payload)
         self.dropped += dropped
         return dropped
@@ -210,6 +219,9 @@ class RclpySession:
         self._ended = asyncio.Event()
         self._numbers = itertools.count(1)
         self._declared: dict[int, Ros2Endpoint] = {}
+        self._keys: dict[int, str] = {}
+        # The subscriptions of ROS 2 by their keys without the hash.
+        self._wanted: Counter[str] = Counter()
         self._by_gid: dict[bytes, int] = {}
         self._clients: dict[str, int] = {}
         self.publishers: set[RclpyPublisher] = set()
@@ -373,12 +385,12 @@ class RclpySession:
         if isinstance(endpoint, Ros2Node):
             return _Closer(lambda: None)
         number, gid = next(self._numbers), gid_of(key)
-        self._declared[number] = endpoint
+        self._declared[number], self._keys[number] = endpoint, endpoint.key()
         self._by_gid[gid] = number
         self._create(number, endpoint)
 
         def end() -> None:
-            del self._declared[number], self._by_gid[gid]
+            del self._declared[number], self._keys[number], self._by_gid[gid]
             self.outbox.discard(number)
             self.say(shown_in_ros2(endpoint.name, endpoint.node.name), "")
             self.write("-", number, b"")
@@ -400,14 +412,6 @@ class RclpySession:
         """The endpoint with this GID."""
         return self._by_gid.get(gid)
 
-    def numbers_of(self, key: str) -> list[int]:
-        """The publishers of a key."""
-        return [
-            number
-            for number, each in self._declared.items()
-            if each.kind is EntityKind.PUBLISHER and each.key() == key
-        ]
-
     def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> RclpyPublisher:
         """A publisher for the declared endpoints of a key; ``on_matching`` tells whether ROS 2 subscribes."""
         made = RclpyPublisher(self, key, qos, on_matching)
@@ -417,11 +421,7 @@ class RclpySession:
 
     def subscribed(self, key: str) -> bool:
         """Whether a node of ROS 2 subscribes to a topic with this type, whatever hash it has."""
-        domain_name_type = key.rpartition("/")[0]
-        return any(
-            each.kind is EntityKind.SUBSCRIPTION and each.key().rpartition("/")[0] == domain_name_type
-            for each in self._foreign.values()
-        )
+        return self._wanted[_without_hash(key)] > 0
 
     def subscribe(self, key: str, on_sample: Callable[[ZenohSample], None], *, history: bool = False) -> _Closer:
         """Give what arrives for a key to a function; the subscription is declared by its token."""
@@ -483,13 +483,12 @@ class RclpySession:
         return self._clients[key]
 
     def _message(self, number: int, body: bytes) -> None:
-        endpoint = self._declared.get(number)
-        if endpoint is None:
+        key = self._keys.get(number)
+        if key is None:
             return
         size = body[0]
         real, at = body[1 : 1 + size], 1 + size
         stamp, sequence = _STAMPS.unpack_from(body, at)
-        key = endpoint.key()
         gid, of = self._gids.get(real, (real[:GID_BYTES].ljust(GID_BYTES, b"\0"), key))
         if of != key:
             return  # of a publisher with another definition of the type, which has a subscription of its own
@@ -498,8 +497,7 @@ class RclpySession:
             take(sample)
 
     def _query(self, number: int, body: bytes) -> None:
-        endpoint = self._declared.get(number)
-        key = endpoint.key() if endpoint is not None else ""
+        key = self._keys.get(number, "")
         query = RclpyQuery(self, number, body[: _CALL.size], key, body[_CALL.size :])
         if (take := self._servers.get(key)) is not None:
             take(query)
@@ -563,6 +561,7 @@ class RclpySession:
         kind = EntityKind(row["kind"])
         made = Ros2Endpoint(node, next(self._numbers), kind, row["name"], type_name, type_hash, qos)
         self._foreign[row["gid"]] = made
+        self._wanted[_without_hash(made.key())] += kind is EntityKind.SUBSCRIPTION
         if kind is not EntityKind.SERVICE:
             self._gids[bytes.fromhex(row["gid"])] = gid_of(made.token()), made.key()
         self._tell(made, alive=True)
@@ -570,6 +569,7 @@ class RclpySession:
     def _remove(self, gid: str) -> None:
         endpoint = self._foreign.pop(gid, None)
         if endpoint is not None:
+            self._wanted[_without_hash(endpoint.key())] -= endpoint.kind is EntityKind.SUBSCRIPTION
             if endpoint.kind is not EntityKind.SERVICE:
                 self._gids.pop(bytes.fromhex(gid), None)
             self._tell(endpoint, alive=False)
