@@ -48,9 +48,12 @@ def main():
     row = {"gid": "f" * 32, "kind": "MS", "node": "/there", "name": "/x", "type": "std_msgs/msg/String"}
     row |= {"hash": "", "qos": {}}
     say("G", 0, json.dumps({"nodes": ["/there"], "added": [row], "removed": []}).encode())
+    made = set()
     while True:
         operation, number, body = read()
-        if operation == "M":  # what is published comes back as if another node had sent it
+        if operation == "+":
+            made.add(number)
+        elif operation == "M" and number in made:  # what is published comes back as if another node had sent it
             if body == b"die":
                 os._exit(1)
             say("M", number, bytes([16]) + b"g" * 16 + struct.pack("<qq", 7, 9) + body)
