@@ -126,7 +126,7 @@ def test_packages_in_the_working_directory_do_not_count(other: Path, monkeypatch
 def checks(module: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Check]:
     """What doctor says when a package's checks are the only ones."""
     monkeypatch.setattr("rmpa.observe.doctor.checks.CHECKS", {})
-    write_package(folder, plugins.CHECKS, module)
+    write_package(folder, plugins.DOCTOR_CHECKS, module)
     return [*examine(None)]  # type: ignore[arg-type] # the checks do not look
 
 

@@ -288,13 +288,13 @@ def _join_by_token(module: Module, text: str) -> MemberFiles:
 
 def _write_request(module: Module, out: Path, options: Options) -> None:
     from rmpa.trust import certificates
-    from rmpa.trust import store as files_of
     from rmpa.trust.membership import new_key, private_key, request_pem
+    from rmpa.trust.store import REQUEST_KEY
 
     pem = new_key()
-    request = certificates.make_request(private_key(pem, files_of.REQUEST_KEY), module.name)
+    request = certificates.make_request(private_key(pem, REQUEST_KEY), module.name)
     key = certificates.read_request(request).key_hash[: limits.FINGERPRINT_BYTES].hex()
-    module.store.write(files_of.REQUEST_KEY, pem)
+    module.store.write(REQUEST_KEY, pem)
     try:
         out.write_bytes(request_pem(request))
     except OSError as error:
@@ -313,16 +313,16 @@ def _accepted(module: Module, path: Path, ca: str | None) -> MemberFiles:
         ConfigError: It is no answer, or of another authority, another module or another key.
     """
     from rmpa.trust import certificates
-    from rmpa.trust import store as files_of
     from rmpa.trust.joining import check_grant
     from rmpa.trust.membership import private_key
+    from rmpa.trust.store import REQUEST_KEY, MemberFiles
     from rmpa.trust.tokens import CertificateGrant
 
     digits = re.sub(r"[\s:]", "", ca or "").lower()
     if not re.fullmatch(rf"[0-9a-f]{{{_FINGERPRINT}}}", digits):
         raise ConfigError("--ca", f"is not {_FINGERPRINT} hexadecimal digits", "rmpa trust invite --sign shows them")
     pem = module.store.load_request_key()
-    own = certificates.make_request(private_key(pem, files_of.REQUEST_KEY), module.name)
+    own = certificates.make_request(private_key(pem, REQUEST_KEY), module.name)
     try:
         with path.open("rb") as stream:
             answer = msgspec.json.decode(stream.read(limits.JOIN_ANSWER_MAX + 1), type=CertificateGrant)
@@ -335,4 +335,4 @@ def _accepted(module: Module, path: Path, ca: str | None) -> MemberFiles:
     except TrustError as error:
         text = str(error).replace("of the token", "of --ca")
         raise ConfigError(str(path), text, "is it the answer to this module's last request?") from None
-    return files_of.MemberFiles(pem, answer.certificate, answer.ca, answer.keys, answer.deny)
+    return MemberFiles(pem, answer.certificate, answer.ca, answer.keys, answer.deny)

@@ -27,7 +27,7 @@ REPORT: Final = "site.report"
 # The request for a ``SitesReport`` of one site with its sources: ``{site}``.
 SITE_INFO: Final = "site.info"
 # The request for the ways of a topic or a service through gateways: ``{name, site, module, service}``.
-WHY: Final = "site.why"
+SITE_WHY: Final = "site.why"
 _SOURCES: Final = Needs(
     (Access.SUBSCRIBE, Access.CALL),
     "each topic and service; of this site the asking module's own alone. Sites and modules are named to all",
@@ -36,7 +36,7 @@ _WAYS: Final = Needs(
     (Access.SUBSCRIBE, Access.CALL), "the topic or service, by its name here; what leaves is the asking module's own"
 )
 # The questions about other sites.
-QUESTIONS: Final = (REPORT, SITE_INFO, WHY)
+QUESTIONS: Final = (REPORT, SITE_INFO, SITE_WHY)
 
 
 class SiteAnswerer(Protocol):
@@ -72,7 +72,7 @@ class SiteRequests:
         self.answerer, rpc = gateway, self._bridge.rpc
         rpc.on_request(REPORT, partial(self._answer_peer, gateway, REPORT), _SOURCES)
         rpc.on_request(SITE_INFO, partial(self._answer_peer, gateway, SITE_INFO), _SOURCES)
-        rpc.on_request(WHY, partial(self._answer_peer, gateway, WHY), _WAYS)
+        rpc.on_request(SITE_WHY, partial(self._answer_peer, gateway, SITE_WHY), _WAYS)
 
     async def answer(self, args: Args) -> Any:
         """The operation ``site``: ``what`` (one of ``QUESTIONS``) and its ``args``.
@@ -82,7 +82,7 @@ class SiteRequests:
         what, inner = args.get("what"), args.get("args")
         if what not in QUESTIONS or not isinstance(inner, dict):
             raise ConfigError("what", f"{what!r} is no question about sites")
-        return await (self.all(what, inner) if what in {REPORT, WHY} else self.one(what, inner))
+        return await (self.all(what, inner) if what in {REPORT, SITE_WHY} else self.one(what, inner))
 
     async def all(self, what: str, args: Args) -> list[Any]:
         """The answers of all gateways; those that fail are left out."""

@@ -26,7 +26,7 @@ NEIGHBOURS: Final = "rmpa.neighbours"
 # WebSocket protocols of ``rmpa web``: a class of ``web.clients.connection.Session``.
 WEB_PROTOCOLS: Final = "rmpa.web_protocols"
 # Checks of ``rmpa doctor``: called as those of ``CHECKS`` in ``observe.doctor.checks``.
-CHECKS: Final = "rmpa.checks"
+DOCTOR_CHECKS: Final = "rmpa.checks"
 
 
 @functools.cache

@@ -19,8 +19,7 @@ import msgspec
 from rmpa.config.values import did_you_mean
 from rmpa.core.identity import is_legal_name
 from rmpa.web import limits
-from rmpa.web.clients.clients import PROTOCOLS, ClientFigures
-from rmpa.web.clients.clients import REASONS as GATEWAY_REASONS
+from rmpa.web.clients.clients import CLIENT_REFUSALS, PROTOCOLS, ClientFigures
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -152,7 +151,7 @@ REFUSALS: Final = (
     "slow_request",
     "slow_response",
     "oversized",
-    *GATEWAY_REASONS,
+    *CLIENT_REFUSALS,
 )
 # Each node has these; they are shown only where they were called across the mesh.
 _LOGGER_SERVICES: Final = ("/get_loggers", "/set_logger_level")

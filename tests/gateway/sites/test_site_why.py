@@ -20,7 +20,7 @@ from rmpa.gateway.sites.answers import SiteAnswers, WhyQuestion, here_stages, pa
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
 from rmpa.gateway.sites.plans import SiteImport
 from rmpa.observe.check import FAIL, OK, WARN, Check
-from rmpa.observe.sites import REPORT, SITE_INFO, WHY
+from rmpa.observe.sites import REPORT, SITE_INFO, SITE_WHY
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.wire.tcpros import TopicDescription
 from rmpa.trust.permissions import Permissions
@@ -49,7 +49,7 @@ class Asked:
 
     async def why(self, name: str, site: str = "", module: str = "", asker: str = "") -> list[Diagnosis]:
         args = {"name": name, "site": site, "module": module}
-        found: list[Diagnosis] = await self.answers.answer(WHY, args, asker)
+        found: list[Diagnosis] = await self.answers.answer(SITE_WHY, args, asker)
         return found
 
     async def report(self, what: str = REPORT, asker: str = "", **args: str) -> SitesReport:

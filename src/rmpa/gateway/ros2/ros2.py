@@ -24,7 +24,7 @@ from rmpa.gateway.ros2.types import DISTRIBUTIONS
 from rmpa.gateway.rules import CrossingRules, SourceKind
 from rmpa.gateway.topics import flow
 from rmpa.observe.check import FAIL, OK, WARN, Check
-from rmpa.observe.sites import REPORT, SITE_INFO, WHY, SiteInfo, SiteSourceInfo, SitesReport
+from rmpa.observe.sites import REPORT, SITE_INFO, SITE_WHY, SiteInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.why.diagnosis import Diagnosis, until_failure
 
 if TYPE_CHECKING:
@@ -188,7 +188,7 @@ class Ros2Neighbour:
     async def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Any:
         """The reply to one question of ``observe.operations``; raises as that says."""
         name, site, module = (str(args.get(key) or "") for key in ("name", "site", "module"))
-        if what == WHY:
+        if what == SITE_WHY:
             visible = any(self.permissions.tells(asker, kind, name) for kind in SourceKind)
             ways = self.ways(name, site, module) if visible and args.get("service") is not True else []
             return [*ways, *(await self.sites.answer(what, args, asker) if self.sites is not None else ())]

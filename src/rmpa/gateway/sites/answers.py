@@ -30,7 +30,7 @@ from rmpa.gateway.sites.topics import SiteContext
 from rmpa.gateway.topics import flow
 from rmpa.gateway.zenoh.threads import first_answer
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
-from rmpa.observe.sites import REPORT, SITE_INFO, WHY, SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
+from rmpa.observe.sites import REPORT, SITE_INFO, SITE_WHY, SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.why.diagnosis import Diagnosis, permission_there, until_failure
 from rmpa.ros.wire.tcpros import printable
 
@@ -206,7 +206,7 @@ class SiteAnswers:
         known = [self._site, *sorted(others)]
         if what == REPORT:
             return self._report(known, asker, sources=False)
-        if what == WHY:
+        if what == SITE_WHY:
             return await self.ways(name, site, module, asker, service=args.get("service") is True)
         if what == SITE_INFO:
             # Of a site that is not known the names of all are the answer.

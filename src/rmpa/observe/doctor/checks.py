@@ -24,8 +24,7 @@ from rmpa.observe.doctor import machine, network, repairs
 from rmpa.observe.why.diagnosis import judge_peer_clock, misplaced, remedy_for, subscriber_text
 from rmpa.ros.http.rpc import call_api
 from rmpa.runtime.accept import open_files_advice
-from rmpa.runtime.plugins import CHECKS as PLUGIN_CHECKS
-from rmpa.runtime.plugins import find_plugins, load_plugin, plugin_error
+from rmpa.runtime.plugins import DOCTOR_CHECKS, find_plugins, load_plugin, plugin_error
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -295,7 +294,7 @@ def examine(given: DoctorInput) -> Iterator[Check]:
     """Run all checks, then those of other packages; each result comes as soon as it is there, the whole in 2 s."""
     for check in CHECKS.values():
         yield from check(given)
-    for name, entry in find_plugins(PLUGIN_CHECKS).items():
+    for name, entry in find_plugins(DOCTOR_CHECKS).items():
         try:
             for found in load_plugin(entry)(given):
                 if not isinstance(found, Check):

@@ -19,7 +19,7 @@ from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.identity import OWN_NODE, is_global_name, is_own
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, OK, Check
-from rmpa.observe.sites import WHY as WHY_SITES
+from rmpa.observe.sites import SITE_WHY
 from rmpa.observe.snapshot import INFO, ModuleFacts
 from rmpa.observe.why.diagnosis import (
     PERMISSION_THERE,
@@ -113,7 +113,7 @@ class WhyService:
         site, _, module = (peer or "").partition("/")
         asked = {"name": name, "site": site, "module": module, "service": service}
         found: list[Diagnosis] = []
-        for answer in await self._sites.all(WHY_SITES, asked):
+        for answer in await self._sites.all(SITE_WHY, asked):
             with contextlib.suppress(msgspec.ValidationError):  # of another release
                 found += msgspec.convert(answer, tuple[Diagnosis, ...])
         return tuple(found)

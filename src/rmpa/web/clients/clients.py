@@ -43,12 +43,12 @@ PROTOCOLS: Final = ("foxglove", "monitor", "rosbridge")
 # Why WebSocket clients are refused or disconnected, as counted: a handshake that is malformed or asks for another
 # protocol; too many clients; a malformed frame or message, or one that does not end; one that is too long; too many
 # in a second.
-REASONS: Final = ("handshake", "clients", "message", "message_size", "message_rate")
+CLIENT_REFUSALS: Final = ("handshake", "clients", "message", "message_size", "message_rate")
 
 
 @dataclass(frozen=True, slots=True)
 class ClientFigures:
-    """The clients of one gateway.
+    """The clients of one protocol.
 
     Attributes:
         clients: Connected at present.
@@ -92,7 +92,7 @@ class WebSocketClients:
         monitor: Monitor | None = None,
         others: Sequence[type[Session]] = (),
     ) -> None:
-        # Clients that were refused or disconnected, by the words of ``REASONS``.
+        # Clients that were refused or disconnected, by the words of ``CLIENT_REFUSALS``.
         self.counters = Counters()
         self._refusals = RefusalLog(_log, self.counters)
         # Called when the handshake of a WebSocket is done, with what is to be called if a frame of the client is not
@@ -121,7 +121,7 @@ class WebSocketClients:
         return tuple(session.connection for session in self._open)
 
     def figures(self) -> dict[str, ClientFigures]:
-        """What each gateway counts."""
+        """What each protocol counts."""
         found = {}
         for kind in self._kinds:
             present = [each.connection for each in self._open if each.kind == kind]
@@ -193,7 +193,7 @@ class WebSocketClients:
 
         Args:
             address: The client's.
-            reason: One of ``REASONS``.
+            reason: One of ``CLIENT_REFUSALS``.
             text: What happened, for the log.
         """
         self._refusals.refuse(time.monotonic(), reason, address, f"{address}: {text}")

@@ -220,7 +220,7 @@ class CommandAge:
 
 
 class ClientConnection:
-    """One client of a gateway.
+    """One client of a protocol.
 
     Args:
         session: Its protocol.
@@ -272,7 +272,7 @@ class ClientConnection:
         Args:
             code: Of RFC 6455, section 7.4.
             reason: For the client and the log.
-            refusal: Which of ``clients.REASONS`` is counted, where the client is the cause.
+            refusal: Which of ``clients.CLIENT_REFUSALS`` is counted, where the client is the cause.
         """
         if self._close is not None:
             return
@@ -314,7 +314,7 @@ class ClientConnection:
             request: Asks for the WebSocket.
             socket_: Not prepared yet.
             upgraded: Called when the handshake is done; what it returns counts the bytes that the client has sent.
-            refused: ``(reason, text)``: called if the client is disconnected for one of ``clients.REASONS``.
+            refused: ``(reason, text)``: called if the client is disconnected for one of ``clients.CLIENT_REFUSALS``.
 
         Raises:
             PeerRefused: There are too many clients.

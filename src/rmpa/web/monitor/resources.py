@@ -15,8 +15,7 @@ from rmpa.core.identity import proxied_peer
 from rmpa.core.limits import KIB, MIB
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
-from rmpa.ros.types.descriptor import CONFIG_TYPE, LEVEL_FOR, Descriptor
-from rmpa.ros.types.descriptor import TOPIC as DESCRIPTOR
+from rmpa.ros.types.descriptor import CONFIG_TYPE, LEVEL_FOR, TOPIC, Descriptor
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import Tree, without_nulls
 
@@ -176,7 +175,7 @@ _TEXT: Final = "std_msgs/String"
 _ALWAYS, _SHOWN, _LOOKED_AT = range(3)
 # The topics below each resource, with their types.
 _TOPICS: Final = {
-    DESCRIPTOR: (_TEXT, _ALWAYS),
+    TOPIC: (_TEXT, _ALWAYS),
     "state": (_TEXT, _SHOWN),
     "profile": (_TEXT, _SHOWN),
     "context": (_TEXT, _SHOWN),
@@ -284,7 +283,7 @@ class ResourceWatch:
         ]
 
     def _graph_changed(self) -> None:
-        ending = f"/{DESCRIPTOR}"
+        ending = f"/{TOPIC}"
         present = {
             name.removesuffix(ending): topic
             for name, topic in self._hub.graph.topics.items()
@@ -321,7 +320,7 @@ class ResourceWatch:
         before = path.heard.get(peer) or ResourceFacts(name=path.name, peer=peer)
         try:
             values = self._values.of(message)  # latched ones may come before the descriptor
-            said = _described(values["data"]) if topic == DESCRIPTOR else _said(before, topic, values)
+            said = _described(values["data"]) if topic == TOPIC else _said(before, topic, values)
         except (RmpaError, msgspec.DecodeError, KeyError, TypeError, RecursionError):
             return  # another program's topic of that name
         path.heard[peer] = after = msgspec.structs.replace(before, **said)

@@ -1,6 +1,6 @@
 """The server of ``rmpa web``: its routes, and what holds for all of them: access, read-only, headers, counts.
 
-A gateway or a page is added as one more route (``WebServer.start``): the middleware judges its requests, WebSocket
+A protocol or a page is added as one more route (``WebServer.start``): the middleware judges its requests, WebSocket
 upgrades included, before its handler runs.
 """
 
@@ -70,7 +70,7 @@ _AIOHTTP: Final = logging.getLogger("rmpa.web.server.aiohttp")
 _AIOHTTP.setLevel(logging.CRITICAL)
 # Needs no token: it tells only whether the agent answers.
 _HEALTH: Final = "/healthz"
-# Where WebSocket clients connect. The pages have their own path; else the subprotocol chooses the gateway.
+# Where WebSocket clients connect. The pages have their own path; else the subprotocol chooses the protocol.
 WEBSOCKET_PATHS: Final = ("/", "/rosbridge", "/foxglove", MONITOR_PATH)
 _METHODS: Final = ("GET", "HEAD")
 # Characters of a faulty header that are told.

@@ -13,7 +13,7 @@ from rmpa.gateway.ros2.actions import Ros2Actions
 from rmpa.gateway.ros2.conversion import ActionPair
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, data_key
 from rmpa.gateway.ros2.types import Ros2Types, TypePair
-from rmpa.observe.sites import REPORT, SITE_INFO, WHY, SiteInfo, SitesReport
+from rmpa.observe.sites import REPORT, SITE_INFO, SITE_WHY, SiteInfo, SitesReport
 from rmpa.ros.types.definitions import SEPARATOR, known_text
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_zenoh import MemoryQuery, eventually
@@ -148,7 +148,7 @@ async def test_ros2_is_listed_with_its_topics_and_what_is_wrong_with_them(bed: R
     rows = {(row.name, row.node): row for row in info.sources}
     assert rows["/chatter", "/bot"].type == "std_msgs/String"
     assert "definitions differ" in rows["/mine", "/older"].problem
-    ways = await answer(WHY, {"name": "/chatter", "site": "ros2"})
+    ways = await answer(SITE_WHY, {"name": "/chatter", "site": "ros2"})
     assert [(way.peer, way.node) for way in ways] == [("ros2", "/bot")]
     with pytest.raises(UnreachableError):
         await answer(SITE_INFO, {"site": "hall"})
@@ -158,5 +158,5 @@ async def test_questions_about_sites_go_to_what_answers_for_them(bed: Ros2Bed) -
     bed.neighbour.sites = OtherSites()
     report: SitesReport = await bed.neighbour.answer(REPORT, {})
     assert [site.name for site in report.sites] == ["hall", "ros2"]
-    for what, args in ((SITE_INFO, {"site": "hall"}), (WHY, {"name": "/nothing"})):
+    for what, args in ((SITE_INFO, {"site": "hall"}), (SITE_WHY, {"name": "/nothing"})):
         assert await bed.neighbour.answer(what, args) == ["of a site"]
