@@ -406,7 +406,8 @@ def _site_text(report: SitesReport, site: SiteInfo) -> Iterator[Text]:
     yield f"Site:      {site.name}"
     yield f"State:     {site.state}{since}"
     yield f"Gateways:  {site.gateways}"
-    yield f"Seen by:   {report.gateway} of site {report.site}{stands_by}"
+    of_site = f" of site {report.site}" if report.site else ""
+    yield f"Seen by:   {report.gateway}{of_site}{stands_by}"
     yield f"Connected: {', '.join(report.endpoints) or 'to nothing'}"
     if site.not_shown:
         yield f"Kept out:  {site.not_shown} topics and services, by rules or for their names"
