@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.core.external import Core
-    from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.trust.permissions import Permissions
 
@@ -106,9 +105,9 @@ class Bridge(Shared):
         self.node.master_uri = self.core.uri  # only now does the embedded core listen
         await self.node.start()
         await self.proxy_nodes.start()
-        self.core.on_change(self._graph_changed)
         self._reconcile_later()
         for part in self._parts:
+            self.core.on_change(part.graph_changed)
             part.start()
 
     async def close(self) -> None:
@@ -152,9 +151,6 @@ class Bridge(Shared):
             sender.acknowledged(sequence)
         elif kind is FrameKind.FENCED:
             sender.fenced(sequence)
-
-    def _graph_changed(self, change: GraphChange) -> None:
-        call_each(self._parts, lambda part: part.graph_changed(change))
 
     def _param_update(self, key: str, _value: XmlRpcValue) -> bool:
         return sum(part.param_update(key) for part in self._parts) > 0  # a sum, because every part must be called

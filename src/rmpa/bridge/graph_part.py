@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Advertise, AdvertiseServices, decode, encode
 from rmpa.bridge.peer_offers import ImportEffects
-from rmpa.bridge.sessions import Part
+from rmpa.bridge.sessions import Part, guarded
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.log import RefusalLog
+from rmpa.core.log import RefusalLog, logged_failure
 from rmpa.runtime.loop import MachineTimer, turn_end, until, yield_to_data
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class GraphPart(Part, ImportEffects):
         self._timer = MachineTimer(self.imports.next_timer, self.imports.handle_timer)
         # Ordered: in a plain dict, taking the first item skips over the places of all items taken before.
         self._changed: OrderedDict[str, None] = OrderedDict()
-        self._advertisements: deque[tuple[PeerSession, bytes | Iterator[None]]] = deque()
+        self._advertisements: deque[tuple[PeerSession, bytes | Iterator[tuple[Any, Any]]]] = deque()
         self._unread_bytes = 0
         self._rejudging: Iterator[None] = iter(())
         self._freeing: deque[Iterator[None]] = deque()
@@ -189,8 +189,10 @@ class GraphPart(Part, ImportEffects):
         """Parse the advertisement that has waited longest, or apply the next entry of it if it is parsed."""
         session, waiting = self._advertisements[0]
         if not isinstance(waiting, bytes):
-            if next(waiting, _END) is _END:
+            if (change := next(waiting, None)) is None:
                 self._advertisements.popleft()
+            else:
+                self.imports.take_in(session.peer, *change, self.now())
             return
         self._advertisements.popleft()
         self._unread_bytes -= len(waiting)
@@ -200,15 +202,10 @@ class GraphPart(Part, ImportEffects):
             self.refuse(session, error)
             return
         if isinstance(message, Advertise | AdvertiseServices):
-            self._advertisements.appendleft((session, self._applied(session, message)))
-
-    def _applied(self, session: PeerSession, message: Advertise | AdvertiseServices) -> Iterator[None]:
-        if message.added or message.removed:
-            more, less = len(message.added), len(message.removed)
-            _log.debug("< %s %s %d more %s, %d less", session.link.name, self.verb, more, self.exports.kind, less)
-        for wire, offer in self.imports.changes(session.peer, message):
-            self.imports.take_in(session.peer, wire, offer, self.now())
-            yield
+            if message.added or message.removed:
+                more, less = len(message.added), len(message.removed)
+                _log.debug("< %s %s %d more %s, %d less", session.link.name, self.verb, more, self.exports.kind, less)
+            self._advertisements.appendleft((session, self.imports.changes(session.peer, message)))
 
     @abstractmethod
     def _look_at(self, name: str) -> None:
@@ -262,35 +259,29 @@ class GraphPart(Part, ImportEffects):
             self._scan_handle = loop.call_later(delay, self._scan) if delay else loop.call_soon(self._scan)
 
     def _scan(self) -> None:
-        self._scan_handle = None
-        try:
-            self._do_slice()
-        except Exception:  # noqa: BLE001 - the rest must not wait for the next change
-            _log.exception("! a slice of work failed; the rest goes on")
-            if self._changed or self._advertisements or self._freeing:  # of which each slice takes some: it ends
-                self.schedule()
-
-    def _do_slice(self) -> None:
         """Take one turn of the loop for it; each kind of work gets on by one item at least."""
+        self._scan_handle = None
         end, told, rejudged = turn_end(), False, False
-        for _ in until(end, _while(self._changed)):
-            self._look_at(self._changed.popitem(last=False)[0])
-        for _ in until(end, self.exports.advertise(self.now(), self._is_busy)):
-            told = True
-        for _ in until(end, _while(self._advertisements)):
-            self._apply_next()
-        for _ in until(end, _while(self._freeing)):
-            if next(self._freeing[0], _END) is _END:
-                self._freeing.popleft()
-        for _ in until(end, self._rejudging):
-            rejudged = True
+        with logged_failure(_log, "a slice of work failed; the rest goes on"):
+            for _ in until(end, _while(self._changed)):
+                self._look_at(self._changed.popitem(last=False)[0])
+            for _ in until(end, self.exports.advertise(self.now(), self._is_busy)):
+                told = True
+            for _ in until(end, _while(self._advertisements)):
+                self._apply_next()
+            for _ in until(end, _while(self._freeing)):
+                if next(self._freeing[0], _END) is _END:
+                    self._freeing.popleft()
+            for _ in until(end, self._rejudging):
+                rejudged = True
         pending = self.exports.pending
         if self._changed or self._advertisements or self._freeing or rejudged or (told and pending):
             self.schedule()
         elif pending:  # earlier portions are still on their way
             self.schedule(limits.TELL_PAUSE)
         else:
-            self._settled()
+            with guarded(self):
+                self._settled()
 
     def _is_busy(self, peer: int) -> bool:
         session = self._shared.sessions.get(peer)

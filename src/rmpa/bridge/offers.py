@@ -92,9 +92,10 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
 
     Attributes:
         kind: The setting that limits the offered entries: ``topics`` or ``services``.
-        warning: The counter of entries beyond that limit.
+        counter: Counts the entries beyond that limit.
         access: What a peer does with an entry.
         owner: What provides an entry, for texts.
+        message: ``(added, removed, full, more)``: the message to a peer with a portion of the entries.
         renews: Whether a changed entry is told again although its offer is the same.
         seen: What the local graph has, whether it crosses or not.
         offered: What peers may have, within the limit; ``judge_for`` decides for each of them.
@@ -103,9 +104,10 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
     """
 
     kind: ClassVar[str]
-    warning: ClassVar[str]
+    counter: ClassVar[str]
     access: ClassVar[Access]
     owner: ClassVar[str]
+    message: ClassVar[Callable[..., Message]]
     renews: ClassVar[bool] = False
 
     def __init__(self, out: Effects) -> None:
@@ -126,10 +128,6 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
     @abstractmethod
     def offer_for(self, key: KeyT, local: LocalT, wire: str) -> OfferT:
         """The offer of an entry under a name on the wire."""
-
-    @abstractmethod
-    def _message(self, added: tuple[OfferT, ...], removed: tuple[KeyT, ...], full: bool, more: bool) -> Message:
-        """The message to a peer with a portion of the entries."""
 
     @abstractmethod
     def _ended(self, key: KeyT, reason: str) -> None:
@@ -199,7 +197,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
                 self.beyond[key] = None
                 text = f"this module has more {self.kind} than limits.{self.kind} = {self.limit}; the rest is "
                 text += "offered to no peer: raise it in rmpa.toml and `rmpa reload`, or deny some"
-                self._out.warn(self.warning, "local", text)
+                self._out.warn(self.counter, "local", text)
                 return
             self.beyond.pop(key, None)
             self.offered[key] = local
@@ -316,7 +314,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
             added.append(offer)
         full, more = not told.begun, not told.whole and bool(told.due)
         if added or removed or full or (not told.whole and not more):
-            self._out.send(peer, self._message(tuple(added), tuple(removed), full, more))
+            self._out.send(peer, self.message(tuple(added), tuple(removed), full, more))
         told.begun, told.whole = True, not more
 
     def _asked_in_vain(self, peer: int, wire: str) -> None:

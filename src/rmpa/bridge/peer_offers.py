@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.peer import PeerRun
 
 
-# Causes for which an entry is hidden: another type here, a permission, ``limits.nodes``.
-CONFLICT, DENIED, CROWDED = "conflict", "denied", "crowded"
-
-
 @dataclass(slots=True, eq=False, kw_only=True)
 class Remote(Generic[KeyT]):
     """A topic or service of one node of a peer, as the peer offers it.
@@ -36,7 +32,7 @@ class Remote(Generic[KeyT]):
         type: Its message type; ``None`` for a service.
         origin: Its module and node, if the peer only relays it.
         shown: Whether it is in the local graph.
-        cause: The kind of the reason why it is not: ``CONFLICT``, ``DENIED`` or ``CROWDED``; empty: another one.
+        cause: The kind of the reason why it is not, of ``core.facts``; empty: another one.
         problem: Why its route was not opened or was closed last, or empty.
     """
 

@@ -17,7 +17,7 @@ from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.rules import CLOCK
 from rmpa.config.settings import TimeSettings
 from rmpa.config.values import PEER
-from rmpa.core.identity import NEVER_CROSSING, is_own, matches
+from rmpa.core.identity import NEVER_CROSSING, OUTSIDE_GUID, is_own, matches
 from rmpa.core.statistics import Counters
 from rmpa.mesh import limits as mesh_limits
 from rmpa.trust.permissions import PermissionDecision, prohibition, refusal
@@ -285,10 +285,6 @@ OPEN_GATE: Final = PermissionGate()
 
 # A topic and the proxy that publishes it, by their local names.
 Place = tuple[str, str]
-
-
-# The GUID of all origins outside the mesh: it is well-formed, but no module can have this address.
-OUTSIDE_GUID: Final = "0.0.0.0:0#1"
 
 
 def is_outside(origin: Origin) -> bool:

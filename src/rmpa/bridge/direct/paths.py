@@ -21,7 +21,6 @@ import msgspec
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import NO_LINK, Condition, DirectAsk, Grant, Unmet, Want, read_ask, read_reply
 from rmpa.bridge.peer_offers import EntryT
-from rmpa.bridge.rpc import UNKNOWN_QUESTION
 from rmpa.core.contract import Contract, Transport
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.runtime.tasks import OwnedTasks
@@ -320,8 +319,7 @@ class Paths(ABC, Generic[EntryT]):
                 found = read_reply(value, want.node)
                 path.held = isinstance(found, Grant)
             except PeerRefused as error:
-                older = UNKNOWN_QUESTION in error.reason
-                found = Unmet(Condition.RELEASE if older else Condition.AGENT, str(error))
+                found = Unmet(Condition.RELEASE if error.unknown else Condition.AGENT, str(error))
             except RemoteProtocolError as error:
                 found = Unmet(Condition.RELEASE, f"{session.link.name}: {error}")
             except RmpaError as error:

@@ -28,7 +28,6 @@ from rmpa.bridge import limits
 from rmpa.bridge.messages import (
     AdvertiseServices,
     CloseService,
-    Message,
     OpenService,
     ServiceClosed,
     ServiceOffer,
@@ -36,11 +35,12 @@ from rmpa.bridge.messages import (
     is_crossing_name,
 )
 from rmpa.bridge.offers import OfferBook
-from rmpa.bridge.peer_offers import CROWDED, DENIED, ImportBook, Remote
+from rmpa.bridge.peer_offers import ImportBook, Remote
 from rmpa.bridge.policy import PolicyDecision, is_outside
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
+from rmpa.core.facts import CROWDED, DENIED
 from rmpa.ros.wire.tcpros import ServiceDescription
 
 if TYPE_CHECKING:
@@ -75,7 +75,8 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
             calls.
     """
 
-    kind, warning, access, owner = "services", "services.too_many", Access.CALL, "its server"
+    kind, counter, access, owner = "services", "services.too_many", Access.CALL, "its server"
+    message = AdvertiseServices
     renews = True  # behind another server what peers know of a service may not be true any more
     _out: Services
 
@@ -111,9 +112,6 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
     def offer_for(self, key: str, local: LocalService, wire: str) -> ServiceOffer:  # noqa: ARG002 - as of OfferBook
         """As of ``OfferBook``."""
         return ServiceOffer(wire, local.node, local.origin)
-
-    def _message(self, added: tuple[ServiceOffer, ...], removed: tuple[str, ...], full: bool, more: bool) -> Message:
-        return AdvertiseServices(added, removed, full, more)
 
     def reload(self) -> Iterator[None]:
         """Judge by new rules; routes that no permission allows any more end at once."""

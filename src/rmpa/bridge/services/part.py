@@ -18,12 +18,12 @@ from rmpa.bridge.direct.grants import ServiceGrants
 from rmpa.bridge.graph_part import GraphPart
 from rmpa.bridge.messages import CloseService, OpenService, ServiceClosed, ServiceOpened, Source
 from rmpa.bridge.peer import PeerState
-from rmpa.bridge.peer_offers import DENIED
 from rmpa.bridge.policy import Needs, service_place
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.services.books import ServiceExports, ServiceImports
 from rmpa.bridge.services.calls import Budgets, Caller, CallStats, Serving
 from rmpa.bridge.services.direct import ServicePaths
+from rmpa.core.facts import DENIED
 from rmpa.core.identity import is_own
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint

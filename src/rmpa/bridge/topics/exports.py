@@ -25,7 +25,6 @@ from rmpa.bridge.data.export import ExportRoute
 from rmpa.bridge.messages import (
     Advertise,
     CloseRoute,
-    Message,
     OpenRoute,
     RouteClosed,
     RouteOpened,
@@ -68,7 +67,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
         _cut: The run of each named peer that had no link when a route of it ended, so that it may miss messages.
     """
 
-    kind, warning, access, owner = "topics", "sources.too_many", Access.SUBSCRIBE, "the node"
+    kind, counter, access, owner, message = "topics", "sources.too_many", Access.SUBSCRIBE, "the node", Advertise
     _out: Topics
 
     def __init__(self, out: Topics) -> None:
@@ -118,9 +117,6 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
     def offer_for(self, key: Source, local: LocalSource, wire: str) -> TopicOffer:
         """As of ``OfferBook``."""
         return TopicOffer(wire, key.node, local.type, local.origin)
-
-    def _message(self, added: tuple[TopicOffer, ...], removed: tuple[Source, ...], full: bool, more: bool) -> Message:
-        return Advertise(added, removed, full, more)
 
     def reload(self) -> Iterator[None]:
         """Judge by new rules. Routes that they end, end at once: a slow peer is told of the topics later."""

@@ -9,12 +9,13 @@ from rmpa.bridge.data.quality import PeerClockHistory, QosEventKind, shown_secon
 from rmpa.bridge.data.route_sender import ReliableRouteSender
 from rmpa.bridge.direct.conditions import Condition, Want, unmet_by_contract
 from rmpa.bridge.direct.paths import AGENTS
-from rmpa.bridge.peer_offers import CONFLICT, CROWDED
 from rmpa.bridge.policy import PolicyDecision
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
 from rmpa.core.contract import KEYS, Contract, Transport
 from rmpa.core.facts import (
+    CONFLICT,
+    CROWDED,
     Arrival,
     ContractTerm,
     EventInfo,
@@ -363,7 +364,7 @@ class TopicFacts:
         """What a peer is told of a publisher here."""
         exports = self._bridge.topics.exports
         local, flow = exports.seen.get(source), exports.flows.get(source)
-        kind = local.type if local is not None else self._core.type_of(source.topic)
+        kind = local.type if local is not None else self._core.type_of(source.topic, source.node)
         decision = exports.decision(session.peer, source)
         if decision is None:  # it has just come, or cannot be reached
             decision = self._bridge.context.policy.judge(source.topic, kind, source.node)

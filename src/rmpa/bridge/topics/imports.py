@@ -36,10 +36,11 @@ from rmpa.bridge.messages import (
     TopicOffer,
     is_crossing_name,
 )
-from rmpa.bridge.peer_offers import CONFLICT, CROWDED, DENIED, ImportBook
+from rmpa.bridge.peer_offers import ImportBook
 from rmpa.bridge.topics.import_route import RemoteTopic
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
+from rmpa.core.facts import CONFLICT, CROWDED, DENIED
 from rmpa.core.timers import Backoff
 from rmpa.mesh import limits as mesh_limits
 

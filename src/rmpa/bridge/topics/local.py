@@ -23,11 +23,10 @@ from rmpa.bridge.messages import Audience, Description, Source, is_crossing_name
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.bridge.topics.import_route import ImportRoute
 from rmpa.config.peer_rules import Access
-from rmpa.core.identity import OWN_NODE, is_own, is_type_name, proxied_node, proxy_name
+from rmpa.core.identity import OWN_NODE, is_own, proxied_node, proxy_name
 from rmpa.core.limits import UINT32_MAX
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ResumeTable
-from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.subscription import InProcessConnection, PublisherConnection
 from rmpa.ros.wire.tcpros import TopicDescription as TcprosDescription
 from rmpa.runtime.accept import DESCRIPTORS
@@ -52,55 +51,31 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-class LocalSources:
-    """The core's publishers, each with the type that it registered itself.
-
-    The master keeps one type for each topic, the last one registered; peers need the type of each publisher.
+def own_sources(core: Core, topic: str, flows: Callable[[Source], bool] = lambda _: False) -> dict[str, LocalSource]:
+    """This module's own publishers of a topic, by node, without those that cannot be reached.
 
     Args:
         core: The local core.
-        relay: Knows which proxies are offered to other modules.
+        topic: The topic.
         flows: Whether the agent is connected to a source; such a source counts as reachable, whatever the core found.
     """
+    unreachable = core.unreachable()
+    return {
+        node: LocalSource(core.type_of(topic, node), uri)
+        for node, uri in core.publishers(topic).items()
+        if not is_own(node)
+        and (node not in unreachable or not unreachable[node].withdrawn or flows(Source(topic, node)))
+    }
 
-    def __init__(self, core: Core, relay: Relay, flows: Callable[[Source], bool] = lambda _: False) -> None:
-        self._core = core
-        self._flows = flows
-        self._relay = relay
-        self._types: dict[Source, str] = {}
 
-    def changed(self, change: GraphChange) -> None:
-        """Remembers the type of a publisher that registers; forgets it when the publisher leaves."""
-        if change.kind is RegistrationKind.PUBLISHER:
-            if is_own(change.node) and not self._relay.enabled:
-                return  # thousands of proxies, whose types only a relay needs
-            source = Source(change.name, change.node)
-            if not change.added:
-                self._types.pop(source, None)
-            elif is_type_name(change.type):
-                self._types[source] = change.type
-
-    def of(self, topic: str) -> dict[str, LocalSource]:
-        """This module's own publishers of a topic, by node, without those that cannot be reached."""
-        unreachable = self._core.unreachable()
-        return {
-            node: LocalSource(self._type(topic, node), uri)
-            for node, uri in self._core.publishers(topic).items()
-            if not is_own(node)
-            and (node not in unreachable or not unreachable[node].withdrawn or self._flows(Source(topic, node)))
-        }
-
-    def relayed(self, topic: str) -> dict[str, LocalSource]:
-        """The proxies of a topic that this agent relays, by node, with their origin; empty if it is no relay."""
-        publishers: Mapping[str, str] = self._core.publishers(topic) if self._relay.enabled else {}
-        return {
-            node: LocalSource(self._type(topic, node), uri, origin)
-            for node, uri in publishers.items()
-            if (origin := self._relay.origin((topic, node))) is not None
-        }
-
-    def _type(self, topic: str, node: str) -> str:
-        return self._types.get(Source(topic, node)) or self._core.type_of(topic)
+def relayed_sources(core: Core, relay: Relay, topic: str) -> dict[str, LocalSource]:
+    """The proxies of a topic that this agent relays, by node, with their origin; empty if it is no relay."""
+    publishers: Mapping[str, str] = core.publishers(topic) if relay.enabled else {}
+    return {
+        node: LocalSource(core.type_of(topic, node), uri, origin)
+        for node, uri in publishers.items()
+        if (origin := relay.origin((topic, node))) is not None
+    }
 
 
 class LocalSubscriptions:

@@ -22,7 +22,7 @@ from rmpa.bridge.topics.exports import Exports
 from rmpa.bridge.topics.import_route import ImportRoute
 from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.joins import Joins
-from rmpa.bridge.topics.local import LocalSources, LocalSubscriptions, RemoteSubscribers
+from rmpa.bridge.topics.local import LocalSubscriptions, RemoteSubscribers, own_sources, relayed_sources
 from rmpa.bridge.topics.reports import LossReports, Mismatches
 from rmpa.core.contract import Priority, Reliability
 from rmpa.core.identity import is_own
@@ -84,7 +84,6 @@ class Topics(GraphPart):
         self.joins = Joins(shared, self.exports, self.imports, self.outbound, self.subscribers)
         self.direct_exports = TopicGrants(shared, self.exports)
         self.direct_imports = TopicPaths(shared, self.warn, self.imports)
-        self._local = LocalSources(shared.core, shared.relay, lambda s: self.exports.description(s) is not None)
         self._nodes: dict[str, tuple[str, ...]] = {}
         self._ticker: asyncio.TimerHandle | None = None
 
@@ -214,7 +213,6 @@ class Topics(GraphPart):
 
     def graph_changed(self, change: GraphChange) -> None:
         """Have the topic of a registration that came or went looked at."""
-        self._local.changed(change)
         self.direct_exports.graph_changed(change)
         self.direct_imports.graph_changed(change)
         if change.kind is RegistrationKind.SUBSCRIBER:
@@ -226,8 +224,9 @@ class Topics(GraphPart):
         return (*self._nodes, *self._shared.core.state().publishers)
 
     def _look_at(self, name: str) -> None:
-        local, before = self._local.of(name), self._nodes.pop(name, ())
-        publishers = local | self._local.relayed(name)
+        core, before = self._shared.core, self._nodes.pop(name, ())
+        local = own_sources(core, name, lambda source: self.exports.description(source) is not None)
+        publishers = local | relayed_sources(core, self._shared.relay, name)
         nodes = dict.fromkeys((*before, *publishers))
         leaving = [node for node in nodes if node not in publishers and self.outbound.leave(Source(name, node))]
         if publishers or leaving:

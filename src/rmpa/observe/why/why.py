@@ -10,12 +10,12 @@ import msgspec
 
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Source
-from rmpa.bridge.peer_offers import DENIED
 from rmpa.bridge.policy import Needs
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
+from rmpa.core.facts import DENIED
 from rmpa.core.identity import OWN_NODE, is_global_name, is_own
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, OK, Check
