@@ -64,14 +64,14 @@ class GraphPart(Part, ImportEffects):
         refusals: Logs and counts warnings, and peers that break the protocol.
     """
 
-    exports: OfferBook[Any, Any, Any]
+    exports: OfferBook[Any, Any, Any, Any]
     imports: ImportBook[Any, Any, Any]
     direct_exports: Grants
     direct_imports: Paths[Any]
     verb: ClassVar[str]
 
     def __init__(
-        self, shared: Shared, exports: type[OfferBook[Any, Any, Any]], imports: type[ImportBook[Any, Any, Any]]
+        self, shared: Shared, exports: type[OfferBook[Any, Any, Any, Any]], imports: type[ImportBook[Any, Any, Any]]
     ) -> None:
         self._shared = shared
         self.rng = shared.rng

@@ -125,8 +125,6 @@ class Nodes(Part):
                 if proxy is not None and _service(proxy) not in services:
                     self._register(proxy)
 
-    # --- nodes of which nothing crosses, to the peers ----------------------------------------------------------
-
     def link_up(self, session: PeerSession) -> None:
         """Tell a peer with a new link."""
         self._told.pop(session.peer, None)
@@ -163,8 +161,6 @@ class Nodes(Part):
         """Whether the rules for a peer let a node's name cross, as they do its topics and services."""
         return self._shared.context.policy.judge_for(peer, node, wire=node).allowed
 
-    # --- and of the peers ---------------------------------------------------------------------------------------
-
     def _told_by_peer(self, session: PeerSession, args: dict[str, Any]) -> None:
         told = args.get("nodes")
         names: list[Any] = told[: self._shared.context.settings.limits.nodes] if isinstance(told, list) else [None]
@@ -194,8 +190,6 @@ class Nodes(Part):
     def _hide(self, proxy: SlaveNode) -> None:
         self._core.call("unregisterService", proxy.name, _service(proxy), proxy.service_uri)
         proxy.remove_service(_service(proxy))
-
-    # --- the peers' requests ------------------------------------------------------------------------------------
 
     def _list(self, asker: PeerSession, _args: dict[str, Any]) -> tuple[NodeLine, ...]:
         problems = {node: found.problem for node, found in self._core.unreachable().items()}

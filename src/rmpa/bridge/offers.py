@@ -55,17 +55,19 @@ class Effects:
 KeyT = TypeVar("KeyT", bound="Hashable")
 LocalT = TypeVar("LocalT", bound=Local)
 OfferT = TypeVar("OfferT")
+RouteT = TypeVar("RouteT")
 
 
 @dataclass(slots=True)
-class Told(Generic[KeyT, LocalT, OfferT]):
-    """One linked peer, and what it was told over this link.
+class Told(Generic[KeyT, LocalT, OfferT, RouteT]):
+    """One linked peer, what it was told over this link, and what it has asked for.
 
     Args:
         session: The peer. Nothing that came from its run is relayed back to it.
         due: The entries to examine for this peer: they may have changed (a dict, for its order).
         offers: By key: the offer that the peer was told, and the local entry that it was made of.
         by_wire: The keys of ``offers``, by name on the wire.
+        routes: The routes that it has asked for, by its own numbers of them.
         behind: By name on the wire: keys of entries that are not told because another entry has that name.
         begun: Whether the first portion was told.
         whole: Whether the peer was told everything once.
@@ -76,13 +78,14 @@ class Told(Generic[KeyT, LocalT, OfferT]):
     due: dict[KeyT, None]
     offers: dict[KeyT, tuple[OfferT, LocalT]] = field(default_factory=dict)
     by_wire: dict[KeyT, KeyT] = field(default_factory=dict)
+    routes: dict[int, RouteT] = field(default_factory=dict)
     behind: dict[KeyT, list[KeyT]] = field(default_factory=dict)
     begun: bool = False
     whole: bool = False
     told_at: float = -math.inf
 
 
-class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
+class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
     """The entries of the local graph, which of them are offered, and what each linked peer was told of them.
 
     Keys are local names; a subclass says what an entry is, whether it may cross, and what its peers are told.
@@ -115,7 +118,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         self.seen: dict[KeyT, LocalT] = {}
         self.offered: dict[KeyT, LocalT] = {}
         self.beyond: dict[KeyT, None] = {}
-        self.peers: dict[int, Told[KeyT, LocalT, OfferT]] = {}
+        self.peers: dict[int, Told[KeyT, LocalT, OfferT, RouteT]] = {}
 
     @abstractmethod
     def judge(self, key: KeyT, local: LocalT) -> PolicyDecision:
@@ -137,7 +140,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         """End what one peer uses of an entry: it may not have it any more, or has it under another name now."""
 
     def judge_for(
-        self, told: Told[KeyT, LocalT, OfferT], key: KeyT, local: LocalT
+        self, told: Told[KeyT, LocalT, OfferT, RouteT], key: KeyT, local: LocalT
     ) -> PolicyDecision | PermissionDecision:
         """Decide whether an entry that may cross may cross to one peer."""
         context, origin = self._out.context, local.origin
@@ -151,7 +154,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         permission = context.gate.judge(self.access, peer, name)
         return decision if permission.allowed or not decision.allowed else permission
 
-    def _offer(self, told: Told[KeyT, LocalT, OfferT], key: KeyT) -> OfferT | None:
+    def _offer(self, told: Told[KeyT, LocalT, OfferT, RouteT], key: KeyT) -> OfferT | None:
         """The offer of an entry for one peer; ``None`` if the peer may not know of it."""
         local, context, name = self.offered.get(key), self._out.context, self.name_of(key)
         if local is None:
@@ -225,8 +228,12 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         self._portion(session.peer, told)
 
     def link_down(self, peer: int) -> None:
-        """Forget what a peer was told."""
+        """Forget what a peer was told; its routes have no numbers any more."""
         self.peers.pop(peer, None)
+
+    def route(self, peer: int, number: int) -> RouteT | None:
+        """The route that a linked peer has asked for by this number."""
+        return told.routes.get(number) if (told := self.peers.get(peer)) is not None else None
 
     def offer(self, peer: int, key: KeyT) -> OfferT | None:
         """The offer that a peer was told last of an entry; ``None`` if it does not know the entry."""
@@ -286,7 +293,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
             self._portion(peer, told)
             yield peer
 
-    def _portion(self, peer: int, told: Told[KeyT, LocalT, OfferT]) -> None:
+    def _portion(self, peer: int, told: Told[KeyT, LocalT, OfferT, RouteT]) -> None:
         added: list[OfferT] = []
         removed: list[KeyT] = []
         for key in tuple(islice(told.due, limits.ADVERTISED_AT_ONCE)):

@@ -163,9 +163,16 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
     def handle_timer(self, now: float) -> None:
         """Handle due timers."""
 
-    @abstractmethod
     def reload(self, now: float) -> Iterator[None]:
         """Judge by new rules, an entry with each item; what they do not change goes on untouched."""
+        yield from self._rejudge_all(now)
+        for peer, known in list(self._peers.items()):
+            while self._peers.get(peer) is known and self._admit(peer, known, now):
+                yield
+
+    @abstractmethod
+    def _rejudge_all(self, now: float) -> Iterator[None]:
+        """Judge what is known by new rules, an entry with each item."""
 
     @abstractmethod
     def _entry(self, peer: int, offer: OfferT) -> EntryT:
@@ -242,24 +249,13 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         known = self._peers.get(peer)
         if known is None:
             return
-        if offer is not None:
-            self._add(peer, known, offer, now)
-            return
-        known.refused.pop(wire, None)
-        if (entry := known.entries.get(wire)) is not None:
-            self._drop(entry, f"its server at {known.session.name} has gone")
-        self._admit(peer, known, now)
-
-    def _admit(self, peer: int, known: Heard[KeyT, EntryT, OfferT], now: float) -> bool:
-        """Take the first offer beyond the limit, if there is room now; return whether there was one."""
-        if not known.refused or len(known.entries) >= self.limit:
-            return False
-        self._add(peer, known, known.refused.popitem(last=False)[1], now)
-        return True
-
-    def _add(self, peer: int, known: Heard[KeyT, EntryT, OfferT], offer: OfferT, now: float) -> None:
-        wire = wire_of(offer)
         entry = known.entries.get(wire)
+        if offer is None:
+            known.refused.pop(wire, None)
+            if entry is not None:
+                self._drop(entry, f"its server at {known.session.name} has gone")
+            self._admit(peer, known, now)
+            return
         if entry is not None and _is_same(entry, offer):
             self._by_path(entry, cast("Any", offer).origin)
             self._came_again(entry, now)
@@ -275,6 +271,13 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         if entry.origin is not None and self.ways.count(peer, entry.origin, 1):
             self._ways_changed({entry.origin.instance})
         self._judge(entry)
+
+    def _admit(self, peer: int, known: Heard[KeyT, EntryT, OfferT], now: float) -> bool:
+        """Take the first offer beyond the limit, if there is room now; return whether there was one."""
+        if not known.refused or len(known.entries) >= self.limit:
+            return False
+        self.take_in(peer, *known.refused.popitem(last=False), now)
+        return True
 
     def _by_path(self, entry: EntryT, origin: Origin | None) -> None:
         """Note by which relays an entry comes now."""

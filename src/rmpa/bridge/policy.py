@@ -269,20 +269,6 @@ class PermissionGate:
 OPEN_GATE: Final = PermissionGate()
 
 
-# --- Relaying between two networks by a module that is in both, as the paper's proxies do ---------------------------
-#
-# Pure.
-#
-# ::
-#
-#     network 0                                      network 1
-#     a ──── /cmd ───► r (relay) ──── /cmd, origin a, path r ───► b     shown there as /rmpa/a/…
-#
-# The relay offers the proxies in its own graph, each with its *origin*. The origin lists every relay on the path,
-# which prevents loops: a source is not offered to its own module nor to a relay on its path, and a relay on its path
-# does not show it. A module that is linked to the origin, or reaches it by a better relay, hides the source.
-
-
 # A topic and the proxy that publishes it, by their local names.
 Place = tuple[str, str]
 
@@ -299,6 +285,15 @@ def service_place(service: str, node: str) -> Place:
 
 class Relay:
     """The relaying side: which proxies of the local graph are offered to other peers, with which origin.
+
+    A module that is in two networks may pass on what one offers to the other, as the paper's proxies do::
+
+        network 0                                      network 1
+        a ──── /cmd ───► r (relay) ──── /cmd, origin a, path r ───► b     shown there as /rmpa/a/…
+
+    The origin lists every relay on the path, which prevents loops: a source is not offered to its own module nor to a
+    relay on its path, and a relay on its path does not show it. A module that is linked to the origin, or reaches it
+    by a better relay, hides the source.
 
     Args:
         enabled: Whether this module relays at all.

@@ -143,9 +143,6 @@ def unmet_by_rules(
     return Unmet(Condition.NAME, f"it is {other} in {owner}") if other else None
 
 
-# --- messages ------------------------------------------------------------------------------------------------------
-
-
 class Want(NamedTuple):
     """What is to be reached directly.
 
@@ -225,9 +222,6 @@ def reply_of(found: Grant | Unmet) -> dict[str, object]:
     if isinstance(found, Grant):
         return {"port": found.port, "probe": found.probe}
     return {"why": found.condition.value, "text": found.text}
-
-
-# --- what was lost -------------------------------------------------------------------------------------------------
 
 
 # When a subscriber was without its direct path, by the peer's name and what is reached: how often, when the last time

@@ -144,8 +144,6 @@ class Paths(ABC, Generic[EntryT]):
     def _now() -> float:
         return asyncio.get_running_loop().time()
 
-    # --- what subclasses do -----------------------------------------------------------------------------------------
-
     @abstractmethod
     async def _probe(self, path: Path[EntryT], grant: Grant) -> str:
         """Why a node cannot be reached from here; empty: it can."""
@@ -157,8 +155,6 @@ class Paths(ABC, Generic[EntryT]):
     @abstractmethod
     def _subject(self, path: Path[EntryT]) -> str:
         """A path in a warning."""
-
-    # --- facts ------------------------------------------------------------------------------------------------------
 
     def judge(
         self, session: PeerSession, want: Want, entry: EntryT, contract: Contract, unmet: Unmet | None
@@ -238,8 +234,6 @@ class Paths(ABC, Generic[EntryT]):
         for path in self:
             self._stop(path)
         await self._tasks.close()
-
-    # --- the decision -----------------------------------------------------------------------------------------------
 
     def _unmet(self, path: Path[EntryT]) -> Unmet | None:
         """The condition that does not hold by what is known here; ``None``: the peer decides."""

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge import limits
-from rmpa.bridge.params import rules as transfer
+from rmpa.bridge.params import transfer
 from rmpa.bridge.params.owner import ParamCore, ParamOwner, read_text
-from rmpa.bridge.params.rules import follow_rules
+from rmpa.bridge.params.transfer import follow_rules
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.sessions import Part
 from rmpa.config.rules import SIM_TIME, overlap
@@ -100,8 +100,6 @@ class Params(Part):
         found = (entry for entry in self.followed if entry.problem and entry.peer is not None)
         return tuple(f"parameter {entry.rule} is not followed: {entry.problem}" for entry in found)
 
-    # --- the bridge's part ---------------------------------------------------------------------------------------
-
     def reload(self) -> None:
         """Apply other settings; parameters that they do not affect are not touched."""
         self.owner.judge_again()
@@ -174,8 +172,6 @@ class Params(Part):
         finally:
             self._looking = None
 
-    # --- the owners ----------------------------------------------------------------------------------------------
-
     def _claim(self, session: PeerSession) -> bool:
         """Follow a linked peer's parameters that no other peer of its name owns; return whether there are any."""
         owned = [entry for entry in self.followed if entry.rule.owner == session.link.name]
@@ -233,8 +229,6 @@ class Params(Part):
             entry.had = entry.had or text is not None
             entry.due = entry.told = entry.had
         self._work_soon()
-
-    # --- the local core ------------------------------------------------------------------------------------------
 
     async def _compare_all(self, *, restarted: bool) -> None:
         """Put back what was changed here, and ask again for what was refused.

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.params import rules as transfer
-from rmpa.bridge.params.rules import (
+from rmpa.bridge.params import transfer
+from rmpa.bridge.params.transfer import (
     key_problem,
     replaced,
     too_large,
@@ -204,8 +204,6 @@ class ParamOwner:
         """What peers follow."""
         return set().union(*(follower.keys for follower in self._followers.values()))
 
-    # --- events from the part ------------------------------------------------------------------------------------
-
     def link_down(self, peer: int) -> None:
         """Forget what a peer follows."""
         follower = self._followers.pop(peer, None)
@@ -251,8 +249,6 @@ class ParamOwner:
     def tasks(self) -> Iterable[asyncio.Task[None] | None]:
         """Those that tell peers."""
         return (follower.task for follower in self._followers.values())
-
-    # --- requests -----------------------------------------------------------------------------------------------
 
     async def _get(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         key, peer = self._key(args.get("key")), session.link.name
@@ -367,8 +363,6 @@ class ParamOwner:
     def _refuse(self, why: str) -> None:
         if why:
             raise RmpaError(why, code="not-permitted")
-
-    # --- telling the followers -----------------------------------------------------------------------------------
 
     def _tell_soon(self, follower: _Follower, keys: set[str]) -> None:
         for key in keys:

@@ -46,7 +46,6 @@ from rmpa.ros.wire.tcpros import ServiceDescription
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from rmpa.bridge.peer import PeerRun
     from rmpa.bridge.services.part import Services
 
 
@@ -65,12 +64,11 @@ class ServiceRoute:
     requests: int = 0
 
 
-class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
+class ServiceExports(OfferBook[str, LocalService, ServiceOffer, ServiceRoute]):
     """The outbound half: services of this module, called by peers.
 
     Attributes:
         about: What the servers of services have said of them.
-        _routes: The routes that each linked peer has asked for, by the peer's own route numbers.
         _serial: Counts the routes of requests. They are even; the odd ones are for replies to this module's own
             calls.
     """
@@ -83,7 +81,6 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
     def __init__(self, out: Services) -> None:
         super().__init__(out)
         self.about: dict[str, ServiceDescription] = {}
-        self._routes: dict[int, dict[int, ServiceRoute]] = {}
         self._serial = 0
 
     def callers(self, service: str) -> tuple[int, ...]:
@@ -94,8 +91,8 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
         """The routes to a service: each with its peer and the peer's number for it."""
         return [
             (peer, number, route)
-            for peer, routes in self._routes.items()
-            for number, route in routes.items()
+            for peer, told in self.peers.items()
+            for number, route in told.routes.items()
             if route.service == service
         ]
 
@@ -117,20 +114,16 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
         """Judge by new rules; routes that no permission allows any more end at once."""
         gate = self._out.context.gate
         for peer, told in self.peers.items():
-            for number, route in list(self._routes[peer].items()):
+            for number, route in list(told.routes.items()):
                 if why := gate.why_not(Access.CALL, told.session.name, route.service):
                     self._close(peer, number, why)
         return super().reload()
 
-    def link_up(self, session: PeerRun) -> None:
-        """As of ``OfferBook``; the peer has no service open."""
-        self._routes[session.peer] = {}
-        super().link_up(session)
-
     def link_down(self, peer: int) -> None:
         """End all routes of a peer whose link is gone."""
+        told = self.peers.get(peer)
         super().link_down(peer)
-        for route in self._routes.pop(peer, {}).values():
+        for route in told.routes.values() if told is not None else ():
             if route.requests:
                 self._out.serving.end_route(peer, route.requests)
 
@@ -140,7 +133,7 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
         Raises:
             RemoteProtocolError: The peer's route is in use.
         """
-        routes, number = self._routes[peer], message.route
+        routes, number = self.peers[peer].routes, message.route
         if number in routes:
             raise RemoteProtocolError(f"route {number} is opened twice, for {message.service} now")
         service = self.local(peer, message.service)
@@ -164,7 +157,7 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
 
         A route that is not open is ignored: this module's own ``ServiceClosed`` may have crossed the peer's message.
         """
-        route = self._routes[peer].pop(message.route, None)
+        route = self.peers[peer].routes.pop(message.route, None)
         if route is not None and route.requests:
             self._out.serving.end_route(peer, route.requests)
 
@@ -202,7 +195,7 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
         self._out.direct_exports.server_gone(key)
 
     def _close(self, peer: int, number: int, reason: str) -> None:
-        route = self._routes[peer].pop(number)
+        route = self.peers[peer].routes.pop(number)
         if route.requests:
             self._out.serving.end_route(peer, route.requests)
         self._out.send(peer, ServiceClosed(number, reason[: limits.CONTROL_TEXT_MAX]))
@@ -334,8 +327,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
             self._local[service] = node
         self._choose(service)
 
-    def reload(self, now: float) -> Iterator[None]:
-        """Judge by new rules, a service with each item; services that they do not affect stay shown and open."""
+    def _rejudge_all(self, now: float) -> Iterator[None]:  # noqa: ARG002 - as of ImportBook
         for _, remote in list(self):
             known = self._peers.get(remote.peer)
             if known is None or known.entries.get(remote.wire) is not remote:
@@ -349,9 +341,6 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         for name in tuple(self._claims):
             self._choose(name)
             yield
-        for peer, known in list(self._peers.items()):
-            while self._peers.get(peer) is known and self._admit(peer, known, now):
-                yield
 
     def _choose(self, service: str) -> None:
         """Show the one service of a name that goes first, by the facts of now; call it whenever one has changed."""

@@ -228,16 +228,12 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         for entry in self.at(topic):
             self._judge(entry)
 
-    def reload(self, now: float) -> Iterator[None]:
-        """Judge by new rules, a source with each item; what they do not change goes on untouched."""
+    def _rejudge_all(self, now: float) -> Iterator[None]:
         # Shown ones first: what another relay brings from now on has the same proxies.
         for entry in sorted(self, key=lambda one: not one.shown):
             if self.get(entry.peer, entry.wire) is entry:
                 self._rejudge(entry, now)
             yield
-        for peer, known in list(self._peers.items()):
-            while self._peers.get(peer) is known and self._admit(peer, known, now):
-                yield
 
     def _rejudge(self, entry: RemoteTopic, now: float) -> None:
         name = self.name_here(entry.peer, entry.wire.topic, entry.origin)

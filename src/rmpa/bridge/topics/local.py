@@ -28,7 +28,7 @@ from rmpa.core.limits import UINT32_MAX
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ResumeTable
 from rmpa.ros.node.subscription import InProcessConnection, PublisherConnection
-from rmpa.ros.wire.tcpros import TopicDescription as TcprosDescription
+from rmpa.ros.wire.tcpros import TopicDescription
 from rmpa.runtime.accept import DESCRIPTORS
 from rmpa.runtime.loop import MachineTimer
 
@@ -239,7 +239,7 @@ class LocalSubscriptions:
         self._timer.close()
 
     def _header(self, source: Source, flow: ExportFlow, fields: Mapping[str, str]) -> None:
-        about = TcprosDescription.from_header(fields)
+        about = TopicDescription.from_header(fields)
         text = about.definition.encode(errors="surrogateescape").decode("latin-1")
         description = Description(about.type, about.md5sum, text, about.latching)
         if description.problem:
