@@ -33,8 +33,8 @@ from tests.ros.node.peers import until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 
@@ -183,7 +183,7 @@ class Side:
             counters=self.counters,
             context=BridgeContext.of(Settings(params=params or ParamSettings(), time=time or TimeSettings()), gate),
         )
-        self.params = Params(cast("Shared", self.shared))
+        self.params = Params(cast("Bridge", self.shared))
         self.core.told = self.params.param_update
         self.made.append(self)
 

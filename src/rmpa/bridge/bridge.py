@@ -13,7 +13,6 @@ from rmpa.bridge.policy import PermissionGate, Relay
 from rmpa.bridge.proxies import ProxyNodes
 from rmpa.bridge.rpc import PeerRpc
 from rmpa.bridge.sessions import Part, PeerSessions, call_each, guarded
-from rmpa.bridge.shared import Shared
 from rmpa.bridge.topics.part import Topics
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import OWN_NODE
@@ -36,8 +35,10 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-class Bridge(Shared):
+class Bridge:
     """Wires the parts: each gets the sessions of the peers, their messages and the changes of the local graph.
+
+    The parts know each other, and what they share, by it.
 
     Args:
         core: The local core, started.
@@ -46,6 +47,12 @@ class Bridge(Shared):
         permissions: What each peer may do here; ``None``: the mesh is not secured.
 
     Attributes:
+        node: The agent's own node in the local graph.
+        sessions: The sessions of the peers.
+        rpc: The requests and notifications to and from the peers.
+        relay: Which sources of one peer are offered to others.
+        counters: Counts what happens, by name.
+        context: The rules that hold now; each reading of the settings makes another one.
         gate: Decides what each peer may do.
         proxy_nodes: Makes the nodes that stand for the nodes of peers.
     """
@@ -80,7 +87,7 @@ class Bridge(Shared):
         self._by_op: dict[str, Part] = {}
         self.sessions = PeerSessions(self._parts, self.proxy_nodes, kills.proxy, self.gate)
         self.relay = Relay(enabled=settings.relay)
-        self.topics = Topics(self, find=self.proxy_nodes.publication)
+        self.topics = Topics(self)
         self.add(self.topics)
         self._reconciler: asyncio.TimerHandle | None = None
 

@@ -20,6 +20,7 @@ from rmpa.runtime.loop import MachineTimer, turn_end, until, yield_to_data
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.direct.grants import Grants
     from rmpa.bridge.direct.paths import Paths
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.peer_offers import ImportBook, Remote
     from rmpa.bridge.policy import Place
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
     from rmpa.ros.master.parameters import GraphState
 
 _log = logging.getLogger(__name__)
@@ -51,7 +51,7 @@ class GraphPart(Part, ImportEffects):
     here (a message is sent, a topic is published) is done at once, and calls neither of them back in the same turn.
 
     Args:
-        shared: The core, the peers and the rules.
+        bridge: The core, the peers and the rules.
         exports: The class of ``exports``.
         imports: The class of ``imports``.
 
@@ -71,11 +71,11 @@ class GraphPart(Part, ImportEffects):
     verb: ClassVar[str]
 
     def __init__(
-        self, shared: Shared, exports: type[OfferBook[Any, Any, Any, Any]], imports: type[ImportBook[Any, Any, Any]]
+        self, bridge: Bridge, exports: type[OfferBook[Any, Any, Any, Any]], imports: type[ImportBook[Any, Any, Any]]
     ) -> None:
-        self._shared = shared
-        self.rng = shared.rng
-        self.refusals = RefusalLog(_log, shared.counters)
+        self._bridge = bridge
+        self.rng = bridge.rng
+        self.refusals = RefusalLog(_log, bridge.counters)
         self.exports = exports(self)
         self.imports = imports(self)
         self._timer = MachineTimer(self.imports.next_timer, self.imports.handle_timer)
@@ -93,7 +93,7 @@ class GraphPart(Part, ImportEffects):
     @property
     def context(self) -> BridgeContext:
         """The rules that hold now."""
-        return self._shared.context
+        return self._bridge.context
 
     async def close(self) -> None:
         """Stop all slices and the timer."""
@@ -104,7 +104,7 @@ class GraphPart(Part, ImportEffects):
 
     def send(self, peer: int, message: Message) -> None:
         """As of ``ImportEffects``."""
-        session = self._shared.sessions.get(peer)
+        session = self._bridge.sessions.get(peer)
         if session is not None and session.linked:
             session.link.send_control(encode(message))
 
@@ -124,9 +124,9 @@ class GraphPart(Part, ImportEffects):
 
     def pass_on(self, entry: Remote[Any]) -> None:
         """Have what a peer offers relayed to others, if this module relays."""
-        if (session := self._shared.sessions.get(entry.peer)) is not None:
-            source, place = self._relayed(entry, self._shared.sessions.proxy_name(session, entry.node, entry.origin))
-            self._shared.relay.pass_on(entry.peer, session.link.identity, source, place, entry.origin)
+        if (session := self._bridge.sessions.get(entry.peer)) is not None:
+            source, place = self._relayed(entry, self._bridge.sessions.proxy_name(session, entry.node, entry.origin))
+            self._bridge.relay.pass_on(entry.peer, session.link.identity, source, place, entry.origin)
 
     @abstractmethod
     def _relayed(self, entry: Remote[Any], proxy: str) -> tuple[Source, Place]:
@@ -144,7 +144,7 @@ class GraphPart(Part, ImportEffects):
 
     def link_up(self, session: PeerSession) -> None:
         """Begin the advertisement to a peer, and wait for the peer's own."""
-        self.imports.ways.instance = self._shared.relay.instance
+        self.imports.ways.instance = self._bridge.relay.instance
         self.imports.link_up(session)
         self.exports.link_up(session)
         self.direct_imports.link_up(session)
@@ -234,8 +234,8 @@ class GraphPart(Part, ImportEffects):
         time. A core returns the same object until something is registered, so an idle agent compares seldom. Whether
         a node is reachable decides, too.
         """
-        state = self._shared.core.state()
-        if self._skipped < limits.RECONCILE_SKIPS and state is self._compared and not self._shared.core.unreachable():
+        state = self._bridge.core.state()
+        if self._skipped < limits.RECONCILE_SKIPS and state is self._compared and not self._bridge.core.unreachable():
             self._skipped += 1
             return False
         self._compared, self._skipped = state, 0
@@ -284,5 +284,5 @@ class GraphPart(Part, ImportEffects):
                 self._settled()
 
     def _is_busy(self, peer: int) -> bool:
-        session = self._shared.sessions.get(peer)
+        session = self._bridge.sessions.get(peer)
         return session is not None and session.link.busy

@@ -31,8 +31,8 @@ def wire_of(offer: Any) -> Any:
     return offer.source if isinstance(offer, TopicOffer) else offer.service
 
 
-class Effects:
-    """What a part of the bridge does for its books, at once and without calling back; ``GraphPart`` overrides it.
+class Effects(ABC):
+    """What a part of the bridge does for its books, at once and without calling back; ``GraphPart`` is it.
 
     Attributes:
         rng: Uniform numbers in [0, 1), for the jitter of a back-off.
@@ -45,9 +45,11 @@ class Effects:
     def context(self) -> BridgeContext:
         """The rules that hold now."""
 
+    @abstractmethod
     def send(self, peer: int, message: Message) -> None:
         """Send a control message to a peer, if it has a link."""
 
+    @abstractmethod
     def warn(self, kind: str, who: str, text: str) -> None:
         """Log a warning about ``who`` and count it as ``kind``; repeated ones are only counted."""
 
@@ -141,29 +143,28 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
 
     def judge_for(
         self, told: Told[KeyT, LocalT, OfferT, RouteT], key: KeyT, local: LocalT
-    ) -> PolicyDecision | PermissionDecision:
-        """Decide whether an entry that may cross may cross to one peer."""
+    ) -> tuple[PolicyDecision | PermissionDecision, str]:
+        """Decide whether an entry that may cross may cross to one peer, and by which name on the wire."""
         context, origin = self._out.context, local.origin
         name, peer = self.name_of(key), told.session.name
         if origin is not None and not may_have(told.session.instance, origin):
-            return PolicyDecision(False, f"it comes from {peer}")
+            return PolicyDecision(False, f"it comes from {peer}"), ""
         wire = context.names.of(peer).wire_name(name)
         if not is_crossing_name(wire):
-            return PolicyDecision(False, f"its name there would be {wire!r}")
+            return PolicyDecision(False, f"its name there would be {wire!r}"), wire
         decision = context.policy.judge_for(peer, name, local.type, wire)
         permission = context.gate.judge(self.access, peer, name)
-        return decision if permission.allowed or not decision.allowed else permission
+        return (decision if permission.allowed or not decision.allowed else permission), wire
 
     def _offer(self, told: Told[KeyT, LocalT, OfferT, RouteT], key: KeyT) -> OfferT | None:
         """The offer of an entry for one peer; ``None`` if the peer may not know of it."""
-        local, context, name = self.offered.get(key), self._out.context, self.name_of(key)
-        if local is None:
+        if (local := self.offered.get(key)) is None:
             return None
-        decision, peer = self.judge_for(told, key, local), told.session.name
+        decision, wire = self.judge_for(told, key, local)
         if decision.allowed:
-            return self.offer_for(key, local, context.names.of(peer).wire_name(name))
+            return self.offer_for(key, local, wire)
         if isinstance(decision, PermissionDecision):
-            context.gate.refused(self.access, peer, name, decision)
+            self._out.context.gate.refused(self.access, told.session.name, self.name_of(key), decision)
         return None
 
     @property
@@ -247,11 +248,10 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
             return None
         key = told.by_wire.get(wire, wire)  # one that it has not been told yet may be on its way
         local = self.offered.get(key)
-        # Judged anew: after new rules the peer is told a little later.
-        if local is None or not self.judge_for(told, key, local).allowed:
+        if local is None:
             return None
-        name = self._out.context.names.of(told.session.name).wire_name(self.name_of(key))
-        return key if wire_of(self.offer_for(key, local, name)) == wire else None
+        decision, name = self.judge_for(told, key, local)  # anew: after new rules the peer is told a little later
+        return key if decision.allowed and wire_of(self.offer_for(key, local, name)) == wire else None
 
     def decision(self, peer: int, key: KeyT) -> PolicyDecision | PermissionDecision | None:
         """Whether an entry may cross to a peer, and the rule that decides; ``None``: the graph has no such entry."""
@@ -261,7 +261,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
         decision = self.judge(key, local)
         if not decision.allowed or told is None:
             return decision
-        special = self.judge_for(told, key, local)
+        special, _ = self.judge_for(told, key, local)
         return special if special.rule or not special.allowed else decision
 
     @property

@@ -130,9 +130,11 @@ def _is_same(entry: Remote[Any], offer: Any) -> bool:
 class ImportEffects(Effects):
     """What a part does for what peers offer, likewise."""
 
+    @abstractmethod
     def arm_timer(self) -> None:
         """Look at ``ImportBook.next_timer`` again."""
 
+    @abstractmethod
     def path_changed(self, entry: Remote[Any]) -> None:
         """Offer what is relayed with the path that it has now."""
 

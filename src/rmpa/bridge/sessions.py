@@ -160,7 +160,7 @@ class Part:
         return False
 
     def reload(self) -> None:
-        """Judge again: the settings were read again, and ``Shared.context`` is another one."""
+        """Judge again: the settings were read again, and ``Bridge.context`` is another one."""
 
     def reconcile(self) -> None:
         """Compare the actual state with the planned one, and mend it; called each ``limits.RECONCILE_INTERVAL``."""

@@ -36,9 +36,9 @@ from rmpa.trust.permissions import refusal
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.policy import PermissionGate
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
     from rmpa.config.settings import Settings
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.slave_node import SlaveNode
@@ -176,14 +176,14 @@ class ParamOwner:
 
     Args:
         core: The local core.
-        shared: The peers and the rules.
+        bridge: The peers and the rules.
     """
 
-    def __init__(self, core: ParamCore, shared: Shared) -> None:
+    def __init__(self, core: ParamCore, bridge: Bridge) -> None:
         self._core = core
-        self._shared = shared
+        self._bridge = bridge
         self._followers: dict[int, _Follower] = {}
-        rpc = shared.rpc
+        rpc = bridge.rpc
         rpc.on_request(transfer.GET, self._get, _EACH)
         rpc.on_request(transfer.NAMES, self._names, Needs((Access.PARAM,), "each parameter; others are left out"))
         rpc.on_request(transfer.SET, self._set, _EACH)
@@ -193,11 +193,11 @@ class ParamOwner:
 
     @property
     def _settings(self) -> Settings:
-        return self._shared.context.settings
+        return self._bridge.context.settings
 
     @property
     def _gate(self) -> PermissionGate:
-        return self._shared.context.gate
+        return self._bridge.context.gate
 
     @property
     def followed(self) -> set[str]:
@@ -402,7 +402,7 @@ class ParamOwner:
                 why = str(error)
         args = {"key": key, "refused": why} if why else {"key": key, "text": text}
         try:
-            await self._shared.rpc.request(follower.session, transfer.VALUE, args, limits.PARAM_ASK_TIMEOUT)
+            await self._bridge.rpc.request(follower.session, transfer.VALUE, args, limits.PARAM_ASK_TIMEOUT)
         except RmpaError as error:
             _log.warning(
                 "! %s does not get the parameter %s: %s [param-trouble]", follower.session.link.name, key, error

@@ -35,11 +35,11 @@ from rmpa.runtime.loop import MachineTimer
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.export import ExportRoute
     from rmpa.bridge.data.route import RouteBegin
     from rmpa.bridge.policy import Relay
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports
     from rmpa.bridge.topics.import_route import RemoteTopic
     from rmpa.bridge.topics.imports import Imports
@@ -82,7 +82,7 @@ class LocalSubscriptions:
     """Subscriptions to local publishers that a peer wants, as the agent's own node, and the routes to the peers.
 
     Args:
-        shared: The local core and the agent's node; its subscriptions are registered, so that ROS tools show them.
+        bridge: The local core and the agent's node; its subscriptions are registered, so that ROS tools show them.
         topics: The part: its exports are told what publishers say; losses are reported.
         find: ``(node, slave API, topic)``: the topic of a proxy of this process, which is subscribed to without a
             socket; ``None`` for others.
@@ -90,14 +90,14 @@ class LocalSubscriptions:
 
     def __init__(
         self,
-        shared: Shared,
+        bridge: Bridge,
         topics: Topics,
         find: Callable[[str, str, str], Publication | None] = lambda *_: None,
     ) -> None:
-        self._core, self._node, self._sessions = shared.core, shared.node, shared.sessions
+        self._core, self._node, self._sessions = bridge.core, bridge.node, bridge.sessions
         self._topics, self._find = topics, find
         # Random, so that no earlier run of this agent, and no other agent, is likely to have had it.
-        self._epoch = int(shared.rng() * UINT32_MAX)
+        self._epoch = int(bridge.rng() * UINT32_MAX)
         self._parked: ResumeTable[ExportRoute] = ResumeTable()
         # Kept messages are dropped when their outage is over.
         self._timer = MachineTimer(self._parked.next_timer, lambda now: self._give_up(self._parked.expire(now)))
@@ -316,14 +316,14 @@ class RemoteSubscribers:
     """The names of listeners, sent and received, for all peers.
 
     Args:
-        shared: The rules about modules behind a relay.
+        bridge: The rules about modules behind a relay.
         out: Warns of too many.
         exports: Finds the routes of peers.
         imports: Knows the modules behind relays.
     """
 
-    def __init__(self, shared: Shared, out: Topics, exports: Exports, imports: Imports) -> None:
-        self._shared, self._out = shared, out
+    def __init__(self, bridge: Bridge, out: Topics, exports: Exports, imports: Imports) -> None:
+        self._bridge, self._out = bridge, out
         self._exports, self._imports = exports, imports
         self._changed: dict[RemoteTopic, None] = {}
         self._soon: asyncio.Handle | None = None
@@ -377,7 +377,7 @@ class RemoteSubscribers:
         relay = session.link.name
         if not any((o.name, via) == (whose[0], relay) for o, via in self._imports.ways):
             return ""
-        return node if self._shared.context.gate.admits(Access.SUBSCRIBE, whose[0], topic, relay=relay) else ""
+        return node if self._bridge.context.gate.admits(Access.SUBSCRIBE, whose[0], topic, relay=relay) else ""
 
     def close(self) -> None:
         """Tell nothing any more."""

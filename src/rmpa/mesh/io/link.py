@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import errno
 import ssl
-from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, cast
@@ -21,7 +20,6 @@ from rmpa.mesh.frames import Frame, FrameKind, Lane
 from rmpa.mesh.io.dial import bound_queue
 from rmpa.mesh.io.lane import LaneSender
 from rmpa.mesh.io.securing import tls_failure
-from rmpa.mesh.keepalive import Pace
 from rmpa.mesh.peering import REPLACED, RESTARTED
 from rmpa.runtime.loop import MachineTimer
 from rmpa.runtime.stream import Stream
@@ -31,12 +29,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.core.identity import Guid, Identity
-    from rmpa.core.statistics import Counters
     from rmpa.mesh.connection import DataHandler
     from rmpa.mesh.frames import Hello, Refuse
+    from rmpa.mesh.io.mesh import Mesh
     from rmpa.mesh.io.securing import SecuredSocket
     from rmpa.mesh.peering import SocketAddress
-    from rmpa.runtime.loop import SystemClock
 
 # Bytes of control frames that may wait for one link: two of the longest. They are never dropped, so beyond this the
 # link is closed.
@@ -82,52 +79,6 @@ class LinkHandlers:
     lane_lost: Callable[[PeerLink], None]
 
 
-@dataclass(eq=False)
-class LinkOwner(ABC):
-    """What connections and links have of their mesh, and what they report to it; the base of ``Mesh``.
-
-    Args:
-        identity: The identity of this agent.
-        handlers: What is called when something happens to a link.
-        clock: The time; its ``now`` must be the loop's own clock.
-        counters: Where refusals and failures are counted.
-        rng: Uniform numbers in [0, 1), for jitter.
-    """
-
-    identity: Identity
-    handlers: LinkHandlers
-    clock: SystemClock
-    counters: Counters
-    rng: Callable[[], float]
-
-    def __post_init__(self) -> None:
-        self.pace = Pace.of(self.identity)
-
-    @abstractmethod
-    def judge(self, connection: Connection, hello: Hello) -> Refuse | None:
-        """Decide on the hello or welcome of the remote side, beside what its machine checks; ``None`` accepts it."""
-
-    @abstractmethod
-    def opened(self, connection: Connection) -> None:
-        """The handshake succeeded."""
-
-    @abstractmethod
-    def refused(self, connection: Connection, refuse: Refuse, *, by_us: bool) -> None:
-        """The handshake was refused; ``ended`` follows."""
-
-    @abstractmethod
-    def ended(self, connection: Connection, reason: str) -> None:
-        """The socket is closed; called once."""
-
-    @abstractmethod
-    def redial(self, link: PeerLink) -> None:
-        """Nothing came from a link's peer for ``quiet_after``; called again from time to time in this silence."""
-
-    @abstractmethod
-    def dial_bulk(self, link: PeerLink) -> None:
-        """Dial the bulk lane of a link, if it is wanted, and this side has to."""
-
-
 class Connection(ConnectionProtocol):
     """One TCP connection: its machine, driven by one stream and one timer.
 
@@ -153,7 +104,7 @@ class Connection(ConnectionProtocol):
     def __init__(
         self,
         connection_id: int,
-        mesh: LinkOwner,
+        mesh: Mesh,
         sock: socket.socket,
         endpoint: SocketAddress,
         *,
@@ -379,7 +330,7 @@ class PeerLink:
         touched_at: Monotonic seconds of the last control frame in either direction.
     """
 
-    def __init__(self, connection: Connection, mesh: LinkOwner) -> None:
+    def __init__(self, connection: Connection, mesh: Mesh) -> None:
         self.id: Final = connection.id
         self.identity: Final = connection.identity
         self.guid: Final = connection.identity.guid

@@ -16,9 +16,9 @@ from rmpa.core.statistics import Counters
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FULL, Lane, Refusal, Refuse
 from rmpa.mesh.io.dial import Dialler, unacknowledged
-from rmpa.mesh.io.link import Connection, LinkHandlers, LinkOwner, PeerLink
+from rmpa.mesh.io.link import Connection, LinkHandlers, PeerLink
 from rmpa.mesh.io.securing import Securing, SecuringError, prove, secure_dialled
-from rmpa.mesh.keepalive import rest_lease
+from rmpa.mesh.keepalive import Pace, rest_lease
 from rmpa.mesh.peering import REPLACED, Peer, Peering, PeeringOutput
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import Acceptor, Use
@@ -53,7 +53,7 @@ def _log_refusal(peer: object, refuse: Refuse) -> None:
     _log.warning("! %s refuses a link: %s [%s]", peer, refuse.text, codes.of_counter(kind))
 
 
-class Mesh(LinkOwner):
+class Mesh:
     """The links to all peers; of several links with one peer, one is used.
 
     Args:
@@ -66,6 +66,10 @@ class Mesh(LinkOwner):
         dialler: Opens the connections; by default real ones.
         security: This module's membership of a secured mesh: all links use TLS then; ``None``: none does.
         on_join: Serves accepted connections for a join or a renewal; ``None``: this module is not the authority.
+
+    Attributes:
+        counters: Where refusals and failures are counted.
+        pace: What the keepalives of all links have in common.
     """
 
     def __init__(
@@ -81,7 +85,8 @@ class Mesh(LinkOwner):
         security: Membership | None = None,
         on_join: OnJoin | None = None,
     ) -> None:
-        super().__init__(identity, handlers, clock or SystemClock(), Counters(), rng)
+        self.identity, self.handlers, self.rng = identity, handlers, rng
+        self.clock, self.counters, self.pace = clock or SystemClock(), Counters(), Pace.of(identity)
         self._acceptor = Acceptor(listen_socket, self._accepted, name="links to peers", use=Use.LINK)
         self._refusals = RefusalLog(_log, self.counters)
         self.dialler: Final = dialler or Dialler(lanes or LaneSettings(), self.counters)
