@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin
     from rmpa.bridge.peer import PeerRun
+    from rmpa.bridge.policy import PolicyDecision
+    from rmpa.config.peer_rules import Access
+    from rmpa.trust.permissions import PermissionDecision
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -147,10 +150,12 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
 
     Attributes:
         kind: The setting that limits the entries of one peer: ``topics`` or ``services``.
+        access: What the module of an entry does here.
         ways: Selects the path to each module that relays offer.
     """
 
     kind: ClassVar[str]
+    access: ClassVar[Access]
 
     def __init__(self, out: ImportEffects) -> None:
         self._out = out
@@ -324,6 +329,22 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         """The module that permissions are asked for, and the peer that relays its entry, or empty."""
         name = self._peers[entry.peer].session.name
         return (name, "") if entry.origin is None else (entry.origin.name, name)
+
+    def permission(self, entry: EntryT, *, report: bool = False) -> PermissionDecision:
+        """Whether its module, and a peer that relays it, may have an entry here; ``report`` counts a refusal."""
+        module, relay = self._speaker(entry)
+        gate = self._out.context.gate
+        decision = gate.judge(self.access, module, entry.name, relay=relay)
+        if report and not decision.allowed:
+            gate.refused(self.access, module, entry.name, decision, relay=relay)
+        return decision
+
+    def _kept_out(self, entry: EntryT, decision: PolicyDecision, wire: str) -> str:
+        """Why rules keep an entry out, or empty: ``decision`` by those for all, or those for its peer or module."""
+        for name in dict.fromkeys((self.peer_name(entry.peer), self._speaker(entry)[0])):
+            if decision.allowed:
+                decision = self._out.context.policy.judge_for(name, entry.name, entry.type, wire)
+        return "" if decision.allowed else decision.rule
 
     def _ways_changed(self, instances: Collection[str]) -> None:
         """Judge what relays bring of modules whose best path may be another one."""

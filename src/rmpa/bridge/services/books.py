@@ -233,7 +233,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         _claims: The services that have a name here.
     """
 
-    kind = "services"
+    kind, access = "services", Access.SERVE
     _out: Services
 
     def __init__(self, out: Services) -> None:
@@ -355,8 +355,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
             elif remote is shown:
                 left = why
             if remote.cause == DENIED != before:
-                module, relay = self._speaker(remote)
-                self._out.context.gate.admits(Access.SERVE, module, service, relay=relay)
+                self.permission(remote, report=True)
         if shown is not None and left:
             self.release(shown, left)
             self._hide(shown, left)
@@ -404,20 +403,15 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
 
     def _objection(self, remote: RemoteService) -> tuple[str, str]:
         """Why a service may not be shown, whatever others there are, and the cause; empty if it may."""
-        context, origin, service = self._out.context, remote.origin, remote.name
+        origin, service = remote.origin, remote.name
         if origin is not None and (why := self.ways.why_not(remote.peer, origin)):
             return why, ""
         if not is_crossing_name(service):
             return f"the rules of names make {service!r} of it", ""
-        decision = context.services.judge(service, remote.node if origin is None else origin.node)
-        for name in (self._peers[remote.peer].session.name, *([origin.name] if origin is not None else ())):
-            if decision.allowed:
-                decision = context.policy.judge_for(name, service, wire=remote.wire)
-        if not decision.allowed:
-            return f"policy: {decision.rule}", ""
-        module, relay = self._speaker(remote)
-        permission = context.gate.judge(Access.SERVE, module, service, relay=relay)
-        if not permission.allowed:
+        decision = self._out.context.services.judge(service, remote.node if origin is None else origin.node)
+        if why := self._kept_out(remote, decision, remote.wire):
+            return f"policy: {why}", ""
+        if not (permission := self.permission(remote)).allowed:
             return permission.rule, DENIED
         crowd = self._crowd(remote)
         return crowd, CROWDED if crowd else ""
