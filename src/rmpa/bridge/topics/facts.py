@@ -353,7 +353,7 @@ class TopicFacts:
             yield node, arrival
 
     def reports(self, session: PeerSession, topic: str, instance: object) -> Iterator[PublisherReport]:
-        """What a peer is told of the publishers of a topic: this module's own, or those that it relays of another one.
+        """What a peer is told of the publishers of a topic: its own ones, or those that it relays.
 
         Args:
             session: The peer.
