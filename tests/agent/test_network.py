@@ -7,7 +7,7 @@ import errno
 import socket
 from contextlib import asynccontextmanager
 from dataclasses import replace
-from ipaddress import IPv4Address
+from ipaddress import IPv4Address, IPv4Interface
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -39,12 +39,12 @@ if TYPE_CHECKING:
     from rmpa.observe.why.diagnosis import Diagnosis
     from rmpa.ros.node.endpoints import Publisher
 
-LO = Interface("lo", 1, (IPv4Address("127.0.0.1"),), up=True, multicast=False, loopback=True)
+LO = Interface("lo", (IPv4Interface("127.0.0.1/8"),), 1, up=True, multicast=False, loopback=True)
 
 
 def card(name: str, *addresses: str, up: bool = True) -> Interface:
-    found = tuple(map(IPv4Address, addresses))
-    return Interface(name, int(name[-1]) + 2, found, up=up, multicast=True, loopback=False)
+    found = tuple(map(IPv4Interface, addresses))
+    return Interface(name, found, int(name[-1]) + 2, up=up, multicast=True, loopback=False)
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,7 @@ def fall_silent(*agents: Agent) -> list[tuple[Agent, PeerLink]]:
     """The link between two agents falls silent, as far as their bridges are told."""
     links = [(agent, session.link) for agent in agents for session in agent.bridge.sessions.linked()]
     for agent, link in links:
-        link.silent = True
+        link.connection.silent = True
         agent.bridge.sessions.link_down(link)
     return links
 
@@ -83,7 +83,7 @@ def fall_silent(*agents: Agent) -> list[tuple[Agent, PeerLink]]:
 def come_back(links: Iterable[tuple[Agent, PeerLink]]) -> None:
     """They have a link again; what the first one sends may come before the second one knows of it: it is dropped."""
     for agent, link in links:
-        link.silent = False
+        link.connection.silent = False
         agent.bridge.sessions.link_up(link)
 
 

@@ -178,7 +178,7 @@ async def test_silence_ends_direct_lookups_at_once_and_the_next_link_restores_th
 def crash(agent: Agent) -> None:
     """The agent at the other end of the link has died, as far as this one can see."""
     (session,) = agent.bridge.sessions.linked()
-    session.link.crashed = True
+    session.link.connection.crashed = True
     agent.bridge.sessions.link_down(session.link)
 
 

@@ -12,13 +12,14 @@ from rmpa.bridge import limits
 from rmpa.bridge.context import Names
 from rmpa.bridge.messages import Advertise, AdvertiseServices, ServiceOffer, Source, TopicOffer
 from rmpa.bridge.peer import PeerRun
-from rmpa.bridge.peer_offers import CROWDED, Heard, ImportBook
+from rmpa.bridge.peer_offers import Heard, ImportBook
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.config.peer_rules import PeerRule, PolicySettings
 from rmpa.config.settings import LimitSettings, ServiceSettings
 from rmpa.core.contract import Contracts
+from rmpa.core.facts import CROWDED
 from tests.bridge.recorder import (
     Exports,
     Imports,

@@ -13,10 +13,10 @@ from rmpa.bridge import limits
 from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.messages import decode
-from rmpa.bridge.params import rules as transfer
+from rmpa.bridge.params import transfer
 from rmpa.bridge.params.follower import Params
 from rmpa.bridge.params.owner import read_text, write_text
-from rmpa.bridge.params.rules import follow_rules, key_problem, replaced, why_not_follow, why_not_get, why_not_set
+from rmpa.bridge.params.transfer import follow_rules, key_problem, replaced, why_not_follow, why_not_get, why_not_set
 from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.rpc import PeerRpc
 from rmpa.config.peer_rules import Effect, PermissionRule
@@ -33,8 +33,8 @@ from tests.ros.node.peers import until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 
@@ -183,7 +183,7 @@ class Side:
             counters=self.counters,
             context=BridgeContext.of(Settings(params=params or ParamSettings(), time=time or TimeSettings()), gate),
         )
-        self.params = Params(cast("Shared", self.shared))
+        self.params = Params(cast("Bridge", self.shared))
         self.core.told = self.params.param_update
         self.made.append(self)
 

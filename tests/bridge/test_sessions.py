@@ -74,12 +74,12 @@ class Link:
     name = "far"
     resumed_at = 0.0
 
-    def __init__(self, run_number: int, *, silent: bool, host: str = "10.0.0.1") -> None:
+    def __init__(self, run_number: int, *, silent: bool, crashed: bool = False, host: str = "10.0.0.1") -> None:
         self.identity = Identity(Guid.of(host, 1000), bytes([run_number]) * 16, self.name)
         self.guid = self.identity.guid
         self.routes: dict[int, object] = {}
         self.silent = silent
-        self.crashed = False
+        self.crashed = crashed
         self.closed = ""
 
     def close(self, reason: str) -> None:
@@ -98,8 +98,8 @@ class Scene:
     async def _killed(self, *_: object) -> RosReply:
         raise NotImplementedError
 
-    def link(self, run_number: int = 1, *, silent: bool = True, host: str = "10.0.0.1") -> PeerLink:
-        link = cast("PeerLink", Link(run_number, silent=silent, host=host))
+    def link(self, run_number: int = 1, *, silent: bool = True, **more: Any) -> PeerLink:
+        link = cast("PeerLink", Link(run_number, silent=silent, **more))
         self.sessions.link_up(link)
         return link
 
@@ -215,8 +215,7 @@ def test_a_session_ends_with_its_grace_or_what_is_kept(
     silent: bool, crashed: bool, outages: tuple[float, ...], grace: float
 ) -> None:
     async def scene(made: Scene) -> None:
-        link = made.link(silent=silent)
-        link.crashed = crashed
+        link = made.link(silent=silent, crashed=crashed)
         made.sessions.link_down(link)
         if grace:
             await asyncio.sleep(grace - 0.1)

@@ -19,7 +19,7 @@ from rmpa.cli.init import _interfaces as of_interfaces
 from rmpa.cli.units import config_text
 from rmpa.config.read import load_settings
 from rmpa.core.identity import peer_name_from
-from rmpa.discovery.network import NetworkInterface
+from rmpa.discovery.network import Interface
 from rmpa.observe import limits
 from tests.cli.conftest import end, free_port, until, with_core
 
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from rmpa.ros.core.embedded import RosCore
     from tests.cli.conftest import Place
 
-LO = NetworkInterface("lo", (IPv4Interface("127.0.0.1/8"),), loopback=True)
-WLAN = NetworkInterface("wlan0", (IPv4Interface("192.168.1.5/24"),))
-ETH = NetworkInterface("eth0", (IPv4Interface("10.0.0.5/24"),))
-CABLE = NetworkInterface("eth1", up=False, used=False)
-DOCKER = NetworkInterface("docker0", (IPv4Interface("172.17.0.1/16"),))
+LO = Interface("lo", (IPv4Interface("127.0.0.1/8"),), loopback=True)
+WLAN = Interface("wlan0", (IPv4Interface("192.168.1.5/24"),))
+ETH = Interface("eth0", (IPv4Interface("10.0.0.5/24"),))
+CABLE = Interface("eth1", up=False, used=False)
+DOCKER = Interface("docker0", (IPv4Interface("172.17.0.1/16"),))
 
 
 def settings_of(path: Path) -> Settings:
@@ -135,7 +135,7 @@ def test_beside_another_agent_the_core_gets_another_port(
         ((LO, DOCKER), None, "left out: docker0 (containers"),
     ],
 )
-def test_interfaces(there: tuple[NetworkInterface, ...], value: object, words: str) -> None:
+def test_interfaces(there: tuple[Interface, ...], value: object, words: str) -> None:
     (one,) = of_interfaces(there)
     assert one.value == value
     assert words in one.text

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.bridge import limits
-from rmpa.bridge.params import rules as transfer
+from rmpa.bridge.params import transfer
 from rmpa.cli.param import read_documents, read_yaml, write_yaml
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response

@@ -9,8 +9,8 @@ import msgspec
 
 from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.messages import Message, Request, Response
-from rmpa.bridge.params import rules as transfer
-from rmpa.bridge.params.rules import key_problem
+from rmpa.bridge.params import transfer
+from rmpa.bridge.params.transfer import key_problem
 from rmpa.bridge.rpc import LinkRequests, PeerRpc
 from rmpa.core.errors import RmpaError
 from rmpa.core.statistics import Counters

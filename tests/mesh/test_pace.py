@@ -132,7 +132,7 @@ def test_a_link_at_rest_takes_the_pace_of_a_mesh_that_grows_and_shrinks(
     rest(dialler, acceptor, time)
     few = run(dialler, acceptor, time, 600.0)
     for each in (dialler, acceptor):
-        each.keepalive.rest_lease = rest_lease(999)
+        each.keepalive.pace.rest_lease = rest_lease(999)
     run(dialler, acceptor, time, 20.0)
     assert dialler.keepalive.remote_lease == acceptor.keepalive.remote_lease == 58.0
     many = run(dialler, acceptor, time, 600.0)
@@ -143,7 +143,7 @@ def test_a_link_at_rest_takes_the_pace_of_a_mesh_that_grows_and_shrinks(
     assert dialler.keepalive.remote_lease == acceptor.keepalive.remote_lease == limits.EXPRESS_LEASE
     rest(dialler, acceptor, time)
     for each in (dialler, acceptor):
-        each.keepalive.rest_lease = rest_lease(2)
+        each.keepalive.pace.rest_lease = rest_lease(2)
     run(dialler, acceptor, time, 60.0)
     assert dialler.keepalive.remote_lease == acceptor.keepalive.remote_lease == limits.IDLE_LEASE
     assert few - 2 <= run(dialler, acceptor, time, 600.0) <= few + 2
@@ -153,7 +153,7 @@ def test_two_sides_with_different_numbers_of_peers_keep_their_own_promises(
     dialler: Side, acceptor: Side, time: Time
 ) -> None:
     """As with an earlier release, whose pace does not change with the number."""
-    dialler.keepalive.rest_lease = rest_lease(999)
+    dialler.keepalive.pace.rest_lease = rest_lease(999)
     rest(dialler, acceptor, time)
     run(dialler, acceptor, time, 600.0)
     assert dialler.state is acceptor.state is ConnectionState.UP

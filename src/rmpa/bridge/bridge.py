@@ -13,7 +13,6 @@ from rmpa.bridge.policy import PermissionGate, Relay
 from rmpa.bridge.proxies import ProxyNodes
 from rmpa.bridge.rpc import PeerRpc
 from rmpa.bridge.sessions import Part, PeerSessions, call_each, guarded
-from rmpa.bridge.shared import Shared
 from rmpa.bridge.topics.part import Topics
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import OWN_NODE
@@ -30,15 +29,16 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.core.external import Core
-    from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.trust.permissions import Permissions
 
 _log = logging.getLogger(__name__)
 
 
-class Bridge(Shared):
+class Bridge:
     """Wires the parts: each gets the sessions of the peers, their messages and the changes of the local graph.
+
+    The parts know each other, and what they share, by it.
 
     Args:
         core: The local core, started.
@@ -47,6 +47,12 @@ class Bridge(Shared):
         permissions: What each peer may do here; ``None``: the mesh is not secured.
 
     Attributes:
+        node: The agent's own node in the local graph.
+        sessions: The sessions of the peers.
+        rpc: The requests and notifications to and from the peers.
+        relay: Which sources of one peer are offered to others.
+        counters: Counts what happens, by name.
+        context: The rules that hold now; each reading of the settings makes another one.
         gate: Decides what each peer may do.
         proxy_nodes: Makes the nodes that stand for the nodes of peers.
     """
@@ -81,7 +87,7 @@ class Bridge(Shared):
         self._by_op: dict[str, Part] = {}
         self.sessions = PeerSessions(self._parts, self.proxy_nodes, kills.proxy, self.gate)
         self.relay = Relay(enabled=settings.relay)
-        self.topics = Topics(self, find=self.proxy_nodes.publication)
+        self.topics = Topics(self)
         self.add(self.topics)
         self._reconciler: asyncio.TimerHandle | None = None
 
@@ -106,9 +112,9 @@ class Bridge(Shared):
         self.node.master_uri = self.core.uri  # only now does the embedded core listen
         await self.node.start()
         await self.proxy_nodes.start()
-        self.core.on_change(self._graph_changed)
         self._reconcile_later()
         for part in self._parts:
+            self.core.on_change(part.graph_changed)
             part.start()
 
     async def close(self) -> None:
@@ -152,9 +158,6 @@ class Bridge(Shared):
             sender.acknowledged(sequence)
         elif kind is FrameKind.FENCED:
             sender.fenced(sequence)
-
-    def _graph_changed(self, change: GraphChange) -> None:
-        call_each(self._parts, lambda part: part.graph_changed(change))
 
     def _param_update(self, key: str, _value: XmlRpcValue) -> bool:
         return sum(part.param_update(key) for part in self._parts) > 0  # a sum, because every part must be called

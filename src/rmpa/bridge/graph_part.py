@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Advertise, AdvertiseServices, decode, encode
 from rmpa.bridge.peer_offers import ImportEffects
-from rmpa.bridge.sessions import Part
+from rmpa.bridge.sessions import Part, guarded
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.log import RefusalLog
+from rmpa.core.log import RefusalLog, logged_failure
 from rmpa.runtime.loop import MachineTimer, turn_end, until, yield_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.direct.grants import Grants
     from rmpa.bridge.direct.paths import Paths
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.peer_offers import ImportBook, Remote
     from rmpa.bridge.policy import Place
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
     from rmpa.ros.master.parameters import GraphState
 
 _log = logging.getLogger(__name__)
@@ -51,7 +51,7 @@ class GraphPart(Part, ImportEffects):
     here (a message is sent, a topic is published) is done at once, and calls neither of them back in the same turn.
 
     Args:
-        shared: The core, the peers and the rules.
+        bridge: The core, the peers and the rules.
         exports: The class of ``exports``.
         imports: The class of ``imports``.
 
@@ -64,24 +64,24 @@ class GraphPart(Part, ImportEffects):
         refusals: Logs and counts warnings, and peers that break the protocol.
     """
 
-    exports: OfferBook[Any, Any, Any]
+    exports: OfferBook[Any, Any, Any, Any]
     imports: ImportBook[Any, Any, Any]
     direct_exports: Grants
     direct_imports: Paths[Any]
     verb: ClassVar[str]
 
     def __init__(
-        self, shared: Shared, exports: type[OfferBook[Any, Any, Any]], imports: type[ImportBook[Any, Any, Any]]
+        self, bridge: Bridge, exports: type[OfferBook[Any, Any, Any, Any]], imports: type[ImportBook[Any, Any, Any]]
     ) -> None:
-        self._shared = shared
-        self.rng = shared.rng
-        self.refusals = RefusalLog(_log, shared.counters)
+        self._bridge = bridge
+        self.rng = bridge.rng
+        self.refusals = RefusalLog(_log, bridge.counters)
         self.exports = exports(self)
         self.imports = imports(self)
         self._timer = MachineTimer(self.imports.next_timer, self.imports.handle_timer)
         # Ordered: in a plain dict, taking the first item skips over the places of all items taken before.
         self._changed: OrderedDict[str, None] = OrderedDict()
-        self._advertisements: deque[tuple[PeerSession, bytes | Iterator[None]]] = deque()
+        self._advertisements: deque[tuple[PeerSession, bytes | Iterator[tuple[Any, Any]]]] = deque()
         self._unread_bytes = 0
         self._rejudging: Iterator[None] = iter(())
         self._freeing: deque[Iterator[None]] = deque()
@@ -93,7 +93,7 @@ class GraphPart(Part, ImportEffects):
     @property
     def context(self) -> BridgeContext:
         """The rules that hold now."""
-        return self._shared.context
+        return self._bridge.context
 
     async def close(self) -> None:
         """Stop all slices and the timer."""
@@ -104,7 +104,7 @@ class GraphPart(Part, ImportEffects):
 
     def send(self, peer: int, message: Message) -> None:
         """As of ``ImportEffects``."""
-        session = self._shared.sessions.get(peer)
+        session = self._bridge.sessions.get(peer)
         if session is not None and session.linked:
             session.link.send_control(encode(message))
 
@@ -124,9 +124,9 @@ class GraphPart(Part, ImportEffects):
 
     def pass_on(self, entry: Remote[Any]) -> None:
         """Have what a peer offers relayed to others, if this module relays."""
-        if (session := self._shared.sessions.get(entry.peer)) is not None:
-            source, place = self._relayed(entry, self._shared.sessions.proxy_name(session, entry.node, entry.origin))
-            self._shared.relay.pass_on(entry.peer, session.link.identity, source, place, entry.origin)
+        if (session := self._bridge.sessions.get(entry.peer)) is not None:
+            source, place = self._relayed(entry, self._bridge.sessions.proxy_name(session, entry.node, entry.origin))
+            self._bridge.relay.pass_on(entry.peer, session.link.identity, source, place, entry.origin)
 
     @abstractmethod
     def _relayed(self, entry: Remote[Any], proxy: str) -> tuple[Source, Place]:
@@ -144,7 +144,7 @@ class GraphPart(Part, ImportEffects):
 
     def link_up(self, session: PeerSession) -> None:
         """Begin the advertisement to a peer, and wait for the peer's own."""
-        self.imports.ways.instance = self._shared.relay.instance
+        self.imports.ways.instance = self._bridge.relay.instance
         self.imports.link_up(session)
         self.exports.link_up(session)
         self.direct_imports.link_up(session)
@@ -189,8 +189,10 @@ class GraphPart(Part, ImportEffects):
         """Parse the advertisement that has waited longest, or apply the next entry of it if it is parsed."""
         session, waiting = self._advertisements[0]
         if not isinstance(waiting, bytes):
-            if next(waiting, _END) is _END:
+            if (change := next(waiting, None)) is None:
                 self._advertisements.popleft()
+            else:
+                self.imports.take_in(session.peer, *change, self.now())
             return
         self._advertisements.popleft()
         self._unread_bytes -= len(waiting)
@@ -200,15 +202,10 @@ class GraphPart(Part, ImportEffects):
             self.refuse(session, error)
             return
         if isinstance(message, Advertise | AdvertiseServices):
-            self._advertisements.appendleft((session, self._applied(session, message)))
-
-    def _applied(self, session: PeerSession, message: Advertise | AdvertiseServices) -> Iterator[None]:
-        if message.added or message.removed:
-            more, less = len(message.added), len(message.removed)
-            _log.debug("< %s %s %d more %s, %d less", session.link.name, self.verb, more, self.exports.kind, less)
-        for wire, offer in self.imports.changes(session.peer, message):
-            self.imports.take_in(session.peer, wire, offer, self.now())
-            yield
+            if message.added or message.removed:
+                more, less = len(message.added), len(message.removed)
+                _log.debug("< %s %s %d more %s, %d less", session.link.name, self.verb, more, self.exports.kind, less)
+            self._advertisements.appendleft((session, self.imports.changes(session.peer, message)))
 
     @abstractmethod
     def _look_at(self, name: str) -> None:
@@ -237,8 +234,8 @@ class GraphPart(Part, ImportEffects):
         time. A core returns the same object until something is registered, so an idle agent compares seldom. Whether
         a node is reachable decides, too.
         """
-        state = self._shared.core.state()
-        if self._skipped < limits.RECONCILE_SKIPS and state is self._compared and not self._shared.core.unreachable():
+        state = self._bridge.core.state()
+        if self._skipped < limits.RECONCILE_SKIPS and state is self._compared and not self._bridge.core.unreachable():
             self._skipped += 1
             return False
         self._compared, self._skipped = state, 0
@@ -262,36 +259,30 @@ class GraphPart(Part, ImportEffects):
             self._scan_handle = loop.call_later(delay, self._scan) if delay else loop.call_soon(self._scan)
 
     def _scan(self) -> None:
-        self._scan_handle = None
-        try:
-            self._do_slice()
-        except Exception:  # noqa: BLE001 - the rest must not wait for the next change
-            _log.exception("! a slice of work failed; the rest goes on")
-            if self._changed or self._advertisements or self._freeing:  # of which each slice takes some: it ends
-                self.schedule()
-
-    def _do_slice(self) -> None:
         """Take one turn of the loop for it; each kind of work gets on by one item at least."""
+        self._scan_handle = None
         end, told, rejudged = turn_end(), False, False
-        for _ in until(end, _while(self._changed)):
-            self._look_at(self._changed.popitem(last=False)[0])
-        for _ in until(end, self.exports.advertise(self.now(), self._is_busy)):
-            told = True
-        for _ in until(end, _while(self._advertisements)):
-            self._apply_next()
-        for _ in until(end, _while(self._freeing)):
-            if next(self._freeing[0], _END) is _END:
-                self._freeing.popleft()
-        for _ in until(end, self._rejudging):
-            rejudged = True
+        with logged_failure(_log, "a slice of work failed; the rest goes on"):
+            for _ in until(end, _while(self._changed)):
+                self._look_at(self._changed.popitem(last=False)[0])
+            for _ in until(end, self.exports.advertise(self.now(), self._is_busy)):
+                told = True
+            for _ in until(end, _while(self._advertisements)):
+                self._apply_next()
+            for _ in until(end, _while(self._freeing)):
+                if next(self._freeing[0], _END) is _END:
+                    self._freeing.popleft()
+            for _ in until(end, self._rejudging):
+                rejudged = True
         pending = self.exports.pending
         if self._changed or self._advertisements or self._freeing or rejudged or (told and pending):
             self.schedule()
         elif pending:  # earlier portions are still on their way
             self.schedule(limits.TELL_PAUSE)
         else:
-            self._settled()
+            with guarded(self):
+                self._settled()
 
     def _is_busy(self, peer: int) -> bool:
-        session = self._shared.sessions.get(peer)
+        session = self._bridge.sessions.get(peer)
         return session is not None and session.link.busy

@@ -239,7 +239,6 @@ DIRECT_LIST_AGAIN: Final = 3.0
 # Seconds between two looks while a move waits.
 DIRECT_LOOK: Final = 0.02
 
-# --- permissions ----------------------------------------------------------------------------------------------
 # Modules and sites that are logged as refused by one rule for one kind of access; further ones, whose names may be
 # invented, are only counted until the rules change.
 REFUSALS_LOGGED: Final = 128

@@ -30,10 +30,10 @@ from rmpa.runtime.loop import yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.part import Topics
     from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.node.service_server import ServiceCall
@@ -77,7 +77,7 @@ class Nodes(Part):
     ``~get_loggers``, as every ROS node has it: no publisher, relay or subscriber takes notice of that.
 
     Args:
-        shared: The core, the peers and the rules. ``limits.nodes`` bounds how many nodes a peer shows, and is told.
+        bridge: The core, the peers and the rules. ``limits.nodes`` bounds how many nodes a peer shows, and is told.
         topics: The part with the topics that cross.
         services: The part with the services that cross.
 
@@ -86,15 +86,15 @@ class Nodes(Part):
         _shown: The nodes that each peer has told of.
     """
 
-    def __init__(self, shared: Shared, topics: Topics, services: Services) -> None:
-        self._shared = shared
-        self._core = shared.core
+    def __init__(self, bridge: Bridge, topics: Topics, services: Services) -> None:
+        self._bridge = bridge
+        self._core = bridge.core
         self._topics = topics
         self._services = services
         self._told: dict[int, tuple[str, ...]] = {}
         self._shown: dict[int, set[str]] = {}
         self._soon: asyncio.TimerHandle | None = None
-        rpc = shared.rpc
+        rpc = bridge.rpc
         rpc.on_notification(NODES, self._told_by_peer, Needs((), "names of the peer's own nodes"))
         rpc.on_request(LIST, self._list, _VISIBLE)
         rpc.on_request(NODE_INFO, self._info, _VISIBLE)
@@ -119,13 +119,11 @@ class Nodes(Part):
         """Register missing proxies again: the core has been restarted."""
         services = self._core.state().services
         for peer, nodes in self._shown.items():
-            session = self._shared.sessions.get(peer)
+            session = self._bridge.sessions.get(peer)
             for node in nodes:
                 proxy = session.proxies.get(node) if session is not None else None
                 if proxy is not None and _service(proxy) not in services:
                     self._register(proxy)
-
-    # --- nodes of which nothing crosses, to the peers ----------------------------------------------------------
 
     def link_up(self, session: PeerSession) -> None:
         """Tell a peer with a new link."""
@@ -150,24 +148,22 @@ class Nodes(Part):
             and not node.startswith(MEASURING)
             and is_crossing_name(node)
         ]
-        most = self._shared.context.settings.limits.nodes
-        for session in self._shared.sessions.linked():
+        most = self._bridge.context.settings.limits.nodes
+        for session in self._bridge.sessions.linked():
             peer = session.link.name
             visible = self._visible(peer)
             names = tuple(sorted(one for one in nodes if one in visible and self._passes(peer, one))[:most])
             if names != self._told.get(session.peer):  # over a new link also that there are none any more
                 self._told[session.peer] = names
-                self._shared.rpc.notify(session, NODES, {"nodes": list(names)})
+                self._bridge.rpc.notify(session, NODES, {"nodes": list(names)})
 
     def _passes(self, peer: str, node: str) -> bool:
         """Whether the rules for a peer let a node's name cross, as they do its topics and services."""
-        return self._shared.context.policy.judge_for(peer, node, wire=node).allowed
-
-    # --- and of the peers ---------------------------------------------------------------------------------------
+        return self._bridge.context.policy.judge_for(peer, node, wire=node).allowed
 
     def _told_by_peer(self, session: PeerSession, args: dict[str, Any]) -> None:
         told = args.get("nodes")
-        names: list[Any] = told[: self._shared.context.settings.limits.nodes] if isinstance(told, list) else [None]
+        names: list[Any] = told[: self._bridge.context.settings.limits.nodes] if isinstance(told, list) else [None]
         if not all(isinstance(name, str) and is_crossing_name(name) for name in names):
             raise RemoteProtocolError(f"{NODES} has no list of nodes' names")
         wanted = {name for name in names if self._passes(session.link.name, name)}
@@ -195,8 +191,6 @@ class Nodes(Part):
         self._core.call("unregisterService", proxy.name, _service(proxy), proxy.service_uri)
         proxy.remove_service(_service(proxy))
 
-    # --- the peers' requests ------------------------------------------------------------------------------------
-
     def _list(self, asker: PeerSession, _args: dict[str, Any]) -> tuple[NodeLine, ...]:
         problems = {node: found.problem for node, found in self._core.unreachable().items()}
         found = list_nodes(*self._tables(asker.link.name), self._core.state().nodes, problems, yielding_to_data)
@@ -204,7 +198,7 @@ class Nodes(Part):
 
     def _tables(self, peer: str = "") -> tuple[_Table, _Table, _Table]:
         """The nodes by published topic, by subscribed topic and by service: by those that a peer may have."""
-        state, gate = self._core.state(), self._shared.context.gate
+        state, gate = self._core.state(), self._bridge.context.gate
 
         def permitted(access: Access, table: _Table) -> _Table:
             if not peer or not gate.on:
@@ -220,7 +214,7 @@ class Nodes(Part):
 
     def _visible(self, peer: str) -> Collection[str]:
         """The nodes that a peer is told of: those of which it may have something."""
-        if not self._shared.context.gate.on:
+        if not self._bridge.context.gate.on:
             return self._core.state().nodes
         return {node for table in self._tables(peer) for nodes in yielding_to_data(table.values()) for node in nodes}
 
@@ -238,7 +232,7 @@ class Nodes(Part):
             RmpaError: There is no such node.
         """
         node, uri = self._own(args, self._visible(peer) if peer else None)
-        state, gate = self._core.state(), self._shared.context.gate
+        state, gate = self._core.state(), self._bridge.context.gate
         facts = describe_node(node, uri, *self._tables(peer), state.types)
         try:
             answer = await ping_node(node, uri, OWN_NODE)
@@ -259,16 +253,16 @@ class Nodes(Part):
         return await ping_node(node, uri, OWN_NODE)
 
     async def _kill(self, asker: PeerSession, args: dict[str, Any]) -> dict[str, bool]:
-        peer, gate = asker.link.name, self._shared.context.gate
+        peer, gate = asker.link.name, self._bridge.context.gate
         named = str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
         if why := gate.why_not(Access.KILL, peer, named):
             raise RmpaError(why, code="not-permitted")  # before whether there is such a node
         nodes = [node for node in self._core.state().nodes if gate.judge(Access.KILL, peer, node).allowed]
         node, uri = self._own(args, nodes)
         who = f"{peer}'s {str(args.get('by', ''))[: limits.ASK_NAME_MAX]}"
-        if not any(matches(glob, node) for glob in self._shared.context.settings.nodes.kill):
+        if not any(matches(glob, node) for glob in self._bridge.context.settings.nodes.kill):
             _log.warning("! %s may not end %s: no glob of nodes.kill fits [not-permitted]", who, node)
-            here = self._shared.context.settings.name
+            here = self._bridge.context.settings.name
             raise RmpaError(
                 f"no glob of nodes.kill in the rmpa.toml of {here} fits {node}; allow it there", code="not-permitted"
             )
@@ -287,7 +281,7 @@ class Nodes(Part):
         Raises:
             RmpaError: There is no such node.
         """
-        here = self._shared.context.settings.name
+        here = self._bridge.context.settings.name
         node = args.get("node")
         if not isinstance(node, str) or len(node) > config_limits.CROSSING_NAME_MAX or not is_global_name(node):
             raise RmpaError("the question names no node")

@@ -31,8 +31,8 @@ def wire_of(offer: Any) -> Any:
     return offer.source if isinstance(offer, TopicOffer) else offer.service
 
 
-class Effects:
-    """What a part of the bridge does for its books, at once and without calling back; ``GraphPart`` overrides it.
+class Effects(ABC):
+    """What a part of the bridge does for its books, at once and without calling back; ``GraphPart`` is it.
 
     Attributes:
         rng: Uniform numbers in [0, 1), for the jitter of a back-off.
@@ -45,9 +45,11 @@ class Effects:
     def context(self) -> BridgeContext:
         """The rules that hold now."""
 
+    @abstractmethod
     def send(self, peer: int, message: Message) -> None:
         """Send a control message to a peer, if it has a link."""
 
+    @abstractmethod
     def warn(self, kind: str, who: str, text: str) -> None:
         """Log a warning about ``who`` and count it as ``kind``; repeated ones are only counted."""
 
@@ -55,17 +57,19 @@ class Effects:
 KeyT = TypeVar("KeyT", bound="Hashable")
 LocalT = TypeVar("LocalT", bound=Local)
 OfferT = TypeVar("OfferT")
+RouteT = TypeVar("RouteT")
 
 
 @dataclass(slots=True)
-class Told(Generic[KeyT, LocalT, OfferT]):
-    """One linked peer, and what it was told over this link.
+class Told(Generic[KeyT, LocalT, OfferT, RouteT]):
+    """One linked peer, what it was told over this link, and what it has asked for.
 
     Args:
         session: The peer. Nothing that came from its run is relayed back to it.
         due: The entries to examine for this peer: they may have changed (a dict, for its order).
         offers: By key: the offer that the peer was told, and the local entry that it was made of.
         by_wire: The keys of ``offers``, by name on the wire.
+        routes: The routes that it has asked for, by its own numbers of them.
         behind: By name on the wire: keys of entries that are not told because another entry has that name.
         begun: Whether the first portion was told.
         whole: Whether the peer was told everything once.
@@ -76,13 +80,14 @@ class Told(Generic[KeyT, LocalT, OfferT]):
     due: dict[KeyT, None]
     offers: dict[KeyT, tuple[OfferT, LocalT]] = field(default_factory=dict)
     by_wire: dict[KeyT, KeyT] = field(default_factory=dict)
+    routes: dict[int, RouteT] = field(default_factory=dict)
     behind: dict[KeyT, list[KeyT]] = field(default_factory=dict)
     begun: bool = False
     whole: bool = False
     told_at: float = -math.inf
 
 
-class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
+class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
     """The entries of the local graph, which of them are offered, and what each linked peer was told of them.
 
     Keys are local names; a subclass says what an entry is, whether it may cross, and what its peers are told.
@@ -92,9 +97,10 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
 
     Attributes:
         kind: The setting that limits the offered entries: ``topics`` or ``services``.
-        warning: The counter of entries beyond that limit.
+        counter: Counts the entries beyond that limit.
         access: What a peer does with an entry.
         owner: What provides an entry, for texts.
+        message: ``(added, removed, full, more)``: the message to a peer with a portion of the entries.
         renews: Whether a changed entry is told again although its offer is the same.
         seen: What the local graph has, whether it crosses or not.
         offered: What peers may have, within the limit; ``judge_for`` decides for each of them.
@@ -103,9 +109,10 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
     """
 
     kind: ClassVar[str]
-    warning: ClassVar[str]
+    counter: ClassVar[str]
     access: ClassVar[Access]
     owner: ClassVar[str]
+    message: ClassVar[Callable[..., Message]]
     renews: ClassVar[bool] = False
 
     def __init__(self, out: Effects) -> None:
@@ -113,7 +120,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         self.seen: dict[KeyT, LocalT] = {}
         self.offered: dict[KeyT, LocalT] = {}
         self.beyond: dict[KeyT, None] = {}
-        self.peers: dict[int, Told[KeyT, LocalT, OfferT]] = {}
+        self.peers: dict[int, Told[KeyT, LocalT, OfferT, RouteT]] = {}
 
     @abstractmethod
     def judge(self, key: KeyT, local: LocalT) -> PolicyDecision:
@@ -128,10 +135,6 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         """The offer of an entry under a name on the wire."""
 
     @abstractmethod
-    def _message(self, added: tuple[OfferT, ...], removed: tuple[KeyT, ...], full: bool, more: bool) -> Message:
-        """The message to a peer with a portion of the entries."""
-
-    @abstractmethod
     def _ended(self, key: KeyT, reason: str) -> None:
         """End what uses an entry: it is not offered any more, or another one has its place."""
 
@@ -139,30 +142,29 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         """End what one peer uses of an entry: it may not have it any more, or has it under another name now."""
 
     def judge_for(
-        self, told: Told[KeyT, LocalT, OfferT], key: KeyT, local: LocalT
-    ) -> PolicyDecision | PermissionDecision:
-        """Decide whether an entry that may cross may cross to one peer."""
+        self, told: Told[KeyT, LocalT, OfferT, RouteT], key: KeyT, local: LocalT
+    ) -> tuple[PolicyDecision | PermissionDecision, str]:
+        """Decide whether an entry that may cross may cross to one peer, and by which name on the wire."""
         context, origin = self._out.context, local.origin
         name, peer = self.name_of(key), told.session.name
         if origin is not None and not may_have(told.session.instance, origin):
-            return PolicyDecision(False, f"it comes from {peer}")
+            return PolicyDecision(False, f"it comes from {peer}"), ""
         wire = context.names.of(peer).wire_name(name)
         if not is_crossing_name(wire):
-            return PolicyDecision(False, f"its name there would be {wire!r}")
+            return PolicyDecision(False, f"its name there would be {wire!r}"), wire
         decision = context.policy.judge_for(peer, name, local.type, wire)
         permission = context.gate.judge(self.access, peer, name)
-        return decision if permission.allowed or not decision.allowed else permission
+        return (decision if permission.allowed or not decision.allowed else permission), wire
 
-    def _offer(self, told: Told[KeyT, LocalT, OfferT], key: KeyT) -> OfferT | None:
+    def _offer(self, told: Told[KeyT, LocalT, OfferT, RouteT], key: KeyT) -> OfferT | None:
         """The offer of an entry for one peer; ``None`` if the peer may not know of it."""
-        local, context, name = self.offered.get(key), self._out.context, self.name_of(key)
-        if local is None:
+        if (local := self.offered.get(key)) is None:
             return None
-        decision, peer = self.judge_for(told, key, local), told.session.name
+        decision, wire = self.judge_for(told, key, local)
         if decision.allowed:
-            return self.offer_for(key, local, context.names.of(peer).wire_name(name))
+            return self.offer_for(key, local, wire)
         if isinstance(decision, PermissionDecision):
-            context.gate.refused(self.access, peer, name, decision)
+            self._out.context.gate.refused(self.access, told.session.name, self.name_of(key), decision)
         return None
 
     @property
@@ -199,7 +201,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
                 self.beyond[key] = None
                 text = f"this module has more {self.kind} than limits.{self.kind} = {self.limit}; the rest is "
                 text += "offered to no peer: raise it in rmpa.toml and `rmpa reload`, or deny some"
-                self._out.warn(self.warning, "local", text)
+                self._out.warn(self.counter, "local", text)
                 return
             self.beyond.pop(key, None)
             self.offered[key] = local
@@ -227,8 +229,12 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         self._portion(session.peer, told)
 
     def link_down(self, peer: int) -> None:
-        """Forget what a peer was told."""
+        """Forget what a peer was told; its routes have no numbers any more."""
         self.peers.pop(peer, None)
+
+    def route(self, peer: int, number: int) -> RouteT | None:
+        """The route that a linked peer has asked for by this number."""
+        return told.routes.get(number) if (told := self.peers.get(peer)) is not None else None
 
     def offer(self, peer: int, key: KeyT) -> OfferT | None:
         """The offer that a peer was told last of an entry; ``None`` if it does not know the entry."""
@@ -242,11 +248,10 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
             return None
         key = told.by_wire.get(wire, wire)  # one that it has not been told yet may be on its way
         local = self.offered.get(key)
-        # Judged anew: after new rules the peer is told a little later.
-        if local is None or not self.judge_for(told, key, local).allowed:
+        if local is None:
             return None
-        name = self._out.context.names.of(told.session.name).wire_name(self.name_of(key))
-        return key if wire_of(self.offer_for(key, local, name)) == wire else None
+        decision, name = self.judge_for(told, key, local)  # anew: after new rules the peer is told a little later
+        return key if decision.allowed and wire_of(self.offer_for(key, local, name)) == wire else None
 
     def decision(self, peer: int, key: KeyT) -> PolicyDecision | PermissionDecision | None:
         """Whether an entry may cross to a peer, and the rule that decides; ``None``: the graph has no such entry."""
@@ -256,7 +261,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         decision = self.judge(key, local)
         if not decision.allowed or told is None:
             return decision
-        special = self.judge_for(told, key, local)
+        special, _ = self.judge_for(told, key, local)
         return special if special.rule or not special.allowed else decision
 
     @property
@@ -288,7 +293,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
             self._portion(peer, told)
             yield peer
 
-    def _portion(self, peer: int, told: Told[KeyT, LocalT, OfferT]) -> None:
+    def _portion(self, peer: int, told: Told[KeyT, LocalT, OfferT, RouteT]) -> None:
         added: list[OfferT] = []
         removed: list[KeyT] = []
         for key in tuple(islice(told.due, limits.ADVERTISED_AT_ONCE)):
@@ -316,7 +321,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
             added.append(offer)
         full, more = not told.begun, not told.whole and bool(told.due)
         if added or removed or full or (not told.whole and not more):
-            self._out.send(peer, self._message(tuple(added), tuple(removed), full, more))
+            self._out.send(peer, self.message(tuple(added), tuple(removed), full, more))
         told.begun, told.whole = True, not more
 
     def _asked_in_vain(self, peer: int, wire: str) -> None:

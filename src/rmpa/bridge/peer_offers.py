@@ -18,10 +18,9 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin
     from rmpa.bridge.peer import PeerRun
-
-
-# Causes for which an entry is hidden: another type here, a permission, ``limits.nodes``.
-CONFLICT, DENIED, CROWDED = "conflict", "denied", "crowded"
+    from rmpa.bridge.policy import PolicyDecision
+    from rmpa.config.peer_rules import Access
+    from rmpa.trust.permissions import PermissionDecision
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -36,7 +35,7 @@ class Remote(Generic[KeyT]):
         type: Its message type; ``None`` for a service.
         origin: Its module and node, if the peer only relays it.
         shown: Whether it is in the local graph.
-        cause: The kind of the reason why it is not: ``CONFLICT``, ``DENIED`` or ``CROWDED``; empty: another one.
+        cause: The kind of the reason why it is not, of ``core.facts``; empty: another one.
         problem: Why its route was not opened or was closed last, or empty.
     """
 
@@ -134,9 +133,11 @@ def _is_same(entry: Remote[Any], offer: Any) -> bool:
 class ImportEffects(Effects):
     """What a part does for what peers offer, likewise."""
 
+    @abstractmethod
     def arm_timer(self) -> None:
         """Look at ``ImportBook.next_timer`` again."""
 
+    @abstractmethod
     def path_changed(self, entry: Remote[Any]) -> None:
         """Offer what is relayed with the path that it has now."""
 
@@ -149,10 +150,12 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
 
     Attributes:
         kind: The setting that limits the entries of one peer: ``topics`` or ``services``.
+        access: What the module of an entry does here.
         ways: Selects the path to each module that relays offer.
     """
 
     kind: ClassVar[str]
+    access: ClassVar[Access]
 
     def __init__(self, out: ImportEffects) -> None:
         self._out = out
@@ -167,9 +170,16 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
     def handle_timer(self, now: float) -> None:
         """Handle due timers."""
 
-    @abstractmethod
     def reload(self, now: float) -> Iterator[None]:
         """Judge by new rules, an entry with each item; what they do not change goes on untouched."""
+        yield from self._rejudge_all(now)
+        for peer, known in list(self._peers.items()):
+            while self._peers.get(peer) is known and self._admit(peer, known, now):
+                yield
+
+    @abstractmethod
+    def _rejudge_all(self, now: float) -> Iterator[None]:
+        """Judge what is known by new rules, an entry with each item."""
 
     @abstractmethod
     def _entry(self, peer: int, offer: OfferT) -> EntryT:
@@ -246,24 +256,13 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         known = self._peers.get(peer)
         if known is None:
             return
-        if offer is not None:
-            self._add(peer, known, offer, now)
-            return
-        known.refused.pop(wire, None)
-        if (entry := known.entries.get(wire)) is not None:
-            self._drop(entry, f"its server at {known.session.name} has gone")
-        self._admit(peer, known, now)
-
-    def _admit(self, peer: int, known: Heard[KeyT, EntryT, OfferT], now: float) -> bool:
-        """Take the first offer beyond the limit, if there is room now; return whether there was one."""
-        if not known.refused or len(known.entries) >= self.limit:
-            return False
-        self._add(peer, known, known.refused.popitem(last=False)[1], now)
-        return True
-
-    def _add(self, peer: int, known: Heard[KeyT, EntryT, OfferT], offer: OfferT, now: float) -> None:
-        wire = wire_of(offer)
         entry = known.entries.get(wire)
+        if offer is None:
+            known.refused.pop(wire, None)
+            if entry is not None:
+                self._drop(entry, f"its server at {known.session.name} has gone")
+            self._admit(peer, known, now)
+            return
         if entry is not None and _is_same(entry, offer):
             self._by_path(entry, cast("Any", offer).origin)
             self._came_again(entry, now)
@@ -279,6 +278,13 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         if entry.origin is not None and self.ways.count(peer, entry.origin, 1):
             self._ways_changed({entry.origin.instance})
         self._judge(entry)
+
+    def _admit(self, peer: int, known: Heard[KeyT, EntryT, OfferT], now: float) -> bool:
+        """Take the first offer beyond the limit, if there is room now; return whether there was one."""
+        if not known.refused or len(known.entries) >= self.limit:
+            return False
+        self.take_in(peer, *known.refused.popitem(last=False), now)
+        return True
 
     def _by_path(self, entry: EntryT, origin: Origin | None) -> None:
         """Note by which relays an entry comes now."""
@@ -323,6 +329,22 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         """The module that permissions are asked for, and the peer that relays its entry, or empty."""
         name = self._peers[entry.peer].session.name
         return (name, "") if entry.origin is None else (entry.origin.name, name)
+
+    def permission(self, entry: EntryT, *, report: bool = False) -> PermissionDecision:
+        """Whether its module, and a peer that relays it, may have an entry here; ``report`` counts a refusal."""
+        module, relay = self._speaker(entry)
+        gate = self._out.context.gate
+        decision = gate.judge(self.access, module, entry.name, relay=relay)
+        if report and not decision.allowed:
+            gate.refused(self.access, module, entry.name, decision, relay=relay)
+        return decision
+
+    def _kept_out(self, entry: EntryT, decision: PolicyDecision, wire: str) -> str:
+        """Why rules keep an entry out, or empty: ``decision`` by those for all, or those for its peer or module."""
+        for name in dict.fromkeys((self.peer_name(entry.peer), self._speaker(entry)[0])):
+            if decision.allowed:
+                decision = self._out.context.policy.judge_for(name, entry.name, entry.type, wire)
+        return "" if decision.allowed else decision.rule
 
     def _ways_changed(self, instances: Collection[str]) -> None:
         """Judge what relays bring of modules whose best path may be another one."""

@@ -17,7 +17,7 @@ from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.rules import CLOCK
 from rmpa.config.settings import TimeSettings
 from rmpa.config.values import PEER
-from rmpa.core.identity import NEVER_CROSSING, is_own, matches
+from rmpa.core.identity import NEVER_CROSSING, OUTSIDE_GUID, is_own, matches
 from rmpa.core.statistics import Counters
 from rmpa.mesh import limits as mesh_limits
 from rmpa.trust.permissions import PermissionDecision, prohibition, refusal
@@ -269,26 +269,8 @@ class PermissionGate:
 OPEN_GATE: Final = PermissionGate()
 
 
-# --- Relaying between two networks by a module that is in both, as the paper's proxies do ---------------------------
-#
-# Pure.
-#
-# ::
-#
-#     network 0                                      network 1
-#     a ──── /cmd ───► r (relay) ──── /cmd, origin a, path r ───► b     shown there as /rmpa/a/…
-#
-# The relay offers the proxies in its own graph, each with its *origin*. The origin lists every relay on the path,
-# which prevents loops: a source is not offered to its own module nor to a relay on its path, and a relay on its path
-# does not show it. A module that is linked to the origin, or reaches it by a better relay, hides the source.
-
-
 # A topic and the proxy that publishes it, by their local names.
 Place = tuple[str, str]
-
-
-# The GUID of all origins outside the mesh: it is well-formed, but no module can have this address.
-OUTSIDE_GUID: Final = "0.0.0.0:0#1"
 
 
 def is_outside(origin: Origin) -> bool:
@@ -303,6 +285,15 @@ def service_place(service: str, node: str) -> Place:
 
 class Relay:
     """The relaying side: which proxies of the local graph are offered to other peers, with which origin.
+
+    A module that is in two networks may pass on what one offers to the other, as the paper's proxies do::
+
+        network 0                                      network 1
+        a ──── /cmd ───► r (relay) ──── /cmd, origin a, path r ───► b     shown there as /rmpa/a/…
+
+    The origin lists every relay on the path, which prevents loops: a source is not offered to its own module nor to a
+    relay on its path, and a relay on its path does not show it. A module that is linked to the origin, or reaches it
+    by a better relay, hides the source.
 
     Args:
         enabled: Whether this module relays at all.

@@ -27,10 +27,7 @@ if TYPE_CHECKING:
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.publication import Publication
 
-
-# --- Names the proxies ----------------------------------------------------------------------------------------------
-#
-# One namespace for each module that has nodes in the local graph.
+_log = logging.getLogger(__name__)
 
 
 class ProxyNamespaces:
@@ -87,12 +84,6 @@ class ProxyNamespaces:
         """The namespaces that other modules have."""
         linked = {prefix for other, prefix in self._linked.values() if other != instance}
         return linked | {prefix for other, prefix in self._relayed.items() if other != instance}
-
-
-# --- Makes the proxy nodes; where possible, all of them share one pair of listening sockets -------------------------
-
-
-_log = logging.getLogger(__name__)
 
 
 class ProxyNodes:
@@ -178,9 +169,6 @@ class ProxyNodes:
         """
         node = self._made.get(name)
         return node.publication(topic) if node is not None and node.uri == uri else None
-
-
-# --- The nodes in the local graph that stand for the nodes of one module, whichever peers bring it -----------------
 
 
 # What a topic or service does at its proxy: ``ready(proxy)`` registers it there, ``left(proxy)`` removes it.

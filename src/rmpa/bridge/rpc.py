@@ -25,7 +25,14 @@ from rmpa.bridge import limits
 from rmpa.bridge.messages import Notification, Request, Response, decode, encode, with_text, without_text
 from rmpa.bridge.services.bodies import BodyReceiver, BodySender, Budget
 from rmpa.bridge.sessions import Part
-from rmpa.core.errors import LimitExceeded, PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.core.errors import (
+    UNKNOWN_QUESTION,
+    LimitExceeded,
+    PeerRefused,
+    RemoteProtocolError,
+    RmpaError,
+    UnreachableError,
+)
 from rmpa.core.limits import UINT32_MAX
 from rmpa.runtime.tasks import OwnedTasks, end_tasks
 
@@ -37,8 +44,6 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-# In the response of an agent of an earlier release.
-UNKNOWN_QUESTION: Final = "does not know the question"
 # The route of large messages; those of topics and services have numbers above it.
 _ROUTE: Final = 0
 _UNTIL: Final = 8

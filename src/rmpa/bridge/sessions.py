@@ -160,7 +160,7 @@ class Part:
         return False
 
     def reload(self) -> None:
-        """Judge again: the settings were read again, and ``Shared.context`` is another one."""
+        """Judge again: the settings were read again, and ``Bridge.context`` is another one."""
 
     def reconcile(self) -> None:
         """Compare the actual state with the planned one, and mend it; called each ``limits.RECONCILE_INTERVAL``."""
@@ -268,8 +268,7 @@ class PeerSessions:
         """
         old = next((one.link for one in self.linked() if one.link.identity.is_same_run(link.identity)), None)
         if old is not None:
-            old.silent = True
-            self.link_down(old)
+            self.link_down(old, silent=True)
             old.close(f"{link.name} has another address")
         session = self._waiting_for(link)
         if session is not None:
@@ -301,13 +300,18 @@ class PeerSessions:
                 self._end(session)
         return None
 
-    def link_down(self, link: PeerLink) -> None:
-        """Detach a link that is gone; after silence its session waits for ``mesh.limits.SILENT_GRACE``."""
+    def link_down(self, link: PeerLink, *, silent: bool = False) -> None:
+        """Detach a link that is gone; after silence its session waits for ``mesh.limits.SILENT_GRACE``.
+
+        Args:
+            link: The link.
+            silent: Whether its peer is there, although the link is not closed yet.
+        """
         session = self._by_link.pop(link, None)
         if session is None:
             return
         session.away_since = asyncio.get_running_loop().time()
-        session.state, session.silent = PeerState.SILENT, link.silent
+        session.state, session.silent = PeerState.SILENT, silent or link.silent
         call_each(self._parts, lambda part: part.link_down(session))
         session.link.routes.clear()
         if session.silent:

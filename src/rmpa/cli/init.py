@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from rmpa.config.schema import Key
-    from rmpa.discovery.network import NetworkInterface
+    from rmpa.discovery.network import Interface
     from rmpa.observe.snapshot import AgentInfo
 
 _HEAD: Final = "# Written by `rmpa init`: the comment above each active line says what was found.\n"
@@ -200,7 +200,7 @@ def _core(agents: Sequence[AgentInfo], name: str, port: int) -> Iterator[Finding
         yield Finding(("core", "master"), "the master answers there", f"http://localhost:{port}/")
 
 
-def _interfaces(there: Sequence[NetworkInterface]) -> Iterator[Finding]:
+def _interfaces(there: Sequence[Interface]) -> Iterator[Finding]:
     from rmpa.discovery.network import CONTAINERS
 
     outer = [one for one in there if not one.loopback]

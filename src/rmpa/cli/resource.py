@@ -10,14 +10,13 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.bridge.policy import OUTSIDE_GUID
 from rmpa.cli.completion import graph_of, of_peer
 from rmpa.cli.graph import GraphName, read_graph, read_name, run_stream, suggestion, with_node
 from rmpa.cli.options import Options, argument, count_option, flag, graph_verb
 from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, warn
 from rmpa.config.rules import ROS2
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
-from rmpa.core.identity import proxied_node, proxied_peer
+from rmpa.core.identity import OUTSIDE_GUID, proxied_node, proxied_peer
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE, TOPIC, Descriptor
 from rmpa.ros.types.messages import MessageType

@@ -108,6 +108,10 @@ class LimitExceeded(RemoteProtocolError):  # noqa: N818 - the name says what hap
         return f"{self.what} of {self.claimed} bytes exceeds the limit of {self.limit}"
 
 
+# In the answer of an agent that does not know a question.
+UNKNOWN_QUESTION: Final = "does not know the question"
+
+
 @dataclass(eq=False)
 class PeerRefused(RmpaError):  # noqa: N818 - an event's name
     """A peer answered, and the answer was no."""
@@ -116,6 +120,11 @@ class PeerRefused(RmpaError):  # noqa: N818 - an event's name
     reason: str
     remedy: str = ""
     code: str = field(default="refused", kw_only=True)
+
+    @property
+    def unknown(self) -> bool:
+        """Whether the peer's agent does not know the question: it is of an earlier release."""
+        return UNKNOWN_QUESTION in self.reason
 
     def __str__(self) -> str:
         """``<peer> refused: reason; remedy``."""

@@ -10,6 +10,9 @@ import msgspec
 
 from rmpa.core.statistics import SampleSpread
 
+# Why what a peer offers is hidden (``Arrival.cause``): another type here, a permission, ``limits.nodes``.
+CONFLICT, DENIED, CROWDED = "conflict", "denied", "crowded"
+
 
 class FilesInfo(msgspec.Struct, kw_only=True, frozen=True):
     """The file descriptors of the agent's process.

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
 
+# The GUID of what a gateway reaches outside the mesh: it is well-formed, but no module can have this address.
+OUTSIDE_GUID: Final = "0.0.0.0:0#1"
+
+
 # GUIDs. They identify a peer, and decide which of two peers dials (paper, section 4.2).
 
 

@@ -11,7 +11,7 @@ import random
 import re
 import socket
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from ipaddress import IPv4Address, IPv4Interface
 from typing import TYPE_CHECKING, Final
@@ -58,24 +58,31 @@ class Interface:
 
     Args:
         name: As in ``ip link``.
+        networks: Its IPv4 addresses with their networks, in the kernel's order.
         index: The kernel's number of it.
-        addresses: Its IPv4 addresses, in the kernel's order.
         up: Whether it is up and has a carrier.
-        multicast: Whether it can carry multicast.
+        multicast: Whether its flags say that it can carry multicast.
         loopback: Whether it never leaves this machine.
+        used: Whether an agent started here would use it; see ``read_interfaces``.
     """
 
     name: str
-    index: int
-    addresses: tuple[IPv4Address, ...]
-    up: bool
-    multicast: bool
-    loopback: bool
+    networks: tuple[IPv4Interface, ...] = ()
+    index: int = 0
+    up: bool = True
+    multicast: bool = True
+    loopback: bool = False
+    used: bool = True
+
+    @property
+    def addresses(self) -> tuple[IPv4Address, ...]:
+        """Its IPv4 addresses."""
+        return tuple(dict.fromkeys(network.ip for network in self.networks))
 
     @property
     def usable(self) -> bool:
         """Whether beacons can be sent there; loopback carries multicast though its flags do not say so."""
-        return self.up and bool(self.addresses) and (self.multicast or self.loopback)
+        return self.up and bool(self.networks) and (self.multicast or self.loopback)
 
     def __str__(self) -> str:
         """``eth0 (10.0.0.1)``."""
@@ -91,12 +98,14 @@ def list_interfaces() -> tuple[Interface, ...]:
         if name not in stats:
             continue  # gone between the two looks
         flags = stats[name].flags.split(",")
-        ipv4 = [IPv4Address(a.address) for a in addresses.get(name, ()) if a.family == socket.AF_INET]
-        found.append(
-            Interface(
-                name, index, tuple(dict.fromkeys(ipv4)), stats[name].isup, "multicast" in flags, "loopback" in flags
-            )
+        ipv4 = (
+            IPv4Interface(f"{each.address}/{each.netmask or '255.255.255.255'}")
+            for each in addresses.get(name, ())
+            if each.family == socket.AF_INET
         )
+        networks, up = tuple(dict.fromkeys(ipv4)), stats[name].isup
+        one = Interface(name, networks, index, up, multicast="multicast" in flags, loopback="loopback" in flags)
+        found.append(one)
     return tuple(found)
 
 
@@ -105,48 +114,11 @@ def choose(interfaces: Iterable[Interface], wanted: tuple[str, ...] = ()) -> tup
     return tuple(i for i in interfaces if i.usable and (not wanted or i.name in wanted))
 
 
-@dataclass(frozen=True, slots=True)
-class NetworkInterface:
-    """One network interface.
-
-    Args:
-        name: As in ``ip link``.
-        networks: Its IPv4 addresses with their networks.
-        up: Whether it is up and has a carrier.
-        multicast: Whether its flags say so.
-        loopback: Whether it never leaves this machine.
-        used: Whether an agent started here would use it.
-    """
-
-    name: str
-    networks: tuple[IPv4Interface, ...] = ()
-    up: bool = True
-    multicast: bool = True
-    loopback: bool = False
-    used: bool = True
-
-
-def read_interfaces(wanted: tuple[str, ...]) -> tuple[NetworkInterface, ...]:
+def read_interfaces(wanted: tuple[str, ...]) -> tuple[Interface, ...]:
     """All interfaces; ``wanted`` are the names that the settings give, none for all that can be used."""
     there = list_interfaces()
-    used = {interface.name for interface in choose(there, wanted)}
-    masks = {
-        (name, address.address): address.netmask or "255.255.255.255"
-        for name, addresses in psutil.net_if_addrs().items()
-        for address in addresses
-        if address.family == socket.AF_INET
-    }
-    return tuple(
-        NetworkInterface(
-            one.name,
-            tuple(IPv4Interface(f"{a}/{masks.get((one.name, str(a)), '255.255.255.255')}") for a in one.addresses),
-            one.up,
-            one.multicast,
-            one.loopback,
-            one.name in used,
-        )
-        for one in there
-    )
+    used = choose(there, wanted)
+    return tuple(replace(one, used=one in used) for one in there)
 
 
 def unknown_names(interfaces: Iterable[Interface], wanted: tuple[str, ...]) -> str | None:

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import Origin, Source, is_crossing_name, is_crossing_type
-from rmpa.bridge.policy import OUTSIDE_GUID, is_outside, service_place
+from rmpa.bridge.policy import is_outside, service_place
 from rmpa.bridge.proxies import PeerProxies
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.core.identity import peer_name_problem
+from rmpa.core.identity import OUTSIDE_GUID, peer_name_problem
 from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.service_server import ServiceEndpoint

@@ -18,7 +18,7 @@ from rmpa.bridge.messages import is_crossing_name, is_crossing_type
 from rmpa.bridge.policy import is_outside, service_place
 from rmpa.bridge.services.bodies import LocalService, ServicePool
 from rmpa.bridge.sessions import Part
-from rmpa.bridge.topics.local import LocalSources
+from rmpa.bridge.topics.local import own_sources, relayed_sources
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.core.log import logged_failure
@@ -65,7 +65,6 @@ class MeshSources:
         self._agent = agent
         self._name = name
         self._relay = agent.bridge.relay
-        self._local = LocalSources(agent.core, agent.bridge.relay)
         self.known: dict[SourceKey, MeshSource] = {}
         self.watchers: list[Callable[[MeshSource, bool], None]] = []
         self._by_name: dict[tuple[SourceKind, str], dict[SourceKey, MeshSource]] = {}
@@ -88,7 +87,6 @@ class MeshSources:
 
     def changed(self, change: GraphChange) -> None:
         """Have a name examined that was registered or unregistered."""
-        self._local.changed(change)
         if change.kind in _KINDS:
             self._look((_KINDS[change.kind], change.name))
 
@@ -129,10 +127,10 @@ class MeshSources:
                 on_change(source, there)
 
     def _topic(self, topic: str) -> Iterator[MeshSource]:
-        for node, local in self._local.of(topic).items():
+        for node, local in own_sources(self._agent.core, topic).items():
             if self._may_cross(topic, local.type, node):
                 yield self._own(SourceKind.TOPIC, node, topic, local.type)
-        for proxy, local in self._local.relayed(topic).items():
+        for proxy, local in relayed_sources(self._agent.core, self._relay, topic).items():
             shown, origin = self._relay.source((topic, proxy)), local.origin
             if origin is None or shown is None or is_outside(origin):
                 continue

@@ -25,7 +25,7 @@ from rmpa.core.outbox import FIRST, LAST
 from rmpa.core.statistics import Counters
 from rmpa.mesh import frames, limits
 from rmpa.mesh.frames import PACE_NEEDED, WHOLE, Frame, FrameKind, Hello, Lane, Refuse, judge_welcome
-from rmpa.mesh.keepalive import Keepalive, RemoteClock
+from rmpa.mesh.keepalive import Keepalive, Pace, RemoteClock
 from rmpa.runtime import limits as runtime_limits
 from rmpa.trust.permissions import TrustReason
 
@@ -94,6 +94,7 @@ class ConnectionProtocol:
         secured: Whether the connection is inside TLS.
         label: The remote side's name, until it is known.
         counters: Counts data frames of routes that are not open, as ``route.unknown``.
+        pace: That of all links of this agent; ``None``: one of its own.
 
     Attributes:
         name: The name of the remote side, or its address while that is not known.
@@ -121,6 +122,7 @@ class ConnectionProtocol:
         secured: bool = False,
         label: str = "?",
         counters: Counters | None = None,
+        pace: Pace | None = None,
     ) -> None:
         self.ours = ours
         self.dialled = dialled
@@ -133,9 +135,8 @@ class ConnectionProtocol:
         self.malformed = False
         self.routes: Mapping[int, DataHandler] = {}
         self.clock = RemoteClock()
-        phase = int.from_bytes(ours.instance[:2], "big") / 65536 * limits.IDLE_KEEPALIVE_INTERVAL
         lease = limits.BULK_LEASE if lane == Lane.BULK else limits.EXPRESS_LEASE
-        self.keepalive = Keepalive(lease, now, acceptor=not dialled, phase=phase)
+        self.keepalive = Keepalive(lease, now, pace or Pace.of(ours), acceptor=not dialled)
         self.doubted = self.moves = False
         self.output = bytearray()
         self._proof: int | None = None

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import Final
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Self
 
 from rmpa.mesh import limits
+
+if TYPE_CHECKING:
+    from rmpa.core.identity import Identity
 
 # Pings that follow each other when a link's rest ends: the best of them gives the latency of the first messages an
 # exact clock.
@@ -35,6 +39,25 @@ def rest_lease(peers: int) -> float:
     return max(limits.IDLE_LEASE, 3 * interval + 1)
 
 
+@dataclass(slots=True)
+class Pace:
+    """What the keepalives of all links of an agent have in common.
+
+    Args:
+        phase: When they fall on resting links: at this time plus multiples of ``limits.IDLE_KEEPALIVE_INTERVAL`` (of
+            ``limits.IDLE_KEEPALIVE_GRID`` where they come more rarely), so that the agent wakes once for all of them.
+        rest_lease: What the agent promises on links at rest; see the function ``rest_lease``.
+    """
+
+    phase: float
+    rest_lease: float = limits.IDLE_LEASE
+
+    @classmethod
+    def of(cls, identity: Identity) -> Self:
+        """That of an agent: agents have different phases."""
+        return cls(int.from_bytes(identity.instance[:2], "big") / 65536 * limits.IDLE_KEEPALIVE_INTERVAL)
+
+
 class Keepalive:
     """Keepalive and lease of one connection; pure, all times in monotonic seconds.
 
@@ -50,15 +73,12 @@ class Keepalive:
     Args:
         lease: Seconds that this side promises while the link is in use.
         now: When the connection was established.
-        phase: When the keepalives of all resting links of this agent fall: at this time plus multiples of
-            ``limits.IDLE_KEEPALIVE_INTERVAL`` (of ``limits.IDLE_KEEPALIVE_GRID`` where they come more rarely), so
-            that the agent wakes once for all of them.
+        pace: That of this agent's links.
         acceptor: Whether the remote side dialled. The acceptor pings a little later than the dialler, so that on an
             idle connection it sends only pongs.
 
     Attributes:
         usual: The promise of this side while the link is in use, and the one that holds now.
-        rest_lease: What this side promises at rest; see the function ``rest_lease``.
         remote_lease: Seconds of silence that the remote side promised last.
         needed: Whether this side, and the remote one, needs the short lease.
         heard: When bytes were last received, and when the handshake ended.
@@ -66,11 +86,10 @@ class Keepalive:
         excused: Seconds of the present silence during which this process did not run.
     """
 
-    def __init__(self, lease: float, now: float, *, acceptor: bool, phase: float) -> None:
+    def __init__(self, lease: float, now: float, pace: Pace, *, acceptor: bool) -> None:
         self._acceptor = acceptor
-        self._phase = phase
+        self.pace = pace
         self.usual = self.lease = lease
-        self.rest_lease = limits.IDLE_LEASE
         self.remote_lease = limits.EXPRESS_LEASE
         self.needed = self.remote_needs = True
         self.heard = self.up_at = now
@@ -97,8 +116,8 @@ class Keepalive:
             self.lease = self.usual
             if before > self.usual:
                 self._burst = WAKE_PINGS  # the estimate of the remote clock is as old as the rest
-        elif not self.rests or abs(self.rest_lease - before) >= before / 10:
-            self.lease = self.rest_lease
+        elif not self.rests or abs(self.pace.rest_lease - before) >= before / 10:
+            self.lease = self.pace.rest_lease
         return self.lease != before
 
     def wake(self, now: float, within: float) -> None:
@@ -156,8 +175,8 @@ class Keepalive:
         """
         rare = self.lease > limits.IDLE_LEASE
         grid = limits.IDLE_KEEPALIVE_GRID if rare else limits.IDLE_KEEPALIVE_INTERVAL
-        turns = (due - self._phase) / grid
-        return self._phase + grid * (math.ceil(turns) if self._acceptor else math.floor(turns + 1e-9))
+        turns = (due - self.pace.phase) / grid
+        return self.pace.phase + grid * (math.ceil(turns) if self._acceptor else math.floor(turns + 1e-9))
 
     @property
     def lease_end(self) -> float:

@@ -10,7 +10,7 @@ import msgspec
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge import nodes as node_requests
-from rmpa.bridge.params import rules as transfer
+from rmpa.bridge.params import transfer
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.facts import ContractTerm, FollowedInfo

@@ -10,7 +10,6 @@ import msgspec
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.rpc import UNKNOWN_QUESTION
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
 
@@ -111,7 +110,7 @@ class SiteRequests:
             try:
                 value = await self._bridge.rpc.request(session, what, args, bridge_limits.PARAM_ASK_TIMEOUT)
             except RmpaError as error:
-                if not (isinstance(error, PeerRefused) and UNKNOWN_QUESTION in error.reason):
+                if not (isinstance(error, PeerRefused) and error.unknown):
                     problem = problem or error
             else:
                 self._liked[site] = str(session.link.guid)

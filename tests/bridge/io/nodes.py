@@ -101,7 +101,7 @@ class Core:
         found: Mapping[str, str] = self.state().subscribers.get(topic, {})
         return found
 
-    def type_of(self, topic: str) -> str:
+    def type_of(self, topic: str, _node: str = "") -> str:
         """As RosCore's."""
         return self._types.get(topic, "*")
 

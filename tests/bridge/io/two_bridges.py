@@ -296,7 +296,7 @@ class World:
         for side in self.sides:
             bridge = side.bridge
             assert not bridge.topics.exports.flows
-            assert not any(bridge.topics.exports._routes.values())
+            assert not any(told.routes for told in bridge.topics.exports.peers.values())
             assert not bridge.topics.joins._served
             assert not bridge.topics.outbound._parked
             assert not bridge.topics.imports.flowing

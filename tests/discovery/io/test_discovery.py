@@ -312,7 +312,7 @@ async def test_an_interface_that_refuses_is_said_once(
     agents: list[Agent], settings: Settings, caplog: pytest.LogCaptureFixture
 ) -> None:
     (loopback,) = (i for i in list_interfaces() if i.name == "lo")
-    gone = Interface("gone0", 4242, loopback.addresses, up=True, multicast=True, loopback=False)
+    gone = Interface("gone0", loopback.networks, 4242)
     both = Settings(multicast=settings.multicast)
     base, pc = Agent("base", both, look=lambda: (loopback, gone)), Agent("pc", settings)
     await start(agents, base, pc)
@@ -386,7 +386,7 @@ async def test_an_identity_that_no_longer_fits_is_announced_no_more(agents: list
     await start(agents, base)
     await until(lambda: not base.discovery._membership._burst)
     for times in (1, 2):
-        now_there.append(Interface(f"new{times}", 4242 + times, (), up=False, multicast=False, loopback=False))
+        now_there.append(Interface(f"new{times}", index=4242 + times, up=False))
         base.discovery._look_again()
         assert len(asked) == times
         assert bool(base.discovery._membership._burst) == (times == 2)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ipaddress import IPv4Address
+from ipaddress import IPv4Address, IPv4Interface
 
 import pytest
 
@@ -13,8 +13,8 @@ from rmpa.discovery.network import Interface, choose, further_addresses, pick_ad
 def interface(name: str, *addresses: str, up: bool = True, multicast: bool = True) -> Interface:
     loopback = name == "lo"
     carries = multicast and not loopback
-    ipv4 = tuple(map(IPv4Address, addresses))
-    return Interface(name, len(name), ipv4, up=up, multicast=carries, loopback=loopback)
+    ipv4 = tuple(map(IPv4Interface, addresses))
+    return Interface(name, ipv4, len(name), up=up, multicast=carries, loopback=loopback)
 
 
 LO = interface("lo", "127.0.0.1")

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.agent.agent import Agent
-from rmpa.bridge.policy import OUTSIDE_GUID, is_outside
+from rmpa.bridge.policy import is_outside
 from rmpa.core.errors import PeerRefused, UnreachableError
+from rmpa.core.identity import OUTSIDE_GUID
 from rmpa.gateway.foreign import foreign_origin
 from rmpa.gateway.own_graph import AgentGraph
 from rmpa.gateway.rules import ForeignSource, MeshSource, SourceKind

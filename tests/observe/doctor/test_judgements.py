@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from rmpa.core.facts import FilesInfo, UnreachableInfo
-from rmpa.discovery.network import NetworkInterface
+from rmpa.discovery.network import Interface
 from rmpa.observe.check import FAIL, WARN, Check
 from rmpa.observe.doctor.checks import is_beyond_loopback, judge_agents, judge_exposed_nodes, judge_membership
 from rmpa.observe.doctor.machine import (
@@ -37,9 +37,9 @@ from tests.observe.samples import SNAPSHOT
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-LO = NetworkInterface("lo", (IPv4Interface("127.0.0.1/8"),), loopback=True)
-WLAN = NetworkInterface("wlan0", (IPv4Interface("192.168.1.5/24"),))
-ETH = NetworkInterface("eth0", (IPv4Interface("10.0.0.5/24"),))
+LO = Interface("lo", (IPv4Interface("127.0.0.1/8"),), loopback=True)
+WLAN = Interface("wlan0", (IPv4Interface("192.168.1.5/24"),))
+ETH = Interface("eth0", (IPv4Interface("10.0.0.5/24"),))
 STRICT: Final = {"all": 1, "wlan0": 0, "eth0": 0}
 GOOD: Final[dict[str, Any]] = {"stepped": 0.00001, "synchronised": True, "error": 0.004, "year": 2026}
 WALL: Final = 1_790_000_000
@@ -51,13 +51,13 @@ ROUTES: Final = {f"10.0.{n >> 8}.{n & 255} (m{n})": "" for n in range(999)} | {"
 
 
 def interfaces(
-    *more: NetworkInterface, wanted: tuple[str, ...] = (), container: bool = False
+    *more: Interface, wanted: tuple[str, ...] = (), container: bool = False
 ) -> Callable[[], Iterable[Check]]:
     return partial(judge_interfaces, (LO, *more), wanted, container=container)
 
 
-def card(name: str, network: str) -> NetworkInterface:
-    return NetworkInterface(name, (IPv4Interface(network),))
+def card(name: str, network: str) -> Interface:
+    return Interface(name, (IPv4Interface(network),))
 
 
 def one(judge: Callable[..., Check], *args: object, **more: object) -> Callable[[], Iterable[Check]]:
@@ -77,9 +77,9 @@ def files(problem: str = "", *, near: bool = False) -> Callable[[], Iterable[Che
 UNIT: Final = {"LoadState": "loaded", "ActiveState": "active", "UnitFileState": "enabled", "Result": "success"}
 CASES: dict[str, Callable[[], Iterable[Check]]] = {
     "two ordinary interfaces": interfaces(WLAN, ETH),
-    "an interface that is down": interfaces(NetworkInterface("eth0", up=False, used=False)),
+    "an interface that is down": interfaces(Interface("eth0", up=False, used=False)),
     "no network at all": interfaces(),
-    "settings that keep to loopback": interfaces(NetworkInterface("eth0", ETH.networks, used=False), wanted=("lo",)),
+    "settings that keep to loopback": interfaces(Interface("eth0", ETH.networks, used=False), wanted=("lo",)),
     "an interface that is not there": interfaces(WLAN, wanted=("wlan0", "eth7")),
     **{f"a tunnel {name}": interfaces(card(name, "10.8.0.2/32")) for name in ("tun0", "wg0", "tailscale0", "ztabc")},
     "interfaces of containers": interfaces(card("docker0", "172.17.0.1/16")),

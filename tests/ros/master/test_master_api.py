@@ -87,6 +87,17 @@ def test_a_new_type_is_a_change(master: Master) -> None:
     assert master.changes == [GraphChange(RegistrationKind.PUBLISHER, True, "/t", "/p", A, "std_msgs/Int8")]
 
 
+def test_each_publisher_keeps_the_type_that_it_registered(master: Master) -> None:
+    master("registerPublisher", "/p", "/t", STRING, A)
+    master("registerPublisher", "/q", "/t", "std_msgs/Int8", C)
+    master("registerPublisher", "/any", "/t", "*", B)
+    type_of = master.api.registrations.type_of
+    assert [type_of("/t", node) for node in ("/p", "/q", "/any")] == [STRING, "std_msgs/Int8", "std_msgs/Int8"]
+    master("unregisterPublisher", "/p", "/t", A)
+    assert type_of("/t", "/p") == type_of("/t") == "std_msgs/Int8"
+    assert type_of("/unknown") == "*"
+
+
 def test_a_withdrawn_publisher_leaves_the_list(master: Master) -> None:
     master("registerSubscriber", "/s", "/t", "*", B)
     master("registerPublisher", "/p", "/t", STRING, A)

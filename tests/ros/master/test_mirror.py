@@ -125,6 +125,11 @@ def test_later_type_is_a_change_but_publishers_keep_theirs(pair: Pair) -> None:
     pair.look()
     changes = pair.graph.take()[1]
     assert [(change.node, change.type) for change in changes] == [("/other", "std_msgs/Int8")]
+    assert [pair.graph.type_of("/t", node) for node in ("/p", "/other", "")] == [
+        STRING,
+        "std_msgs/Int8",
+        "std_msgs/Int8",
+    ]
 
 
 def test_other_type_of_a_topic_is_a_change(pair: Pair) -> None:

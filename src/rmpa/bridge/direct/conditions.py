@@ -19,9 +19,9 @@ from rmpa.core.contract import Contract, Transport, needs_agents
 from rmpa.core.errors import RemoteProtocolError
 
 if TYPE_CHECKING:
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
 
 
 class Condition(StrEnum):
@@ -120,13 +120,13 @@ def unmet_by_contract(contract: Contract, where: str) -> Unmet | None:
 
 
 def unmet_by_rules(
-    contract: Contract, shared: Shared, peer: PeerSession, where: str, owner: str, other: str, origin: Origin | None
+    contract: Contract, bridge: Bridge, peer: PeerSession, where: str, owner: str, other: str, origin: Origin | None
 ) -> Unmet | None:
     """The condition that is not met by what both sides of topics and services judge alike, if any.
 
     Args:
         contract: That of the side that judges; of a service the transport alone.
-        shared: Whether the mesh is secured, and whether plain connections are let all the same.
+        bridge: Whether the mesh is secured, and whether plain connections are let all the same.
         peer: The peer: on one machine a connection does not leave it.
         where: Whose rules these are, as text.
         owner: The owner's module, as text.
@@ -135,15 +135,12 @@ def unmet_by_rules(
     """
     if (unmet := unmet_by_contract(contract, where)) is not None:
         return unmet
-    if not (shared.context.gate.plain or peer.same_machine):
+    if not (bridge.context.gate.plain or peer.same_machine):
         text = f"the mesh is secured, and nothing would protect the connection; trust.direct is false in {where}"
         return Unmet(Condition.TRUST, text)
     if origin is not None:
         return Unmet(Condition.OWN_SOURCE, f"it is {origin.name}'s, and comes by a relay")
     return Unmet(Condition.NAME, f"it is {other} in {owner}") if other else None
-
-
-# --- messages ------------------------------------------------------------------------------------------------------
 
 
 class Want(NamedTuple):
@@ -225,9 +222,6 @@ def reply_of(found: Grant | Unmet) -> dict[str, object]:
     if isinstance(found, Grant):
         return {"port": found.port, "probe": found.probe}
     return {"why": found.condition.value, "text": found.text}
-
-
-# --- what was lost -------------------------------------------------------------------------------------------------
 
 
 # When a subscriber was without its direct path, by the peer's name and what is reached: how often, when the last time

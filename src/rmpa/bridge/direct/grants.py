@@ -46,9 +46,9 @@ from rmpa.runtime.tasks import end_tasks, start_task
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.services.books import ServiceExports
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.runtime.kernel_tcp import TcpSocket
@@ -64,7 +64,7 @@ class Grants(ABC):
     """What peers asked for, and what they were answered. Subclasses know the conditions, and where nodes listen.
 
     Args:
-        shared: The core, the peers and the rules.
+        bridge: The core, the peers and the rules.
 
     Attributes:
         kind: The middle of the names of the messages.
@@ -75,8 +75,8 @@ class Grants(ABC):
 
     kind = ""
 
-    def __init__(self, shared: Shared) -> None:
-        self._shared = shared
+    def __init__(self, bridge: Bridge) -> None:
+        self._bridge = bridge
         self._asked: dict[int, dict[Want, _Entry]] = {}
         self._by_node: dict[tuple[str, str], list[tuple[int, str, Grant]]] | None = None
 
@@ -130,7 +130,7 @@ class Grants(ABC):
                 return reply_of(Unmet(Condition.AGENT, "it was given up meanwhile"))  # released, or asked again
         self._set(session, asked, found)
         if isinstance(found, Grant):
-            self._shared.counters.add("direct.granted")
+            self._bridge.counters.add("direct.granted")
         _log.debug("< %s: %s: %s", session.link.name, asked.want, found)
         return reply_of(found)
 
@@ -152,7 +152,7 @@ class Grants(ABC):
 
     def _is_hidden(self, found: Grant | Unmet) -> bool:
         """Whether a peer must not learn of changes: it may not have this topic or service."""
-        return self._shared.context.gate.on and isinstance(found, Unmet) and found.condition is Condition.OFFERED
+        return self._bridge.context.gate.on and isinstance(found, Unmet) and found.condition is Condition.OFFERED
 
     def _set(self, session: PeerSession, asked: DirectAsk, found: Grant | Unmet | None) -> None:
         """Note what a peer is answered; ``None``: it does not ask any more."""
@@ -182,7 +182,7 @@ class Grants(ABC):
 
     def _tell(self, session: PeerSession, want: Want) -> None:
         if session.linked:
-            self._shared.rpc.notify(session, f"direct.{self.kind}_again", want._asdict())
+            self._bridge.rpc.notify(session, f"direct.{self.kind}_again", want._asdict())
 
     def _released(self, session: PeerSession, args: dict[str, Any]) -> None:
         self._set(session, read_ask(args), None)
@@ -201,7 +201,7 @@ class Grants(ABC):
                 continue
             unmet = self._judge(session, asked)
             if unmet is not None:
-                if self._shared.context.gate.on and isinstance(before, Grant):
+                if self._bridge.context.gate.on and isinstance(before, Grant):
                     self._end(session, before.port)
                 if granted or self._is_hidden(unmet):
                     self._set(session, asked, unmet)
@@ -222,7 +222,7 @@ class Grants(ABC):
         if session.link.crashed:
             return
         shared = any(
-            other.address == session.address for other in self._shared.sessions.linked() if other is not session
+            other.address == session.address for other in self._bridge.sessions.linked() if other is not session
         )
         if session.silent and not shared:
             for port in {grant.port for peer, _, grant in self if peer == session.peer}:
@@ -237,7 +237,7 @@ class Grants(ABC):
     def _end(self, session: PeerSession, port: int) -> None:
         if session.same_machine:
             return
-        self._shared.counters.add("direct.ended")
+        self._bridge.counters.add("direct.ended")
         if problem := end_all(connections(local_port=port, remote=(session.address, None))):
             text = "! %s: connections of local nodes to it may hang: they cannot be ended (%s)"
             _log.info(text, session.link.name, problem)
@@ -319,7 +319,7 @@ class TopicGrants(Grants):
     """The direct connections of peers' subscribers to local publishers.
 
     Args:
-        shared: As of ``Grants``.
+        bridge: As of ``Grants``.
         exports: Knows what is offered to each peer.
 
     Attributes:
@@ -328,9 +328,9 @@ class TopicGrants(Grants):
 
     kind = "topic"
 
-    def __init__(self, shared: Shared, exports: Exports) -> None:
-        super().__init__(shared)
-        rpc = shared.rpc
+    def __init__(self, bridge: Bridge, exports: Exports) -> None:
+        super().__init__(bridge)
+        rpc = bridge.rpc
         rpc.on_request("direct.topic", self._ask, Needs((Access.SUBSCRIBE,), "the topic: only what is offered"))
         rpc.on_notification("direct.topic_release", self._released, _RELEASED)
         self._exports = exports
@@ -369,10 +369,10 @@ class TopicGrants(Grants):
             session.proxies.release(want.user, held)
 
     def _register(self, topic: str, proxy: SlaveNode) -> None:
-        self._shared.core.call("registerSubscriber", proxy.name, topic, ANY, proxy.uri)
+        self._bridge.core.call("registerSubscriber", proxy.name, topic, ANY, proxy.uri)
 
     def _leave(self, topic: str, proxy: SlaveNode) -> None:
-        self._shared.core.call("unregisterSubscriber", proxy.name, topic, proxy.uri)
+        self._bridge.core.call("unregisterSubscriber", proxy.name, topic, proxy.uri)
 
     def reconcile(self, subscribers: Mapping[str, Mapping[str, str]]) -> None:
         """Register missing subscribers again: the core has been restarted."""
@@ -383,7 +383,7 @@ class TopicGrants(Grants):
 
     def _uri(self, want: Want) -> str:
         """The slave API of a publisher now; the exports learn a new one a little later."""
-        return self._shared.core.publishers(want.name).get(want.node, "")
+        return self._bridge.core.publishers(want.name).get(want.node, "")
 
     async def _find(self, session: PeerSession, want: Want) -> Grant | Unmet:
         uri = self._uri(want)
@@ -393,12 +393,12 @@ class TopicGrants(Grants):
         if isinstance(port, Unmet):
             return port
         service = f"{want.node}/get_loggers"  # rospy and roscpp nodes have it
-        known = want.node in self._shared.core.state().services.get(service, ())
+        known = want.node in self._bridge.core.state().services.get(service, ())
         return grant_at(session, want.node, port, service if known else "")
 
     def _broke(self, want: Want) -> None:
         self.ports.forget(self._uri(want))
-        self._shared.core.suspect(want.node)
+        self._bridge.core.suspect(want.node)
 
     def _unmet(self, session: PeerSession, asked: DirectAsk) -> Unmet | None:
         if asked.contract is None or not asked.user:
@@ -408,15 +408,15 @@ class TopicGrants(Grants):
         if local is None:
             return Unmet(Condition.OFFERED, f"{source} is not offered")
         offered, other = self._exports.offered[local], local.topic if local != source else ""
-        contract = combine(self._shared.context.contracts.of(local.topic, offered.type), asked.contract)
-        unmet = unmet_by_rules(contract, self._shared, session, where, where, other, offered.origin)
+        contract = combine(self._bridge.context.contracts.of(local.topic, offered.type), asked.contract)
+        unmet = unmet_by_rules(contract, self._bridge, session, where, where, other, offered.origin)
         if unmet is not None:
             return unmet
         if compares_names(offered.type):
             return Unmet(Condition.ACTION, f"actions compare the names of the nodes at {offered.type}")
         if not self._uri(asked.want):
             return Unmet(Condition.NODE, f"{source.node} has just left")
-        if asked.user in self._shared.core.subscribers(source.topic):
+        if asked.user in self._bridge.core.subscribers(source.topic):
             return Unmet(Condition.CALLER_ID, f"a node {asked.user} of the publisher's module subscribes too")
         return None
 
@@ -425,16 +425,16 @@ class ServiceGrants(Grants):
     """The direct calls of peers' nodes to local servers.
 
     Args:
-        shared: As of ``Grants``.
+        bridge: As of ``Grants``.
         exports: Knows what is offered to each peer.
         on_warning: ``(kind, subject, text)``: logs and counts a warning.
     """
 
     kind = "service"
 
-    def __init__(self, shared: Shared, exports: ServiceExports, on_warning: Callable[[str, str, str], None]) -> None:
-        super().__init__(shared)
-        rpc = shared.rpc
+    def __init__(self, bridge: Bridge, exports: ServiceExports, on_warning: Callable[[str, str, str], None]) -> None:
+        super().__init__(bridge)
+        rpc = bridge.rpc
         offered = Needs((Access.CALL,), "the service: only what is offered to the peer")
         rpc.on_request("direct.service", self._ask, offered)
         rpc.on_notification("direct.service_release", self._released, _RELEASED)
@@ -447,7 +447,7 @@ class ServiceGrants(Grants):
 
     async def _ask(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         reply = await super()._ask(session, args)
-        if "why" in reply and self._shared.context.services.transport(args["name"]) is Transport.DIRECT:
+        if "why" in reply and self._bridge.context.services.transport(args["name"]) is Transport.DIRECT:
             name, service = session.link.name, args["name"]
             text = f'{service}: calls from {name} are relayed although transport is "direct": {reply["text"]}'
             self._on_warning("direct.relayed", f"{name} {service} {reply['why']}", text)
@@ -469,5 +469,5 @@ class ServiceGrants(Grants):
         if server.node != asked.node:
             return Unmet(Condition.OFFERED, f"{server.node} provides {service} now")
         where, other = "the server's module", local if local != service else ""
-        contract = Contract(transport=self._shared.context.services.transport(service))
-        return unmet_by_rules(contract, self._shared, session, where, where, other, server.origin)
+        contract = Contract(transport=self._bridge.context.services.transport(service))
+        return unmet_by_rules(contract, self._bridge, session, where, where, other, server.origin)

@@ -21,7 +21,6 @@ import msgspec
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import NO_LINK, Condition, DirectAsk, Grant, Unmet, Want, read_ask, read_reply
 from rmpa.bridge.peer_offers import EntryT
-from rmpa.bridge.rpc import UNKNOWN_QUESTION
 from rmpa.core.contract import Contract, Transport
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.runtime.tasks import OwnedTasks
@@ -29,8 +28,8 @@ from rmpa.runtime.tasks import OwnedTasks
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
 
 _log = logging.getLogger(__name__)
 _UNSTABLE: Final = Unmet(
@@ -110,7 +109,7 @@ class Paths(ABC, Generic[EntryT]):
     """The decisions of this module. Subclasses probe nodes, and carry the decisions out.
 
     Args:
-        shared: The core, the peers and the rules.
+        bridge: The core, the peers and the rules.
         on_warning: ``(kind, subject, text)``: logs and counts a warning.
 
     Attributes:
@@ -120,8 +119,8 @@ class Paths(ABC, Generic[EntryT]):
 
     kind = ""
 
-    def __init__(self, shared: Shared, on_warning: Callable[[str, str, str], None]) -> None:
-        self._shared = shared
+    def __init__(self, bridge: Bridge, on_warning: Callable[[str, str, str], None]) -> None:
+        self._bridge = bridge
         self._on_warning = on_warning
         self._paths: dict[tuple[int, str, str], dict[str, Path[EntryT]]] = {}
         self._probes: dict[tuple[int, int, str], asyncio.Task[str]] = {}
@@ -145,8 +144,6 @@ class Paths(ABC, Generic[EntryT]):
     def _now() -> float:
         return asyncio.get_running_loop().time()
 
-    # --- what subclasses do -----------------------------------------------------------------------------------------
-
     @abstractmethod
     async def _probe(self, path: Path[EntryT], grant: Grant) -> str:
         """Why a node cannot be reached from here; empty: it can."""
@@ -158,8 +155,6 @@ class Paths(ABC, Generic[EntryT]):
     @abstractmethod
     def _subject(self, path: Path[EntryT]) -> str:
         """A path in a warning."""
-
-    # --- facts ------------------------------------------------------------------------------------------------------
 
     def judge(
         self, session: PeerSession, want: Want, entry: EntryT, contract: Contract, unmet: Unmet | None
@@ -224,7 +219,7 @@ class Paths(ABC, Generic[EntryT]):
         want = read_ask(args).want
         path = self.get(session.peer, want)
         if path is None:
-            self._shared.rpc.notify(session, f"direct.{self.kind}_release", want._asdict())
+            self._bridge.rpc.notify(session, f"direct.{self.kind}_release", want._asdict())
         elif path.found is not _UNSTABLE:
             path.held = True  # an earlier release may have been lost with its link
             self.update(path, pause=path.asked_at + limits.DIRECT_RETRY_PAUSE - self._now())
@@ -239,8 +234,6 @@ class Paths(ABC, Generic[EntryT]):
         for path in self:
             self._stop(path)
         await self._tasks.close()
-
-    # --- the decision -----------------------------------------------------------------------------------------------
 
     def _unmet(self, path: Path[EntryT]) -> Unmet | None:
         """The condition that does not hold by what is known here; ``None``: the peer decides."""
@@ -274,7 +267,7 @@ class Paths(ABC, Generic[EntryT]):
                 while path.task is not None and not path.task.done():
                     await asyncio.wait([path.task])
         except TimeoutError:
-            self._shared.counters.add("direct.undecided")
+            self._bridge.counters.add("direct.undecided")
 
     def _stop(self, path: Path[EntryT]) -> None:
         for work in (path.task, path.retry):
@@ -314,14 +307,13 @@ class Paths(ABC, Generic[EntryT]):
             asked = DirectAsk(*want, path.contract if want.user else None, broken)
             path.asked_at, path.held = self._now(), True
             try:
-                value = await self._shared.rpc.request(
+                value = await self._bridge.rpc.request(
                     session, f"direct.{self.kind}", msgspec.to_builtins(asked), limits.DIRECT_ASK_TIMEOUT
                 )
                 found = read_reply(value, want.node)
                 path.held = isinstance(found, Grant)
             except PeerRefused as error:
-                older = UNKNOWN_QUESTION in error.reason
-                found = Unmet(Condition.RELEASE if older else Condition.AGENT, str(error))
+                found = Unmet(Condition.RELEASE if error.unknown else Condition.AGENT, str(error))
             except RemoteProtocolError as error:
                 found = Unmet(Condition.RELEASE, f"{session.link.name}: {error}")
             except RmpaError as error:
@@ -342,4 +334,4 @@ class Paths(ABC, Generic[EntryT]):
         """Give back a grant that the peer may hold."""
         if path.held and path.session.linked:
             path.held = False
-            self._shared.rpc.notify(path.session, f"direct.{self.kind}_release", path.want._asdict())
+            self._bridge.rpc.notify(path.session, f"direct.{self.kind}_release", path.want._asdict())

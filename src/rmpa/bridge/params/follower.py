@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge import limits
-from rmpa.bridge.params import rules as transfer
+from rmpa.bridge.params import transfer
 from rmpa.bridge.params.owner import ParamCore, ParamOwner, read_text
-from rmpa.bridge.params.rules import follow_rules
+from rmpa.bridge.params.transfer import follow_rules
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.sessions import Part
 from rmpa.config.rules import SIM_TIME, overlap
@@ -23,8 +23,8 @@ from rmpa.core.log import RefusalLog
 from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
     from rmpa.config.rules import FollowRule
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
@@ -71,7 +71,7 @@ class Params(Part):
     """The part of the bridge for parameters.
 
     Args:
-        shared: The core, the peers and the rules.
+        bridge: The core, the peers and the rules.
 
     Attributes:
         owner: This module's own parameters, for peers.
@@ -80,12 +80,12 @@ class Params(Part):
         _renamed: Names under which values still stand that have another name since a reload.
     """
 
-    def __init__(self, shared: Shared) -> None:
-        self._shared = shared
-        self._core = ParamCore(shared.core, shared.node)
-        self.owner = ParamOwner(self._core, shared)
-        self.followed = [Followed(rule) for rule in follow_rules(shared.context.settings)]
-        self._refusals = RefusalLog(_log, shared.counters)
+    def __init__(self, bridge: Bridge) -> None:
+        self._bridge = bridge
+        self._core = ParamCore(bridge.core, bridge.node)
+        self.owner = ParamOwner(self._core, bridge)
+        self.followed = [Followed(rule) for rule in follow_rules(bridge.context.settings)]
+        self._refusals = RefusalLog(_log, bridge.counters)
         self._time_before: list[str | None] = []
         self._renamed: set[str] = set()
         self._asking: dict[int, asyncio.Task[None]] = {}
@@ -93,20 +93,18 @@ class Params(Part):
         self._looking: asyncio.Task[None] | None = None
         self._run: XmlRpcValue = None
         own = Needs((), "what `[[param]]` follows from this very peer")
-        shared.rpc.on_request(transfer.VALUE, self._told, own)
+        bridge.rpc.on_request(transfer.VALUE, self._told, own)
 
     def notes(self) -> tuple[str, ...]:
         """Messages to the user about parameters that are not followed although their owner is linked."""
         found = (entry for entry in self.followed if entry.problem and entry.peer is not None)
         return tuple(f"parameter {entry.rule} is not followed: {entry.problem}" for entry in found)
 
-    # --- the bridge's part ---------------------------------------------------------------------------------------
-
     def reload(self) -> None:
         """Apply other settings; parameters that they do not affect are not touched."""
         self.owner.judge_again()
         before = {entry.rule: entry for entry in self.followed}
-        rules = follow_rules(self._shared.context.settings)
+        rules = follow_rules(self._bridge.context.settings)
         sources = {(rule.owner, rule.key): rule.to for rule in rules}
         self._renamed |= {
             rule.to
@@ -115,7 +113,7 @@ class Params(Part):
         }
         self.followed = [before.pop(rule, Followed(rule)) for rule in rules]
         gone = {rule.owner for rule in before}
-        for session in self._shared.sessions.linked():
+        for session in self._bridge.sessions.linked():
             if self._claim(session) or session.link.name in gone:
                 self._ask(session)
 
@@ -135,7 +133,7 @@ class Params(Part):
         mine = [entry for entry in self.followed if entry.peer == session.peer]
         for entry in mine:
             entry.peer, entry.problem = None, ""
-        for other in list(self._shared.sessions.linked()):
+        for other in list(self._bridge.sessions.linked()):
             if other.peer != session.peer and any(entry.rule.owner == other.link.name for entry in mine):
                 self.link_up(other)
 
@@ -174,8 +172,6 @@ class Params(Part):
         finally:
             self._looking = None
 
-    # --- the owners ----------------------------------------------------------------------------------------------
-
     def _claim(self, session: PeerSession) -> bool:
         """Follow a linked peer's parameters that no other peer of its name owns; return whether there are any."""
         owned = [entry for entry in self.followed if entry.rule.owner == session.link.name]
@@ -199,7 +195,7 @@ class Params(Part):
         mine = [entry for entry in self.followed if entry.peer == session.peer]
         keys = [entry.rule.key for entry in mine]
         try:
-            answer = await self._shared.rpc.request(session, transfer.FOLLOW, {"keys": keys})
+            answer = await self._bridge.rpc.request(session, transfer.FOLLOW, {"keys": keys})
             refused = answer.get("refused", {}) if isinstance(answer, dict) else {}
         except RmpaError as error:
             refused = dict.fromkeys(keys, str(error))
@@ -234,8 +230,6 @@ class Params(Part):
             entry.due = entry.told = entry.had
         self._work_soon()
 
-    # --- the local core ------------------------------------------------------------------------------------------
-
     async def _compare_all(self, *, restarted: bool) -> None:
         """Put back what was changed here, and ask again for what was refused.
 
@@ -253,7 +247,7 @@ class Params(Part):
             elif entry.doubted or len(entry.text or "") <= limits.PARAM_SMALL:
                 entry.due = entry.known and entry.had
         refused = {entry.peer for entry in self.followed if not entry.known}
-        for session in self._shared.sessions.linked():
+        for session in self._bridge.sessions.linked():
             if session.peer in refused:
                 self._ask(session)
         self._work_soon()

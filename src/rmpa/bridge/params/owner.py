@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.params import rules as transfer
-from rmpa.bridge.params.rules import (
+from rmpa.bridge.params import transfer
+from rmpa.bridge.params.transfer import (
     key_problem,
     replaced,
     too_large,
@@ -36,9 +36,9 @@ from rmpa.trust.permissions import refusal
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.policy import PermissionGate
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
     from rmpa.config.settings import Settings
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.slave_node import SlaveNode
@@ -176,14 +176,14 @@ class ParamOwner:
 
     Args:
         core: The local core.
-        shared: The peers and the rules.
+        bridge: The peers and the rules.
     """
 
-    def __init__(self, core: ParamCore, shared: Shared) -> None:
+    def __init__(self, core: ParamCore, bridge: Bridge) -> None:
         self._core = core
-        self._shared = shared
+        self._bridge = bridge
         self._followers: dict[int, _Follower] = {}
-        rpc = shared.rpc
+        rpc = bridge.rpc
         rpc.on_request(transfer.GET, self._get, _EACH)
         rpc.on_request(transfer.NAMES, self._names, Needs((Access.PARAM,), "each parameter; others are left out"))
         rpc.on_request(transfer.SET, self._set, _EACH)
@@ -193,18 +193,16 @@ class ParamOwner:
 
     @property
     def _settings(self) -> Settings:
-        return self._shared.context.settings
+        return self._bridge.context.settings
 
     @property
     def _gate(self) -> PermissionGate:
-        return self._shared.context.gate
+        return self._bridge.context.gate
 
     @property
     def followed(self) -> set[str]:
         """What peers follow."""
         return set().union(*(follower.keys for follower in self._followers.values()))
-
-    # --- events from the part ------------------------------------------------------------------------------------
 
     def link_down(self, peer: int) -> None:
         """Forget what a peer follows."""
@@ -251,8 +249,6 @@ class ParamOwner:
     def tasks(self) -> Iterable[asyncio.Task[None] | None]:
         """Those that tell peers."""
         return (follower.task for follower in self._followers.values())
-
-    # --- requests -----------------------------------------------------------------------------------------------
 
     async def _get(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         key, peer = self._key(args.get("key")), session.link.name
@@ -368,8 +364,6 @@ class ParamOwner:
         if why:
             raise RmpaError(why, code="not-permitted")
 
-    # --- telling the followers -----------------------------------------------------------------------------------
-
     def _tell_soon(self, follower: _Follower, keys: set[str]) -> None:
         for key in keys:
             follower.told.pop(key, None)
@@ -408,7 +402,7 @@ class ParamOwner:
                 why = str(error)
         args = {"key": key, "refused": why} if why else {"key": key, "text": text}
         try:
-            await self._shared.rpc.request(follower.session, transfer.VALUE, args, limits.PARAM_ASK_TIMEOUT)
+            await self._bridge.rpc.request(follower.session, transfer.VALUE, args, limits.PARAM_ASK_TIMEOUT)
         except RmpaError as error:
             _log.warning(
                 "! %s does not get the parameter %s: %s [param-trouble]", follower.session.link.name, key, error

@@ -28,7 +28,6 @@ from rmpa.bridge import limits
 from rmpa.bridge.messages import (
     AdvertiseServices,
     CloseService,
-    Message,
     OpenService,
     ServiceClosed,
     ServiceOffer,
@@ -36,17 +35,17 @@ from rmpa.bridge.messages import (
     is_crossing_name,
 )
 from rmpa.bridge.offers import OfferBook
-from rmpa.bridge.peer_offers import CROWDED, DENIED, ImportBook, Remote
+from rmpa.bridge.peer_offers import ImportBook, Remote
 from rmpa.bridge.policy import PolicyDecision, is_outside
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
+from rmpa.core.facts import CROWDED, DENIED
 from rmpa.ros.wire.tcpros import ServiceDescription
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from rmpa.bridge.peer import PeerRun
     from rmpa.bridge.services.part import Services
 
 
@@ -65,24 +64,23 @@ class ServiceRoute:
     requests: int = 0
 
 
-class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
+class ServiceExports(OfferBook[str, LocalService, ServiceOffer, ServiceRoute]):
     """The outbound half: services of this module, called by peers.
 
     Attributes:
         about: What the servers of services have said of them.
-        _routes: The routes that each linked peer has asked for, by the peer's own route numbers.
         _serial: Counts the routes of requests. They are even; the odd ones are for replies to this module's own
             calls.
     """
 
-    kind, warning, access, owner = "services", "services.too_many", Access.CALL, "its server"
+    kind, counter, access, owner = "services", "services.too_many", Access.CALL, "its server"
+    message = AdvertiseServices
     renews = True  # behind another server what peers know of a service may not be true any more
     _out: Services
 
     def __init__(self, out: Services) -> None:
         super().__init__(out)
         self.about: dict[str, ServiceDescription] = {}
-        self._routes: dict[int, dict[int, ServiceRoute]] = {}
         self._serial = 0
 
     def callers(self, service: str) -> tuple[int, ...]:
@@ -93,8 +91,8 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
         """The routes to a service: each with its peer and the peer's number for it."""
         return [
             (peer, number, route)
-            for peer, routes in self._routes.items()
-            for number, route in routes.items()
+            for peer, told in self.peers.items()
+            for number, route in told.routes.items()
             if route.service == service
         ]
 
@@ -112,27 +110,20 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
         """As of ``OfferBook``."""
         return ServiceOffer(wire, local.node, local.origin)
 
-    def _message(self, added: tuple[ServiceOffer, ...], removed: tuple[str, ...], full: bool, more: bool) -> Message:
-        return AdvertiseServices(added, removed, full, more)
-
     def reload(self) -> Iterator[None]:
         """Judge by new rules; routes that no permission allows any more end at once."""
         gate = self._out.context.gate
         for peer, told in self.peers.items():
-            for number, route in list(self._routes[peer].items()):
+            for number, route in list(told.routes.items()):
                 if why := gate.why_not(Access.CALL, told.session.name, route.service):
                     self._close(peer, number, why)
         return super().reload()
 
-    def link_up(self, session: PeerRun) -> None:
-        """As of ``OfferBook``; the peer has no service open."""
-        self._routes[session.peer] = {}
-        super().link_up(session)
-
     def link_down(self, peer: int) -> None:
         """End all routes of a peer whose link is gone."""
+        told = self.peers.get(peer)
         super().link_down(peer)
-        for route in self._routes.pop(peer, {}).values():
+        for route in told.routes.values() if told is not None else ():
             if route.requests:
                 self._out.serving.end_route(peer, route.requests)
 
@@ -142,7 +133,7 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
         Raises:
             RemoteProtocolError: The peer's route is in use.
         """
-        routes, number = self._routes[peer], message.route
+        routes, number = self.peers[peer].routes, message.route
         if number in routes:
             raise RemoteProtocolError(f"route {number} is opened twice, for {message.service} now")
         service = self.local(peer, message.service)
@@ -166,7 +157,7 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
 
         A route that is not open is ignored: this module's own ``ServiceClosed`` may have crossed the peer's message.
         """
-        route = self._routes[peer].pop(message.route, None)
+        route = self.peers[peer].routes.pop(message.route, None)
         if route is not None and route.requests:
             self._out.serving.end_route(peer, route.requests)
 
@@ -204,7 +195,7 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
         self._out.direct_exports.server_gone(key)
 
     def _close(self, peer: int, number: int, reason: str) -> None:
-        route = self._routes[peer].pop(number)
+        route = self.peers[peer].routes.pop(number)
         if route.requests:
             self._out.serving.end_route(peer, route.requests)
         self._out.send(peer, ServiceClosed(number, reason[: limits.CONTROL_TEXT_MAX]))
@@ -242,7 +233,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         _claims: The services that have a name here.
     """
 
-    kind = "services"
+    kind, access = "services", Access.SERVE
     _out: Services
 
     def __init__(self, out: Services) -> None:
@@ -336,8 +327,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
             self._local[service] = node
         self._choose(service)
 
-    def reload(self, now: float) -> Iterator[None]:
-        """Judge by new rules, a service with each item; services that they do not affect stay shown and open."""
+    def _rejudge_all(self, now: float) -> Iterator[None]:  # noqa: ARG002 - as of ImportBook
         for _, remote in list(self):
             known = self._peers.get(remote.peer)
             if known is None or known.entries.get(remote.wire) is not remote:
@@ -351,9 +341,6 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         for name in tuple(self._claims):
             self._choose(name)
             yield
-        for peer, known in list(self._peers.items()):
-            while self._peers.get(peer) is known and self._admit(peer, known, now):
-                yield
 
     def _choose(self, service: str) -> None:
         """Show the one service of a name that goes first, by the facts of now; call it whenever one has changed."""
@@ -368,8 +355,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
             elif remote is shown:
                 left = why
             if remote.cause == DENIED != before:
-                module, relay = self._speaker(remote)
-                self._out.context.gate.admits(Access.SERVE, module, service, relay=relay)
+                self.permission(remote, report=True)
         if shown is not None and left:
             self.release(shown, left)
             self._hide(shown, left)
@@ -417,20 +403,15 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
 
     def _objection(self, remote: RemoteService) -> tuple[str, str]:
         """Why a service may not be shown, whatever others there are, and the cause; empty if it may."""
-        context, origin, service = self._out.context, remote.origin, remote.name
+        origin, service = remote.origin, remote.name
         if origin is not None and (why := self.ways.why_not(remote.peer, origin)):
             return why, ""
         if not is_crossing_name(service):
             return f"the rules of names make {service!r} of it", ""
-        decision = context.services.judge(service, remote.node if origin is None else origin.node)
-        for name in (self._peers[remote.peer].session.name, *([origin.name] if origin is not None else ())):
-            if decision.allowed:
-                decision = context.policy.judge_for(name, service, wire=remote.wire)
-        if not decision.allowed:
-            return f"policy: {decision.rule}", ""
-        module, relay = self._speaker(remote)
-        permission = context.gate.judge(Access.SERVE, module, service, relay=relay)
-        if not permission.allowed:
+        decision = self._out.context.services.judge(service, remote.node if origin is None else origin.node)
+        if why := self._kept_out(remote, decision, remote.wire):
+            return f"policy: {why}", ""
+        if not (permission := self.permission(remote)).allowed:
             return permission.rule, DENIED
         crowd = self._crowd(remote)
         return crowd, CROWDED if crowd else ""

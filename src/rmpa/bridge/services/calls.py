@@ -30,9 +30,9 @@ from rmpa.runtime.tasks import OwnedTasks, end_tasks, keep_task
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.reception import LinkTime
     from rmpa.bridge.services.books import ServiceExports, ServiceRoute
-    from rmpa.bridge.shared import Shared
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.runtime.tls import Buffer
@@ -300,14 +300,14 @@ class Serving:
     """The servers that peers call, and what they say of their services.
 
     Args:
-        shared: The local core, and the peers.
+        bridge: The local core, and the peers.
         exports: What peers may call; it gets the servers' answers.
         budgets: The budgets of the links, by peer number.
     """
 
-    def __init__(self, shared: Shared, exports: ServiceExports, budgets: Mapping[int, Budgets]) -> None:
-        self._core = shared.core
-        self._sessions = shared.sessions
+    def __init__(self, bridge: Bridge, exports: ServiceExports, budgets: Mapping[int, Budgets]) -> None:
+        self._core = bridge.core
+        self._sessions = bridge.sessions
         self._exports = exports
         self._budgets = budgets
         self.stats: dict[str, CallStats] = {}

@@ -23,9 +23,9 @@ from rmpa.runtime.kernel_tcp import connections
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.services.books import RemoteService
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
 
     ServicePath = Path[RemoteService]
 
@@ -36,7 +36,7 @@ class ServicePaths(Paths["RemoteService"]):
     """Direct calls of local nodes to services of peers.
 
     Args:
-        shared: As of ``Paths``.
+        bridge: As of ``Paths``.
         on_warning: As of ``Paths``.
         proxy_uri: ``(peer, service)``: the proxy's address for a service; empty if there is none.
 
@@ -51,11 +51,11 @@ class ServicePaths(Paths["RemoteService"]):
     kind = "service"
 
     def __init__(
-        self, shared: Shared, on_warning: Callable[[str, str, str], None], proxy_uri: Callable[[int, str], str]
+        self, bridge: Bridge, on_warning: Callable[[str, str, str], None], proxy_uri: Callable[[int, str], str]
     ) -> None:
-        super().__init__(shared, on_warning)
+        super().__init__(bridge, on_warning)
         own = Needs((), "the peer's own services that are called directly")
-        shared.rpc.on_notification("direct.service_again", self._asked_again, own)
+        bridge.rpc.on_notification("direct.service_again", self._asked_again, own)
         self._proxy_uri = proxy_uri
         self.answers: dict[str, ServicePath] = {}
         self.lookups: Counter[str] = Counter()
@@ -63,7 +63,7 @@ class ServicePaths(Paths["RemoteService"]):
         self._waiting: set[bytes] = set()
         self._looking: asyncio.TimerHandle | None = None
         self._used: dict[str, set[tuple[str, int]]] = {}
-        self._able = shared.core.on_lookup(self._lookup)
+        self._able = bridge.core.on_lookup(self._lookup)
 
     def _lookup(self, service: str, uri: str, caller: str, api: str) -> str:
         """Answer a lookup; see ``Core.on_lookup``. It is called for each of them."""
@@ -74,7 +74,7 @@ class ServicePaths(Paths["RemoteService"]):
         local_only = not nearby and is_loopback(host_of(api))
         # Calls of the nodes of ``rmpa service`` are relayed, so that the agents measure them.
         if not api or local_only or is_own(caller) or caller.startswith("/rmpa_service"):
-            self._shared.counters.add("direct.lookup_relayed")
+            self._bridge.counters.add("direct.lookup_relayed")
             return ""
         self.lookups[service] += 1
         if not nearby:
@@ -112,7 +112,7 @@ class ServicePaths(Paths["RemoteService"]):
                 self._looked.add(service)
             if stuck := [one for one in connecting if one.id in before]:
                 end_all(stuck)
-                self._shared.counters.add("direct.service_unreachable")
+                self._bridge.counters.add("direct.service_unreachable")
                 text = f"clients get no answer from {self.address(path.session.peer, service)}"
                 self._stop(path)
                 self._decide(path, Unmet(Condition.REACHABLE, text))
@@ -124,13 +124,13 @@ class ServicePaths(Paths["RemoteService"]):
         path = self.get(remote.peer, Want(remote.name, remote.node))
         if path is not None:
             return path.unmet
-        contract = Contract(transport=self._shared.context.services.transport(remote.name))
+        contract = Contract(transport=self._bridge.context.services.transport(remote.name))
         return unmet_by_contract(contract, "this module")  # nothing is kept of what is relayed by rule
 
     def shown(self, remote: RemoteService) -> None:
         """Judge a service that is in the local graph, or to which other rules apply."""
-        session, want = self._shared.sessions.get(remote.peer), Want(remote.name, remote.node)
-        contract = Contract(transport=self._shared.context.services.transport(remote.name))
+        session, want = self._bridge.sessions.get(remote.peer), Want(remote.name, remote.node)
+        contract = Contract(transport=self._bridge.context.services.transport(remote.name))
         if contract.transport is not Transport.RELAY and session is not None:
             self.judge(session, want, remote, contract, self._unmet_here(session, remote, contract))
         elif (path := self.get(remote.peer, want)) is not None:
@@ -163,9 +163,9 @@ class ServicePaths(Paths["RemoteService"]):
             self.update(path)
 
     def _unmet_here(self, session: PeerSession, remote: RemoteService, contract: Contract) -> Unmet | None:
-        rules, service, owner = self._shared.context.services, remote.name, "the server's module"
+        rules, service, owner = self._bridge.context.services, remote.name, "the server's module"
         other = remote.wire if remote.wire != service else ""
-        unmet = unmet_by_rules(contract, self._shared, session, "this module", owner, other, remote.origin)
+        unmet = unmet_by_rules(contract, self._bridge, session, "this module", owner, other, remote.origin)
         if unmet is not None:
             return unmet
         if not self._able:
@@ -193,7 +193,7 @@ class ServicePaths(Paths["RemoteService"]):
     def _end(self, session: PeerSession, endpoints: Iterable[tuple[str, int]]) -> None:
         """End the connections of clients; over loopback nothing can hang, and others use the same address."""
         for endpoint in () if session.same_machine else endpoints:
-            self._shared.counters.add("direct.service_stopped")
+            self._bridge.counters.add("direct.service_stopped")
             if problem := end_all(connections(remote=endpoint)):
                 text = "! %s: calls to %s:%d may hang: they cannot be ended (%s); see rmpa doctor [stale-connections]"
                 _log.warning(text, session.link.name, *endpoint, problem)

@@ -18,12 +18,12 @@ from rmpa.bridge.direct.grants import ServiceGrants
 from rmpa.bridge.graph_part import GraphPart
 from rmpa.bridge.messages import CloseService, OpenService, ServiceClosed, ServiceOpened, Source
 from rmpa.bridge.peer import PeerState
-from rmpa.bridge.peer_offers import DENIED
 from rmpa.bridge.policy import Needs, service_place
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.services.books import ServiceExports, ServiceImports
 from rmpa.bridge.services.calls import Budgets, Caller, CallStats, Serving
 from rmpa.bridge.services.direct import ServicePaths
+from rmpa.core.facts import DENIED
 from rmpa.core.identity import is_own
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
@@ -33,12 +33,12 @@ from rmpa.runtime.loop import yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.messages import Message
     from rmpa.bridge.peer_offers import Remote
     from rmpa.bridge.policy import Place
     from rmpa.bridge.services.books import RemoteService
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.tcpros import ServiceDescription
 
@@ -83,7 +83,7 @@ class Services(GraphPart):
     """Both directions of services, for all peers.
 
     Args:
-        shared: The core, the peers and the rules.
+        bridge: The core, the peers and the rules.
 
     Attributes:
         make_room: Called with a service whose name a node has already: a gateway's node of another site leaves it.
@@ -97,16 +97,16 @@ class Services(GraphPart):
     direct_exports: ServiceGrants
     direct_imports: ServicePaths
 
-    def __init__(self, shared: Shared) -> None:
-        super().__init__(shared, ServiceExports, ServiceImports)
-        self._core = shared.core
+    def __init__(self, bridge: Bridge) -> None:
+        super().__init__(bridge, ServiceExports, ServiceImports)
+        self._core = bridge.core
         self.make_room: Callable[[str], None] = lambda _: None
         self._budgets: dict[int, Budgets] = {}
         self._shown: dict[RemoteService, ShownService] = {}
-        self.serving = Serving(shared, self.exports, self._budgets)
-        self.direct_exports = ServiceGrants(shared, self.exports, self.warn)
-        self.direct_imports = ServicePaths(shared, self.warn, self._proxy_uri)
-        shared.rpc.on_notification(_MISMATCH, self._told_of_mismatch, Needs((), "a text for the log"))
+        self.serving = Serving(bridge, self.exports, self._budgets)
+        self.direct_exports = ServiceGrants(bridge, self.exports, self.warn)
+        self.direct_imports = ServicePaths(bridge, self.warn, self._proxy_uri)
+        bridge.rpc.on_notification(_MISMATCH, self._told_of_mismatch, Needs((), "a text for the log"))
 
     def __iter__(self) -> Iterator[ShownService]:
         """The peers' services in the local graph."""
@@ -237,17 +237,17 @@ class Services(GraphPart):
     def _to_relay(self, service: str, providers: Mapping[str, str]) -> LocalService | None:
         """The server of a service that is relayed for another module; ``None`` if there is none."""
         for node, uri in providers.items():
-            if (origin := self._shared.relay.origin(service_place(service, node))) is not None:
+            if (origin := self._bridge.relay.origin(service_place(service, node))) is not None:
                 return LocalService(node, uri, origin)
         return None
 
     def provide(self, remote: RemoteService) -> None:
         """Register a peer's service in the local graph, at the proxy of the node that provides it."""
         peer, service, node = remote.peer, remote.name, remote.node
-        session = self._shared.sessions.get(peer)
+        session = self._bridge.sessions.get(peer)
         if session is None:
             return
-        proxies, owner = self._shared.sessions.proxies(session, node, remote.origin)
+        proxies, owner = self._bridge.sessions.proxies(session, node, remote.origin)
         self.pass_on(remote)
         shown = self._shown[remote] = ShownService(remote, session)
         proxies.hold(owner, f"service {service}", lambda proxy: self._expose(shown, proxy))
@@ -293,7 +293,7 @@ class Services(GraphPart):
 
     def withdraw(self, remote: RemoteService, reason: str) -> None:
         """Remove a peer's service from the local graph; its waiting calls fail with the reason."""
-        self._shared.relay.gone(remote.peer, Source(f"service {remote.name}", remote.node))
+        self._bridge.relay.gone(remote.peer, Source(f"service {remote.name}", remote.node))
         shown = self._shown.pop(remote, None)
         if shown is None:
             return
@@ -303,7 +303,7 @@ class Services(GraphPart):
         if (proxy := shown.proxy) is not None:
             self._core.call("unregisterService", proxy.name, remote.name, proxy.service_uri)
             proxy.remove_service(remote.name, text)
-        proxies, owner = self._shared.sessions.proxies(shown.session, remote.node, remote.origin)
+        proxies, owner = self._bridge.sessions.proxies(shown.session, remote.node, remote.origin)
         proxies.release(owner, f"service {remote.name}")
 
     def forget_about(self, remote: RemoteService) -> None:
@@ -364,7 +364,7 @@ class Services(GraphPart):
 
     def ended(self, remote: RemoteService, route: int, reason: str) -> None:
         """A service cannot be called, or no longer: its calls fail with the reason; ``route`` was that of replies."""
-        session = self._shared.sessions.get(remote.peer)
+        session = self._bridge.sessions.get(remote.peer)
         if session is not None:
             session.link.routes.pop(route, None)
         if (shown := self._shown.get(remote)) is None:
@@ -394,7 +394,7 @@ class Services(GraphPart):
         self.warn(_MISMATCH, f"{shown.remote.name}{caller_id}", text)
         if shown.session.linked:
             args: dict[str, Any] = {"service": shown.remote.wire, "text": text[: limits.CONTROL_TEXT_MAX]}
-            self._shared.rpc.notify(shown.session, _MISMATCH, args)
+            self._bridge.rpc.notify(shown.session, _MISMATCH, args)
 
     def _told_of_mismatch(self, session: PeerSession, args: dict[str, Any]) -> None:
         text = printable(str(args.get("text", ""))[: limits.CONTROL_TEXT_MAX])

@@ -41,9 +41,9 @@ from rmpa.runtime.loop import yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.messages import Source
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.import_route import RemoteTopic
     from rmpa.bridge.topics.imports import Imports
     from rmpa.ros.wire.slave_api import BusLink
@@ -148,7 +148,7 @@ class TopicPaths(Paths["RemoteTopic"]):
     """Direct connections of local subscribers to nodes of peers.
 
     Args:
-        shared: As of ``Paths``.
+        bridge: As of ``Paths``.
         on_warning: As of ``Paths``.
         imports: The remote sources.
 
@@ -160,10 +160,10 @@ class TopicPaths(Paths["RemoteTopic"]):
 
     kind = "topic"
 
-    def __init__(self, shared: Shared, on_warning: Callable[[str, str, str], None], imports: Imports) -> None:
-        super().__init__(shared, on_warning)
+    def __init__(self, bridge: Bridge, on_warning: Callable[[str, str, str], None], imports: Imports) -> None:
+        super().__init__(bridge, on_warning)
         own = Needs((), "the peer's own topics that come directly")
-        shared.rpc.on_notification("direct.topic_again", self._asked_again, own)
+        bridge.rpc.on_notification("direct.topic_again", self._asked_again, own)
         self._imports = imports
         self.interruptions: Interruptions = {}
         self._checking: asyncio.TimerHandle | None = None
@@ -189,7 +189,7 @@ class TopicPaths(Paths["RemoteTopic"]):
 
     def shown(self, entry: RemoteTopic) -> None:
         """Judge the subscribers of a source that appears in the local graph, or to which other rules apply."""
-        for node, uri in self._shared.core.subscribers(entry.name).items():
+        for node, uri in self._bridge.core.subscribers(entry.name).items():
             self._consider(entry, node, uri)
 
     def hidden(self, entry: RemoteTopic) -> None:
@@ -199,11 +199,11 @@ class TopicPaths(Paths["RemoteTopic"]):
             self._hang_up(path)
 
     def _consider(self, entry: RemoteTopic, node: str, uri: str) -> None:
-        session = self._shared.sessions.get(entry.peer)
+        session = self._bridge.sessions.get(entry.peer)
         if session is None or not entry.shown or is_own(node):
             return
         want = Want(entry.wire.topic, entry.node, node)
-        contract = self._shared.context.contracts.of(entry.name, entry.type)
+        contract = self._bridge.context.contracts.of(entry.name, entry.type)
         is_known = self.get(entry.peer, want) is not None
         if contract.transport is Transport.RELAY and not is_known:
             return  # nothing is kept of topics that are relayed by rule
@@ -216,7 +216,7 @@ class TopicPaths(Paths["RemoteTopic"]):
         self, session: PeerSession, want: Want, entry: RemoteTopic, contract: Contract, uri: str
     ) -> Unmet | None:
         node, owner, other = want.user, "the publisher's module", want.name if want.name != entry.name else ""
-        unmet = unmet_by_rules(contract, self._shared, session, "this module", owner, other, entry.origin)
+        unmet = unmet_by_rules(contract, self._bridge, session, "this module", owner, other, entry.origin)
         if unmet is not None:
             return unmet
         if compares_names(entry.type):
@@ -224,7 +224,7 @@ class TopicPaths(Paths["RemoteTopic"]):
         if node.startswith(MEASURING):
             return Unmet(Condition.MEASURES, "rmpa's own tools measure by the agents")
         host = host_of(uri)
-        if not is_loopback(self._shared.core.node_host) and not (is_own_name(host) or host in local_addresses()):
+        if not is_loopback(self._bridge.core.node_host) and not (is_own_name(host) or host in local_addresses()):
             return Unmet(Condition.SUBSCRIBER, f"{node} runs at {host}, not on its agent's machine")
         if not self._kernel_tells:
             return Unmet(Condition.SUBSCRIBER, "the kernel does not list the connections of this machine (sock_diag)")
@@ -247,12 +247,12 @@ class TopicPaths(Paths["RemoteTopic"]):
 
     def _uri(self, path: TopicPath) -> str:
         """The slave API of a path's subscriber; empty if it is not registered."""
-        return self._shared.core.subscribers(path.want.name).get(path.want.user, "")
+        return self._bridge.core.subscribers(path.want.name).get(path.want.user, "")
 
     def request(self, peer: int, source: Source, subscriber: str) -> Awaitable[RosReply | None] | None:
         """Answer a subscriber's ``requestTopic`` at the proxy of a source; see ``PublicationEvents``."""
         want = Want(source.topic, source.node, subscriber)
-        path, session = self.get(peer, want), self._shared.sessions.get(peer)
+        path, session = self.get(peer, want), self._bridge.sessions.get(peer)
         recent = self._now() < self._started + limits.DIRECT_ADOPT
         entry = self._imports.get(peer, source)
         if path is None and session is not None and entry and (recent or session.link.name in self._left):
@@ -319,7 +319,7 @@ class TopicPaths(Paths["RemoteTopic"]):
     def _hang_up(self, path: TopicPath) -> None:
         """Make a subscriber leave its direct connection; it is not called back."""
         if path.endpoint is not None and not self._closed:
-            self._shared.counters.add("direct.hung_up")
+            self._bridge.counters.add("direct.hung_up")
             self._tasks.start(self._leave(path), f"hang up {path.want.user}")
             # The source may be shown again at once: the list of its end must not be the last one that arrives.
             asyncio.get_running_loop().call_later(limits.DIRECT_LIST_AGAIN, self._list_again, path)
@@ -362,7 +362,7 @@ class TopicPaths(Paths["RemoteTopic"]):
         """Make a subscriber leave its connection, and call it back to get the answer that was decided."""
         try:
             while self._is_misplaced(path) and await self._renew(path):
-                self._shared.counters.add("direct.moved")
+                self._bridge.counters.add("direct.moved")
         finally:
             path.mover = None
 
@@ -397,7 +397,7 @@ class TopicPaths(Paths["RemoteTopic"]):
         if links is None:
             return path.endpoint  # ``_check`` tries again
         own = proxy.address_of(topic) if proxy is not None else None
-        others = {one for one in self._shared.core.publishers(topic).values() if proxy is None or one != proxy.uri}
+        others = {one for one in self._bridge.core.publishers(topic).values() if proxy is None or one != proxy.uri}
         known = {one.place for one in self if one is not path and one.want.user == path.want.user}
         for link in links:
             end = link.remote
@@ -420,7 +420,7 @@ class TopicPaths(Paths["RemoteTopic"]):
         uri, topic = self._uri(path), path.want.name
         if uri:
             await publisher_update(
-                uri, topic, [one for one in self._shared.core.publishers(topic).values() if one != without]
+                uri, topic, [one for one in self._bridge.core.publishers(topic).values() if one != without]
             )
 
     def _list_again(self, path: TopicPath) -> None:
@@ -465,8 +465,8 @@ class TopicPaths(Paths["RemoteTopic"]):
         if not uri or stands or path.endpoint != endpoint or self.get(path.session.peer, path.want) is not path:
             return
         if links is None:
-            self._shared.core.suspect(path.want.user)
-        self._shared.counters.add("direct.broken")
+            self._bridge.core.suspect(path.want.user)
+        self._bridge.counters.add("direct.broken")
         self._put(path, LOST, -math.inf)
         self.broke(path)
 

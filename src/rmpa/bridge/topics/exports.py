@@ -25,7 +25,6 @@ from rmpa.bridge.data.export import ExportRoute
 from rmpa.bridge.messages import (
     Advertise,
     CloseRoute,
-    Message,
     OpenRoute,
     RouteClosed,
     RouteOpened,
@@ -46,7 +45,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.export import ExportFlow
     from rmpa.bridge.data.route_sender import RouteSender
     from rmpa.bridge.messages import Description, Origin
-    from rmpa.bridge.peer import PeerRun
     from rmpa.bridge.topics.part import Topics
 
 
@@ -59,32 +57,26 @@ class LocalSource(Local):
     origin: Origin | None = None
 
 
-class Exports(OfferBook[Source, LocalSource, TopicOffer]):
+class Exports(OfferBook[Source, LocalSource, TopicOffer, ExportRoute]):
     """The outbound half of topics.
 
     Attributes:
         flows: The sources that the agent is connected to, each with its routes by peer.
-        _routes: The routes of each linked peer by their ids.
         _cut: The run of each named peer that had no link when a route of it ended, so that it may miss messages.
     """
 
-    kind, warning, access, owner = "topics", "sources.too_many", Access.SUBSCRIBE, "the node"
+    kind, counter, access, owner, message = "topics", "sources.too_many", Access.SUBSCRIBE, "the node", Advertise
     _out: Topics
 
     def __init__(self, out: Topics) -> None:
         super().__init__(out)
         self.flows: dict[Source, ExportFlow] = {}
-        self._routes: dict[int, dict[int, ExportRoute]] = {}
         self._cut: OrderedDict[tuple[str, Source], str] = OrderedDict()
 
     def topics_for(self, peer: int) -> int:
         """How many topics a peer was told."""
         told = self.peers.get(peer)
         return len({source.topic for source in told.offers}) if told is not None else 0
-
-    def route(self, peer: int, number: int) -> ExportRoute | None:
-        """The route that a peer has open by this id."""
-        return self._routes.get(peer, {}).get(number)
 
     def routes(self, source: Source) -> Mapping[int, ExportRoute]:
         """The routes of a source by peer, with the suspended ones."""
@@ -97,7 +89,9 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
 
     def senders(self, peer: int) -> list[RouteSender]:
         """The senders of the routes that a linked peer has open."""
-        return [route.sender for route in self._routes.get(peer, {}).values() if route.sender is not None]
+        told = self.peers.get(peer)
+        routes = told.routes.values() if told is not None else ()
+        return [route.sender for route in routes if route.sender is not None]
 
     def description(self, source: Source) -> Description | None:
         """The header of a source's publisher, while the source is connected; else ``None``."""
@@ -119,9 +113,6 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
         """As of ``OfferBook``."""
         return TopicOffer(wire, key.node, local.type, local.origin)
 
-    def _message(self, added: tuple[TopicOffer, ...], removed: tuple[Source, ...], full: bool, more: bool) -> Message:
-        return Advertise(added, removed, full, more)
-
     def reload(self) -> Iterator[None]:
         """Judge by new rules. Routes that they end, end at once: a slow peer is told of the topics later."""
         context = self._out.context
@@ -136,16 +127,6 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
                 else:
                     route.contract = contract
         return super().reload()
-
-    def link_up(self, session: PeerRun) -> None:
-        """As of ``OfferBook``; the routes of the new link have numbers of their own."""
-        self._routes[session.peer] = {}
-        super().link_up(session)
-
-    def link_down(self, peer: int) -> None:
-        """As of ``OfferBook``; its routes have no numbers any more."""
-        super().link_down(peer)
-        self._routes.pop(peer, None)
 
     def link_away(self, peer: int, *, briefly: bool = False) -> Iterator[None]:
         """Suspend the reliable routes of a peer that may come back, and end its other routes, one with each item.
@@ -180,14 +161,14 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
 
     def opened(self, peer: int, message: OpenRoute) -> None:
         """Open a route that a peer asks for, or answer with ``RouteClosed`` and the reason."""
-        routes, number, limit = self._routes[peer], message.route, self.limit
-        if number in routes:
+        told, number, limit = self.peers[peer], message.route, self.limit
+        if number in told.routes:
             self._out.warn("route.doubled", str(peer), f"a peer opens route {number} twice; the second is ignored")
             return
         asked = Source(message.topic, message.node)
         source = self.local(peer, asked)
         before = self.routes(source).get(peer) if source is not None else None
-        if len(routes) >= limit:
+        if len(told.routes) >= limit:
             why = f"more topics are open on one link than limits.topics = {limit} there"
         elif source is None:
             self._asked_in_vain(peer, asked.topic)
@@ -196,7 +177,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
             # One copy for each peer: otherwise a peer could multiply the traffic of this module at will.
             why = f"{source} is open on another route of this link"
         else:
-            self._open(before or ExportRoute(self.peers[peer].session, source), message)
+            self._open(before or ExportRoute(told.session, source), message)
             return
         self._out.send(peer, RouteClosed(number, why))
 
@@ -209,7 +190,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
         ours, asked = self._out.context.contracts.of(source.topic, local.type), message.contract
         unknown = self._cut.pop((session.name, source), session.instance) != session.instance
         route.open(message, combine(ours, asked, local.type), unknown=unknown, shared=flow.description is not None)
-        self._routes[session.peer][route.number] = flow.routes[session.peer] = route
+        self.peers[session.peer].routes[route.number] = flow.routes[session.peer] = route
         if flow.description is not None:
             self._begin(route, flow, flow.description)
 
@@ -220,7 +201,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
 
     def closed(self, peer: int, message: CloseRoute) -> None:
         """End a route that a peer closes; one that is not open is ignored, since both ends may close it at once."""
-        if (route := self._routes[peer].get(message.route)) is not None:
+        if (route := self.route(peer, message.route)) is not None:
             self._end_route(route)
 
     def described(self, source: Source, description: Description) -> None:
@@ -257,7 +238,8 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
     def _forget(self, flow: ExportFlow, route: ExportRoute) -> None:
         del flow.routes[route.peer]
         if route.number:
-            self._routes.get(route.peer, {}).pop(route.number, None)
+            if (told := self.peers.get(route.peer)) is not None:
+                told.routes.pop(route.number, None)
         elif route.reliable:
             self._cut[route.session.name, route.source] = route.session.instance
             if len(self._cut) > mesh_limits.LOSSES_REMEMBERED:

@@ -9,12 +9,13 @@ from rmpa.bridge.data.quality import PeerClockHistory, QosEventKind, shown_secon
 from rmpa.bridge.data.route_sender import ReliableRouteSender
 from rmpa.bridge.direct.conditions import Condition, Want, unmet_by_contract
 from rmpa.bridge.direct.paths import AGENTS
-from rmpa.bridge.peer_offers import CONFLICT, CROWDED
+from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import PolicyDecision
-from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
 from rmpa.core.contract import KEYS, Contract, Transport
 from rmpa.core.facts import (
+    CONFLICT,
+    CROWDED,
     Arrival,
     ContractTerm,
     EventInfo,
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.export import ExportRoute
     from rmpa.bridge.data.quality import QosWatch, QualitySummary
-    from rmpa.bridge.messages import Source
     from rmpa.bridge.peer import PeerRun
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
@@ -346,24 +346,30 @@ class TopicFacts:
                 proxy=name,
                 registered=proxy is not None and publishers.get(name) == proxy.uri,
                 cause=entry.cause,
-                permission=self._permission(session.link.name, entry),
+                permission=topics.imports.permission(entry).rule if self._bridge.gate.on else "",
                 readers={at.number: (printable(at.other), at.waiting, at.dropped) for at in links},
                 mismatches=topics.mismatches.texts(entry.wire),
             )
             yield node, arrival
 
-    def _permission(self, peer: str, entry: RemoteTopic) -> str:
-        """The rule about which modules may publish a peer's topic; empty if trust is off."""
-        if not self._bridge.gate.on:
-            return ""
-        module, relay = (peer, "") if entry.origin is None else (entry.origin.name, peer)
-        return self._bridge.gate.judge(Access.PUBLISH, module, entry.name, relay=relay).rule
+    def reports(self, session: PeerSession, topic: str, instance: object) -> Iterator[PublisherReport]:
+        """What a peer is told of the publishers of a topic: its own ones, or those that it relays.
 
-    def report(self, session: PeerSession, source: Source) -> PublisherReport:
-        """What a peer is told of a publisher here."""
+        Args:
+            session: The peer.
+            topic: The topic.
+            instance: The run of the module that is relayed; empty: this module.
+        """
+        for source in (Source(topic, node) for node in self._core.publishers(topic)):
+            local = self._bridge.topics.exports.offered.get(source)
+            relayed = local is not None and local.origin is not None and local.origin.instance == instance
+            if relayed if instance else not is_own(source.node):
+                yield self._report(session, source)
+
+    def _report(self, session: PeerSession, source: Source) -> PublisherReport:
         exports = self._bridge.topics.exports
         local, flow = exports.seen.get(source), exports.flows.get(source)
-        kind = local.type if local is not None else self._core.type_of(source.topic)
+        kind = local.type if local is not None else self._core.type_of(source.topic, source.node)
         decision = exports.decision(session.peer, source)
         if decision is None:  # it has just come, or cannot be reached
             decision = self._bridge.context.policy.judge(source.topic, kind, source.node)

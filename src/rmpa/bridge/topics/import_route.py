@@ -22,10 +22,10 @@ from rmpa.ros.wire.tcpros import TopicDescription, printable
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.quality import QosEvent, QosWatch
     from rmpa.bridge.messages import Description, RouteOpened
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.part import Topics
     from rmpa.core.timers import Backoff
     from rmpa.ros.node.publication import Receiver, SubscriberConnection
@@ -136,7 +136,7 @@ class ImportRoute(PublicationEvents):
     """One source on its way to the local subscribers, whichever peer carries it.
 
     Args:
-        shared: The core.
+        bridge: The core.
         part: Knows what subscribers want.
         session: The peer that carries it.
         entry: The source, as that peer offers it; its number is that of the route.
@@ -151,10 +151,10 @@ class ImportRoute(PublicationEvents):
     """
 
     __slots__ = (
+        "_bridge",
         "_key",
         "_part",
         "_pasts",
-        "_shared",
         "entry",
         "flow",
         "node",
@@ -165,8 +165,8 @@ class ImportRoute(PublicationEvents):
         "topic",
     )
 
-    def __init__(self, shared: Shared, part: Topics, session: PeerSession, entry: RemoteTopic) -> None:
-        self._shared, self._part, self.session, self.entry = shared, part, session, entry
+    def __init__(self, bridge: Bridge, part: Topics, session: PeerSession, entry: RemoteTopic) -> None:
+        self._bridge, self._part, self.session, self.entry = bridge, part, session, entry
         self.topic = entry.name
         # Where its events are remembered, by its names in its module and here: another peer may carry it next.
         self._pasts, self._key = part.pasts(entry.module[1]), entry.past
@@ -186,7 +186,7 @@ class ImportRoute(PublicationEvents):
         """Unregister the topic; nothing happens if it was never registered."""
         if self.node is not None:
             self.node = self.publication = None
-            self._shared.core.call("unregisterPublisher", node.name, self.topic, node.uri)
+            self._bridge.core.call("unregisterPublisher", node.name, self.topic, node.uri)
             # rospy does not leave a publisher when the master removes it, so its connection is closed.
             node.remove_publication(self.topic)
 
@@ -195,7 +195,7 @@ class ImportRoute(PublicationEvents):
         if (node := self.node) is None:
             return
         params = (node.name, self.topic, self.entry.type, node.uri)
-        code, status, _ = self._shared.core.call("registerPublisher", *params)
+        code, status, _ = self._bridge.core.call("registerPublisher", *params)
         if code != 1:
             _log.error("! the ROS core does not accept %s of %s: %s [core-refuses]", self.topic, node.name, status)
 
@@ -265,7 +265,7 @@ class ImportRoute(PublicationEvents):
         goes_on = flow.bind(link, opened.route, opened.epoch, opened.first)
         link.routes[opened.route] = flow
         renumbered = (flow is not before or not goes_on) and publication.description is not None
-        if self._shared.relay.enabled and renumbered and self.on_open is None:
+        if self._bridge.relay.enabled and renumbered and self.on_open is None:
             publication.hang_up(OWN_NODE)  # what is relayed has other numbers from now on
         publication.bound(contract.queue_depth)
         if contract.durability is Durability.TRANSIENT_LOCAL:
@@ -300,12 +300,12 @@ class ImportRoute(PublicationEvents):
                 publication,
                 contract,
                 time,
-                self._shared.counters,
+                self._bridge.counters,
                 self._occurred,
                 self._torn,
                 past,
                 numbering=numbering,
-                relays=self._shared.relay.enabled,
+                relays=self._bridge.relay.enabled,
             )
         self.flow, flow.contract, flow.link_time = flow, contract, time
         return flow

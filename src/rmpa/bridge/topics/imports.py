@@ -36,10 +36,11 @@ from rmpa.bridge.messages import (
     TopicOffer,
     is_crossing_name,
 )
-from rmpa.bridge.peer_offers import CONFLICT, CROWDED, DENIED, ImportBook
+from rmpa.bridge.peer_offers import ImportBook
 from rmpa.bridge.topics.import_route import RemoteTopic
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
+from rmpa.core.facts import CONFLICT, CROWDED, DENIED
 from rmpa.core.timers import Backoff
 from rmpa.mesh import limits as mesh_limits
 
@@ -60,7 +61,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         _timers: A heap; an item that is not its source's time any more is skipped.
     """
 
-    kind = "topics"
+    kind, access = "topics", Access.PUBLISH
     _out: Topics
 
     def __init__(self, out: Topics) -> None:
@@ -227,16 +228,12 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         for entry in self.at(topic):
             self._judge(entry)
 
-    def reload(self, now: float) -> Iterator[None]:
-        """Judge by new rules, a source with each item; what they do not change goes on untouched."""
+    def _rejudge_all(self, now: float) -> Iterator[None]:
         # Shown ones first: what another relay brings from now on has the same proxies.
         for entry in sorted(self, key=lambda one: not one.shown):
             if self.get(entry.peer, entry.wire) is entry:
                 self._rejudge(entry, now)
             yield
-        for peer, known in list(self._peers.items()):
-            while self._peers.get(peer) is known and self._admit(peer, known, now):
-                yield
 
     def _rejudge(self, entry: RemoteTopic, now: float) -> None:
         name = self.name_here(entry.peer, entry.wire.topic, entry.origin)
@@ -264,19 +261,18 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 self._out.warn(counter, str(entry.wire), f"{entry.wire}: {text}")
             self._out.send(entry.peer, Mismatch(entry.wire.topic, entry.node, "", text))
         if entry.cause == DENIED != before:
-            module, relay = self._speaker(entry)
-            self._out.context.gate.admits(Access.PUBLISH, module, entry.name, relay=relay)
+            self.permission(entry, report=True)
         if entry.cause == CROWDED != before:
             self._warn_limit(known.session.name, "nodes", self._out.context.settings.limits.nodes)
 
     def why_hidden(self, entry: RemoteTopic) -> tuple[str, str]:
         """Why a source may not be in the local graph, and the cause (see ``Remote``); empty if it may."""
-        context, origin, topic = self._out.context, entry.origin, entry.name
+        origin, topic = entry.origin, entry.name
         if origin is not None and (why := self.ways.objection(origin)):
             return why, ""
         if topic == CLOCK:
             why, conflict = self._why_no_time(entry)
-        elif why := self._why_kept_out(entry):
+        elif why := self._why_left_out(entry):
             conflict = False
         else:
             local = self._local_types.get(topic, entry.type)
@@ -285,25 +281,18 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             why = why + "rename one of the topics or use one type" if conflict else ""
         if why and not conflict:
             return why, ""
-        module, relay = self._speaker(entry)
-        decision = context.gate.judge(Access.PUBLISH, module, topic, relay=relay)
-        if not decision.allowed:
-            return decision.rule, DENIED
+        if not (permission := self.permission(entry)).allowed:
+            return permission.rule, DENIED
         if conflict:
             return why, CONFLICT
         crowd = self._crowd(entry)
         return crowd, CROWDED if crowd else ""
 
-    def _why_kept_out(self, entry: RemoteTopic) -> str:
+    def _why_left_out(self, entry: RemoteTopic) -> str:
         """Why rules or another source of its node keep a source out, or empty."""
-        policy, origin, topic = self._out.context.policy, entry.origin, entry.name
-        decision = policy.judge(topic, entry.type, entry.node if origin is None else origin.node)
-        peer = self.peer_name(entry.peer)
-        for name in (peer,) if origin is None else (peer, origin.name):
-            if decision.allowed:
-                decision = policy.judge_for(name, topic, entry.type, entry.wire.topic)
-        if not decision.allowed:
-            return decision.rule
+        topic, decision = entry.name, self._out.context.policy.judge(entry.name, entry.type, entry.past.node)
+        if why := self._kept_out(entry, decision, entry.wire.topic):
+            return why
         if not is_crossing_name(topic):
             return f"its name here would be {topic}, which is too long"
         for other in self._topics[entry.peer][topic]:

@@ -38,14 +38,12 @@ from rmpa.runtime.tasks import OwnedTasks
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.export import ExportFlow, ExportRoute
     from rmpa.bridge.data.reception import ImportFlow
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
-    from rmpa.bridge.topics.exports import Exports
     from rmpa.bridge.topics.import_route import ImportRoute
-    from rmpa.bridge.topics.imports import Imports
-    from rmpa.bridge.topics.local import LocalSubscriptions, RemoteSubscribers
+    from rmpa.bridge.topics.part import Topics
     from rmpa.ros.node.publication import SubscriberConnection
     from rmpa.ros.node.subscription import TopicConnection
     from rmpa.runtime.tls import Buffer
@@ -339,27 +337,16 @@ class Joins:
     """The joining subscribers, here and at peers.
 
     Args:
-        shared: The peers.
-        exports: Finds a peer's route.
-        imports: Numbers the routes.
-        outbound: Connects to publishers.
-        subscribers: Names a peer's subscribers.
+        bridge: The peers.
+        topics: Finds and numbers routes, connects to publishers, and names a peer's subscribers.
     """
 
-    def __init__(
-        self,
-        shared: Shared,
-        exports: Exports,
-        imports: Imports,
-        outbound: LocalSubscriptions,
-        subscribers: RemoteSubscribers,
-    ) -> None:
-        self._shared, self._exports, self._imports = shared, exports, imports
-        self._outbound, self._subscribers = outbound, subscribers
+    def __init__(self, bridge: Bridge, topics: Topics) -> None:
+        self._bridge, self._topics = bridge, topics
         self._served: dict[tuple[int, int], ServedJoin] = {}
         self._joining: dict[tuple[int, int], JoiningSubscriber] = {}
         self._tasks = OwnedTasks()
-        shared.rpc.on_request(JOIN, self._asked, Needs((), "a route that the peer has open"))
+        bridge.rpc.on_request(JOIN, self._asked, Needs((), "a route that the peer has open"))
 
     def sender(self, peer: int, number: int) -> RouteSender | None:
         """What sends to a peer's joining subscriber on this route."""
@@ -380,7 +367,7 @@ class Joins:
             return None
         if flow.contract.max_rate is not None:
             return None
-        own = self._imports.next_route(session.peer)
+        own = self._topics.imports.next_route(session.peer)
         key = session.peer, own
 
         def over() -> None:
@@ -397,7 +384,7 @@ class Joins:
         if joining.ended:  # with its link: the number is one of another route by now
             return
         try:
-            after = await self._shared.rpc.request(session, JOIN, args, limits.JOIN_WINDOW)
+            after = await self._bridge.rpc.request(session, JOIN, args, limits.JOIN_WINDOW)
             joining.begin(messages.convert(JOIN, after, messages.Sequence))
         except RmpaError as error:
             _log.debug("= %s: a subscriber joins unseen: %s", session.link.name, error)
@@ -414,10 +401,11 @@ class Joins:
                 key = session.peer, own
             case _:
                 raise RemoteProtocolError(f"{JOIN} names no route")
-        route = self._exports.route(session.peer, number)
-        if route is None or route.sender is None or key in self._served or self._exports.route(*key) is not None:
+        exports = self._topics.exports
+        route = exports.route(session.peer, number)
+        if route is None or route.sender is None or key in self._served or exports.route(*key) is not None:
             raise RmpaError(f"route {number} is not open")
-        flow = self._exports.flows[route.source]
+        flow = exports.flows[route.source]
         if sum(peer == session.peer for peer, _ in self._served) >= limits.JOINS_MAX:
             raise LimitExceeded("joining subscribers", limits.JOINS_MAX + 1, limits.JOINS_MAX)
         sender = RouteSender(session.link, own, Contract(history=History.KEEP_ALL), large=flow.large)
@@ -427,13 +415,13 @@ class Joins:
             session.link.close_route(own)
 
         join = self._served[key] = ServedJoin(flow, route.sender, sender, over)
-        caller = self._subscribers.name(session, node, route.source.topic) or f"{session.proxies.prefix}/joins"
+        caller = self._topics.subscribers.name(session, node, route.source.topic) or f"{session.proxies.prefix}/joins"
         self._connect(route, flow, join, caller)
         return route.sender.last
 
     def _connect(self, route: ExportRoute, flow: ExportFlow, join: ServedJoin, caller: str) -> None:
         _log.debug("> %s: %s joins", route.source, caller)
-        join.connection = self._outbound.connection(
+        join.connection = self._topics.outbound.connection(
             route.source,
             flow.uri,
             caller,

@@ -23,24 +23,23 @@ from rmpa.bridge.messages import Audience, Description, Source, is_crossing_name
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.bridge.topics.import_route import ImportRoute
 from rmpa.config.peer_rules import Access
-from rmpa.core.identity import OWN_NODE, is_own, is_type_name, proxied_node, proxy_name
+from rmpa.core.identity import OWN_NODE, is_own, proxied_node, proxy_name
 from rmpa.core.limits import UINT32_MAX
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ResumeTable
-from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.subscription import InProcessConnection, PublisherConnection
-from rmpa.ros.wire.tcpros import TopicDescription as TcprosDescription
+from rmpa.ros.wire.tcpros import TopicDescription
 from rmpa.runtime.accept import DESCRIPTORS
 from rmpa.runtime.loop import MachineTimer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.export import ExportRoute
     from rmpa.bridge.data.route import RouteBegin
     from rmpa.bridge.policy import Relay
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports
     from rmpa.bridge.topics.import_route import RemoteTopic
     from rmpa.bridge.topics.imports import Imports
@@ -52,62 +51,38 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-class LocalSources:
-    """The core's publishers, each with the type that it registered itself.
-
-    The master keeps one type for each topic, the last one registered; peers need the type of each publisher.
+def own_sources(core: Core, topic: str, flows: Callable[[Source], bool] = lambda _: False) -> dict[str, LocalSource]:
+    """This module's own publishers of a topic, by node, without those that cannot be reached.
 
     Args:
         core: The local core.
-        relay: Knows which proxies are offered to other modules.
+        topic: The topic.
         flows: Whether the agent is connected to a source; such a source counts as reachable, whatever the core found.
     """
+    unreachable = core.unreachable()
+    return {
+        node: LocalSource(core.type_of(topic, node), uri)
+        for node, uri in core.publishers(topic).items()
+        if not is_own(node)
+        and (node not in unreachable or not unreachable[node].withdrawn or flows(Source(topic, node)))
+    }
 
-    def __init__(self, core: Core, relay: Relay, flows: Callable[[Source], bool] = lambda _: False) -> None:
-        self._core = core
-        self._flows = flows
-        self._relay = relay
-        self._types: dict[Source, str] = {}
 
-    def changed(self, change: GraphChange) -> None:
-        """Remembers the type of a publisher that registers; forgets it when the publisher leaves."""
-        if change.kind is RegistrationKind.PUBLISHER:
-            if is_own(change.node) and not self._relay.enabled:
-                return  # thousands of proxies, whose types only a relay needs
-            source = Source(change.name, change.node)
-            if not change.added:
-                self._types.pop(source, None)
-            elif is_type_name(change.type):
-                self._types[source] = change.type
-
-    def of(self, topic: str) -> dict[str, LocalSource]:
-        """This module's own publishers of a topic, by node, without those that cannot be reached."""
-        unreachable = self._core.unreachable()
-        return {
-            node: LocalSource(self._type(topic, node), uri)
-            for node, uri in self._core.publishers(topic).items()
-            if not is_own(node)
-            and (node not in unreachable or not unreachable[node].withdrawn or self._flows(Source(topic, node)))
-        }
-
-    def relayed(self, topic: str) -> dict[str, LocalSource]:
-        """The proxies of a topic that this agent relays, by node, with their origin; empty if it is no relay."""
-        publishers: Mapping[str, str] = self._core.publishers(topic) if self._relay.enabled else {}
-        return {
-            node: LocalSource(self._type(topic, node), uri, origin)
-            for node, uri in publishers.items()
-            if (origin := self._relay.origin((topic, node))) is not None
-        }
-
-    def _type(self, topic: str, node: str) -> str:
-        return self._types.get(Source(topic, node)) or self._core.type_of(topic)
+def relayed_sources(core: Core, relay: Relay, topic: str) -> dict[str, LocalSource]:
+    """The proxies of a topic that this agent relays, by node, with their origin; empty if it is no relay."""
+    publishers: Mapping[str, str] = core.publishers(topic) if relay.enabled else {}
+    return {
+        node: LocalSource(core.type_of(topic, node), uri, origin)
+        for node, uri in publishers.items()
+        if (origin := relay.origin((topic, node))) is not None
+    }
 
 
 class LocalSubscriptions:
     """Subscriptions to local publishers that a peer wants, as the agent's own node, and the routes to the peers.
 
     Args:
-        shared: The local core and the agent's node; its subscriptions are registered, so that ROS tools show them.
+        bridge: The local core and the agent's node; its subscriptions are registered, so that ROS tools show them.
         topics: The part: its exports are told what publishers say; losses are reported.
         find: ``(node, slave API, topic)``: the topic of a proxy of this process, which is subscribed to without a
             socket; ``None`` for others.
@@ -115,14 +90,14 @@ class LocalSubscriptions:
 
     def __init__(
         self,
-        shared: Shared,
+        bridge: Bridge,
         topics: Topics,
         find: Callable[[str, str, str], Publication | None] = lambda *_: None,
     ) -> None:
-        self._core, self._node, self._sessions = shared.core, shared.node, shared.sessions
+        self._core, self._node, self._sessions = bridge.core, bridge.node, bridge.sessions
         self._topics, self._find = topics, find
         # Random, so that no earlier run of this agent, and no other agent, is likely to have had it.
-        self._epoch = int(shared.rng() * UINT32_MAX)
+        self._epoch = int(bridge.rng() * UINT32_MAX)
         self._parked: ResumeTable[ExportRoute] = ResumeTable()
         # Kept messages are dropped when their outage is over.
         self._timer = MachineTimer(self._parked.next_timer, lambda now: self._give_up(self._parked.expire(now)))
@@ -264,7 +239,7 @@ class LocalSubscriptions:
         self._timer.close()
 
     def _header(self, source: Source, flow: ExportFlow, fields: Mapping[str, str]) -> None:
-        about = TcprosDescription.from_header(fields)
+        about = TopicDescription.from_header(fields)
         text = about.definition.encode(errors="surrogateescape").decode("latin-1")
         description = Description(about.type, about.md5sum, text, about.latching)
         if description.problem:
@@ -341,14 +316,14 @@ class RemoteSubscribers:
     """The names of listeners, sent and received, for all peers.
 
     Args:
-        shared: The rules about modules behind a relay.
+        bridge: The rules about modules behind a relay.
         out: Warns of too many.
         exports: Finds the routes of peers.
         imports: Knows the modules behind relays.
     """
 
-    def __init__(self, shared: Shared, out: Topics, exports: Exports, imports: Imports) -> None:
-        self._shared, self._out = shared, out
+    def __init__(self, bridge: Bridge, out: Topics, exports: Exports, imports: Imports) -> None:
+        self._bridge, self._out = bridge, out
         self._exports, self._imports = exports, imports
         self._changed: dict[RemoteTopic, None] = {}
         self._soon: asyncio.Handle | None = None
@@ -402,7 +377,7 @@ class RemoteSubscribers:
         relay = session.link.name
         if not any((o.name, via) == (whose[0], relay) for o, via in self._imports.ways):
             return ""
-        return node if self._shared.context.gate.admits(Access.SUBSCRIBE, whose[0], topic, relay=relay) else ""
+        return node if self._bridge.context.gate.admits(Access.SUBSCRIBE, whose[0], topic, relay=relay) else ""
 
     def close(self) -> None:
         """Tell nothing any more."""

@@ -22,7 +22,7 @@ from rmpa.bridge.topics.exports import Exports
 from rmpa.bridge.topics.import_route import ImportRoute
 from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.joins import Joins
-from rmpa.bridge.topics.local import LocalSources, LocalSubscriptions, RemoteSubscribers
+from rmpa.bridge.topics.local import LocalSubscriptions, RemoteSubscribers, own_sources, relayed_sources
 from rmpa.bridge.topics.reports import LossReports, Mismatches
 from rmpa.core.contract import Priority, Reliability
 from rmpa.core.identity import is_own
@@ -31,17 +31,16 @@ from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Iterable, Iterator
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.quality import QosWatch
     from rmpa.bridge.data.route_sender import RouteSender
     from rmpa.bridge.messages import Message
     from rmpa.bridge.peer_offers import Remote
     from rmpa.bridge.policy import Place
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.import_route import Pasts, RemoteTopic
-    from rmpa.ros.node.publication import Publication
 
 _log = logging.getLogger(__name__)
 
@@ -54,8 +53,7 @@ class Topics(GraphPart):
     """The topics of all peers, in both directions.
 
     Args:
-        shared: The core, the peers and the rules.
-        find: ``(node, slave API, topic)``: the topic of a proxy of this process; see ``LocalSubscriptions``.
+        bridge: The core, the peers and the rules.
 
     Attributes:
         outbound: The subscriptions to local publishers.
@@ -74,17 +72,16 @@ class Topics(GraphPart):
     direct_exports: TopicGrants
     direct_imports: TopicPaths
 
-    def __init__(self, shared: Shared, find: Callable[[str, str, str], Publication | None]) -> None:
-        super().__init__(shared, Exports, Imports)
+    def __init__(self, bridge: Bridge) -> None:
+        super().__init__(bridge, Exports, Imports)
         self._pasts: OrderedDict[str, Pasts] = OrderedDict()
-        self.losses = LossReports(shared, self)
-        self.outbound = LocalSubscriptions(shared, self, find)
+        self.losses = LossReports(bridge, self)
+        self.outbound = LocalSubscriptions(bridge, self, bridge.proxy_nodes.publication)
         self.mismatches = Mismatches(self, self.exports, self.imports)
-        self.subscribers = RemoteSubscribers(shared, self, self.exports, self.imports)
-        self.joins = Joins(shared, self.exports, self.imports, self.outbound, self.subscribers)
-        self.direct_exports = TopicGrants(shared, self.exports)
-        self.direct_imports = TopicPaths(shared, self.warn, self.imports)
-        self._local = LocalSources(shared.core, shared.relay, lambda s: self.exports.description(s) is not None)
+        self.subscribers = RemoteSubscribers(bridge, self, self.exports, self.imports)
+        self.joins = Joins(bridge, self)
+        self.direct_exports = TopicGrants(bridge, self.exports)
+        self.direct_imports = TopicPaths(bridge, self.warn, self.imports)
         self._nodes: dict[str, tuple[str, ...]] = {}
         self._ticker: asyncio.TimerHandle | None = None
 
@@ -138,7 +135,7 @@ class Topics(GraphPart):
             flow.link_down()
         # Those whose further losses cannot be counted.
         if interrupted := sum(flow.contract.reliability is not Reliability.RELIABLE for flow in flows):
-            self._shared.counters.add("route.interrupted", interrupted)
+            self._bridge.counters.add("route.interrupted", interrupted)
         self.joins.link_down(peer)
         # Without a pause for data: among it could be the peer's new link, which must find all routes suspended.
         deque(self.exports.link_away(peer, briefly=session.silent), 0)
@@ -172,7 +169,7 @@ class Topics(GraphPart):
         entries = self.imports.gone(peer)
         self.mismatches.peer_gone(session.link.name)
         self.run(self.exports.gone(peer))
-        self._shared.relay.peer_gone(peer)
+        self._bridge.relay.peer_gone(peer)
         for route in [entry.route for entry in entries.values() if entry.route is not None]:
             route.end(missed=True, gone=False)
             route.release()
@@ -214,7 +211,6 @@ class Topics(GraphPart):
 
     def graph_changed(self, change: GraphChange) -> None:
         """Have the topic of a registration that came or went looked at."""
-        self._local.changed(change)
         self.direct_exports.graph_changed(change)
         self.direct_imports.graph_changed(change)
         if change.kind is RegistrationKind.SUBSCRIBER:
@@ -223,11 +219,12 @@ class Topics(GraphPart):
             self.look((change.name,))
 
     def _names(self) -> Iterable[str]:
-        return (*self._nodes, *self._shared.core.state().publishers)
+        return (*self._nodes, *self._bridge.core.state().publishers)
 
     def _look_at(self, name: str) -> None:
-        local, before = self._local.of(name), self._nodes.pop(name, ())
-        publishers = local | self._local.relayed(name)
+        core, before = self._bridge.core, self._nodes.pop(name, ())
+        local = own_sources(core, name, lambda source: self.exports.description(source) is not None)
+        publishers = local | relayed_sources(core, self._bridge.relay, name)
         nodes = dict.fromkeys((*before, *publishers))
         leaving = [node for node in nodes if node not in publishers and self.outbound.leave(Source(name, node))]
         if publishers or leaving:
@@ -239,7 +236,7 @@ class Topics(GraphPart):
 
     def reconcile(self) -> None:
         """Register missing publications again; topics without local subscribers miss nothing any more."""
-        state, compared = self._shared.core.state(), self.look_again()
+        state, compared = self._bridge.core.state(), self.look_again()
         for pasts in self._pasts.values():
             for source, (watch, missed_at) in pasts.items():
                 if all(map(is_own, state.subscribers.get(missed_at, ()))):
@@ -266,22 +263,22 @@ class Topics(GraphPart):
 
     def publish(self, entry: RemoteTopic) -> None:
         """Publish a peer's source at its proxy, in a later turn of the loop."""
-        if (session := self._shared.sessions.get(entry.peer)) is not None:
-            proxies, node = self._shared.sessions.proxies(session, entry.node, entry.origin)
+        if (session := self._bridge.sessions.get(entry.peer)) is not None:
+            proxies, node = self._bridge.sessions.proxies(session, entry.node, entry.origin)
             self.pass_on(entry)
-            route = entry.route = ImportRoute(self._shared, self, session, entry)
+            route = entry.route = ImportRoute(self._bridge, self, session, entry)
             route.release = lambda: proxies.release(node, route.topic)
             proxies.hold(node, route.topic, route.ready, route.left)
             self.direct_imports.shown(entry)
 
     def moved(self, old: RemoteTopic, new: RemoteTopic) -> None:
         """Let another way carry a source, whose proxy and subscribers stay."""
-        session, route = self._shared.sessions.get(new.peer), old.route
+        session, route = self._bridge.sessions.get(new.peer), old.route
         if session is not None and route is not None:
             route.session, route.entry = session, new
             old.route, new.route = None, route
             self.pass_on(new)
-            self._shared.relay.gone(old.peer, old.wire)
+            self._bridge.relay.gone(old.peer, old.wire)
             self.direct_imports.hidden(old)
             self.direct_imports.shown(new)
             self.look((new.name,))
@@ -291,7 +288,7 @@ class Topics(GraphPart):
 
     def retract(self, entry: RemoteTopic) -> None:
         """Remove a peer's source from the local graph: its data stops at once, its registration in a later turn."""
-        self._shared.relay.gone(entry.peer, entry.wire)
+        self._bridge.relay.gone(entry.peer, entry.wire)
         self.direct_imports.hidden(entry)
         route, entry.route = entry.route, None
         if route is not None:
@@ -317,7 +314,7 @@ class Topics(GraphPart):
             missed: Local nodes still listen, so they miss what is published before a route is open again.
             last: If the publisher has gone: the sequence of its last message.
         """
-        if entry.number and (session := self._shared.sessions.get(entry.peer)) is not None:
+        if entry.number and (session := self._bridge.sessions.get(entry.peer)) is not None:
             session.link.routes.pop(entry.number, None)
         if not keep and entry.route is not None:
             entry.route.detach(missed=missed, last=last)

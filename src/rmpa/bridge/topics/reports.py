@@ -22,10 +22,10 @@ from rmpa.ros import limits as ros_limits
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.export import ExportFlow, ExportRoute
     from rmpa.bridge.peer import PeerRun
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports
     from rmpa.bridge.topics.imports import Imports
     from rmpa.bridge.topics.part import Topics
@@ -104,14 +104,14 @@ class LossReports:
     """The reports of losses, sent and received, for all peers.
 
     Args:
-        shared: What the parts share.
+        bridge: What the parts share.
         out: Warns of losses, and knows the routes.
     """
 
-    def __init__(self, shared: Shared, out: Topics) -> None:
-        self._shared, self._out = shared, out
+    def __init__(self, bridge: Bridge, out: Topics) -> None:
+        self._bridge, self._out = bridge, out
         needs = Needs((), "the peer's own topics; a text for the log")
-        shared.rpc.on_notification(OVERSIZED, self._oversized_there, needs)
+        bridge.rpc.on_notification(OVERSIZED, self._oversized_there, needs)
 
     def given_up(self, peer: PeerRun, counts: Mapping[Source, int]) -> None:
         """Report that messages are not kept any more for an absent peer.
@@ -129,14 +129,14 @@ class LossReports:
         text = f"{name} has been away for {shown_seconds(seconds)}: {count} messages for it are given up, of {shown} "
         text += "(the contract's outage is for how long they are kept, "
         text += f"at most {mesh_limits.RESUME_BYTES_MAX >> 20} MiB over all)"
-        self._shared.counters.add("message.given_up", count)
-        self._shared.counters.add("route.given_up", len(counts) - 1)
+        self._bridge.counters.add("message.given_up", count)
+        self._bridge.counters.add("route.given_up", len(counts) - 1)
         self._out.warn("route.given_up", name, text)
 
     def missed(self, route: ExportRoute, count: int) -> None:
         """Report how many messages of a reliable source a peer that is back has missed."""
         source, name = route.source, route.session.name
-        self._shared.counters.add("message.given_up", count)
+        self._bridge.counters.add("message.given_up", count)
         text = f"{source}: {name} has missed {count} messages: it was away for longer than they were kept"
         self._out.warn("route.missed", f"{name} {source}", text)
 
@@ -151,10 +151,10 @@ class LossReports:
 
     def tell_oversized(self, route: ExportRoute, flow: ExportFlow) -> None:
         """Report to one peer how many messages of a source were left out until now, if any."""
-        session, offer = self._shared.sessions.get(route.peer), self._out.exports.offer(route.peer, route.source)
+        session, offer = self._bridge.sessions.get(route.peer), self._out.exports.offer(route.peer, route.source)
         if flow.oversized and session is not None and session.linked and offer is not None:
             told = {"topic": offer.topic, "node": offer.node, "count": flow.oversized, "size": flow.oversized_bytes}
-            self._shared.rpc.notify(session, OVERSIZED, told)
+            self._bridge.rpc.notify(session, OVERSIZED, told)
 
     def _oversized_there(self, session: PeerSession, args: dict[str, Any]) -> None:
         """Takes a peer's report of messages that it left out.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import errno
 import ssl
-from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, cast
@@ -21,6 +20,7 @@ from rmpa.mesh.frames import Frame, FrameKind, Lane
 from rmpa.mesh.io.dial import bound_queue
 from rmpa.mesh.io.lane import LaneSender
 from rmpa.mesh.io.securing import tls_failure
+from rmpa.mesh.peering import REPLACED, RESTARTED
 from rmpa.runtime.loop import MachineTimer
 from rmpa.runtime.stream import Stream
 
@@ -29,12 +29,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.core.identity import Guid, Identity
-    from rmpa.core.statistics import Counters
     from rmpa.mesh.connection import DataHandler
     from rmpa.mesh.frames import Hello, Refuse
+    from rmpa.mesh.io.mesh import Mesh
     from rmpa.mesh.io.securing import SecuredSocket
     from rmpa.mesh.peering import SocketAddress
-    from rmpa.runtime.loop import SystemClock
 
 # Bytes of control frames that may wait for one link: two of the longest. They are never dropped, so beyond this the
 # link is closed.
@@ -80,51 +79,6 @@ class LinkHandlers:
     lane_lost: Callable[[PeerLink], None]
 
 
-@dataclass(eq=False)
-class LinkOwner(ABC):
-    """What connections and links have of their mesh, and what they report to it; the base of ``Mesh``.
-
-    Args:
-        identity: The identity of this agent.
-        handlers: What is called when something happens to a link.
-        clock: The time; its ``now`` must be the loop's own clock.
-        counters: Where refusals and failures are counted.
-        rng: Uniform numbers in [0, 1), for jitter.
-        rest_lease: What this agent promises on links at rest; see ``mesh.keepalive.rest_lease``.
-    """
-
-    identity: Identity
-    handlers: LinkHandlers
-    clock: SystemClock
-    counters: Counters
-    rng: Callable[[], float]
-    rest_lease: float = limits.IDLE_LEASE
-
-    @abstractmethod
-    def judge(self, connection: Connection, hello: Hello) -> Refuse | None:
-        """Decide on the hello or welcome of the remote side, beside what its machine checks; ``None`` accepts it."""
-
-    @abstractmethod
-    def opened(self, connection: Connection) -> None:
-        """The handshake succeeded."""
-
-    @abstractmethod
-    def refused(self, connection: Connection, refuse: Refuse, *, by_us: bool) -> None:
-        """The handshake was refused; ``ended`` follows."""
-
-    @abstractmethod
-    def ended(self, connection: Connection, reason: str) -> None:
-        """The socket is closed; called once."""
-
-    @abstractmethod
-    def redial(self, link: PeerLink) -> None:
-        """Nothing came from a link's peer for ``quiet_after``; called again from time to time in this silence."""
-
-    @abstractmethod
-    def dial_bulk(self, link: PeerLink) -> None:
-        """Dial the bulk lane of a link, if it is wanted, and this side has to."""
-
-
 class Connection(ConnectionProtocol):
     """One TCP connection: its machine, driven by one stream and one timer.
 
@@ -150,7 +104,7 @@ class Connection(ConnectionProtocol):
     def __init__(
         self,
         connection_id: int,
-        mesh: LinkOwner,
+        mesh: Mesh,
         sock: socket.socket,
         endpoint: SocketAddress,
         *,
@@ -187,8 +141,8 @@ class Connection(ConnectionProtocol):
             secured=secured is not None,
             label=f"{endpoint[0]}:{endpoint[1]}",
             counters=mesh.counters,
+            pace=mesh.pace,
         )
-        self.keepalive.rest_lease = mesh.rest_lease
         self._timer = MachineTimer(self.next_timer, self._due, now=mesh.clock.now)
         self.flush()
 
@@ -208,7 +162,8 @@ class Connection(ConnectionProtocol):
         If more than ``CONNECTION_URGENT_BYTES`` wait, the remote side does not read, and the connection is
         closed.
         """
-        if self.up:
+        if self.up and self.link is not None:
+            self.link.touch()
             self.stream.send((self.pack_control(payload),), URGENT)
             self._check_urgent()
 
@@ -365,9 +320,9 @@ class PeerLink:
         backoff: The pauses between dials of the bulk lane.
         redial: The task that dials the bulk lane, and the one that dials the silent peer anew, if there is one.
         used: Whether this link carries the peer's data; of two links with one peer, only one is used.
+        over: Why it is no longer used; see ``LinkHandlers.down``.
         routes: The handlers of the data that arrives, by route; both lanes look here while the link is used.
-        silent: Once the link is down: whether it ended without a bye, so that the peer may soon be linked again.
-        crashed: Once the link is down: whether the peer's agent died, or a better link took over; its nodes go on.
+        send_control: ``(payload)``: sends one control frame, before all data that waits; never dropped.
         mark: ``(kind, route, sequence)``: acknowledges messages of a route, before all waiting data.
         abort: ``(reason)``: closes at once, without a bye.
         close: ``(reason)``: sends a bye, waits shortly for the last bytes to be sent, and closes.
@@ -375,7 +330,7 @@ class PeerLink:
         touched_at: Monotonic seconds of the last control frame in either direction.
     """
 
-    def __init__(self, connection: Connection, mesh: LinkOwner) -> None:
+    def __init__(self, connection: Connection, mesh: Mesh) -> None:
         self.id: Final = connection.id
         self.identity: Final = connection.identity
         self.guid: Final = connection.identity.guid
@@ -394,8 +349,8 @@ class PeerLink:
         self.redial: asyncio.Task[None] | None = None
         self.used = False
         self.routes: dict[int, DataHandler] = {}
-        self.silent = False
-        self.crashed = False
+        self.over = ""
+        self.send_control: Final = connection.send_control
         self.mark: Final = connection.send_mark
         self.abort: Final = connection.lost
         self.close: Final = connection.end
@@ -407,6 +362,16 @@ class PeerLink:
         self._bulk_in = self._bulk_out = 0  # bytes of the bulk lane's earlier connections
         connection.link = self
         self.express.connect(connection.stream)
+
+    @property
+    def silent(self) -> bool:
+        """Once the link is down: whether the peer may be back soon: it ended without a bye, or the peer moves."""
+        return self.over == REPLACED or self.connection.silent or self.connection.moves
+
+    @property
+    def crashed(self) -> bool:
+        """Once the link is down: whether the peer's agent died, or a better link took over; its nodes go on."""
+        return self.over in (REPLACED, RESTARTED) or self.connection.crashed
 
     def want_bulk(self) -> None:
         """A message waits for the bulk lane, here or at the peer that asks for it; the side that dialled dials it."""
@@ -505,11 +470,6 @@ class PeerLink:
             lease=self.connection.keepalive.remote_lease,
             lanes=lanes,
         )
-
-    def send_control(self, payload: bytes) -> None:
-        """Send one control frame, before all data that waits; never dropped; see ``Connection``."""
-        self.touch()
-        self.connection.send_control(payload)
 
     def need(self, *, needed: bool) -> None:
         """Say whether something of this module depends on the link; it rests when neither side needs it.

@@ -16,10 +16,10 @@ from rmpa.core.statistics import Counters
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FULL, Lane, Refusal, Refuse
 from rmpa.mesh.io.dial import Dialler, unacknowledged
-from rmpa.mesh.io.link import Connection, LinkHandlers, LinkOwner, PeerLink
+from rmpa.mesh.io.link import Connection, LinkHandlers, PeerLink
 from rmpa.mesh.io.securing import Securing, SecuringError, prove, secure_dialled
-from rmpa.mesh.keepalive import rest_lease
-from rmpa.mesh.peering import REPLACED, RESTARTED, Peer, Peering, PeeringOutput
+from rmpa.mesh.keepalive import Pace, rest_lease
+from rmpa.mesh.peering import REPLACED, Peer, Peering, PeeringOutput
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.loop import MachineTimer, SystemClock
@@ -53,7 +53,7 @@ def _log_refusal(peer: object, refuse: Refuse) -> None:
     _log.warning("! %s refuses a link: %s [%s]", peer, refuse.text, codes.of_counter(kind))
 
 
-class Mesh(LinkOwner):
+class Mesh:
     """The links to all peers; of several links with one peer, one is used.
 
     Args:
@@ -66,6 +66,10 @@ class Mesh(LinkOwner):
         dialler: Opens the connections; by default real ones.
         security: This module's membership of a secured mesh: all links use TLS then; ``None``: none does.
         on_join: Serves accepted connections for a join or a renewal; ``None``: this module is not the authority.
+
+    Attributes:
+        counters: Where refusals and failures are counted.
+        pace: What the keepalives of all links have in common.
     """
 
     def __init__(
@@ -81,7 +85,8 @@ class Mesh(LinkOwner):
         security: Membership | None = None,
         on_join: OnJoin | None = None,
     ) -> None:
-        super().__init__(identity, handlers, clock or SystemClock(), Counters(), rng)
+        self.identity, self.handlers, self.rng = identity, handlers, rng
+        self.clock, self.counters, self.pace = clock or SystemClock(), Counters(), Pace.of(identity)
         self._acceptor = Acceptor(listen_socket, self._accepted, name="links to peers", use=Use.LINK)
         self._refusals = RefusalLog(_log, self.counters)
         self.dialler: Final = dialler or Dialler(lanes or LaneSettings(), self.counters)
@@ -161,9 +166,7 @@ class Mesh(LinkOwner):
 
     def count_peers(self, peers: int) -> None:
         """Take the number of peers that are present: it decides how rare the keepalives of links at rest are."""
-        self.rest_lease = rest_lease(peers)
-        for connection in self.connections():
-            connection.keepalive.rest_lease = self.rest_lease
+        self.pace.rest_lease = rest_lease(peers)
 
     def peers(self) -> list[Peer]:
         """All known peers: linked, or why not and when the next attempt is due."""
@@ -266,13 +269,10 @@ class Mesh(LinkOwner):
         if connection.expected is not None:
             self._peering.dial_failed(connection.expected, reason, now, connection.remote_endpoint)
         if (link := self._links.get(connection.id)) is not None:
-            link.silent |= connection.silent
-            link.crashed |= connection.crashed
             if discarded := link.discard():
                 self.counters.add("link.discarded", discarded)
             needed = connection.keepalive.remote_lease <= limits.EXPRESS_LEASE  # that of a link at rest is longer
-            self._peering.link_down(link.id, reason, now, silent=link.silent, needed=needed)
-            link.silent |= connection.moves
+            self._peering.link_down(link.id, reason, now, silent=connection.silent, needed=needed)
         self._act()
         self._links.pop(connection.id, None)
 
@@ -319,9 +319,7 @@ class Mesh(LinkOwner):
                 link = self._links[link_id]
                 self.counters.add("link.replaced" if reason == REPLACED else "link.down")
                 _log.info("= %s: link down: %s", link.identity, reason)
-                link.silent |= reason == REPLACED
-                # The link of a peer that restarted within its lease: its agent died, the host is there.
-                link.crashed |= reason in (REPLACED, RESTARTED)
+                link.over = reason
                 link.use(used=False)
                 self.handlers.down(link, reason)
             case ("refused", identity, refuse):

@@ -24,7 +24,7 @@ from rmpa.config.settings import Settings
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.limits import KIB, MIB
-from rmpa.discovery.network import NetworkInterface, read_interfaces
+from rmpa.discovery.network import Interface, read_interfaces
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check, CheckLevel
 from rmpa.observe.control_client import ControlClient, find_agents
@@ -60,7 +60,7 @@ class DoctorInput:
     settings: Settings
     settings_checks: tuple[Check, ...]
     agents: Mapping[str, Snapshot | str]
-    interfaces: tuple[NetworkInterface, ...]
+    interfaces: tuple[Interface, ...]
     listen: float = 0.0
 
     @property

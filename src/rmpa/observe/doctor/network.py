@@ -36,7 +36,7 @@ from rmpa.runtime.kernel_tcp import program_at
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from rmpa.discovery.network import Interface, NetworkInterface
+    from rmpa.discovery.network import Interface
     from rmpa.observe.doctor.machine import DoctorInput
 
 
@@ -62,7 +62,7 @@ def _in_container() -> bool:
 
 
 def judge_interfaces(
-    interfaces: Sequence[NetworkInterface], wanted: Sequence[str], *, container: bool = False
+    interfaces: Sequence[Interface], wanted: Sequence[str], *, container: bool = False
 ) -> Iterator[Check]:
     """Which interfaces an agent can use, and which of these are likely to make trouble.
 
@@ -97,7 +97,7 @@ def judge_interfaces(
         yield check(WARN, text, remedy, where=outer[0].name)
 
 
-def _judge_interface(one: NetworkInterface) -> Check:
+def _judge_interface(one: Interface) -> Check:
     addresses, check = ", ".join(map(str, one.networks)), partial(Check, "interface", where=one.name)
     if _TUNNELS.match(one.name) or not one.multicast:
         text = f"{addresses}: a tunnel; most of them carry no multicast"
@@ -373,7 +373,7 @@ def rp_filter(given: DoctorInput) -> Iterable[Check]:
     return [judge_rp_filter(values, given.interfaces)]
 
 
-def judge_rp_filter(values: Mapping[str, int], interfaces: Sequence[NetworkInterface]) -> Check:
+def judge_rp_filter(values: Mapping[str, int], interfaces: Sequence[Interface]) -> Check:
     """Whether the kernel drops packets that come in on another interface than answers would leave by.
 
     Args:

@@ -15,15 +15,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits as bridge_limits
-from rmpa.bridge.peer_offers import CONFLICT, DENIED
-from rmpa.bridge.policy import OUTSIDE_GUID
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
 from rmpa.config.values import did_you_mean
 from rmpa.core import limits as core_limits
-from rmpa.core.facts import Arrival, PublisherReport, RouteInfo
-from rmpa.core.identity import is_meant
+from rmpa.core.facts import CONFLICT, DENIED, Arrival, PublisherReport, RouteInfo
+from rmpa.core.identity import OUTSIDE_GUID, is_meant
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check, CheckLevel
 from rmpa.observe.why.diagnosis import (

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge.messages import Source
-from rmpa.bridge.peer_offers import DENIED
 from rmpa.bridge.policy import Needs
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
+from rmpa.core.facts import DENIED
 from rmpa.core.identity import OWN_NODE, is_global_name, is_own
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, OK, Check
@@ -294,8 +293,7 @@ class WhyService:
         sources: list[PublisherReport] = []
         subscribers: list[str] = []
         for topic in topics:
-            nodes = self._relayed(topic, instance) if instance else self._own(topic)
-            sources += [self._facts.topics.report(session, Source(topic, node)) for node in nodes]
+            sources += self._facts.topics.reports(session, topic, instance)
             subscribers += [node for node in state.subscribers.get(topic, {}) if not is_own(node)]
         known = (topic for topic, nodes in state.publishers.items() if not all(map(is_own, nodes)))
         similar = "" if sources else await self._similar(asker, Access.SUBSCRIBE, wire, known)
@@ -313,12 +311,6 @@ class WhyService:
         known = {context.names.of(asker).wire_name(name) for name in allowed}
         # In a thread: comparing thousands of names takes longer than a message may wait.
         return await asyncio.to_thread(did_you_mean, wire, known) or ""
-
-    def _relayed(self, topic: str, instance: object) -> list[str]:
-        """The proxies of the nodes of a module whose topic this one relays."""
-        offered = self._bridge.topics.exports.offered
-        relayed = ((node, offered.get(Source(topic, node))) for node in self._core.publishers(topic))
-        return [node for node, local in relayed if local and local.origin and local.origin.instance == instance]
 
     async def _service(self, service: str, name: str | None) -> tuple[Diagnosis, ...]:
         """Judge the path of a service from one peer, or from each, to here."""

@@ -22,7 +22,6 @@ from rmpa.ros.core.liveness import Liveness, refuses
 from rmpa.ros.http.rpc import call, call_api, exchange, read_response
 from rmpa.ros.master import mirror
 from rmpa.ros.master.parameters import RegistrationKind
-from rmpa.ros.master.registrations import ANY_TYPE
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief, call_pieces
 from rmpa.runtime.accept import Use
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
@@ -155,9 +154,9 @@ class Core(Protocol):
         """The subscribers of a topic with their slave APIs; never changed afterwards."""
         return self.registrations.at(RegistrationKind.SUBSCRIBER, topic)
 
-    def type_of(self, topic: str) -> str:
-        """The type last registered for a topic; ``*`` for none."""
-        return self.registrations.types().get(topic, ANY_TYPE)
+    def type_of(self, topic: str, node: str = "") -> str:
+        """The type with which a node publishes a topic, else the one registered last; ``*`` for none."""
+        return self.registrations.type_of(topic, node)
 
     def on_change(self, callback: Callable[[GraphChange], None]) -> None:
         """Call ``callback`` in the loop after each change of a registration."""

@@ -9,6 +9,7 @@ from typing import Annotated, Final
 
 import msgspec
 
+from rmpa.core.identity import is_type_name
 from rmpa.ros.master.parameters import GraphChange, GraphState, RegistrationKind, SlaveCall
 
 # Characters of a name that is read from a state file: rosmaster has no limit, and the longest seen have 200.
@@ -16,6 +17,7 @@ _CORE_STATE_NAME_MAX: Final = 4096
 
 ANY_TYPE: Final = "*"
 _NONE: Final[dict[str, str]] = {}
+_NO_ENTRIES: Final[dict[tuple[RegistrationKind, str], str]] = {}
 _OTHER_SIDE: Final = {
     RegistrationKind.PUBLISHER: RegistrationKind.SUBSCRIBER,
     RegistrationKind.SUBSCRIBER: RegistrationKind.PUBLISHER,
@@ -47,8 +49,8 @@ class Registrations:
 
     def __init__(self) -> None:
         self._apis: dict[str, str] = {}
-        # node -> what it registered (dicts, for their order)
-        self._entries: dict[str, dict[tuple[RegistrationKind, str], None]] = {}
+        # node -> what it registered, in order, each with its detail as of ``register``
+        self._entries: dict[str, dict[tuple[RegistrationKind, str], str]] = {}
         # key -> node -> slave API. The inner dicts are replaced, never changed: callers may hold them.
         self._tables: dict[RegistrationKind, dict[str, dict[str, str]]] = {kind: {} for kind in RegistrationKind}
         # service -> node -> service URI, likewise; a service has one provider
@@ -93,6 +95,14 @@ class Registrations:
     def types(self) -> dict[str, str]:
         """The type of each topic that ever had one; not to be changed."""
         return self._types
+
+    def type_of(self, topic: str, node: str = "") -> str:
+        """The type with which a node publishes a topic, else the one registered last by any node; ``*`` for none.
+
+        The master keeps one type for each topic; publishers may have several.
+        """
+        own = self._entries.get(node, _NO_ENTRIES).get((RegistrationKind.PUBLISHER, topic), "")
+        return own if is_type_name(own) else self._types.get(topic, ANY_TYPE)
 
     def record(self, node: str) -> NodeRecord | None:
         """Everything that a node registered; ``None`` for an unknown node."""
@@ -161,7 +171,7 @@ class Registrations:
                 retyped = True
                 self._types[key] = detail
         if retyped or node not in providers:
-            self._entries[node][kind, key] = None
+            self._entries[node][kind, key] = detail
             self._tables[kind][key] = {**providers, node: api}
             self._changed(kind, key, node, api, added=True)
         if kind is RegistrationKind.PUBLISHER:

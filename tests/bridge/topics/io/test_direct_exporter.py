@@ -393,7 +393,7 @@ async def test_a_secured_peer_does_not_learn_of_a_service_that_it_may_not_have(
     server = SimpleNamespace(node="/adder", uri=URI, origin=None)
     exports = SimpleNamespace(offered={"/add": server}, local=lambda *_: None)
     warnings: list[str] = []
-    services = ServiceGrants(module.sut._shared, cast("Any", exports), lambda *words: warnings.append(words[0]))
+    services = ServiceGrants(module.sut._bridge, cast("Any", exports), lambda *words: warnings.append(words[0]))
     for expected in ([], ["direct.relayed"]):
         reply = await module.handlers["direct.service"](module.sessions[1], {"name": "/add", "node": "/adder"})
         assert reply["why"] == Condition.OFFERED

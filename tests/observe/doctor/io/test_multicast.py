@@ -23,7 +23,7 @@ GROUP = config_limits.MULTICAST_GROUP
 
 
 def test_doctor_receives_its_own_packets() -> None:
-    gone = Interface("gone0", 9999, LO.addresses, up=True, multicast=True, loopback=False)
+    gone = Interface("gone0", LO.networks, 9999)
     lo, other = hear([LO, gone], GROUP, PORT)
     assert lo.after is not None
     assert 0 < lo.after < limits.DOCTOR_HEAR

@@ -1,4 +1,16 @@
-"""Which parameters peers may read, set and follow, and how they cross. Without I/O."""
+"""Which parameters peers may read, set and follow, and how they cross. Without I/O.
+
+Values cross as the text of an XML-RPC response (``ros.wire.xmlrpc``), so that their types survive: JSON has neither
+binary data nor dates. ``bridge.rpc`` carries large ones aside of commands. ::
+
+    param.get {key}                → {text}
+    param.names {}                 → {text}       a list of the names of all parameters that may be read
+    param.set {key, text}          → {count}
+    param.delete {key}             → {}
+    param.follow {keys}            → {refused}    from now on the owner asks:
+    param.value {key, text}        → null         the value now; text null: there is none
+    param.value {key, refused}     → null         it may not be followed any more
+"""
 
 from __future__ import annotations
 
@@ -96,20 +108,6 @@ def follow_rules(settings: Settings) -> tuple[FollowRule, ...]:
     """All parameters that this module follows, including the time if ``[time]`` has it followed."""
     owner = settings.time.follow
     return settings.params.follow + ((FollowRule(SIM_TIME, owner, SIM_TIME),) if owner else ())
-
-
-# --- The names of the requests between two agents about parameters --------------------------------------------------
-#
-# Values cross as the text of an XML-RPC response (``ros.wire.xmlrpc``), so that their types survive: JSON has
-# neither binary data nor dates. ``bridge.rpc`` carries large ones aside of commands. ::
-#
-#     param.get {key}                → {text}
-#     param.names {}                 → {text}       a list of the names of all parameters that may be read
-#     param.set {key, text}          → {count}
-#     param.delete {key}             → {}
-#     param.follow {keys}            → {refused}    from now on the owner asks:
-#     param.value {key, text}        → null         the value now; text null: there is none
-#     param.value {key, refused}     → null         it may not be followed any more
 
 
 GET: Final = "param.get"
