@@ -211,16 +211,6 @@ async def test_a_withdrawal_while_the_answer_is_made_is_not_overlooked(module: M
     assert module.moved == ["/viewer"]
 
 
-async def test_one_that_is_connected_already_gets_no_second_connection(module: Module) -> None:
-    module.sut.shown(module.entry)
-    await until(lambda: module.state[0] == "direct")
-    module.connected = [LINK]
-    reply = await module.ask()
-    assert reply is not None
-    assert reply.code == 0
-    assert module.state == ("direct", END)
-
-
 async def test_only_so_many_requests_wait_for_a_peer(module: Module) -> None:
     module.gate.clear()
     module.subscribers["/chatter"] |= {f"/n{number}": "http://10.0.0.2:1/" for number in range(200)}
@@ -298,19 +288,6 @@ async def test_a_probe_over_an_earlier_link_does_not_count_for_the_next_one(modu
     await asyncio.sleep(0)
     module.reachable.set()
     await until(lambda: module.state[0] == "relayed")
-
-
-async def test_a_subscriber_that_ends_frees_its_grant(module: Module) -> None:
-    module.sut.shown(module.entry)
-    assert await module.ask() == DIRECT
-    module.sut.hidden(module.entry)
-    assert "direct.topic_release" in module.told
-    assert list(module.sut) == []
-
-
-async def test_a_grant_that_has_no_use_any_more_is_released(module: Module) -> None:
-    module.sut._asked_again(module.session, {"name": "/chatter", "node": "/talker", "user": "/gone"})
-    assert module.told == ["direct.topic_release"]
 
 
 async def test_a_subscriber_that_the_next_agent_relays_has_lost_its_direct_connection_before(module: Module) -> None:

@@ -13,7 +13,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.data.quality import QosEventKind
 from rmpa.bridge.messages import Description, RouteOpened, Source
 from rmpa.bridge.sessions import AWAY_GRACE
-from rmpa.core.contract import Contract, Durability, Reliability, Transport
+from rmpa.core.contract import Contract, Durability, Reliability
 from rmpa.core.outbox import FIRST
 from tests.bridge.io.nodes import MD5, Core, Ear, stages
 from tests.bridge.io.proxied import Proxied
@@ -29,12 +29,6 @@ if TYPE_CHECKING:
 
 CMD = Source("/cmd", "/joy")
 SURE = Contract(reliability=Reliability.RELIABLE)
-TOLD: list[tuple[dict[str, Any], int, list[QosEventKind]]] = [
-    ({"epoch": 5, "following": 2}, 0, []),
-    ({"epoch": 5, "following": 9}, 7, [QosEventKind.MESSAGES_LOST]),
-    ({"epoch": 6}, 0, [QosEventKind.LOSS_UNKNOWN]),
-]
-"""What a peer says when its route is open again, and what is made of it."""
 ALIVE = Contract(liveliness_lease=5.0)
 
 
@@ -112,23 +106,6 @@ def played(scene: Callable[..., Coroutine[object, object, None]]) -> Callable[..
 
 
 @played
-async def test_a_source_appears_flows_and_disappears(proxied: Scene) -> None:
-    publication = await proxied.publish()
-    assert set(proxied.core.publishers("/cmd")) == {"/rmpa/b/joy"}
-    listener = Heard(publication)
-    assert proxied.demands == [True]
-    flow = proxied.describe(Contract())
-    flow.message(1, 0, framed("one"))
-    proxied.detach()
-    proxied.route.end(missed=True)
-    proxied.route.release()
-    await asyncio.sleep(0.01)
-    assert listener.texts == ["one"]
-    assert listener.closed
-    assert proxied.core.publishers("/cmd") == {}
-
-
-@played
 async def test_the_contract_bounds_the_queue_and_the_latched_messages(proxied: Scene) -> None:
     publication = await proxied.publish()
     proxied.describe(Contract(durability=Durability.TRANSIENT_LOCAL, depth=2), latching=True)
@@ -175,55 +152,6 @@ async def test_a_changed_header_reconnects_the_subscribers(proxied: Scene) -> No
 
 
 @played
-async def test_a_sender_that_began_anew_is_said_and_brings_nothing_again(proxied: Scene) -> None:
-    listener = Heard(await proxied.publish())
-    flow = proxied.describe(SURE, epoch=5, latching=True)
-    flow.message(1, 0, framed("map"))
-    proxied.flow.link_down()
-    assert proxied.describe(SURE, epoch=6, latching=True) is flow
-    flow.message(1, 0, framed("map"))
-    flow.message(2, 0, framed("new map"))
-    assert listener.texts == ["map", "new map"]
-    assert proxied.kinds() == [QosEventKind.LOSS_UNKNOWN]
-
-
-@pytest.mark.parametrize(("told", "count", "kinds"), TOLD)
-@played
-async def test_what_a_sender_says_that_it_has_given_up_is_lost(
-    proxied: Scene, told: dict[str, Any], count: int, kinds: list[QosEventKind]
-) -> None:
-    await proxied.publish()
-    flow = proxied.describe(SURE, epoch=5)
-    flow.message(1, 0, framed("one"))
-    proxied.flow.link_down()
-    assert proxied.describe(SURE, route=2, **told) is flow
-    assert (lost(flow), proxied.kinds()) == (count, kinds)
-
-
-@pytest.mark.parametrize("last", [1, 3])
-@played
-async def test_what_had_not_come_of_a_publisher_that_has_gone_is_lost(proxied: Scene, last: int) -> None:
-    await proxied.publish()
-    proxied.describe(SURE, epoch=5).message(1, 0, framed("one"))
-    proxied.detach(missed=True, last=last)
-    new = proxied.describe(SURE, route=2, epoch=6)
-    assert (lost(new), proxied.kinds()) == (
-        last - 1,
-        [QosEventKind.MESSAGES_LOST] if last > 1 else [],
-    )
-
-
-@played
-async def test_another_transport_continues_the_flow(proxied: Scene) -> None:
-    await proxied.publish()
-    old = proxied.describe(SURE, epoch=5)
-    proxied.flow.link_down()
-    changed = Contract(reliability=Reliability.RELIABLE, transport=Transport.AUTO)
-    assert proxied.describe(changed, epoch=5) is old
-    assert old.contract == changed
-
-
-@played
 async def test_a_changed_contract_makes_a_new_flow(proxied: Scene) -> None:
     listener = Heard(await proxied.publish())
     old = proxied.describe(SURE, epoch=5)
@@ -234,21 +162,6 @@ async def test_a_changed_contract_makes_a_new_flow(proxied: Scene) -> None:
     new.message(1, 0, framed("two"))
     assert listener.texts == ["one", "two"]
     assert (lost(new), proxied.kinds()) == (0, [QosEventKind.LOSS_UNKNOWN])
-
-
-@played
-async def test_a_short_silence_repeats_no_latched_message(proxied: Scene) -> None:
-    publication = await proxied.publish()
-    listener = Heard(publication)
-    proxied.describe(Contract(), latching=True).message(1, 0, framed("map"))
-    proxied.flow.link_down()
-    late = Heard(publication)
-    flow = proxied.describe(Contract(), latching=True)
-    flow.message(1, 0, framed("map"))
-    flow.message(2, 0, framed("map"))
-    assert listener.texts == late.texts == ["map", "map"]
-    assert flow.quality.messages == 1
-    assert publication.latched == (bytes(framed("map")),)
 
 
 # --- what becomes of the contract -----------------------------------------------------------------------------------
@@ -284,19 +197,6 @@ async def test_a_source_that_leaves_with_its_peer_is_lost_at_once(proxied: Scene
     assert proxied.kinds() == [QosEventKind.LIVELINESS_LOST]
     await asyncio.sleep(60.0)
     assert len(proxied.occurred) == 1
-
-
-@played
-async def test_a_source_whose_peer_stays_away_is_lost_when_its_lease_is_over(proxied: Scene) -> None:
-    await proxied.publish()
-    proxied.describe(Contract(reliability=Reliability.RELIABLE, liveliness_lease=5.0), epoch=5)
-    await asyncio.sleep(10.0)
-    began = proxied.loop.time()
-    proxied.flow.link_down()
-    await asyncio.sleep(20.0)
-    [(lost, kind)] = proxied.occurred
-    assert kind is QosEventKind.LIVELINESS_LOST
-    assert 5.0 <= lost - began <= 5.5
 
 
 @played
