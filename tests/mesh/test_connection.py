@@ -254,14 +254,6 @@ def test_the_clock_offset_is_within_its_bound(offset_ns: int) -> None:
     assert abs(offset - offset_ns / 1e9) <= error + 1e-9
 
 
-def test_a_lease_of_a_month_is_cut(time: Time) -> None:
-    acceptor = Side(ACCEPTOR, HIGH, time)
-    hello = Hello(LOW.guid, LOW.instance, LOW.name, 0, 0xFFFFFFFF)
-    deliver(Frame(FrameKind.HELLO, hello.serialize()).serialize(), acceptor, time.now)
-    pass_time(acceptor, time, limits.LINK_LEASE_MAX)
-    assert acceptor.state is ConnectionState.CLOSED
-
-
 def test_identity_of_the_other_side_comes_with_the_hello(dialler: Side) -> None:
     assert dialler.remote is not None
     assert dialler.remote.identity == Identity(HIGH.guid, HIGH.instance, "high", 0)

@@ -175,7 +175,7 @@ async def a_lie(world: World) -> None:
     await world.rest(0.5)
     assert numbers(listener, speaker) == [1, 2]
     world.leave(listener)
-    await world.rest(2 * mesh_limits.RESUME_CLAIM)
+    await world.rest(2 * mesh_limits.RESUME_CLAIM, step=0.1)
     world.check_nothing_is_left()
 
 

@@ -21,7 +21,6 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.statistics import Counters
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.trust.permissions import Permissions
-from tests.ros.node.peers import until
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -204,19 +203,6 @@ async def test_what_is_not_offered_or_not_allowed_is_refused(module: Module) -> 
     assert {peer: list(asked) for peer, asked in module.sut._asked.items()} == {1: [WANT]}, (
         "of malformed questions nothing is kept"
     )
-
-
-async def test_a_node_that_restarts_while_it_is_asked_is_not_granted(module: Module) -> None:
-    module.gate.clear()
-    opening = asyncio.create_task(module.open())
-    await until(lambda: module.asked)
-    module.change(RegistrationKind.PUBLISHER, "/talker", "http://10.0.0.1:9/", added=True)
-    module.gate.set()
-    assert (await opening)["why"] == Condition.NODE
-    assert module.granted == []
-    # The exports learn the new address later; it counts at once.
-    await module.open()
-    assert module.asked == [URI, "http://10.0.0.1:9/"]
 
 
 async def test_only_a_peer_with_a_grant_may_have_a_node_examined(module: Module) -> None:
