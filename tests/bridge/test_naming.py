@@ -6,7 +6,6 @@ from hypothesis import strategies as st
 
 from rmpa.bridge.context import Names, PeerNames
 from rmpa.config.peer_rules import PeerRule
-from rmpa.config.settings import Settings
 
 ROBOT = PeerRule(
     "robot*",
@@ -20,14 +19,6 @@ ROBOT = PeerRule(
     (("/goals/{peer}", "/goal"), ("/shared/**", "/**")),
 )
 NAMES = st.from_regex(r"(/[a-c]{1,2}){1,4}", fullmatch=True)
-
-
-def test_every_peer_may_have_its_names_below_its_own_but_those_that_a_rule_names() -> None:
-    names = Names(Settings(prefix_peers=True, peers=(PeerRule("pc", remap_in=(("/**", "/**"),)), ROBOT)).naming)
-    assert names.of("arm").local_name("/odom") == "/arm/odom"
-    assert names.of("arm").wire_name("/arm/goal") == "/goal"
-    assert names.of("pc").local_name("/cmd_vel") == "/cmd_vel"
-    assert names.of("robot1").local_name("/tf") == "/tf"
 
 
 @pytest.mark.parametrize(
@@ -70,17 +61,6 @@ def test_a_name_is_renamed_once() -> None:
     assert (names.wires_of("/b"), names.wires_of("/a")) == (("/a",), ())
     swapped = PeerNames("p", (PeerRule("p", "", (("/a", "/b"), ("/b", "/a"))),))
     assert (swapped.local_name("/a"), swapped.local_name("/b")) == ("/b", "/a")
-
-
-def test_rules_of_several_tables_apply_in_order_and_others_not_at_all() -> None:
-    rules = (
-        PeerRule("p*", "", (("/a", "/x"),)),
-        PeerRule("q", "/q", (("/a", "/y"),)),
-        PeerRule("*", "/{peer}", (("/a", "/z"), ("/b", "/z2"))),
-    )
-    names = Names(rules)
-    assert [names.of("p1").local_name(name) for name in ("/a", "/b", "/c")] == ["/x", "/z2", "/p1/c"]
-    assert [names.of("q").local_name(name) for name in ("/a", "/b", "/c")] == ["/y", "/z2", "/q/c"]
 
 
 def test_without_rules_for_it_a_peer_is_plain() -> None:

@@ -29,7 +29,6 @@ from tests.bridge.recorder import (
     Send,
     ServiceExports,
     ServiceImports,
-    Warn,
 )
 from tests.bridge.services.test_rules import rules
 
@@ -56,32 +55,6 @@ def told(made: ServiceExports, *busy: int, now: float = 0.0) -> dict[int, tuple[
     return found
 
 
-def test_a_new_peer_is_told_everything_in_portions() -> None:
-    made = book()
-    for number in range(limits.ADVERTISED_AT_ONCE + 2):
-        made.put(f"/e{number:03}", ONE)
-    (first,) = made.link_up(1, "far")
-    begin = first.message
-    assert (len(begin.added), begin.full, begin.more) == (limits.ADVERTISED_AT_ONCE, True, True)
-    assert made.pending
-    ((_, rest),) = made.advertise()
-    assert (len(rest.added), rest.full, rest.more, made.pending) == (2, False, False, False)
-
-
-def test_of_two_entries_of_one_name_the_second_waits_for_the_first() -> None:
-    made = book(1000, PeerRule("robot", prefix="/r"))
-    made.put("/go", ONE)
-    made.put("/r/go", TWO)
-    warning, message = made.link_up(1, "robot")
-    assert warning == Warn("names.taken", "1 /r/go", "/r/go would be /go at robot, as /go is already: rename one")
-    assert message.message.added == (ServiceOffer("/go", "/n"),)
-    made.put("/go", None)
-    # What waits is told behind it.
-    assert told(made) == {1: ([], ["/go"])}
-    assert told(made) == {1: (["/go"], [])}
-    assert made.offer(1, "/r/go") == ServiceOffer("/go", "/n")
-
-
 def test_beyond_the_limit_the_first_one_takes_the_next_free_place() -> None:
     made = book(limit=1)
     made.put("/a", ONE)
@@ -102,15 +75,6 @@ def test_whole_accounts_are_told_to_one_peer_at_a_time_and_in_turn() -> None:
     for number in range(limits.ADVERTISED_AT_ONCE + 2):
         made.put(f"/e{number:03}", ONE)
     assert [list(told(made)) for _ in range(4)] == [[1], [2], [1, 2], []]
-
-
-def test_a_peer_without_a_link_is_told_nothing() -> None:
-    made = book()
-    made.link_up(1, "far")
-    made.link_down(1)
-    made.put("/a", ONE)
-    assert told(made) == {}
-    assert made.offer(1, "/a") is None
 
 
 def test_a_portion_waits_while_the_lane_is_busy_but_not_for_ever() -> None:
@@ -163,22 +127,6 @@ def test_removals_go_first() -> None:
     assert changes(heard(), "/a", "/b", removed=("/gone",)) == [("/gone", None), ("/a", "/a"), ("/b", "/b")]
 
 
-def test_what_a_complete_account_does_not_mention_is_removed_at_its_end() -> None:
-    made = heard("/a", "/b", "/c")
-    assert changes(made, "/a", full=True, more=True) == [("/a", "/a")]
-    assert changes(made, "/b", more=True) == [("/b", "/b")]
-    assert changes(made, "/d") == [("/c", None), ("/d", "/d")]
-    assert changes(made) == []
-
-
-def test_a_complete_account_and_a_long_absence_forget_what_was_refused() -> None:
-    made = heard()
-    for end in (lambda: changes(made, full=True), made.give_up):
-        made.refused["/b"] = "/b"
-        end()
-        assert not made.refused
-
-
 def test_a_bounded_number_of_refused_offers_is_remembered(monkeypatch: Any) -> None:
     monkeypatch.setattr(limits, "REFUSED_MAX", 1)
     made = ServiceImports(rules(), LimitSettings(services=1))
@@ -210,21 +158,6 @@ def published(actions: list[Any]) -> list[str]:
     return [action.source.topic for action in actions if isinstance(action, Publish)]
 
 
-def test_nodes_beyond_the_limit_are_hidden_counted_and_named() -> None:
-    made = imports(nodes=2)
-    actions = made.advertised(1, Advertise(added=offers(range(4), topics=3)))
-    assert shown(made) == {"/n0", "/n1"}
-    warnings = [action for action in actions if isinstance(action, Warn)]
-    assert {(one.kind, one.who) for one in warnings} == {("nodes.too_many", "far")}
-    assert "limits.nodes = 2" in warnings[0].text
-    assert {node: len(sources) for node, sources in made.refused_nodes(1).items()} == {"/n2": 3, "/n3": 3}
-    entry = made.entry(1, Source("/n2/t0", "/n2"))
-    assert entry.cause == CROWDED
-    assert "limits.nodes = 2 of this module" in entry.hidden
-    more = TopicOffer("/late", "/n0", "a/B")
-    assert published(made.advertised(1, Advertise(added=(more,)))) == ["/late"], "its node has a place"
-
-
 def test_a_leaving_node_gives_its_place_to_the_longest_waiting() -> None:
     made = imports(nodes=2)
     made.advertised(1, Advertise(added=offers(range(4), topics=2)))
@@ -235,18 +168,6 @@ def test_a_leaving_node_gives_its_place_to_the_longest_waiting() -> None:
     assert set(made.refused_nodes(1)) == {"/n3"}
     made.advertised(1, Advertise(removed=tuple(offer.source for offer in offers(range(3, 4), topics=2))))
     assert not made.refused_nodes(1), "one that is gone waits no more"
-
-
-def test_topics_beyond_the_limit_come_when_there_is_room() -> None:
-    made = imports(topics=2)
-    actions = made.advertised(1, Advertise(added=offers(range(4))))
-    assert published(actions) == ["/n0/t0", "/n1/t0"]
-    assert [a.kind for a in actions if isinstance(a, Warn)] == ["topics.too_many"] * 2
-    assert made.refused(1) == 2
-    made.advertised(1, Advertise(removed=(Source("/n2/t0", "/n2"),)))
-    assert made.refused(1) == 1
-    assert published(made.advertised(1, Advertise(removed=(Source("/n0/t0", "/n0"),)))) == ["/n3/t0"]
-    assert made.refused(1) == 0
 
 
 @pytest.mark.parametrize("kind", ["nodes", "topics"])
@@ -268,29 +189,6 @@ def test_a_limit_that_is_raised_holds_at_once_and_a_lower_one_for_what_comes(kin
         published(made.advertised(1, Advertise(added=offers(range(5, 6)), removed=(Source("/n0/t0", "/n0"),)))) == []
     )
     assert published(reload(5)) == ["/n5/t0"]
-
-
-def test_a_peer_that_comes_back_begins_anew() -> None:
-    made = imports(nodes=1, topics=3)
-    made.advertised(1, Advertise(added=offers(range(5))))
-    actions, waits = made.link_away(1)
-    assert published(actions) == [], "nobody takes a place of a peer that is away"
-    assert not waits
-    list(made.link_down(1))
-    made.link_up(1, "far")
-    assert (len(made.refused_nodes(1)), made.refused(1)) == (0, 0)
-    made.advertised(1, Advertise(added=offers(range(5)), full=True))
-    assert (len(made.refused_nodes(1)), made.refused(1)) == (2, 2)
-
-
-def test_a_short_loss_of_the_link_keeps_all_places() -> None:
-    made = imports(nodes=1, topics=3)
-    made.advertised(1, Advertise(added=offers(range(5))))
-    made.link_away(1, briefly=True)
-    made.link_up(1, "far")
-    assert published(made.advertised(1, Advertise(added=offers(range(5)), full=True))) == []
-    assert shown(made) == {"/n0"}
-    assert (len(made.refused_nodes(1)), made.refused(1)) == (2, 2)
 
 
 _events = st.lists(st.tuples(st.booleans(), st.integers(0, 6), st.integers(0, 2)), max_size=60)
@@ -376,14 +274,6 @@ def services(*, nodes: int = 100, count: int = 100) -> ServiceImports:
     made = ServiceImports(rules(), LimitSettings(nodes=nodes, services=count))
     made.link_up(1, "far", rank=10)
     return made
-
-
-def test_another_peer_provides_what_one_has_no_place_for() -> None:
-    made = services(nodes=1)
-    made.link_up(2, "other", rank=20)
-    made.advertised(1, provided("/a", node="/first"))
-    made.advertised(1, provided("/b", node="/second"))
-    assert made.advertised(2, provided("/b")) == [Provide(2, "/b", "/n")]
 
 
 def test_the_services_limits_are_reloaded() -> None:

@@ -458,26 +458,6 @@ async def test_what_is_set_here_is_put_back(size: int, caplog: pytest.LogCapture
     assert pad.core.get("/base/robot_description") == "x" * size
 
 
-async def test_an_owner_that_comes_back_without_it_takes_nothing_away() -> None:
-    base, pad = Side("base"), Side("pad", follows(DESCRIPTION))
-    base.core.set("/robot_description", "one")
-    join(base, pad)
-    await until(lambda: pad.core.get("/base/robot_description") == "one")
-    base.down(1)
-    pad.down(1)
-    again = Side("base")
-    join(again, pad, 2)
-    await until(
-        lambda: [one.told for one in again.params.owner._followers.values()] == [{"/robot_description": hash(None)}]
-    )
-    await until(lambda: not pad.params._working)
-    await again.look()
-    await pad.look()
-    assert pad.core.get("/base/robot_description") == "one"
-    again.core.set("/robot_description", "two")
-    await until(lambda: pad.core.get("/base/robot_description") == "two")
-
-
 async def test_two_of_one_name_are_not_mixed(caplog: pytest.LogCaptureFixture) -> None:
     first, second, pad = Side("base"), Side("base"), Side("pad", follows(DESCRIPTION))
     first.core.set("/robot_description", "first")
@@ -568,42 +548,6 @@ async def test_what_the_core_did_not_take_at_once_is_not_taken_for_a_change_of_a
     await pad.look()
     assert pad.core.get("/arm") == value
     assert "put back" not in caplog.text
-
-
-async def test_what_a_peer_no_longer_follows_is_forgotten() -> None:
-    base, pad = Side("base"), Side("pad")
-    join(base, pad)
-    for number in range(3):
-        await pad.ask(transfer.FOLLOW, {"keys": [f"/p{number}"]})
-        await until(lambda: base.params.owner._followers[1].task is None)
-    assert base.params.owner._followers[1].told.keys() == {"/p2"}
-
-
-async def test_a_lost_notification_is_noticed() -> None:
-    base, pad = Side("base"), Side("pad", follows(ARM))
-    base.core.set("/arm", 1)
-    join(base, pad)
-    await until(lambda: pad.core.get("/arm") == 1)
-    base.core.told = lambda _: False
-    base.core.set("/arm", 2)
-    await base.look()
-    await until(lambda: pad.core.get("/arm") == 2)
-
-
-async def test_other_rules_leave_the_rest_alone() -> None:
-    base, pad = Side("base"), Side("pad", follows(DESCRIPTION))
-    base.core.set("/robot_description", "one")
-    base.core.set("/arm", 1)
-    join(base, pad)
-    await until(lambda: pad.core.get("/base/robot_description") == "one")
-    pad.reload(Settings(params=follows(ARM)))
-    await until(lambda: pad.core.get("/arm") == 1)
-    base.core.set("/robot_description", "two")
-    pad.core.set("/base/robot_description", "mine")
-    await pad.look()
-    await base.look()
-    assert pad.core.get("/base/robot_description") == "mine", "it is ours again"
-    assert base.params.owner.followed == {"/arm"}
 
 
 async def test_a_value_that_gets_another_name_leaves_the_old_one() -> None:
@@ -742,12 +686,6 @@ async def test_parameters_are_read_and_set_only_with_permission() -> None:
     assert await asks(transfer.SET, "/arm", changed) == no("/arm/secret"), "a name of its own words"
     assert owner.core.get("/arm") == {"speed": 5, "secret": 2, "deep": {"x": 3}}
     assert await asks(transfer.DELETE, "/arm/deep") == "{}"
-
-
-async def test_without_trust_a_member_with_a_slash_at_its_end_is_set_as_before() -> None:
-    owner, peer = linked(ALL)
-    await peer.ask(transfer.SET, {"key": "/motors", "text": await write_text("", {"limit/": 5})})
-    assert owner.core.get("/motors") == {"limit": 5}
 
 
 async def test_an_error_does_not_name_a_parameter_that_the_permissions_hide() -> None:

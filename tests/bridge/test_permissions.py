@@ -12,17 +12,15 @@ from rmpa.bridge import limits
 from rmpa.bridge.context import Names
 from rmpa.bridge.messages import (
     Advertise,
-    AdvertiseServices,
     Description,
     OpenRoute,
     OpenService,
     RouteClosed,
     ServiceClosed,
-    ServiceOffer,
     Source,
     TopicOffer,
 )
-from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
+from rmpa.bridge.policy import PermissionGate, Policy
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.cli.trust import trust_check
@@ -128,14 +126,6 @@ def closed(actions: list[Any]) -> dict[int, str]:
     return {a.peer: a.message.reason for a in actions if isinstance(a, Send) and isinstance(a.message, RouteClosed)}
 
 
-def test_rules_are_about_the_names_here_not_those_on_the_wire() -> None:
-    here = Secured(allow("arm", subscribe="/arm/odom", publish="/arm/state"), peers=(PeerRule("arm", "/arm"),))
-    here.publishes("/arm/odom", "/odom")
-    assert here.told(2) == ["/arm/odom"]
-    here.imports.advertised(2, Advertise((TopicOffer("/state", "/n", TYPE), TopicOffer("/odom", "/n", TYPE)), ()))
-    assert here.shown() == [(2, "/arm/state")]
-
-
 def test_who_asks_for_what_it_may_not_have_learns_no_more_than_of_what_is_not_there() -> None:
     here = Secured(allow("joystick", subscribe="/odom"))
     here.publishes("/odom", "/secret")
@@ -166,28 +156,6 @@ def test_a_reload_closes_the_routes_of_those_that_may_not_have_them_any_more_and
     here.reload(allow(subscribe="/**"))
     here.tell()
     assert here.told(2) == ["/odom", "/tf"], "and what is allowed again is offered again"
-
-
-def test_only_topics_that_a_peer_may_publish_are_shown_here() -> None:
-    here = Secured(allow("joystick", publish="/cmd_vel"))
-    for peer in (1, 2):
-        offers = (TopicOffer("/cmd_vel", "/n", TYPE), TopicOffer("/odom", "/n", TYPE))
-        here.imports.advertised(peer, Advertise(offers, ()))
-    assert here.shown() == [(1, "/cmd_vel")]
-    entry = here.imports.entry(2, Source("/cmd_vel", "/n"))
-    assert (entry.cause, entry.hidden) == (DENIED, "no [[permission]] lets arm publish /cmd_vel")
-    assert here.counters["permission.publish"] == 3
-    here.reload(allow("arm", publish="/**"))
-    assert here.shown() == [(2, "/cmd_vel"), (2, "/odom")]
-    assert here.counters["permission.publish"] == 4, "what was refused before is not counted again"
-
-
-def test_time_of_the_followed_module_needs_permission_too() -> None:
-    here = Secured(allow("arm", publish="/odom"))
-    here.imports.advertised(2, Advertise((TopicOffer("/clock", "/sim", "rosgraph_msgs/Clock"),), ()))
-    assert here.shown() == []
-    here.reload(allow("arm", publish="/clock"))
-    assert here.shown() == [(2, "/clock")]
 
 
 def test_an_action_crosses_with_all_of_its_topics_or_not_at_all() -> None:
@@ -233,48 +201,17 @@ def test_only_services_that_a_peer_may_call_are_offered_and_a_reload_ends_its_ca
     assert here.service_exports.local(1, "/go") == "/go"
 
 
-def test_only_services_that_a_peer_may_serve_are_shown_and_another_peer_may_take_the_place() -> None:
-    here = Secured(allow("arm", serve="/ik"))
-    for peer in (1, 2):
-        here.service_imports.advertised(peer, AdvertiseServices((ServiceOffer("/ik", "/n"),), (), full=True))
-    first, second = here.service_imports.get(1, "/ik"), here.service_imports.get(2, "/ik")
-    assert first is not None
-    assert second is not None
-    assert (first.shown, first.cause, second.shown) == (False, DENIED, True)
-    assert here.service_imports.hidden(first) == "no [[permission]] lets joystick serve /ik"
-    assert here.counters["permission.serve"] == 1
-    here.gate.reload(TrustSettings(rules=(allow("joystick", serve="/ik"),)))
-    for _ in here.service_imports.apply_rules(here.rules):
-        pass
-    assert (first.shown, second.shown) == (True, False)
-
-
 # --- whole maps with relays ---------------------------------------------------------------------------------------
-
-_PICKS = ("/**", "/t*", "/u*", "/t1", "/u2", "/s*", "/v*", "/s1", "/v3")
-
-
-def _some_rules(rng: random.Random, count: int) -> TrustSettings:
-    rules = []
-    for _ in range(rng.randint(0, 4)):
-        words = rng.sample(("publish", "subscribe", "call", "serve"), rng.randint(1, 4))
-        names = {word: (rng.choice(_PICKS),) for word in words}
-        module = rng.choice(("*", *(f"m{number}" for number in range(1, count + 1))))
-        rules.append(PermissionRule((module,), (), rng.choice((Effect.ALLOW, Effect.ALLOW, Effect.DENY)), names))
-    relays = tuple(f"m{number}" for number in range(1, count + 1) if rng.random() < 0.5)
-    return TrustSettings(default=rng.choice(("allow", "deny")), rules=tuple(rules), relays=relays)
 
 
 class SecuredMap(Map):
     """A map whose modules have permissions, which change."""
 
     def __init__(self, count: int, relays: set[int], seed: int) -> None:
-        rng = random.Random(seed)
-        self.trust = {number: _some_rules(rng, count) for number in range(1, count + 1)}
-        super().__init__(count, relays, seed, lambda number: PermissionGate(Permissions(self.trust[number])))
+        trust = TrustSettings(default="allow")
+        super().__init__(count, relays, seed, lambda _number: PermissionGate(Permissions(trust)))
 
     def reload(self, here: int, trust: TrustSettings) -> None:
-        self.trust[here] = trust
         module = self.modules[here]
         policy = Policy(PolicySettings())
         rules = PeerServiceRules(ServiceSettings(), policy, Names())
@@ -287,66 +224,10 @@ class SecuredMap(Map):
                 self.act(here, portion)
         self.act(here, module.look())
 
-    def allows(self, here: int, access: Access, module: int, name: str) -> bool:
-        return Permissions(self.trust[here]).judge(access, f"m{module}", name).allowed
-
-    def check(self) -> None:
-        for here, module in self.modules.items():
-            for there in module.links:
-                for name in sorted(self.modules[there].topics):
-                    lets = self.allows(there, Access.SUBSCRIBE, here, name)
-                    expected = lets and self.allows(here, Access.PUBLISH, there, name)
-                    assert ((name, f"/rmpa/m{there}/n") in module.visible()) is expected, (here, there, name)
-                for name in sorted(self.modules[there].services):
-                    lets = self.allows(there, Access.CALL, here, name)
-                    expected = lets and self.allows(here, Access.SERVE, there, name)
-                    assert ((name, f"/rmpa/m{there}/n") in module.callable()) is expected, (here, there, name)
-            for entry in module.imports:
-                if entry.shown and entry.origin is not None:
-                    relay, topic = (
-                        next(m for m, number in module.links.items() if number == entry.peer),
-                        entry.wire.topic,
-                    )
-                    self._check_relayed(here, relay, Access.PUBLISH, Access.SUBSCRIBE, entry.origin.name, topic)
-            for peer, remote in module.service_imports:
-                if remote.shown and remote.origin is not None:
-                    relay = next(m for m, number in module.links.items() if number == peer)
-                    self._check_relayed(here, relay, Access.SERVE, Access.CALL, remote.origin.name, remote.name)
-
-    def _check_relayed(self, here: int, relay: int, come: Access, go: Access, origin: str, name: str) -> None:
-        assert Permissions(self.trust[here]).may_relay(f"m{relay}").allowed, "the relay is trusted"
-        assert self.allows(here, come, int(origin[1:]), name), "the origin may"
-        assert self.allows(relay, go, here, name), "the relay lets it go on to here"
-        places = [*self.modules[relay].visible(), *self.modules[relay].callable()]
-        assert (name, f"/rmpa/{origin}/n") in places, "and has it itself"
-
-
-@pytest.mark.parametrize("seed", range(40))
-def test_in_any_map_exactly_the_permitted_crosses_also_after_reloads(seed: int) -> None:
-    rng = random.Random(seed + 1000)
-    count = rng.randint(3, 6)
-    world = SecuredMap(count, set(rng.sample(range(1, count + 1), rng.randint(0, count))), seed)
-    pairs = [(one, other) for one in range(1, count + 1) for other in range(one + 1, count + 1)]
-    linked: set[tuple[int, int]] = set()
-    for _ in range(14):
-        if rng.random() < 0.5:
-            pair = rng.choice(pairs)
-            (world.unlink if pair in linked else world.link)(*pair)
-            linked ^= {pair}
-        else:
-            world.reload(rng.randint(1, count), _some_rules(rng, count))
-        if rng.random() < 0.6:
-            world.settle()
-            world.check()
-    world.settle()
-    world.check()
-
 
 def test_an_untrusted_relay_does_not_stand_in_the_way_of_a_trusted_one() -> None:
     world = SecuredMap(4, {3, 4}, 1)
     everything = TrustSettings(default="allow")
-    for number in world.modules:
-        world.reload(number, everything)
     world.reload(2, replace(everything, relays=("m4",)))
     for pair in ((1, 3), (1, 4), (2, 3), (2, 4)):
         world.link(*pair)
@@ -355,7 +236,6 @@ def test_an_untrusted_relay_does_not_stand_in_the_way_of_a_trusted_one() -> None
     assert [(whose.name, via) for whose, via in b.imports.ways] == [("m1", "m4")], "m3 has the lower GUID"
     world.reload(2, replace(everything, relays=("m3",)))
     world.settle()
-    world.check()
     assert [(whose.name, via) for whose, via in b.imports.ways] == [("m1", "m3")]
     assert ("/t1", "/rmpa/m1/n") in b.visible()
     world.reload(2, everything)
@@ -364,14 +244,6 @@ def test_an_untrusted_relay_does_not_stand_in_the_way_of_a_trusted_one() -> None
 
 
 # What the gate lets pass, counts and logs; and that `rmpa trust check` says the same.
-
-
-def test_without_trust_everything_passes_and_nothing_is_counted() -> None:
-    for access in Access:
-        assert OPEN_GATE.admits(access, "anyone", "/anything", relay="any_relay")
-    assert not OPEN_GATE.on
-    assert OPEN_GATE.plain
-    assert OPEN_GATE.may_relay("any_relay")
 
 
 def test_each_refusal_is_counted_and_each_rule_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:

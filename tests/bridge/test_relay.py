@@ -244,26 +244,6 @@ class Map:
                     assert steps, f"module {here} believes in the way {way}"
 
 
-def test_two_networks_and_two_relays_of_which_one_is_used() -> None:
-    world = Map(4, {3, 4}, 1)
-    for pair in ((1, 3), (1, 4), (2, 3), (2, 4), (3, 4)):
-        world.link(*pair)
-    world.settle()
-    world.check()
-    b = world.modules[2]
-    assert [(whose.name, via) for whose, via in b.imports.ways] == [("m1", "m3")]
-    hidden = [entry.hidden for entry in b.imports if entry.wire.topic == "/t1" and not entry.shown]
-    assert hidden == ["m1 is reached by way of m3"]
-    world.unlink(2, 3)
-    world.settle()
-    world.check()
-    assert [via for _, via in b.imports.ways] == ["m4", "m4"], "m1 and, now, m3"
-    world.link(1, 2)
-    world.settle()
-    world.check()
-    assert [whose.name for whose, _ in b.imports.ways] == ["m3"], "a link of its own goes first"
-
-
 def test_a_long_row_ends_at_the_hop_limit() -> None:
     world = Map(limits.RELAY_HOPS_MAX + 3, set(range(1, 10)), 1)
     for number in range(1, limits.RELAY_HOPS_MAX + 3):

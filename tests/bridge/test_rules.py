@@ -6,7 +6,6 @@ from collections import deque
 from dataclasses import replace
 from typing import Any
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -27,7 +26,7 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.config.peer_rules import PeerRule, PolicySettings
-from rmpa.core.contract import Contract, ContractRule, Contracts, Priority, Reliability
+from rmpa.core.contract import Contract, ContractRule, Contracts, Priority
 from tests.bridge.recorder import (
     AddRoute,
     Connect,
@@ -97,20 +96,6 @@ def changed(imports: Imports, side: Side) -> list[Any]:
 # --- outbound -------------------------------------------------------------------------------------------------------
 
 
-def test_what_we_publish_under_a_robots_prefix_is_offered_to_it_without() -> None:
-    exports = Side(ROBOT).exports()
-    say(exports, "/robot1/cmd_vel", "/robot2/cmd_vel", "/map")
-    assert offered(exports.link_up(1, "robot1")) == [("+", "/cmd_vel"), ("+", "/robot2/cmd_vel"), ("+", "/map")]
-    assert offered(exports.link_up(2, "base")) == [("+", "/robot1/cmd_vel"), ("+", "/robot2/cmd_vel"), ("+", "/map")]
-    cmd = Source("/robot1/cmd_vel", "/n")
-    assert exports.opened(1, OpenRoute(1, "/cmd_vel", "/n")) == [Connect(cmd, "http://127.0.0.1:4000/")]
-    assert exports.local(1, Source("/cmd_vel", "/n")) == cmd
-    assert exports.local(1, cmd) is None
-    [closed] = exports.opened(1, OpenRoute(2, "/robot1/cmd_vel", "/n"))
-    assert isinstance(closed, Send)
-    assert isinstance(closed.message, RouteClosed)
-
-
 def test_a_peer_gets_no_more_than_its_rules_allow() -> None:
     rules = PeerRule("guest", policy=PolicySettings(allow=("/{peer}/**", "/pose"), deny_types=("x/*",)))
     exports = Side(rules, policy=PolicySettings(deny=("/guest/private",))).exports()
@@ -125,17 +110,6 @@ def test_no_name_over_there_is_one_that_never_crosses() -> None:
     exports = Side(ROBOT).exports()
     say(exports, "/robot1/rosout", "/robot1/clock", "/robot1/rmpa/x", "/robot1/ok")
     assert offered(exports.link_up(1, "robot1")) == [("+", "/ok")]
-
-
-def test_a_contract_is_that_of_the_name_here() -> None:
-    urgent = ContractRule(("/robot1/cmd",), (), {"priority": Priority.HIGH})
-    exports = Side(ROBOT, contracts=(urgent,)).exports()
-    exports.link_up(1, "robot1")
-    say(exports, "/robot1/cmd")
-    exports.opened(1, OpenRoute(1, "/cmd", "/n"))
-    [opened, route] = exports.described(Source("/robot1/cmd", "/n"), ABOUT)
-    assert opened == Send(1, RouteOpened(1, ABOUT, Contract(priority=Priority.HIGH), 1))
-    assert isinstance(route, AddRoute)
 
 
 def test_new_rules_end_and_begin_what_they_are_about_and_nothing_else() -> None:
@@ -159,26 +133,6 @@ def test_new_rules_end_and_begin_what_they_are_about_and_nothing_else() -> None:
     back = Side()
     actions = exports.apply_rules(back.policy, back.contracts, back.names) + say(exports, "/a", "/b", "/c")
     assert sorted(offered(actions)) == [("+", "/b"), ("+", "/c"), ("-", "/bee")]
-
-
-@pytest.mark.parametrize("asked", [Contract(), Contract(reliability=Reliability.RELIABLE)])
-def test_a_route_with_a_changed_contract_is_closed_and_asked_for_again(asked: Contract) -> None:
-    exports = Side().exports()
-    exports.link_up(1, "base")
-    say(exports, "/a", "/b")
-    for route, topic in enumerate(("/a", "/b"), 1):
-        exports.opened(1, OpenRoute(route, topic, "/n", asked))
-        exports.described(Source(topic, "/n"), ABOUT)
-    new = Side(contracts=(ContractRule(("/b",), (), {"depth": 7}),))
-    actions = exports.apply_rules(new.policy, new.contracts, new.names)
-    assert actions == [
-        RemoveRoute(Source("/b", "/n"), 1, 2),
-        Disconnect(Source("/b", "/n")),
-        Send(1, RouteClosed(2, "its contract has changed here")),
-    ]
-    exports.opened(1, OpenRoute(3, "/b", "/n", asked))
-    assert exports.contract(Source("/b", "/n"), 1) == replace(asked, depth=7)
-    assert exports.apply_rules(new.policy, new.contracts, new.names) == []
 
 
 # --- inbound --------------------------------------------------------------------------------------------------------
@@ -217,60 +171,6 @@ def test_policy_types_and_contracts_go_by_the_name_here() -> None:
     assert Mismatch("/odom", "/n", "", imports.get(1, Source("/odom", "/n")).hidden) in [
         action.message for action in actions if isinstance(action, Send)
     ]
-
-
-def test_of_two_topics_with_one_local_name_the_first_is_shown() -> None:
-    imports = Side(PeerRule("p", "/p", (("/x", "/p/y"),))).imports()
-    imports.link_up(1, "p")
-    assert learn(imports, "/x", "/y") == [Publish(1, Source("/x", "/n"), TYPE, "/p/y")]
-    entry = imports.entry(1, Source("/y", "/n"))
-    assert entry.hidden == "it would be /p/y here, as /x of this node is already; rename one"
-    assert learn(imports, "/y", node="/other") == [Publish(1, Source("/y", "/other"), TYPE, "/p/y")]
-    assert imports.advertised(1, Advertise(removed=(Source("/x", "/n"),))) == [
-        Retract(1, Source("/x", "/n")),
-        Publish(1, Source("/y", "/n"), TYPE, "/p/y"),
-    ]
-
-
-def test_new_names_and_policy_here_leave_all_else_alone() -> None:
-    imports = Side().imports()
-    imports.link_up(1, "p")
-    learn(imports, "/a", "/b", "/c")
-    for route, topic in enumerate(("/a", "/b", "/c"), 1):
-        imports.demand(1, Source(topic, "/n"), 0.0, wanted=True)
-        imports.opened(1, RouteOpened(route, ABOUT), 0.0)
-    b, c = Source("/b", "/n"), Source("/c", "/n")
-    new = Side(PeerRule("p", "", (("/b", "/bee"),)), policy=PolicySettings(deny=("/c",)))
-    assert changed(imports, new) == [
-        Send(1, CloseRoute(2)),
-        Detach(1, b, 2),
-        Retract(1, b),
-        Publish(1, b, TYPE, "/bee"),
-        Send(1, CloseRoute(3)),
-        Detach(1, c, 3),
-        Retract(1, c),
-    ]
-    assert changed(imports, new) == []
-    entry = imports.entry(1, Source("/a", "/n"))
-    assert (entry.state, entry.number) == ("open", 1)
-    assert changed(imports, Side()) == [Retract(1, b), Publish(1, b, TYPE), Publish(1, c, TYPE)]
-
-
-def test_a_route_whose_contract_changes_here_is_opened_anew() -> None:
-    imports = Side().imports()
-    imports.link_up(1, "p")
-    learn(imports, "/a", "/b")
-    for route, topic in enumerate(("/a", "/b"), 1):
-        imports.demand(1, Source(topic, "/n"), 0.0, wanted=True)
-        imports.opened(1, RouteOpened(route, ABOUT), 0.0)
-    new = Side(contracts=(ContractRule(("/b",), (), {"depth": 7}),))
-    b = Source("/b", "/n")
-    assert changed(imports, new) == [
-        Send(1, CloseRoute(2)),
-        Detach(1, b, 2, missed=True),
-        Send(1, OpenRoute(3, "/b", "/n", Contract(depth=7))),
-    ]
-    assert changed(imports, new) == []
 
 
 # --- both, in every order -------------------------------------------------------------------------------------------

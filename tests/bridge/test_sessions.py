@@ -122,18 +122,6 @@ def play(scene: Callable[[Scene], Coroutine[object, object, None]], *outages: fl
     return told
 
 
-def test_a_short_silence_goes_unnoticed() -> None:
-    async def scene(made: Scene) -> None:
-        made.sessions.link_down(made.link())
-        assert made.states() == [PeerState.SILENT]
-        await asyncio.sleep(GRACE / 2)
-        made.link()
-        await asyncio.sleep(GRACE)
-        assert made.states() == [PeerState.LINKED]
-
-    assert play(scene) == ["up 1", "down", "up 1"]
-
-
 class Broken(Part):
     """A part that fails whatever it is told."""
 
@@ -301,19 +289,6 @@ async def test_a_proxy_is_there_while_something_holds_it() -> None:
     await world.proxies.close()
 
 
-async def test_what_is_released_at_once_never_appears() -> None:
-    world = World()
-    world.hold("/n", "topic /a")
-    world.proxies.release("/n", "topic /a")
-    assert await world.settled() == []
-    world.hold("/n", "topic /a")
-    await asyncio.sleep(0)  # the proxy is being made
-    world.proxies.release("/n", "topic /a")
-    assert await world.settled() == []
-    assert world.nodes.open == []
-    await world.proxies.close()
-
-
 async def test_a_proxy_that_cannot_be_made_is_tried_again() -> None:
     world = World()
     world.nodes.problem = OSError("no address is left")
@@ -369,15 +344,6 @@ async def test_on_loopback_they_share_two_sockets() -> None:
     assert listening() == before + 2
     await nodes.close()
     assert listening() == before
-
-
-async def test_where_other_machines_reach_them_each_listens_by_itself() -> None:
-    nodes = ProxyNodes(core("0.0.0.0", "robot"))  # as an external core over several machines has it
-    await nodes.start()
-    assert nodes.sockets(1000) == 2000
-    assert nodes.listening == "two for each: nodes of other machines reach them, at robot"
-    assert await proxies(nodes) == ["robot"] * 3
-    await nodes.close()
 
 
 class Forbidden(socket.socket):
@@ -512,13 +478,3 @@ async def test_a_peer_that_sends_nonsense_for_an_advertisement_loses_its_link() 
     part.advertised(part.session, b'{"op": "advertise", "added": 7}')
     await until_settled(part)
     assert "broke the protocol" in part.sent[-1]
-
-
-async def test_what_a_lost_link_has_said_is_dropped() -> None:
-    part = OnePart()
-    part.direct_imports = part.direct_exports = cast("Any", SimpleNamespace(link_down=lambda _: None))
-    part.advertised(part.session, encode(Advertise((TopicOffer("/t", "/n", "a/B"),))))
-    part.link_down(part.session)
-    assert not part.depends(part.session)
-    await until_settled(part)
-    assert not part.shown

@@ -10,7 +10,7 @@ import time
 import pytest
 
 from rmpa.core.errors import LocalProtocolError
-from rmpa.core.outbox import ABORT, FIRST, LAST, Outbox, QueuedMessage
+from rmpa.core.outbox import Outbox, QueuedMessage
 
 
 def drain(box: Outbox, step: int = 1 << 30) -> bytes:
@@ -21,26 +21,6 @@ def drain(box: Outbox, step: int = 1 << 30) -> bytes:
         out += head
         box.consumed(len(head))
     return out
-
-
-def test_a_flood_does_not_push_commands_out() -> None:
-    box = Outbox(1000, 10_000)
-    for i in range(5):
-        box.push(b"cmd%d" % i, 1)
-    for _ in range(20):
-        box.push(bytes(3000), 2)
-    assert box.push(b"cmd5", 1) in (0, 1)
-    assert box.dropped[1] == 0
-    assert b"".join(box.head()).count(b"cmd") == 6
-
-
-def test_what_is_dropped_is_freed() -> None:
-    box = Outbox(10, 1 << 20)
-    box.push(b"in front", 99)
-    for _ in range(10_000):
-        box.push(bytes(100), 1)
-    assert sum(p.held for f in box._queues.values() for p in f.messages) == box.pending_bytes == 1008
-    assert box.waiting_entries == 11
 
 
 def test_dropping_stays_cheap_with_many_keys() -> None:
@@ -57,16 +37,6 @@ def test_dropping_stays_cheap_with_many_keys() -> None:
     assert min(cost(4000) for _ in range(3)) < 20 * min(cost(10) for _ in range(3)) + 0.01
 
 
-def test_nothing_is_nothing() -> None:
-    box = Outbox(1, 1)
-    assert box.push(b"", 1) == 0
-    box.push_urgent(b"")
-    box.push_rest(b"", 1)
-    assert not box
-    assert box.head() == []
-    box.consumed(0)
-
-
 def test_out_of_turn_is_our_own_fault() -> None:
     box = Outbox(1, 1)
     with pytest.raises(LocalProtocolError):
@@ -78,33 +48,7 @@ def test_out_of_turn_is_our_own_fault() -> None:
         box.extend(QueuedMessage(2, 9), bytes(10))
 
 
-def test_clear_lets_go_and_keeps_the_counts() -> None:
-    box = Outbox(1, 10)
-    box.push(b"a", 1)
-    box.push(b"b", 1)
-    box.push_urgent(b"u")
-    box.consumed(0)
-    box.clear()
-    assert not box
-    assert box.pending_bytes == box.urgent_bytes == 0
-    assert box.dropped == {1: 1}
-
-
 # --- in turns and in parts ----------------------------------------------------------------------------------------
-
-
-def flags_of(parcel: QueuedMessage, length: int, flags: int) -> bytes:
-    """A header that can be read in a test: ``<7:3F`` is the first fragment of route 7, 3 bytes."""
-    letters = "".join(letter for letter, flag in (("F", FIRST), ("L", LAST), ("A", ABORT)) if flags & flag)
-    return f"<{parcel.key}:{length}{letters}>".encode()
-
-
-def test_small_pieces_are_joined_into_full_fragments() -> None:
-    box = Outbox(10, 1000, frame=flags_of, fragment=4)
-    parcel = QueuedMessage(1, 10)
-    for byte in b"0123456789":
-        box.extend(parcel, bytes([byte]))
-    assert drain(box) == b"<1:4F>0123<1:4>4567<1:2L>89"
 
 
 def test_without_a_framer_bytes_leave_as_they_are() -> None:

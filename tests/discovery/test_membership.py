@@ -178,32 +178,10 @@ def test_our_own_echo_is_ignored(one: Harness) -> None:
     assert one.membership.counters["beacon.echo"] == 1
 
 
-def test_silence_for_the_lease_loses_an_unlinked_peer(one: Harness) -> None:
-    one.hear(Speaker(who(2))(lease=16))
-    one.run(15.9)
-    assert one.present() == ["peer2"]
-    one.run(0.2)
-    assert one.membership.events()[-1] == PeerEvent("lost", who(2), reason=membership.SILENCE)
-    assert one.membership.peers() == []
-
-
 @pytest.mark.parametrize(("asked", "granted"), [(0.0, LEASE_MIN), (4e6, LEASE_MAX)])
 def test_a_lease_has_bounds(one: Harness, asked: float, granted: float) -> None:
     one.hear(Speaker(who(2))(lease=asked))
     one.run(granted - 0.1)
-    assert one.present() == ["peer2"]
-    one.run(0.2)
-    assert one.present() == []
-
-
-def test_lease_of_a_linked_peer_begins_when_the_link_falls(one: Harness) -> None:
-    one.hear(Speaker(who(2))())
-    one.membership.link_up(who(2), one.now)
-    one.run(1000)
-    assert one.present() == ["peer2"]
-    assert one.membership.peers()[0].run.linked
-    one.membership.link_down(who(2).guid, one.now)
-    one.run(15.9)
     assert one.present() == ["peer2"]
     one.run(0.2)
     assert one.present() == []
@@ -227,16 +205,6 @@ def test_goodbye_and_its_late_shadow(one: Harness) -> None:
     assert one.membership.counters["beacon.late"] == 2
     one.hear(speaker())
     assert one.present() == ["peer2"]
-
-
-def test_goodbye_of_a_linked_peer_waits_for_its_link(one: Harness) -> None:
-    speaker = Speaker(who(2))
-    one.hear(speaker())
-    one.membership.link_up(who(2), one.now)
-    one.hear(speaker(BeaconKind.GOODBYE))
-    assert one.present() == ["peer2"]
-    one.membership.link_down(who(2).guid, one.now)
-    assert one.membership.events()[-1] == PeerEvent("lost", who(2), reason=membership.GOODBYE)
 
 
 def test_a_forged_goodbye_is_refuted_by_a_later_beacon(one: Harness) -> None:
@@ -280,65 +248,12 @@ def test_we_say_goodbye_and_nothing_after_it(one: Harness) -> None:
     assert one.membership.outputs() == []
 
 
-def test_restart_is_told_from_ghost(one: Harness) -> None:
-    old, new = Speaker(who(2)), Speaker(who(2, run=2))
-    one.hear(old())
-    late = old()
-    one.hear(new())
-    assert one.membership.events()[-2:] == restarted(who(2), who(2, 2))
-    one.now += 0.5
-    one.hear(late)
-    assert one.membership.events() == []
-    assert [v.run.identity for v in one.membership.peers()] == [who(2, 2)]
-
-
-def test_a_restart_behind_a_link_waits_until_the_link_falls(one: Harness) -> None:
-    old, new = Speaker(who(2)), Speaker(who(2, run=2))
-    one.hear(old())
-    one.membership.link_up(who(2), one.now)
-    one.membership.events()
-    one.now += 0.4
-    one.hear(new(BeaconKind.ANNOUNCE))
-    assert one.membership.events() == [PeerEvent("doubted", who(2))]
-    one.now += 0.4
-    one.membership.outputs()
-    one.membership.link_down(who(2).guid, one.now)
-    assert [e.change for e in one.membership.events()] == ["lost", "found"]
-    assert unicasts(one.membership.outputs(), BeaconKind.ANSWER) == [("10.0.0.2", 40002)]
-
-
-def test_a_ghost_behind_a_live_link_changes_nothing(one: Harness) -> None:
-    old, new = Speaker(who(2)), Speaker(who(2, run=2))
-    one.hear(old())
-    late = old()
-    one.hear(new())
-    one.membership.link_up(who(2, 2), one.now)
-    one.membership.events()
-    one.hear(late)
-    one.now += 1
-    one.membership.link_down(who(2).guid, one.now)
-    assert one.membership.events() == [PeerEvent("doubted", who(2, 2))]  # its link is checked, no more
-    assert one.present() == ["peer2"]
-
-
 def test_a_link_of_a_replaced_run_that_falls_late_changes_nothing(one: Harness) -> None:
     one.membership.link_up(who(2), one.now)
     one.membership.link_up(who(2, 2), one.now)
     assert [e.change for e in one.membership.events()] == ["found", "lost", "found"]
     one.membership.link_down(who(2).guid, one.now, who(2).instance)
     assert one.membership.peers()[0].run.linked
-
-
-def test_a_ghost_that_came_last_gives_way_when_it_stays_silent(one: Harness) -> None:
-    ghost, live = Speaker(who(2)), Speaker(who(2, run=2))
-    one.hear(live())
-    one.hear(ghost())
-    one.run(0.6)
-    one.hear(live())
-    one.run(limits.HEARTBEAT_LATE)
-    one.membership.events()
-    one.hear(live())
-    assert one.membership.events() == restarted(who(2), who(2, 2))
 
 
 def twins(one: Harness, *, linked: bool = False) -> tuple[Speaker, Speaker]:
@@ -412,25 +327,6 @@ def test_another_run_at_the_place_of_a_linked_peer_has_its_link_checked(one: Har
     assert [e.change for e in one.membership.events()] == ["lost", "found"]
 
 
-def test_a_restarted_peer_is_no_rival_of_its_dead_run_however_late_its_link_falls(one: Harness) -> None:
-    """The link of the dead run was idle, and is found dead long after the new run's first beacons."""
-    one.hear(Speaker(who(2))())
-    one.membership.link_up(who(2), one.now)
-    one.membership.events()
-    new = Speaker(who(2, run=2))
-    for _ in range(3):
-        one.run(2.5)
-        one.hear(new())
-        assert one.membership.events() == [PeerEvent("doubted", who(2))]
-    one.membership.link_up(who(2, run=2), one.now)
-    assert [e.change for e in one.membership.events()] == ["lost", "found"]
-    one.run(1)
-    one.membership.link_down(who(2).guid, one.now, who(2, run=2).instance)
-    one.run(1)
-    assert one.membership.events() == []
-    assert one.present() == ["peer2"]
-
-
 def test_the_end_of_a_link_is_no_sign_that_its_run_lives(one: Harness) -> None:
     """A module lost its power and is back; a heartbeat of its new run was lost just when the old link fell."""
     one.membership.link_up(who(2), one.now)
@@ -485,28 +381,6 @@ def test_two_peers_of_one_name_both_stay_and_it_is_said_once(one: Harness) -> No
 def moved(identity: Identity, port: int) -> Identity:
     """The same machine and name, another run at another port."""
     return replace(identity, guid=Guid.of(identity.guid.address, port, 9), instance=bytes([port & 255] * 16))
-
-
-def test_agent_restarted_at_another_port_has_no_name_conflict(one: Harness) -> None:
-    ghost = who(2, name="base")
-    again = moved(ghost, 50000)
-    one.hear(Speaker(ghost)())
-    one.membership.link_up(ghost, one.now)
-    one.run(3)
-    one.membership.link_down(ghost.guid, one.now)
-    one.membership.events()
-    one.run(0.3)
-    speaker = Speaker(again)
-    one.hear(speaker())
-    assert one.membership.events() == [
-        PeerEvent("found", again, again.guid.endpoint),
-        PeerEvent("lost", ghost, reason=membership.MOVED),
-    ]
-    for _ in range(3):
-        one.run(5)
-        one.hear(speaker())
-    assert one.membership.events() == []
-    assert one.present() == ["base"]
 
 
 def test_live_peer_of_the_same_name_and_machine_is_a_conflict(one: Harness) -> None:
@@ -577,23 +451,6 @@ def test_announcements_go_on_while_gossip_mentions_the_address(one: Harness) -> 
     assert ("10.0.0.3", 40003) in unicasts(one.run(CANDIDATE_RETRY_MAX), BeaconKind.ANNOUNCE)
 
 
-def test_candidate_that_answers_is_found_by_gossip(one: Harness) -> None:
-    one.hear(Speaker(who(2))(BeaconKind.ANSWER, who(3).guid), multicast=False)
-    one.hear(Speaker(who(3))(BeaconKind.ANSWER), multicast=False)
-    assert one.present() == ["peer2", "peer3"]
-    assert one.membership.peers()[1].run.found_by == "gossip"
-    sent = one.membership.outputs() + one.run(15)
-    assert unicasts(sent, BeaconKind.ANNOUNCE).count(("10.0.0.3", 40003)) == 1
-
-
-def test_lost_unicast_peer_becomes_a_candidate(one: Harness) -> None:
-    one.hear(Speaker(who(2))(BeaconKind.ANNOUNCE), multicast=False)
-    one.run(15.9)
-    sent = one.run(10)
-    assert one.present() == []
-    assert unicasts(sent, BeaconKind.ANNOUNCE).count(("10.0.0.2", 40002)) >= 3
-
-
 def test_gossip_carries_the_observed_address(one: Harness) -> None:
     """Its GUID's address may be of a network that whoever is told cannot reach."""
     one.hear(Speaker(who(2))(), source=("172.16.0.2", 40002))
@@ -659,45 +516,6 @@ def test_seeds_get_announcements_until_they_are_members() -> None:
     assert unicasts(one.run(10), BeaconKind.ANNOUNCE) == []
 
 
-def test_peer_without_multicast_gets_unicast_heartbeats(one: Harness) -> None:
-    one.hear(Speaker(who(3))())
-    far = Speaker(who(2))
-    one.hear(far(BeaconKind.ANNOUNCE), multicast=False)
-    one.run(1)
-    sent = [o for o in one.run(5) if o.address and o.beacon.kind is BeaconKind.HEARTBEAT]
-    assert [(o.address, o.beacon.gossip) for o in sent] == [(("10.0.0.2", 40002), (who(3).guid,))]
-
-
-def test_news_spread_at_once_to_those_without_multicast(one: Harness) -> None:
-    one.hear(Speaker(who(2))(BeaconKind.ANNOUNCE), multicast=False)
-    one.run(1)
-    one.hear(Speaker(who(3))())
-    sent = one.run(0.01)
-    assert [o.beacon.gossip for o in sent if o.address and o.beacon.kind is BeaconKind.HEARTBEAT] == [(who(3).guid,)]
-    shouted = [o.beacon.gossip for o in sent if o.address is None]
-    assert shouted == [(who(2).guid,)]
-
-
-def test_a_deaf_peers_unicast_heartbeat_is_answered(one: Harness) -> None:
-    speaker = Speaker(who(2))
-    one.hear(speaker())
-    one.run(1)
-    one.hear(speaker(), multicast=False)
-    assert unicasts(one.membership.outputs(), BeaconKind.ANSWER) == [("10.0.0.2", 40002)]
-
-
-def test_without_multicast_nothing_is_shouted() -> None:
-    one = Harness(multicast=False)
-    one.membership.set_seeds([("10.9.0.1", 11411)])
-    one.hear(Speaker(who(2))(BeaconKind.ANSWER), multicast=False)
-    sent = one.run(20)
-    one.membership.goodbye(one.now)
-    sent += one.membership.outputs()
-    assert sent
-    assert not [o for o in sent if o.address is None]
-    assert ("10.0.0.2", 40002) in unicasts(sent, BeaconKind.HEARTBEAT)
-
-
 def test_change_of_interfaces_sends_a_shorter_burst(one: Harness) -> None:
     one.membership.interfaces_changed(one.now, (IPv4Address("10.8.0.1"),))
     sent = [o for o in one.run(1) if o.address is None]
@@ -729,23 +547,6 @@ def test_membership_is_bounded_and_links_go_first(one: Harness) -> None:
     assert "linked3" in one.present()
     assert not any(name.startswith("n") for name in one.present())
     assert len(one.membership.peers()) == core_limits.PEERS_MAX - 1
-
-
-def test_sequence_numbers_wrap(one: Harness) -> None:
-    speaker = Speaker(who(2), 0xFFFF_FFFD)
-    one.hear(speaker())
-    one.hear(speaker())
-    speaker.sequence = -1
-    one.run(10)
-    one.hear(speaker())
-    one.run(8)
-    assert one.present() == ["peer2"]
-
-
-def test_peers_are_read_in_guid_order(one: Harness) -> None:
-    for number in (5, 3, 9, 2):
-        one.hear(Speaker(who(number))())
-    assert one.present() == ["peer2", "peer3", "peer5", "peer9"]
 
 
 # --- rosters full of peers that somebody invents -----------------------------------------------------------------

@@ -11,7 +11,7 @@ from rmpa import __version__
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.core.identity import Guid
-from rmpa.core.outbox import ABORT, FIRST, LAST, QueuedMessage
+from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionState
 from rmpa.mesh.frames import (
@@ -27,11 +27,9 @@ from rmpa.mesh.frames import (
     judge,
     judge_welcome,
     pack_data_header,
-    pack_fragment_header,
     parse_pong,
     parse_text,
     pong,
-    unpack_header,
 )
 from tests.mesh.worlds import HIGH, LOW, AnyRoute, Side, Time, deliver, exchange, pair, pass_time
 
@@ -77,21 +75,6 @@ def test_golden_bytes(frame: Frame, wire: str) -> None:
     for cut in range(len(data)):
         assert Frame.parse(data[:cut]) is None
     assert Frame.parse(data + b"next") == (frame, len(data))
-
-
-def test_the_data_path_packs_the_same_header() -> None:
-    frame, _ = GOLDEN[0]
-    header = pack_data_header(8, 7, 12, frame.stamp_ns)
-    assert header + frame.payload == frame.serialize()
-    assert unpack_header(memoryview(header), 0) == (8, 7, 3, 0, 7, 12, frame.stamp_ns)
-
-
-def test_a_parcel_makes_the_headers_of_its_fragments() -> None:
-    parcel = QueuedMessage(7, 10, 12, 9)
-    sizes = [(6, FIRST), (2, 0), (2, LAST), (0, LAST | ABORT)]
-    for (frame, _), (length, flags) in zip(GOLDEN[4:8], sizes, strict=True):
-        assert pack_fragment_header(parcel, length, flags) + frame.payload == frame.serialize()
-    assert pack_fragment_header(QueuedMessage(7, 10, (1 << 32) + 12, 9), 2, 0) == GOLDEN[5][0].serialize()[:24]
 
 
 def test_the_sequence_wraps() -> None:
@@ -359,18 +342,6 @@ def fragments(route: int, sequence: int, payload: bytes, sizes: list[int]) -> li
     return frames
 
 
-@pytest.mark.parametrize("chunk", [1, 7, 24, 25, 4096, 1 << 20])
-def test_fragments_of_several_routes_interleave(acceptor: Side, time: Time, chunk: int) -> None:
-    one, two = bytes(range(256)) * 4, b"two" * 300
-    first, second = fragments(1, 5, one, [100, 900]), fragments(2, 6, two, [1, 898])
-    small = pack_data_header(5, 3, 1, 99) + b"small"
-    wire = b"".join([first[0], second[0], small, second[1], first[1], first[2], small, second[2]])
-    deliver(wire, acceptor, time.now, chunk)
-    assert acceptor.messages() == [(1, 5, 99, one), (2, 6, 99, two)]
-    assert [flags for route, _, _, flags, _ in acceptor.parts if route == 1] == [FIRST, 0, LAST]
-    assert acceptor.data == [(3, 1, 99, b"small")] * 2
-
-
 @pytest.mark.parametrize("flags", [FIRST, 0, LAST, WHOLE])
 @pytest.mark.parametrize("chunk", [1000, 65_536, 131_073])
 def test_a_large_frame_is_handed_on_while_it_arrives(acceptor: Side, time: Time, flags: int, chunk: int) -> None:
@@ -398,13 +369,6 @@ def test_short_frame_is_delivered_whole(acceptor: Side, time: Time) -> None:
     assert acceptor.parts == []
 
 
-def test_header_alone_delivers_nothing(acceptor: Side, time: Time) -> None:
-    for size in (100, limits.DATA_PAYLOAD_MAX):
-        assert acceptor.receive(memoryview(pack_data_header(size, 7, 1, 99)), time.now) == (0, 24 + size)
-    assert not acceptor.parts
-    assert not acceptor.data
-
-
 def test_an_abort_is_handed_on_as_a_part_without_bytes(acceptor: Side, time: Time) -> None:
     frames = fragments(7, 1, bytes(900), [300, 300])
     abort = Frame(FrameKind.DATA, b"", 7, 1, 99, LAST | ABORT).serialize()
@@ -430,14 +394,6 @@ def test_closing_from_within_a_part_stops_the_reading(acceptor: Side, time: Time
     acceptor.receive(memoryview(wire[150_000:]), time.now)
     assert got == [150_000 - 24]
     assert acceptor.data == []
-
-
-def test_rest_of_a_begun_frame_is_dropped_while_closing(acceptor: Side, time: Time) -> None:
-    wire = pack_data_header(200_000, 1, 1, 0) + bytes(200_000)
-    acceptor.receive(memoryview(wire[:150_000]), time.now)
-    acceptor.close("done", time.now)
-    acceptor.receive(memoryview(wire[150_000:]), time.now)
-    assert len(acceptor.parts) == 1
 
 
 def test_half_read_frame_renews_the_lease_only_with_bytes(acceptor: Side, time: Time) -> None:

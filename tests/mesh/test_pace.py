@@ -42,19 +42,6 @@ def rest(one: Side, other: Side, time: Time) -> None:
     assert resting(one, other) == [True, True]
 
 
-def test_a_link_rests_when_neither_side_needs_it(dialler: Side, acceptor: Side, time: Time) -> None:
-    dialler.need(time.now, needed=False)
-    exchange(dialler, acceptor, time)
-    assert resting(dialler, acceptor) == [False, False], "the other side needs it still"
-    busy = run(dialler, acceptor, time, 60.0)
-    acceptor.need(time.now, needed=False)
-    exchange(dialler, acceptor, time)
-    assert resting(dialler, acceptor) == [True, True]
-    calm = run(dialler, acceptor, time, 60.0)
-    assert dialler.state is acceptor.state is ConnectionState.UP
-    assert calm * 15 < busy
-
-
 def test_silence_is_worth_a_check_at_the_pace_of_the_link(dialler: Side, acceptor: Side, time: Time) -> None:
     """In use within a second, at rest before the long lease ends, and soon when it is needed again."""
     assert dialler.keepalive.quiet_after == limits.GHOST_QUIET < limits.EXPRESS_LEASE
@@ -107,14 +94,6 @@ def run_all(links: list[tuple[Side, Side]], time: Time, seconds: float) -> tuple
         exchange(*pair_, time)
 
 
-def test_silence_at_rest_ends_the_link_by_the_longer_lease(dialler: Side, acceptor: Side, time: Time) -> None:
-    rest(dialler, acceptor, time)
-    pass_time(dialler, time, limits.IDLE_LEASE - 0.01)
-    assert dialler.state is ConnectionState.UP
-    pass_time(dialler, time, 0.02)
-    assert dialler.last() == ("closed", "high was silent for its lease of 46 s")
-
-
 @pytest.mark.parametrize(
     ("peers", "interval", "lease"), [(3, 15.0, 46.0), (150, 15.0, 46.0), (170, 17.0, 52.0), (999, 19.0, 58.0)]
 )
@@ -149,17 +128,6 @@ def test_a_link_at_rest_takes_the_pace_of_a_mesh_that_grows_and_shrinks(
     assert few - 2 <= run(dialler, acceptor, time, 600.0) <= few + 2
 
 
-def test_two_sides_with_different_numbers_of_peers_keep_their_own_promises(
-    dialler: Side, acceptor: Side, time: Time
-) -> None:
-    """As with an earlier release, whose pace does not change with the number."""
-    dialler.keepalive.pace.rest_lease = rest_lease(999)
-    rest(dialler, acceptor, time)
-    run(dialler, acceptor, time, 600.0)
-    assert dialler.state is acceptor.state is ConnectionState.UP
-    assert (dialler.keepalive.remote_lease, acceptor.keepalive.remote_lease) == (limits.IDLE_LEASE, 58.0)
-
-
 @pytest.mark.parametrize("who", [0, 1])
 def test_the_clock_is_measured_anew_as_soon_as_a_rest_ends(time: Time, who: int) -> None:
     both = pair(time)
@@ -176,46 +144,6 @@ def test_the_clock_is_measured_anew_as_soon_as_a_rest_ends(time: Time, who: int)
         assert now[1] < before[1] / 3, "the old one is of seconds ago"
         pongs = [event for event in each.events[heard[each] :] if event[0] == "pong"]
         assert len(pongs) >= WAKE_PINGS, "one of several is quick even on a busy path"
-
-
-@pytest.mark.parametrize("who", [0, 1])
-def test_one_side_that_needs_the_link_brings_back_the_short_lease(time: Time, who: int) -> None:
-    both = pair(time)
-    rest(*both, time)
-    run(*both, time, 33.0)
-    both[who].need(time.now, needed=True)
-    exchange(*both, time)
-    assert not any(each.rests for each in both)
-    run(*both, time, 5.0)
-    dead, alive = both[1 - who], both[who]
-    dead.take_output()
-    pass_time(alive, time, limits.EXPRESS_LEASE + 0.3)
-    assert alive.state is ConnectionState.CLOSED
-
-
-def test_a_peer_that_died_at_rest_is_noticed_soon_once_it_is_needed(
-    dialler: Side, acceptor: Side, time: Time
-) -> None:
-    rest(dialler, acceptor, time)
-    pass_time(dialler, time, 3.0)
-    dialler.need(time.now, needed=True)
-    pass_time(dialler, time, limits.GHOST_QUIET)
-    assert dialler.keepalive.quiet_after == limits.GHOST_QUIET
-    assert not dialler.seen("closed"), "it has time to answer"
-    pass_time(dialler, time, limits.WAKE_TIMEOUT - limits.GHOST_QUIET + 0.01)
-    assert dialler.state is ConnectionState.CLOSED
-    assert dialler.last() == ("closed", "high was silent for its lease of 1.5 s")
-
-
-def test_a_pause_at_rest_that_is_shorter_than_the_lease_changes_nothing(
-    dialler: Side, acceptor: Side, time: Time
-) -> None:
-    """The peer's process is stopped for 3 s (or this one: a suspended machine), and nothing needs the link."""
-    rest(dialler, acceptor, time)
-    time.now += 3.0
-    run(dialler, acceptor, time, 30.0)
-    assert resting(dialler, acceptor) == [True, True]
-    assert dialler.state is acceptor.state is ConnectionState.UP
 
 
 def test_a_suspend_of_this_machine_is_not_the_peers_silence_and_the_next_use_asks_it(

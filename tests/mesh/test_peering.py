@@ -78,15 +78,6 @@ def test_many_peers_that_fall_silent_share_the_attempts() -> None:
     assert len(made) < limits.PURSUIT * PURSUITS_PER_SECOND
 
 
-def test_higher_guid_dials_later() -> None:
-    low, high = of(LOW), of(HIGH)
-    low.peer_found(HIGH, 0.0)
-    high.peer_found(LOW, 0.0)
-    assert dials(low.take()) == [HIGH.guid.endpoint]
-    assert dials(high.take()) == []
-    assert until_dial(high, 0.0) == (DIAL_FALLBACK, LOW.guid.endpoint)
-
-
 def test_all_addresses_are_dialled_before_a_pause() -> None:
     low = of(LOW)
     low.peer_found(DUAL, 0.0, source="172.16.0.2")
@@ -103,18 +94,6 @@ def test_all_addresses_are_dialled_before_a_pause() -> None:
     assert seen == [(0.0, everywhere), (0.1, everywhere), (0.3, everywhere)]
     (status,) = low.peers()
     assert (status.state, status.last_error, status.attempts) == ("waiting", "no answer anywhere", 3)
-
-
-def test_wrong_peer_at_one_address_leaves_the_others() -> None:
-    low = of(LOW)
-    low.peer_found(DUAL, 0.0)
-    stranger, *rest = DUAL.endpoints
-    low.take()
-    low.dial_refused(DUAL.guid, Refuse(Refusal.WRONG_PEER, "I am another"), 1.0, stranger)
-    low.handle_timer(1.0)
-    assert low.take() == [("dial", DUAL.guid, tuple(rest), False)]
-    low.dial_failed(DUAL.guid, "hung up", 2.0, rest[0])
-    assert until_dial(low, 2.0)[0] > 2.0
 
 
 def test_retries_for_ever_with_a_cap() -> None:
@@ -144,26 +123,6 @@ def test_flapping_link_is_dialled_slower_than_a_stable_one() -> None:
     assert pauses[5] > 1.0
     now, _ = until_dial(low, now)
     assert now - (before + pauses[-1]) <= LINK_STABLE + limits.BACKOFF_FIRST
-
-
-def test_where_it_worked_is_dialled_first() -> None:
-    low = of(LOW)
-    low.peer_found(DUAL, 0.0)
-    assert until_dial(low, 0.0)[1] == HIGH.guid.endpoint
-    good = ("192.168.0.2", 40002)
-    low.link_up(1, DUAL, 0.0, dialled=True, endpoint=good)
-    low.link_down(1, "lost", 9.0)
-    assert until_dial(low, 9.0)[1] == good
-
-
-def test_since_when_a_peer_is_linked_or_not() -> None:
-    low = of(LOW)
-    low.peer_found(HIGH, 0.0)
-    assert [status.since for status in low.peers()] == [None]
-    low.link_up(1, HIGH, 3.0, dialled=True, endpoint=HIGH.guid.endpoint)
-    assert [status.since for status in low.peers()] == [3.0]
-    low.link_down(1, "lost", 9.0)
-    assert [status.since for status in low.peers()] == [9.0]
 
 
 def test_unannounced_peer_is_forgotten_after_its_link() -> None:
@@ -240,38 +199,12 @@ def test_a_new_instance_replaces_its_ghost() -> None:
     assert low.peers()[0].state == "linked"
 
 
-def test_new_instance_links_before_its_beacon() -> None:
-    low = of(LOW, alive=False)
-    low.link_up(1, HIGH, 0.0, dialled=False)
-    assert low.judge(Hello.of(AGAIN, lease=1.0, expected=None), 1.0) is None
-    low.link_up(2, AGAIN, 1.0, dialled=False)
-    assert low.take()[1:] == [
-        ("close", 1, "the peer restarted"),
-        ("down", 1, "the peer restarted"),
-        ("up", 2),
-    ]
-
-
 def test_two_live_instances_with_one_address_are_refused() -> None:
     low = of(LOW, alive=True)
     low.link_up(1, HIGH, 0.0, dialled=False)
     verdict = low.judge(Hello.of(AGAIN, lease=1.0, expected=None), 1.0)
     assert verdict is not None
     assert verdict.code == Refusal.DUPLICATE
-
-
-def test_of_one_direction_the_newer_stays() -> None:
-    low = of(LOW)
-    low.link_up(1, HIGH, 0.0, dialled=False)
-    assert low.judge(Hello.of(HIGH, lease=1.0, expected=None), 1.0) is None
-    low.link_up(2, HIGH, 1.0, dialled=False)
-    reason = "replaced by a newer link"
-    assert low.take() == [
-        ("up", 1),
-        ("close", 1, reason),
-        ("down", 1, reason),
-        ("up", 2),
-    ]
 
 
 def test_invented_identities_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -446,20 +379,6 @@ def test_new_peer_is_dialled_at_once_among_many_silent_ones() -> None:
     network.run(2.0)
     assert network.linked() == ["high"]
     assert network.first(HIGH) - 0.5 <= 2 / limits.DIAL_STRANGERS_RATE + 1e-6
-
-
-def test_verified_peer_is_dialled_without_the_bound() -> None:
-    network = Network(HIGH)
-    network.find(HIGH)
-    network.find(*map(stranger, range(160)))
-    network.run(30.0)
-    here = network.there.pop(HIGH.guid)
-    network.peering.link_down(network.links, "its power failed", network.now)
-    network.run(60.0)
-    assert network.linked() == []
-    network.there[HIGH.guid] = here
-    network.run(limits.BACKOFF_MAX)
-    assert network.linked() == ["high"]
 
 
 def test_forged_peers_do_not_starve_a_waiting_one() -> None:

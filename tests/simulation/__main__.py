@@ -6,7 +6,6 @@ import argparse
 import sys
 
 from tests.simulation.direct_scenario import DirectScenario
-from tests.simulation.lanes_scenario import LanesScenario
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.rests_scenario import RestsScenario
 from tests.simulation.scenario import Scenario
@@ -17,16 +16,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.simulation", description=__doc__)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--peers", type=int, default=2, help="not with --kind direct")
-    kinds = ["rosters", "mesh", "lanes", "direct", "rests"]
+    kinds = ["rosters", "mesh", "direct", "rests"]
     parser.add_argument("--kind", choices=kinds, default="rosters")
     arguments = parser.parse_args()
     scenario: Scenario | DirectScenario
     if arguments.kind == "direct":
         scenario = DirectScenario(arguments.seed, keep=True)
     else:
-        make = {"rosters": Scenario, "mesh": MeshScenario, "lanes": LanesScenario, "rests": RestsScenario}[
-            arguments.kind
-        ]
+        make = {"rosters": Scenario, "mesh": MeshScenario, "rests": RestsScenario}[arguments.kind]
         scenario = make(arguments.seed, arguments.peers, keep=True)
     problem = ""
     try:

@@ -523,6 +523,7 @@ class Network:
 
     def _standing(self, address: str, _port: int | None = None) -> dict[int, set[int]]:
         found: dict[int, set[int]] = {}
-        for listener, source, port in self._rows(self._module_of(address)):
-            found.setdefault(port, set()).add(self._port(listener, source, port))
+        for module in self._modules:
+            for listener, source, port in self._rows(module) if module.address == address else ():
+                found.setdefault(port, set()).add(self._port(listener, source, port))
         return found

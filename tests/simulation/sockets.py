@@ -49,8 +49,6 @@ class SimSocket:
         self.closed = False
         self.in_flight = 0
         """Bytes that the other end has not got."""
-        self.trap: tuple[int, Callable[[], None]] | None = None
-        """What happens when the other end has got so many more bytes, and not one beyond them."""
         self._network = network
         self._fd = next(_descriptors)
         self._window = network.world.rng.choice([16 * KIB, 64 * KIB, 400 * KIB])
@@ -198,31 +196,17 @@ class SimSocket:
                 self._stall()
                 return
             self._stalled = None
-            item = self._next()
+            item = self._packets.popleft()[1]
             self.in_flight -= len(item) if item is not _FIN else 0
             if self.other.closed:
                 self._packets.clear()
                 world.after(self._network.delay(), lambda: self.fail(errno.ECONNRESET))
                 break
             self.other._arrive(item)
-            if self.trap is not None and self.trap[0] == 0:
-                happen, self.trap = self.trap[1], None
-                happen()
         self._pumping = bool(self._packets)
         if self._pumping:
             world.at(self._packets[0][0], self._pump)
         self._wake_writer()
-
-    def _next(self) -> bytes:
-        """The next piece, cut where a trap is."""
-        item = self._packets.popleft()[1]
-        if self.trap is not None and item is not _FIN:
-            left, happen = self.trap
-            if len(item) > left:
-                self._packets.appendleft((self._network.world.now, item[left:]))
-                item = item[:left]
-            self.trap = (left - len(item), happen)
-        return item
 
     def _stall(self) -> None:
         """TCP tries again; the socket's options say for how long."""

@@ -72,23 +72,6 @@ def test_each_subscriber_of_a_module_is_a_new_connection(seed: int, topic: str, 
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_publisher_that_is_silent_greets_too(seed: int) -> None:
-    async def scene(world: World) -> None:
-        speaker, greeter = greets(world, "/plain", BIG)
-        world.link()
-        await world.rest(0.2)
-        listeners = []
-        for _ in range(3):
-            listeners.append(world.listen(world.sides[1], "/plain"))
-            await world.rest(1.0)
-        speaker.say(10)
-        await world.rest(1.0)
-        judge(listeners, speaker, greeter)
-
-    play(seed, scene)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("greeting", [False, True])
 def test_a_latched_message_comes_once(seed: int, greeting: bool) -> None:
     async def scene(world: World) -> None:

@@ -31,6 +31,7 @@ RULES = (
     ContractRule(("/kept",), (), {"durability": Durability.TRANSIENT_LOCAL, "depth": 3}),
     ContractRule(("/urgent",), (), {"priority": Priority.HIGH, "reliability": Reliability.RELIABLE}),
     ContractRule(("/slow",), (), {"max_rate": 50.0}),
+    ContractRule(("/timed",), (), {"deadline": 1.0, "liveliness_lease": 5.0}),
 )
 
 
@@ -175,7 +176,7 @@ async def a_lie(world: World) -> None:
     await world.rest(0.5)
     assert numbers(listener, speaker) == [1, 2]
     world.leave(listener)
-    await world.rest(2 * mesh_limits.RESUME_CLAIM)
+    await world.rest(2 * mesh_limits.RESUME_CLAIM, step=0.1)
     world.check_nothing_is_left()
 
 
@@ -263,3 +264,99 @@ def test_whatever_happens_all_is_well_in_the_end(block: int, caplog: pytest.LogC
     for seed in range(1000 + block * 10, 1000 + block * 10 + 10):
         play(seed, mischief, clocks=bool(seed % 2))
     assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
+
+
+# --- one source at its proxy --------------------------------------------------------------------------------------
+
+
+async def timed(world: World) -> Speaker:
+    """A source with a deadline and a lease, which one node of the other side listens to and has heard once."""
+    a, b = world.sides
+    speaker, listener = world.speak(a, "/timed", "/one"), world.listen(b, "/timed")
+    world.link()
+    await world.rest(1.0)
+    speaker.say(10)
+    await world.rest(0.5)
+    assert numbers(listener, speaker) == [1]
+    return speaker
+
+
+async def a_missed_deadline(world: World) -> None:
+    speaker, counters = await timed(world), world.sides[1].bridge.counters
+    assert counters["contract.deadline_missed"] == 0
+    await world.rest(1.0)
+    assert counters["contract.deadline_missed"] == 1, "it is said when it is missed"
+    world.leave(world.sides[1].listeners[0])
+    await world.rest(limits.ROUTE_LINGER + 1.0)
+    missed = counters["contract.deadline_missed"]
+    await world.rest(10.0)
+    assert counters["contract.deadline_missed"] == missed, "nothing waits for it any more"
+    assert speaker.said == 1
+
+
+async def a_bye(world: World) -> None:
+    await timed(world)
+    for index in (0, 1):
+        world.notice(index, silent=False)
+    await asyncio.sleep(0.1)
+    assert world.sides[1].bridge.counters["contract.liveliness_lost"] == 1, "at once"
+    await asyncio.sleep(60.0)
+    assert world.sides[1].bridge.counters["contract.liveliness_lost"] == 1
+
+
+async def a_silence(world: World) -> None:
+    await timed(world)
+    for index in (0, 1):
+        world.notice(index, silent=True)
+    await asyncio.sleep(1.0)
+    assert world.sides[1].bridge.counters["contract.liveliness_lost"] == 0
+    await asyncio.sleep(60.0)
+    assert world.sides[1].bridge.counters["contract.liveliness_lost"] == 1
+
+
+async def a_late_listener(world: World) -> None:
+    """Of what a publisher has said it gets as much as the contract keeps."""
+    a, b = world.sides
+    speaker, first = world.speak(a, "/kept", "/one"), world.listen(b, "/kept")
+    world.link()
+    await world.rest(1.0)
+    for _ in range(5):
+        speaker.say(10)
+        await world.rest(0.1)
+    assert numbers(first, speaker) == [1, 2, 3, 4, 5]
+    late = world.listen(b, "/kept")
+    await world.rest(0.5)
+    assert numbers(late, speaker) == [3, 4, 5]
+
+
+async def a_changed_header(world: World) -> None:
+    a, b = world.sides
+    listener = world.listen(b, "/plain")
+    world.link()
+    for latching in (False, True):
+        speaker = world.speak(a, "/plain", "/one", latching=latching)
+        await world.rest(2.0)
+        speaker.say(10)
+        await world.rest(2.0)
+        assert numbers(listener, speaker)[-1:] == [1]
+    ears = [listener.got[number][-1][0] for number in (1, 2)]
+    assert ears[0] is not ears[1], "its subscribers are to read the new header"
+
+
+async def a_core_that_forgets(world: World) -> None:
+    a, b = world.sides
+    world.speak(a, "/plain", "/one")
+    world.link()
+    await world.rest(1.0)
+    there = b.core.publishers("/plain")
+    [(node, uri)] = there.items()
+    b.core.call("unregisterPublisher", node, "/plain", uri)
+    await world.rest(2 * limits.RECONCILE_INTERVAL, step=0.1)
+    assert b.core.publishers("/plain") == there
+
+
+@pytest.mark.parametrize(
+    "scene", [a_missed_deadline, a_bye, a_silence, a_late_listener, a_changed_header, a_core_that_forgets]
+)
+def test_a_source_at_its_proxy(scene: Callable[[World], Coroutine[object, object, None]]) -> None:
+    play(1, scene)

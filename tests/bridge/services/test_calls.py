@@ -252,15 +252,6 @@ async def test_calls_of_every_size_at_once_by_the_lane_of_their_size() -> None:
     ends.assert_nothing_held()
 
 
-async def test_answers_come_in_any_order() -> None:
-    ends = Ends()
-    ends.pool.waiting = []
-    calls = [ends.call(b"%d" % number) for number in range(3)]
-    for body, done in reversed(ends.pool.waiting):
-        done(True, b"to " + body)
-    assert [call.answer for call in calls] == [(True, b"to %d" % number) for number in range(3)]
-
-
 async def test_a_client_that_leaves_wants_no_answer() -> None:
     ends = Ends()
     ends.pool.waiting = []
@@ -412,16 +403,6 @@ def test_parts_that_are_not_followed_are_told_and_let_go() -> None:
     assert taker._budget.used == 0
 
 
-def test_parts_beyond_the_budget_pass_unkept() -> None:
-    budget = Budget(10)
-    assert budget.take(8)
-    taker = Kept(budget)
-    taker.part(1, 0, FIRST, memoryview(b"\4\0\0\0ab"))
-    taker.part(1, 0, LAST, memoryview(b"cd"))
-    assert [sequence for sequence, _ in taker.failures] == [1]
-    assert (taker.bodies, budget.used) == ([], 8)
-
-
 # The connections to one server: calls at once, each over its own, and no call lost with one that was closed.
 
 
@@ -518,17 +499,6 @@ async def test_a_connection_that_the_server_closed_meanwhile_is_replaced(desk: D
     await desk.until(answers=1)
     assert desk.answers[b"1"] == (True, b"one")
     desk.node.remove_service("/add")
-
-
-async def test_a_server_that_dies_in_the_middle_of_a_call(desk: Desk) -> None:
-    desk.call(b"1")
-    await desk.until(calls=1)
-    for session in tuple(desk.endpoint._clients):
-        session.close()
-    await desk.until(answers=1, lost=1)
-    ok, text = desk.answers[b"1"]
-    assert not ok
-    assert b"in the middle of the call" in text
 
 
 async def test_a_server_that_is_not_there(desk: Desk) -> None:

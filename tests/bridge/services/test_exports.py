@@ -15,9 +15,7 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.config import limits as config_limits
-from rmpa.config.peer_rules import PeerRule, PolicySettings
 from rmpa.config.settings import ServiceSettings
-from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.wire.tcpros import ServiceDescription
 from tests.bridge.recorder import EndRoute, Probe, Send, ServerGone, ServeRoute, ServiceExports
 from tests.bridge.services.test_rules import rules
@@ -51,22 +49,6 @@ def exports() -> ServiceExports:
     made.graph("/add", ADD)
     made.link_up(1, "base")
     return made
-
-
-def test_an_empty_graph_is_told_too() -> None:
-    made = ServiceExports(rules())
-    assert made.link_up(1, "base") == [Send(1, AdvertiseServices(full=True))]
-    assert told(made) == []
-
-
-def test_changes_are_told_once(exports: ServiceExports) -> None:
-    exports.graph("/sub", LocalService("/n", "rosrpc://127.0.0.1:6"))
-    exports.graph("/add", None)
-    assert told(exports) == [AdvertiseServices((ServiceOffer("/sub", "/n"),), ("/add",))]
-    exports.graph("/sub", LocalService("/n", "rosrpc://127.0.0.1:6"))
-    exports.graph("/gone", ADD)
-    exports.graph("/gone", None)
-    assert told(exports) == []
 
 
 def test_a_server_at_another_address_is_told_again_and_its_routes_end(exports: ServiceExports) -> None:
@@ -117,22 +99,3 @@ def test_one_probe_answers_all_who_wait(exports: ServiceExports) -> None:
         Send(2, ServiceClosed(ROUTE, "no answer")),
     ]
     assert exports.opened(1, OpenService(ROUTE, "/add")) == [Probe("/add", ADD)], "whoever asks again has another try"
-
-
-def test_one_route_for_two_services_breaks_the_protocol(exports: ServiceExports) -> None:
-    exports.opened(1, OpenService(ROUTE, "/add"))
-    with pytest.raises(RemoteProtocolError):
-        exports.opened(1, OpenService(ROUTE, "/add"))
-
-
-def test_names_on_the_way_are_each_peers_own() -> None:
-    peers = (PeerRule("robot", prefix="/robot1"), PeerRule("deaf", policy=PolicySettings(deny=("/robot1/**",))))
-    made = ServiceExports(rules(peers=peers))
-    made.graph("/robot1/go", ADD)
-    (robot,), (deaf,), (base,) = (made.link_up(n, name) for n, name in enumerate(("robot", "deaf", "base")))
-    assert robot == Send(0, AdvertiseServices((ServiceOffer("/go", "/adder"),), full=True))
-    assert deaf == Send(1, AdvertiseServices(full=True))
-    assert base == Send(2, AdvertiseServices((ServiceOffer("/robot1/go", "/adder"),), full=True))
-    assert made.opened(0, OpenService(ROUTE, "/go")) == [Probe("/robot1/go", ADD)]
-    (refused,) = made.opened(1, OpenService(ROUTE, "/robot1/go"))
-    assert isinstance(refused, Send)

@@ -112,14 +112,6 @@ def test_a_peer_that_does_not_answer_is_given_up(imports: ServiceImports) -> Non
     assert imports.opened(1, ServiceOpened(ROUTE, REQUESTS, "a/Add", MD5)) == [], "too late"
 
 
-def test_a_refusal_ends_the_attempt(imports: ServiceImports) -> None:
-    imports.want(imports.get(1, "/add"), 0.0)
-    assert imports.closed(1, ServiceClosed(ROUTE, "no")) == [EndedService(1, "/add", ROUTE, "no")]
-    assert imports.closed(1, ServiceClosed(ROUTE, "no")) == []
-    remote = imports.entry(1, "/add")
-    assert (remote.state, remote.problem) == ("idle", "no")
-
-
 def test_a_lost_link_ends_calls_and_keeps_services_until_the_peer_is_gone(imports: ServiceImports) -> None:
     opened(imports)
     assert imports.link_down(1) == [EndedService(1, "/add", ROUTE, "the link to base was lost")]
@@ -134,25 +126,10 @@ def test_a_lost_link_ends_calls_and_keeps_services_until_the_peer_is_gone(import
     assert list(imports) == []
 
 
-def test_another_node_in_its_place_is_another_service(imports: ServiceImports) -> None:
-    assert imports.advertised(1, offer("/add", node="/m")) == [
-        Withdraw(1, "/add", "/n", "another node of base provides it now"),
-        Provide(1, "/add", "/m"),
-    ]
-
-
 def test_opened_twice_breaks_the_protocol(imports: ServiceImports) -> None:
     opened(imports)
     with pytest.raises(RemoteProtocolError):
         imports.opened(1, ServiceOpened(ROUTE, REQUESTS, "a/Add", MD5))
-
-
-def test_what_is_not_shown_is_not_opened(imports: ServiceImports) -> None:
-    imports.local("/add", "/mine")
-    remote = imports.get(1, "/add")
-    with pytest.raises(LocalProtocolError):
-        imports.want(remote, 0.0)
-    assert imports.release(remote, "no node calls it") == []
 
 
 def test_names_here_are_made_by_the_peers_rules() -> None:

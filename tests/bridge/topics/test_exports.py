@@ -22,7 +22,7 @@ from rmpa.bridge.topics.exports import LocalSource
 from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.settings import LimitSettings
 from rmpa.core.contract import Contract, ContractRule, Contracts, Durability, Priority, Reliability, Transport
-from tests.bridge.recorder import AddRoute, Connect, Disconnect, Exports, RemoveRoute, Send, SuspendRoute, Warn
+from tests.bridge.recorder import AddRoute, Connect, Disconnect, Exports, RemoveRoute, Send, Warn
 
 CMD = Source("/cmd", "/joy")
 JOY = LocalSource("sensor_msgs/Joy", "http://127.0.0.1:4000/")
@@ -71,24 +71,6 @@ def test_a_new_link_is_told_all_that_policy_lets_cross(exports: Exports) -> None
     ]
 
 
-def test_changes_are_told_to_every_link_and_only_changes(exports: Exports) -> None:
-    exports.link_up(1)
-    exports.link_up(2)
-    change = Advertise(added=(TopicOffer("/cmd", "/joy", "sensor_msgs/Joy"),))
-    assert graph(exports, {CMD: JOY}) == [Send(1, change), Send(2, change)]
-    assert graph(exports, {CMD: JOY}) == []
-    assert graph(exports, {}) == [Send(1, Advertise(removed=(CMD,))), Send(2, Advertise(removed=(CMD,)))]
-
-
-def test_a_changed_type_is_offered_again_and_a_changed_address_is_not(exports: Exports) -> None:
-    exports.link_up(1)
-    graph(exports, {CMD: JOY})
-    assert graph(exports, {CMD: LocalSource("sensor_msgs/Joy", "http://127.0.0.1:5000/")}) == []
-    assert graph(exports, {CMD: LocalSource("std_msgs/Empty", "http://127.0.0.1:5000/")}) == [
-        Send(1, Advertise(added=(TopicOffer("/cmd", "/joy", "std_msgs/Empty"),)))
-    ]
-
-
 def test_one_connection_on_demand_serves_all_subscribers(offering: Exports) -> None:
     offering.link_up(2)
     assert offering.opened(1, OpenRoute(7, "/cmd", "/joy")) == [Connect(CMD, JOY.uri)]
@@ -116,26 +98,6 @@ def test_a_lost_publisher_closes_every_route_and_forgets_them(offering: Exports)
     assert offering.lost(CMD, "it closed the connection") == []
     assert offering.closed(1, CloseRoute(7)) == []
     assert offering.opened(1, OpenRoute(7, "/cmd", "/joy")) == [Connect(CMD, JOY.uri)]
-
-
-def test_a_restarted_node_is_left_at_its_old_address(offering: Exports) -> None:
-    offering.opened(1, OpenRoute(7, "/cmd", "/joy"))
-    offering.described(CMD, ABOUT)
-    assert graph(offering, {CMD: LocalSource(JOY.type, "http://127.0.0.1:5000/")}) == [
-        RemoveRoute(CMD, 1, 7),
-        Disconnect(CMD),
-        Send(1, RouteClosed(7, "the node has restarted")),
-    ]
-
-
-def test_a_link_that_falls_takes_its_routes_along(offering: Exports) -> None:
-    offering.link_up(2)
-    offering.opened(1, OpenRoute(7, "/cmd", "/joy"))
-    offering.opened(2, OpenRoute(7, "/cmd", "/joy"))
-    offering.described(CMD, ABOUT)
-    assert offering.link_down(1) == [RemoveRoute(CMD, 1, 7)]
-    assert offering.link_down(2) == [RemoveRoute(CMD, 2, 7), Disconnect(CMD)]
-    assert offering.link_down(2) == []
 
 
 def test_a_route_opened_twice_is_ignored_and_said(offering: Exports) -> None:
@@ -171,20 +133,6 @@ def test_the_number_of_routes_is_bounded() -> None:
 
 def many(count: int) -> dict[Source, LocalSource]:
     return {Source(f"/t{index:04}", "/n"): JOY for index in range(count)}
-
-
-def test_what_came_and_went_before_it_was_told_is_not_told(exports: Exports) -> None:
-    exports.link_up(1)
-    exports.graph("/cmd", {"/joy": JOY})
-    exports.graph("/cmd", {})
-    assert exports.advertise() == []
-    graph(exports, {CMD: JOY})
-    exports.graph("/cmd", {})
-    exports.graph("/cmd", {"/joy": JOY})
-    assert [exports.pending, exports.advertise(), exports.pending] == [True, [], False]
-    exports.graph("/cmd", {})
-    exports.graph("/cmd", {"/joy": LocalSource("std_msgs/Empty", JOY.uri)})
-    assert exports.advertise() == [Send(1, Advertise(added=(TopicOffer("/cmd", "/joy", "std_msgs/Empty"),)))]
 
 
 def test_a_change_costs_what_changed_and_not_what_there_is(exports: Exports) -> None:
@@ -260,65 +208,6 @@ def test_another_transport_alone_leaves_routes_open(flowing: Exports) -> None:
     assert [type(message) for message in sends(flowing.apply_rules(policy, slower, Names()))] == [RouteClosed] * 2
 
 
-def test_a_route_resumes_with_another_transport(flowing: Exports) -> None:
-    flowing.apply_rules(Policy(PolicySettings()), Contracts((), Transport.AUTO), Names())
-    flowing.link_away(1)
-    flowing.link_up(1)
-    asked = Contract(reliability=Reliability.RELIABLE, transport=Transport.DIRECT)
-    assert flowing.opened(1, OpenRoute(2, "/cmd", "/joy", asked, epoch=1, after=41)) == [
-        Send(1, RouteOpened(2, ABOUT, asked, 1, 42, 42)),
-        AddRoute(CMD, 1, 2, asked, 1, 41),
-    ]
-
-
-def test_a_reliable_route_outlives_its_link_and_resumes(flowing: Exports) -> None:
-    assert flowing.link_away(1) == ([SuspendRoute(CMD, 1)], True)
-    assert flowing.outage(1)
-    assert flowing.flowing(CMD) == ()
-    flowing.link_up(1)
-    assert flowing.opened(1, OpenRoute(2, "/cmd", "/joy", RELIABLE, epoch=1, after=41)) == [
-        Send(1, RouteOpened(2, ABOUT, RELIABLE, 1, 42, 42)),
-        AddRoute(CMD, 1, 2, RELIABLE, 1, 41),
-    ]
-    assert not flowing.outage(1)
-    assert flowing.link_away(1) == ([SuspendRoute(CMD, 1)], True)
-    flowing.link_up(1)
-    flowing.opened(1, OpenRoute(1, "/cmd", "/joy", RELIABLE, epoch=1, after=50))
-    assert flowing.closed(1, CloseRoute(1)) == [RemoveRoute(CMD, 1, 1), Disconnect(CMD)]
-
-
-@pytest.mark.parametrize("asked", [SURE, OpenRoute(7, "/cmd", "/joy", RELIABLE, epoch=9, after=3)])
-def test_who_knows_nothing_of_the_numbering_begins_with_the_next_message(flowing: Exports, asked: OpenRoute) -> None:
-    flowing.link_away(1)
-    flowing.link_up(1)
-    assert flowing.opened(1, asked) == [
-        Send(1, RouteOpened(7, ABOUT, RELIABLE, 1, shared=True)),
-        AddRoute(CMD, 1, 7, RELIABLE, 1),
-    ]
-    assert not flowing.outage(1)
-
-
-def test_what_is_not_reliable_or_does_not_flow_yet_ends_with_its_link(exports: Exports) -> None:
-    plain, connecting = Source("/plain", "/joy"), Source("/new", "/joy")
-    graph(exports, {plain: JOY, connecting: JOY})
-    exports.link_up(1)
-    exports.opened(1, OpenRoute(1, "/plain", "/joy"))
-    exports.described(plain, ABOUT)
-    exports.opened(1, OpenRoute(2, "/new", "/joy", RELIABLE))
-    assert exports.link_away(1) == ([RemoveRoute(plain, 1, 1), Disconnect(plain), Disconnect(connecting)], False)
-    assert exports.link_down(1) == []
-
-
-@pytest.mark.parametrize("how", ["link_down", "given_up"])
-def test_a_suspended_route_that_nobody_asks_for_is_given_up(flowing: Exports, how: str) -> None:
-    flowing.link_away(1)
-    ended = flowing.link_down(1) if how == "link_down" else flowing.given_up(CMD, 1)
-    assert ended == [RemoveRoute(CMD, 1, 0), Disconnect(CMD)]
-    assert flowing.given_up(CMD, 1) == []
-    assert not flowing.outage(1)
-    assert flowing.link_down(1) == []
-
-
 @pytest.mark.parametrize("instance", ["first", "second"])
 def test_another_run_of_a_peer_is_told_once_that_messages_may_be_lost(exports: Exports, instance: str) -> None:
     graph(exports, {CMD: JOY})
@@ -356,24 +245,3 @@ def test_what_the_peer_asked_for_again_is_claimed(flowing: Exports) -> None:
     assert flowing.given_up(CMD, 1) == []
     assert flowing.flowing(CMD) == (1,)
     assert flowing.link_down(2) == [RemoveRoute(CMD, 2, 0)]
-
-
-def test_a_publisher_that_goes_takes_suspended_routes_along(flowing: Exports) -> None:
-    flowing.link_up(2)
-    flowing.opened(2, SURE)
-    flowing.link_away(1)
-    assert flowing.lost(CMD, "it died") == [
-        RemoveRoute(CMD, 1, 0),
-        RemoveRoute(CMD, 2, 7),
-        Disconnect(CMD),
-        Send(2, RouteClosed(7, "it died")),
-    ]
-    flowing.link_up(1)
-    assert flowing.opened(1, OpenRoute(1, "/cmd", "/joy", RELIABLE, epoch=1, after=3)) == [Connect(CMD, JOY.uri)]
-    assert len(sends(flowing.described(CMD, ABOUT))) == 1
-
-
-def test_a_suspended_route_is_told_of_nothing(flowing: Exports) -> None:
-    flowing.link_away(1)
-    assert graph(flowing, {CMD: JOY, Source("/b", "/joy"): JOY}) == []
-    assert flowing.described(CMD, ABOUT) == []

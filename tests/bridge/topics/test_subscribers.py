@@ -183,14 +183,6 @@ async def test_of_several_changes_at_once_the_last_is_told(world: World) -> None
     assert world.sent == [Audience(1, ("/two",))]
 
 
-async def test_other_topics_and_sources_that_went_are_nobodys_business(world: World) -> None:
-    world.imports.advertised(1, Advertise(added=(TopicOffer("/chatter", "/client", "std_msgs/String"),)))
-    world.imports.demand(1, CHATTER, 0.0, wanted=True)
-    world.imports.opened(1, RouteOpened(1, Description("std_msgs/String", MD5, "", False)), 0.0)
-    assert await world.changed(CHATTER, "/listener") == []
-    assert await world.changed(GOAL, "/server") == []
-
-
 # --- the peer's listeners ---------------------------------------------------------------------------------------
 
 
@@ -390,12 +382,6 @@ def test_a_refused_subscriber_is_told_to_the_peer_until_it_registers_again(repor
     assert reports.done == [Send(BASE, Mismatch("/cmd", "/joy", "/viewer", ""))]
 
 
-def test_a_peers_report_is_a_warning_that_names_the_peer(reports: Reports) -> None:
-    reports.hear("other md5")
-    assert reports.texts(CMD) == ("other md5",)
-    assert reports.warnings == [f"base: {CMD}: other md5"]
-
-
 def test_a_peers_report_ends_with_an_empty_text_or_with_the_peer(reports: Reports) -> None:
     reports.hear("other md5")
     reports.hear("")
@@ -404,14 +390,6 @@ def test_a_peers_report_ends_with_an_empty_text_or_with_the_peer(reports: Report
     reports.peer_gone("base")
     assert reports.texts(CMD) == ()
     assert len(reports.warnings) == 2, "an end is no warning"
-
-
-def test_only_nodes_of_a_peer_that_is_gone_are_forgotten(reports: Reports) -> None:
-    reports.hear("of base")
-    reports.reported(2, "base2", Mismatch(CMD.topic, CMD.node, "/viewer", "of base2"))
-    reports.refused(BASE, CMD, "/viewer", "ours")
-    reports.peer_gone("base")
-    assert reports.texts(CMD) == ("of base2", "ours")
 
 
 def test_a_source_has_only_so_many_and_each_of_them_can_still_change(reports: Reports) -> None:

@@ -64,17 +64,6 @@ def by_system(cell: Cell) -> Measured:
     return made(0.3, 1.0, 60.0 if cell.settings["mode"] == "polled" else 0.4)
 
 
-def test_both_systems_get_the_same_phase_in_a_round() -> None:
-    given: dict[object, set[object]] = {}
-    for cell in EXPERIMENT.cells(Plan()):
-        if cell.settings["mode"] == "polled":
-            given.setdefault(cell.settings["round"], set()).add(cell.settings["phase_ms"])
-        else:
-            assert "phase_ms" not in cell.settings
-    assert all(len(phase) == 1 for phase in given.values())
-    assert len(set.union(*given.values())) == len(given) > 1
-
-
 # --- findings -------------------------------------------------------------------------------------------------------
 
 
@@ -102,47 +91,3 @@ def test_the_claims_hold_each_round_against_its_neighbour() -> None:
     assert polled.value == pytest.approx((60.3 + 50 / 101 * 0.3) / (60.0 + 50 / 101 * 0.7))
     assert polled.reached
     assert polled.paper == pytest.approx(0.59)
-
-
-def test_one_bad_round_does_not_decide_a_ratio() -> None:
-    def measure(cell: Cell) -> Measured:
-        bad = cell.settings["round"] == 2 and cell.settings["system"] == "rmpa"
-        return made(30.0, 30.0, 60.0) if bad else made(0.3, 0.3, 60.0)
-
-    claims = EXPERIMENT.findings(run(FULL, measure)).claims
-    assert claim(claims, "CMD at the pc, event, roscpp: RMPA / classic").value == pytest.approx(1.0)
-
-
-def test_a_round_that_failed_on_one_side_is_left_out_on_both() -> None:
-    def measure(cell: Cell) -> Measured | None:
-        if cell.settings["round"] == 1:
-            return made(9.0, 9.0, 60.0) if cell.settings["system"] == "classic" else None
-        return by_system(cell)
-
-    claims = EXPERIMENT.findings(run(FULL, measure)).claims
-    assert claim(claims, "CMD at the pc, polled, roscpp: RMPA / classic").value == pytest.approx(2.0)
-
-
-def test_the_direct_transport_is_held_against_classic_ros_more_strictly() -> None:
-    claims = EXPERIMENT.findings(run(FULL, by_system)).claims
-    cmd = claim(claims, "CMD at the pc, event, roscpp: RMPA direct / classic")
-    assert cmd.value == pytest.approx(1.05)
-    assert (cmd.limit, cmd.reached) == (1.1, True)
-    later = claim(claims, "control delay, event, roscpp: RMPA direct less classic")
-    assert later.value == pytest.approx(0.06 + 50 / 101 * (0.735 - 0.7))
-    assert (later.limit, later.reached) == (0.05, False)
-
-
-def test_table_1_has_the_papers_figures_beside_ours() -> None:
-    grids = EXPERIMENT.findings(run(FULL, by_system)).grids
-    polled, event = grids
-    shown = ("RMPA", "RMPA direct", "classic", "classic, nodelay off")
-    assert polled.columns[1:9] == tuple(f"{what}, {one}" for what in ("mean", "sd") for one in shown)
-    assert polled.columns[9:] == ("sd, RMPA / classic", "sd, RMPA direct / classic")
-    rows = {row[0]: row[1:] for row in polled.rows}
-    assert rows["Command Order"][4:7] == ("0.603", "0.3166", "0.3015")
-    assert [ratio.split()[0] for ratio in rows["Command Order"][8:]] == ["2", "1.05"]
-    assert rows["Command Order, in the paper"] == ("99.9", "", "99.9", "", "0.5059", "", "0.2724", "", "1.86", "")
-    assert rows["Control Computation Delay, in the paper"][:3] == ("61.3", "", "103.8")
-    assert all("paper" not in row[0] for row in event.rows)
-    assert all(len(row) == len(grid.columns) for grid in grids for row in grid.rows)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from lab.bed.plan import Plan
-from lab.experiments.images import EXPERIMENT, bytes_per_second
+from lab.experiments.images import EXPERIMENT
 from lab.experiments.model import Cell, Measured, Results, Value
 from lab.frames import frame
 
@@ -43,12 +43,6 @@ def claims(*cells: tuple[Cell, Measured]) -> dict[str, Claim]:
     return {claim.text: claim for claim in findings(*cells).claims}
 
 
-def test_only_images_that_came_in_the_span_count() -> None:
-    came = [n * 100_000_000 for n in range(11)]
-    assert bytes_per_second(came, 200_000_000, 600_000_000) == pytest.approx(10 * MB)
-    assert bytes_per_second(came, 50_000_000, 150_000_000) == 0
-
-
 def test_the_claims_hold_a_percentile_of_all_rounds() -> None:
     fast = [0.5] * 985 + [0.9] * 15
     slow = [5.0] * 985 + [20.0] * 15
@@ -60,25 +54,3 @@ def test_the_claims_hold_a_percentile_of_all_rounds() -> None:
     assert found["commands beside images, p99, classic, roscpp"].value == pytest.approx(20.0)
     assert found["images' share of the cable, RMPA, roscpp"].value == pytest.approx(8 * MB / 0.09 / 1e8, rel=1e-3)
     assert all(claim.reached for claim in found.values())
-
-
-def test_commands_beside_direct_images_are_held_against_both_relayed() -> None:
-    found = claims(
-        (cell("rmpa"), measured([0.5] * 985 + [1.0] * 15)),
-        (cell("rmpa", transport="direct"), measured([5.0] * 1000)),
-        (cell("rmpa", transport="mixed"), measured([0.5] * 985 + [1.2] * 15)),
-    )
-    text = "commands beside images, p99, roscpp: images direct, commands relayed / both relayed"
-    assert found[text].value == pytest.approx(1.2)
-    assert found[text].reached is False
-    assert found["commands beside images, p99, RMPA, roscpp"].value == pytest.approx(1.0)
-
-
-def test_a_message_that_came_twice_counts_once() -> None:
-    told = measured([0.5] * 1000)
-    rows = list(told.tables["commands"].itertuples(index=False, name=None))
-    doubled = Measured(
-        {**told.tables, "commands": frame(told.tables["commands"].columns, [*rows, rows[-1]])}, told.facts
-    )
-    beside = findings((cell("rmpa"), doubled)).grids[0].rows[1]
-    assert beside[8] == "1000"

@@ -42,18 +42,6 @@ RESULTS = Results(
 )
 
 
-def test_master_and_helpers_are_one() -> None:
-    told = measured(0.2, [], [None])
-    processes = told.tables["processes"]
-    rows = [("idle", f"{name}@pc", percent, 1) for name, percent in (("roscore", 0.1), ("master", 0.4))]
-    both = Measured(
-        {**told.tables, "processes": frame(processes.columns, [*processes.itertuples(index=False, name=None), *rows])}
-    )
-    grid = EXPERIMENT.findings(Results(Plan(), [(cell("classic", 2), both)])).grids[0]
-    row = dict(zip(grid.columns, grid.rows[0], strict=True))
-    assert (row["idle: % of a core, mean"], row["most"], row["all"]) == ("0.5", "0.5", "0.5")
-
-
 def test_growth_is_held_against_what_classic_ros_did_on_the_same_machine() -> None:
     claims = EXPERIMENT.findings(RESULTS).claims
     growth = next(claim for claim in claims if claim.text.startswith("latency p50 with 32"))
@@ -61,9 +49,3 @@ def test_growth_is_held_against_what_classic_ros_did_on_the_same_machine() -> No
     assert growth.reached is False
     linked = [claim for claim in claims if "all linked" in claim.text]
     assert [claim.value for claim in linked] == [pytest.approx(0.4), pytest.approx(1.75)]
-
-
-def test_the_report_says_where_the_agents_together_fill_the_machine() -> None:
-    notes = EXPERIMENT.findings(RESULTS).notes
-    assert any("With 32 modules the agents together use 62 % of a core" in note for note in notes)
-    assert not any("With 2 modules" in note for note in notes)

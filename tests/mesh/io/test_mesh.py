@@ -178,27 +178,6 @@ async def test_a_restarted_peer_has_the_link_at_rest_of_its_former_run_checked()
         assert one.linked(other)
 
 
-@pytest.mark.parametrize("garbage", [b"GET / HTTP/1.1\r\n\r\n" * 4, bytes(64), b"\xff" * 64])
-async def test_garbage_on_the_port_closes_that_connection_only(
-    garbage: bytes, caplog: pytest.LogCaptureFixture
-) -> None:
-    async with peers(2) as (one, other):
-        await until(lambda: one.linked(other), "a link")
-        for _ in range(3):
-            reader, writer = await asyncio.open_connection("127.0.0.1", one.port)
-            writer.write(garbage)
-            with_reset: bytes | None
-            try:
-                with_reset = await asyncio.wait_for(reader.read(), DEADLINE)
-            except ConnectionResetError:
-                with_reset = b""
-            assert with_reset == b""
-            writer.close()
-        await until(lambda: one.mesh.counters["link.malformed"] == 3, "counted")
-        assert sum("broke the protocol" in r.message for r in caplog.records) == 1
-        assert one.linked(other)
-
-
 async def test_another_domain_is_refused_with_what_to_do(caplog: pytest.LogCaptureFixture) -> None:
     async with peers(1) as (one,):
         stranger = Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "stranger", domain=7)
@@ -389,15 +368,6 @@ async def test_a_killed_agent_is_a_crash() -> None:
         assert how(other)[0] is False, "it gave up the link itself"
 
 
-async def test_a_bye_is_none() -> None:
-    async with linked_pair() as (one, other):
-        one.mesh.peer_gone(other.identity.guid)
-        other.mesh.peer_gone(one.identity.guid)
-        one.link(other).close("maintenance")
-        await until(lambda: bool(one.downs) and bool(other.downs), "both down")
-        assert (how(one), how(other)) == ((False, False), (False, False))
-
-
 async def test_a_reset_is_a_crash_with_bytes_unread() -> None:
     async with peers(1) as (one,):
         sock, _ = await raw(one, STRANGER, lease=60.0)
@@ -406,13 +376,6 @@ async def test_a_reset_is_a_crash_with_bytes_unread() -> None:
         sock.close()
         await until(lambda: bool(one.downs), "reset")
         assert how(one) == (True, True)
-
-
-async def test_a_lease_that_ends_is_silence_and_no_crash() -> None:
-    async with peers(1) as (one,):
-        await raw(one, STRANGER, lease=0.3)
-        await until(lambda: bool(one.downs), "the lease is over")
-        assert how(one) == (False, True)
 
 
 async def test_a_peer_that_breaks_the_protocol_has_not_crashed() -> None:

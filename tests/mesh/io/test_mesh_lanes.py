@@ -184,16 +184,6 @@ async def test_rest_of_a_torn_message_is_not_sent() -> None:
         assert len(one.lanes_lost) == len(other.lanes_lost) == 1, "nor did its pieces disturb the new one"
 
 
-async def test_a_mesh_ends_while_a_bulk_lane_is_being_dialled() -> None:
-    async with peers(2, found=False) as made:
-        one, other = sorted(made, key=lambda peer: peer.identity.guid)
-        hold_bulk(one, until_set=asyncio.Event())
-        one.mesh.peer_found(other.identity)
-        await until(lambda: one.linked(other), "a link")
-        one.link(other).bulk._on_wanted()
-        await until(lambda: one.link(other).bulk_dial is not None, "a link, and the dial")
-
-
 async def test_both_lanes_end_with_the_link() -> None:
     async with linked_pair() as (one, other):
         link = one.link(other)
@@ -351,14 +341,6 @@ async def test_acknowledgements_overtake_data() -> None:
 # --- a lane on demand ---------------------------------------------------------------------------------------------
 
 
-async def test_a_link_without_large_messages_has_one_socket() -> None:
-    async with peers(4) as made:
-        others = {p.number: [o for o in made if o is not p] for p in made}
-        await until(lambda: all(p.linked(*others[p.number]) for p in made), "links everywhere")
-        await until(lambda: all(c.up for p in made for c in p.mesh.connections()), "no connection in a handshake")
-        assert [len(p.mesh.connections()) for p in made] == [3] * 4, "nothing was sent: no bulk lane"
-
-
 @pytest.mark.parametrize("dialler", [True, False])
 async def test_first_message_for_the_lane_dials_it_from_either_side(*, dialler: bool) -> None:
     async with peers(2) as made:
@@ -374,18 +356,6 @@ async def test_first_message_for_the_lane_dials_it_from_either_side(*, dialler: 
         assert other.data == sent
         assert not one.lanes_lost
         assert not other.lanes_lost
-
-
-async def test_a_wish_for_the_lane_before_the_link_is_used_is_kept() -> None:
-    async with linked_pair(lanes=False) as (one, other):
-        link = one.link(other)
-        link.use(used=False)
-        other.link(one).bulk.send(7, 1, 0, b"x")
-        await until(lambda: link.bulk_wanted, "asked")
-        assert link.bulk_dial is None
-        link.use(used=True)
-        one.mesh.dial_bulk(link)
-        await until(lambda: len(one.data) == 1, "it comes")
 
 
 async def test_what_a_peer_asks_waits_after_a_stop_until_the_link_is_proven() -> None:

@@ -22,18 +22,15 @@ from rmpa.mesh.frames import FrameKind
 from rmpa.mesh.reliable import ACK_DELAY
 from rmpa.ros import limits as ros_limits
 from rmpa.runtime import limits as runtime_limits
-from tests.bridge.io.doubles import WALL, Clock, Link, Outlet, add, remove, running
+from tests.bridge.io.doubles import Clock, Link, Outlet, add, running
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 BEST = Contract()
-BULKY = Contract(priority=Priority.HIGH)
-"""Large messages need no change of the lane."""
 RELIABLE = Contract(reliability=Reliability.RELIABLE)
 KEPT = Contract(durability=Durability.TRANSIENT_LOCAL)
 BIG = 200_000
-WRAP = 1 << 32
 
 
 @pytest.fixture(autouse=True)
@@ -47,80 +44,11 @@ def framed(payload: bytes) -> bytes:
     return len(payload).to_bytes(4, "little") + payload
 
 
-def give(flow: ExportFlow, payload: bytes, *, cut: int = 70_000) -> None:
-    """A large message from a publisher, as it arrives."""
-    flow.begin(len(payload))
-    for start in range(0, len(payload), cut):
-        buffer = bytearray(payload[start : start + cut])
-        flow.part(memoryview(buffer))
-        buffer[:] = b"x" * len(buffer)  # the stream's buffer is used again
-
-
 def got(link: Link) -> list[tuple[int, bytes]]:
     return [(sequence, payload) for _, sequence, payload in link.sent]
 
 
 # --- out ------------------------------------------------------------------------------------------------------
-
-
-def test_each_peer_gets_one_copy_with_the_number_that_all_know(clock: Clock) -> None:
-    flow, one, two = ExportFlow(), Link(), Link()
-    add(flow, 1, one, 7, BEST)
-    flow.message(memoryview(b"a"))
-    add(flow, 2, two, 9, BEST)
-    clock.advance(1.0)
-    flow.message(memoryview(b"b"))
-    assert got(one) == [(1, b"a"), (2, b"b")]
-    assert got(two) == [(2, b"b")]
-    assert (set(one.routes), set(two.routes)) == ({7}, {9})
-    assert one.stamps[1] == two.stamps[0] == WALL + 1001 * 10**9
-    assert (flow.messages, flow.bytes) == (2, 2)
-
-
-def test_a_peer_has_one_leg_and_the_newer_one_counts() -> None:
-    flow, link = ExportFlow(), Link()
-    old = add(flow, 1, link, 7, BEST)
-    add(flow, 1, link, 8, BEST)
-    flow.message(memoryview(b"a"))
-    assert link.routes == [8]
-    assert old.link is None
-    remove(flow, 1)
-    remove(flow, 1)
-    flow.message(memoryview(b"b"))
-    assert link.routes == [8]
-    assert flow.routes == {}
-
-
-def test_late_peer_gets_the_latched_message_first() -> None:
-    flow, one, two = ExportFlow(), Link(), Link()
-    flow.latch()
-    add(flow, 1, one, 7, BEST)
-    buffer = bytearray(b"map")
-    flow.message(memoryview(buffer))
-    buffer[:] = b"xxx"  # the stream's buffer is used again
-    add(flow, 2, two, 9, BEST)
-    flow.message(memoryview(b"new"))
-    assert got(two) == [(1, b"map"), (2, b"new")]
-    assert got(one) == [(1, b"map"), (2, b"new")]
-    assert two.stamps[0] == one.stamps[0], "as old as it is"
-
-
-def test_a_source_that_is_left_keeps_nothing() -> None:
-    flow, one, late = ExportFlow(), Link(), Link()
-    flow.latch()
-    add(flow, 1, one, 7, BEST)
-    flow.message(memoryview(b"map"))
-    remove(flow, 1)
-    flow.close()
-    flow.message(memoryview(b"new"))
-    assert got(one) == [(1, b"map")]
-    assert flow.routes == {}
-    flow = ExportFlow()
-    flow.latch()
-    flow.message(memoryview(b"map"))
-    flow.close()
-    add(flow, 2, late, 9, BEST)
-    assert late.sent == []
 
 
 def test_contract_says_how_many_kept_messages_a_peer_gets() -> None:
@@ -153,88 +81,6 @@ def test_no_contract_keeps_more_than_the_limit(monkeypatch: pytest.MonkeyPatch) 
         flow.message(memoryview(bytes([n])))
     add(flow, 2, late, 7, deep)
     assert [payload[0] for _, _, payload in late.sent] == [15, 16, 17, 18, 19]
-
-
-def test_drops_are_counted() -> None:
-    flow, link = ExportFlow(), Link()
-    add(flow, 1, link, 7, BULKY)
-    link.drops.extend([3, 0, 1, 1])
-    flow.message(memoryview(b"a"))
-    flow.message(memoryview(b"b"))
-    give(flow, bytes(BIG), cut=150_000)
-    assert flow.dropped == 5
-
-
-def test_parts_or_the_whole_go_to_each_sender() -> None:
-    flow, streams, whole, slow = ExportFlow(), Link(), Link(), Link()
-    add(flow, 1, streams, 7, BULKY)
-    add(flow, 2, whole, 7, RELIABLE)
-    add(flow, 3, slow, 7, Contract(max_rate=1.0))
-    flow.message(memoryview(b"small"))
-    payload = bytes(range(256)) * 1000
-    flow.begin(len(payload))
-    flow.part(memoryview(payload)[:100])
-    assert streams.parcels[-1].sent == 100, "at once"
-    flow.part(memoryview(payload)[100:])
-    assert got(streams) == [(1, b"small"), (2, payload)]
-    assert got(whole) == [(1, b"small")]
-    sender = flow.routes[2].sender
-    assert sender is not None
-    sender.fenced(whole.fences.popleft()[1])
-    assert got(whole) == [(1, b"small"), (2, payload)]
-    assert got(slow) == [(1, b"small")]
-    assert (flow.messages, flow.bytes) == (2, len(payload) + 5)
-    assert flow.large
-
-
-@pytest.mark.parametrize("latching", [False, True])
-def test_peer_added_in_the_middle_gets_no_half_message(latching: bool) -> None:
-    flow, early, late = ExportFlow(), Link(), Link()
-    if latching:
-        flow.latch()
-    add(flow, 1, early, 7, BULKY)
-    flow.begin(BIG)
-    flow.part(memoryview(bytes(1000)))
-    add(flow, 2, late, 7, BULKY)
-    flow.part(memoryview(bytes(BIG - 1000)))
-    assert got(early) == [(1, bytes(BIG))]
-    assert got(late) == ([(1, bytes(BIG))] if latching else [])
-    give(flow, b"n" * BIG)
-    assert got(late)[-1][1] == b"n" * BIG
-
-
-def test_peer_removed_in_the_middle_gets_no_more_parts() -> None:
-    flow, stays, leaves, whole = ExportFlow(), Link(), Link(), Link()
-    add(flow, 1, stays, 7, BULKY)
-    add(flow, 2, leaves, 7, BULKY)
-    add(flow, 3, whole, 7, RELIABLE)
-    flow.begin(BIG)
-    flow.part(memoryview(bytes(1000)))
-    remove(flow, 2)
-    remove(flow, 3)
-    flow.part(memoryview(bytes(BIG - 1000)))
-    assert got(stays) == [(1, bytes(BIG))]
-    assert leaves.parcels[0].sent == 1000
-    assert whole.sent == []
-
-
-@pytest.mark.parametrize("latching", [False, True])
-def test_dead_publisher_leaves_no_partial_message(latching: bool) -> None:
-    flow, streams, whole, late = ExportFlow(), Link(), Link(), Link()
-    if latching:
-        flow.latch()
-    add(flow, 1, streams, 7, BULKY)
-    add(flow, 2, whole, 7, RELIABLE)
-    flow.begin(BIG)
-    flow.part(memoryview(bytes(1000)))
-    flow.abort()
-    assert streams.log[-1] == ("express", "abandon", 7, 1)
-    assert flow._whole is None
-    add(flow, 3, late, 7, BULKY)
-    assert (whole.sent, late.sent, flow.messages) == ([], [], 0)
-    give(flow, b"n" * BIG)
-    assert got(streams) == [(2, b"n" * BIG)]
-    assert got(late) == [(1, b"n" * BIG)]
 
 
 # --- in: best effort ------------------------------------------------------------------------------------------
@@ -303,41 +149,6 @@ class Inlet:
         return counts["lost"], counts["late"], counts["stale"], counts["expired"]
 
 
-def test_import_counts_received_and_missing_messages_also_before_the_first(clock: Clock) -> None:
-    inlet = Inlet()
-    for sequence, payload in [(2, b"a"), (3, b"b"), (6, b"e"), (7, b"f")]:
-        clock.advance(1.0)
-        inlet.message(sequence, payload, stamp_ns=1000 + sequence)
-    flow = inlet.flow
-    assert inlet.got == [b"a", b"b", b"e", b"f"]
-    assert (flow.quality.messages, flow.quality.bytes) == (4, 20)
-    assert flow.watch.last == clock.now
-    assert inlet.counts == (3, 0, 0, 0)
-    assert flow.watch.counts == {QosEventKind.MESSAGES_LOST: 3}
-    assert flow.position is None
-
-
-def test_a_sequence_that_wraps_loses_nothing() -> None:
-    inlet = Inlet()
-    inlet.message(1)
-    inlet.flow.numbering.next = WRAP - 1
-    for sequence in (WRAP - 1, 0, 1):
-        inlet.message(sequence)
-    assert inlet.counts == (0, 0, 0, 0)
-    inlet.parts(2, bytes(BIG), 5)
-    inlet.message(4)
-    assert inlet.counts == (1, 0, 0, 0)
-
-
-def test_late_and_repeated_messages_are_dropped() -> None:
-    inlet = Inlet()
-    for sequence in (1, 2, 5, 3, 5, 4, 1, 6):
-        inlet.message(sequence, bytes([sequence]))
-    inlet.parts(4, bytes(BIG), 100)
-    assert inlet.got == [b"\1", b"\2", b"\5", b"\6"]
-    assert inlet.counts == (2, 5, 0, 0)
-
-
 @settings(deadline=None, max_examples=60)
 @given(
     st.lists(st.tuples(st.sampled_from([5, 5000, BIG]), st.sets(st.integers(4, 2 * BIG), max_size=4)), max_size=12)
@@ -354,17 +165,6 @@ def test_messages_in_any_parts_are_delivered_unchanged(run: list[tuple[int, set[
         assert inlet.flow.quality.messages == len(run)
         assert inlet.flow.quality.bytes == sum(size + 4 for size, _ in run)
         assert inlet.outlet.torn == 0
-
-
-def test_parts_are_handed_on_before_the_last_one_came() -> None:
-    inlet = Inlet()
-    inlet.parts(1, bytes(BIG), 100, 5000, end=2)
-    assert inlet.outlet.parts == 2
-    assert inlet.flow.quality.messages == 0
-    assert inlet.flow.lane == "express"
-    inlet.flow.part(1, 0, LAST, memoryview(bytes(BIG + 4 - 5000)))
-    assert inlet.got == [bytes(BIG)]
-    assert inlet.flow.lane == "bulk"
 
 
 @pytest.mark.parametrize(
@@ -409,45 +209,6 @@ def test_a_frame_that_does_not_hold_one_message_breaks_the_protocol(payload: byt
     assert inlet.got == []
 
 
-@pytest.mark.parametrize("cut", [4, 100])
-def test_aborted_message_disconnects_its_subscribers(cut: int) -> None:
-    inlet = Inlet()
-    inlet.parts(1, bytes(BIG), cut, end=1)
-    inlet.flow.part(1, 0, LAST | ABORT, memoryview(b""))
-    assert (inlet.outlet.torn, inlet.called_back, inlet.flow.quality.messages) == (1, 1, 0)
-    inlet.flow.torn()
-    assert inlet.called_back == 1
-    inlet.parts(2, bytes(BIG), cut)
-    assert inlet.counts == (0, 0, 0, 0)
-
-
-def test_lost_lane_loses_the_message_in_parts() -> None:
-    inlet = Inlet()
-    inlet.parts(1, bytes(BIG), 50, end=1)
-    inlet.flow.torn()
-    assert (inlet.outlet.torn, inlet.called_back) == (1, 1)
-    inlet.message(2, b"after")
-    assert inlet.got == [b"after"]
-    assert inlet.counts == (1, 0, 0, 0)
-
-
-@pytest.mark.parametrize("small", [False, True])
-def test_newer_message_ends_one_in_parts(small: bool) -> None:
-    """The sender notices sooner than the receiver that a lane is gone, and goes on by the other one."""
-    inlet = Inlet()
-    inlet.message(1, b"one")
-    inlet.parts(2, bytes(BIG), 50, end=1)
-    if small:
-        inlet.message(3, b"three")
-    else:
-        inlet.parts(3, b"three", 5)
-    inlet.flow.part(2, 0, LAST, memoryview(bytes(BIG + 4 - 50)))  # what the old lane still brought
-    inlet.message(4, b"four")
-    assert inlet.got == [b"one", b"three", b"four"]
-    assert (inlet.outlet.torn, inlet.called_back) == (1, 1)
-    assert inlet.counts == (1, 0, 0, 0)
-
-
 @pytest.mark.parametrize("contract", [BEST, RELIABLE], ids=["best_effort", "reliable"])
 def test_late_message_does_not_disturb_one_in_parts(contract: Contract) -> None:
     inlet = Inlet(contract)
@@ -478,30 +239,6 @@ def burst(inlet: Inlet, clock: Clock, ages: list[float], first: int = 2) -> None
         inlet.message(sequence, bytes([sequence]), stamp_ns=clock.wall_ns() - round(age * 1e9))
 
 
-def test_of_what_an_outage_held_up_the_newest_counts(clock: Clock) -> None:
-    inlet = Inlet(NEWEST, error=0.001, first=2)
-    burst(inlet, clock, [9.0, 8.0, 7.0, 0.01, 0.0])
-    assert inlet.got == [b"\5", b"\6"]
-    clock.advance(1.0)
-    assert inlet.got == [b"\5", b"\6"]
-    assert inlet.counts == (0, 0, 3, 0)
-    assert inlet.flow.quality.messages == 2
-
-
-def test_last_command_before_an_outage_is_delivered(clock: Clock) -> None:
-    inlet = Inlet(NEWEST, error=0.001, first=2)
-    burst(inlet, clock, [9.0, 8.0, 7.0])
-    assert inlet.got == []
-    clock.advance(HOLD + 0.001)
-    assert inlet.got == [b"\4"]
-    assert inlet.counts == (0, 0, 2, 0)
-    assert inlet.flow.quality.messages == 1
-    burst(inlet, clock, [5.0], first=5)
-    clock.advance(HOLD + 0.001)
-    assert inlet.got == [b"\4", b"\5"]
-    assert clock.due == []
-
-
 def test_the_hold_is_counted_from_the_first_of_the_burst(clock: Clock) -> None:
     """A source that stays late for ever must not be held for ever."""
     inlet = Inlet(NEWEST, error=0.001, first=2)
@@ -511,14 +248,6 @@ def test_the_hold_is_counted_from_the_first_of_the_burst(clock: Clock) -> None:
     assert len(inlet.got) >= 58 / 4 - 1
     clock.advance(HOLD)
     assert inlet.counts[2] + len(inlet.got) == 58
-
-
-@pytest.mark.parametrize(("error", "age"), [(None, 60.0), (1.0, 1.0), (0.001, 0.1), (0.001, -5.0)])
-def test_message_of_uncertain_age_is_not_held(clock: Clock, error: float | None, age: float) -> None:
-    inlet = Inlet(NEWEST, error=error, first=2)
-    burst(inlet, clock, [age])
-    assert inlet.got == [b"\2"]
-    assert inlet.counts == (0, 0, 0, 0)
 
 
 @pytest.mark.parametrize("ahead", [-3600.0, 3600.0])
@@ -532,16 +261,6 @@ def test_the_peers_clock_is_what_dates_its_messages(clock: Clock, ahead: float) 
     assert inlet.got == [b"new", b"newer"]
 
 
-@pytest.mark.parametrize("resumed", [-math.inf, -5.0])
-def test_what_no_silence_held_up_is_not_thrown_away(clock: Clock, resumed: float) -> None:
-    """A slow link, a full buffer, a process that got no CPU: late, but all that there is."""
-    inlet = Inlet(NEWEST, error=0.001, first=2)
-    inlet.resumed = clock.now + resumed
-    burst(inlet, clock, [3.0, 0.9, 0.5])
-    assert inlet.got == [b"\2", b"\3", b"\4"]
-    assert inlet.counts == (0, 0, 0, 0)
-
-
 def test_messages_from_before_a_silence_are_stale(clock: Clock) -> None:
     inlet = Inlet(NEWEST, error=0.001, first=2)
     inlet.resumed = clock.now - 0.5
@@ -550,28 +269,10 @@ def test_messages_from_before_a_silence_are_stale(clock: Clock) -> None:
     assert inlet.counts == (0, 0, 2, 0)
 
 
-@pytest.mark.parametrize("contract", [BEST, Contract(depth=2), Contract(depth=1, reliability=Reliability.RELIABLE)])
-def test_all_that_an_outage_held_up_counts_without_a_depth_of_one(clock: Clock, contract: Contract) -> None:
-    inlet = Inlet(contract, error=0.001, first=2)
-    burst(inlet, clock, [9.0, 8.0, 7.0])
-    assert inlet.got == [b"\2", b"\3", b"\4"]
-    assert inlet.counts == (0, 0, 0, 0)
-
-
 def test_a_kept_message_is_as_old_as_it_is(clock: Clock) -> None:
     inlet = Inlet(NEWEST, error=0.001)
     burst(inlet, clock, [60.0] * 3, first=1)
     assert inlet.got == [b"\1"]
-
-
-def test_large_message_replaces_a_held_one(clock: Clock) -> None:
-    inlet = Inlet(NEWEST, error=0.001, first=2)
-    burst(inlet, clock, [9.0])
-    inlet.parts(3, bytes(BIG), 50, end=1, stamp_ns=clock.wall_ns())
-    clock.advance(1.0)
-    inlet.flow.part(3, clock.wall_ns(), LAST, memoryview(bytes(BIG + 4 - 50)))
-    assert inlet.got == [bytes(BIG)]
-    assert inlet.counts == (0, 0, 1, 0)
 
 
 def test_beyond_its_lifespan_a_message_is_worth_nothing(clock: Clock) -> None:
@@ -659,16 +360,6 @@ def test_a_new_route_brings_nothing_again(kept: str, sent: str, new: str, contra
     assert replayed(messages(kept), messages(sent), contract, cut=cut) == messages(new)
 
 
-def test_message_of_another_size_ends_the_replay() -> None:
-    inlet = Inlet()
-    inlet.flow.expect_replay([framed(bytes(BIG)), framed(b"b")])
-    inlet.parts(1, bytes(BIG - 1), 50, end=1)
-    assert inlet.outlet.parts == 1
-    inlet.flow.part(1, 0, LAST, memoryview(bytes(BIG + 3 - 50)))
-    inlet.message(2, b"b")
-    assert inlet.got == [bytes(BIG - 1), b"b"]
-
-
 # --- in: reliable ---------------------------------------------------------------------------------------------
 
 
@@ -702,24 +393,6 @@ def test_a_few_large_ones_are_acknowledged_at_once(clock: Clock) -> None:
     assert clock.due == []
 
 
-def test_torn_reliable_message_is_delivered_whole(clock: Clock) -> None:
-    inlet = Inlet(RELIABLE)
-    inlet.begin(1, 1)
-    inlet.message(1, b"one")
-    inlet.parts(2, b"2" * BIG, 50, 100, end=2)
-    assert inlet.outlet.parts == 0
-    inlet.flow.torn()
-    assert (inlet.got, inlet.outlet.torn, inlet.called_back) == ([b"one"], 0, 0)
-    assert inlet.flow.position == (1, 1)
-    inlet.parts(1, b"one", 5)
-    inlet.parts(2, b"2" * BIG, 70)
-    inlet.message(3, b"three")
-    assert inlet.got == [b"one", b"2" * BIG, b"three"]
-    assert inlet.counts == (0, 1, 0, 0)
-    clock.advance(ACK_DELAY)
-    assert inlet.acks == [3]
-
-
 def test_overflow_is_the_exact_gap_on_a_new_link(clock: Clock) -> None:
     inlet = Inlet(RELIABLE)
     assert not inlet.begin(5, 1)
@@ -739,19 +412,6 @@ def test_overflow_is_the_exact_gap_on_a_new_link(clock: Clock) -> None:
     assert inlet.flow.watch.counts == {QosEventKind.MESSAGES_LOST: 5}
     assert acks == [9]
     assert inlet.flow.position == (5, 9)
-
-
-def test_reliable_messages_survive_an_outage_within_their_lifespan(clock: Clock) -> None:
-    for contract, delivered in ((RELIABLE, 4), (Contract(reliability=Reliability.RELIABLE, lifespan=1.0), 1)):
-        inlet = Inlet(contract, error=0.001)
-        inlet.begin(1, 1)
-        burst(inlet, clock, [9.0, 8.0, 0.0], first=1)
-        inlet.parts(4, bytes(BIG), 50, stamp_ns=clock.wall_ns() - 7 * 10**9)
-        assert len(inlet.got) == delivered
-        assert inlet.counts == (0, 0, 0, 4 - delivered)
-        clock.advance(ACK_DELAY)
-        assert inlet.acks == [4], "what is too old has arrived all the same"
-        inlet.flow.close()
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from typing import TYPE_CHECKING, TypeVar
 
@@ -61,41 +60,6 @@ def on_bulk(link: Link, sender: RouteSender) -> None:
 # --- best effort ----------------------------------------------------------------------------------------------
 
 
-def test_messages_behind_a_fence_keep_their_order() -> None:
-    link, sender = fresh(best_effort)
-    sender.message(0, b"1")
-    sender.message(0, LARGE)
-    sender.message(0, b"3")
-    sender.message(0, LARGE)
-    assert link.log == [("express", "message", 7, 1), ("express", "fence", 7, 1)]
-    assert sender.lane == "express"
-    sender.fenced(99)
-    assert len(link.sent) == 1
-    answer(link, sender)
-    assert link.sent == [("express", 1, b"1"), ("bulk", 2, LARGE), ("bulk", 3, b"3"), ("bulk", 4, LARGE)]
-    sender.message(0, b"5")
-    assert link.sent[-1] == ("bulk", 5, b"5")
-    sender.fenced(1)
-    assert len(link.sent) == 5, "answered twice"
-
-
-def test_large_message_waits_for_the_fence_on_the_way_back(clock: Clock) -> None:
-    link, sender = fresh(best_effort)
-    on_bulk(link, sender)
-    clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
-    for _ in range(ROW):
-        sender.message(0, SMALL)
-    held = len(link.sent)
-    sender.message(0, LARGE)
-    sender.message(0, SMALL)
-    assert not sender.begin(0, 1 << 20)
-    answer(link, sender)
-    assert link.lanes[held:] == ["express"], "the small one in front of it"
-    answer(link, sender)
-    assert link.lanes[held:] == ["express", "bulk", "bulk"]
-    assert link.numbers == list(range(1, len(link.sent) + 1))
-
-
 @pytest.mark.parametrize(("history", "kept"), [(History.KEEP_LAST, 3), (History.KEEP_ALL, 10)])
 def test_held_messages_keep_to_the_depth(history: History, kept: int) -> None:
     link, sender = fresh(best_effort, Contract(depth=3, history=history), large=True)
@@ -123,15 +87,6 @@ def test_held_bytes_are_bounded(clock: Clock, monkeypatch: pytest.MonkeyPatch) -
     assert sender.message(0, bytes(1000)) == 0, "the count of bytes began anew"
 
 
-def test_bulk_lost_during_an_express_fence_waits_for_it() -> None:
-    link, sender = fresh(best_effort, large=True)
-    sender.message(0, SMALL)
-    sender.lane_lost()
-    assert not link.sent, "the fence is on the other lane"
-    answer(link, sender)
-    assert link.lanes == ["bulk"]
-
-
 def test_lost_bulk_lane_delivers_nothing_late(clock: Clock) -> None:
     """What waits for the lane's next connection would come late; the fence behind it would never be answered."""
     link, sender = fresh(best_effort)
@@ -147,16 +102,6 @@ def test_lost_bulk_lane_delivers_nothing_late(clock: Clock) -> None:
     sender.message(0, SMALL)
     assert link.numbers == list(range(1, ROW + 3))
     assert link.bulk.terms[7] == DEFAULT, "they hold on"
-
-
-def test_bulk_lost_without_a_fence_keeps_what_waits() -> None:
-    link, sender = fresh(best_effort)
-    on_bulk(link, sender)
-    link.log.clear()
-    sender.lane_lost()
-    assert link.log == []
-    sender.message(0, LARGE)
-    assert link.log == [("bulk", "message", 7, 2)]
 
 
 DEFAULT = (core_limits.ROUTE_QUEUE_MESSAGES, mesh_limits.ROUTE_QUEUE_AGE, mesh_limits.ROUTE_BURST_BYTES, False)
@@ -202,12 +147,6 @@ def cut(sent: int, missed: int, after: int, contract: Contract = BEST_EFFORT, *,
     return link.numbers
 
 
-def test_what_a_silent_link_did_not_deliver_goes_over_the_next_one() -> None:
-    assert cut(5, 3, after=2) == [3, 4, 5, 6, 7, 8, 9]
-    assert cut(5, 0, after=5) == [6]
-    assert cut(0, 2, after=0) == [1, 2, 3]
-
-
 def test_without_a_link_the_depth_bounds_what_waits() -> None:
     assert cut(5, 3, after=2, contract=Contract(depth=2)) == [7, 8, 9]
     assert cut(5, 0, after=2, contract=Contract(depth=1)) == [5, 6]
@@ -219,36 +158,6 @@ def test_what_was_sent_long_ago_is_not_kept() -> None:
     sender.message(10**10, b"")
     sender.suspend()
     assert sender.following == 2
-
-
-def test_what_was_sent_within_both_leases_is_kept() -> None:
-    sender = RouteSender(Link(), 7, Contract())
-    sender.message(0, b"")
-    sender.message(round(2.5 * mesh_limits.EXPRESS_LEASE * 1e9), b"")
-    sender.suspend()
-    assert sender.following == 1
-
-
-def test_what_was_sent_again_counts_from_then_on_for_a_further_cut() -> None:
-    sender = RouteSender(Link(), 7, Contract())
-    long_ago = time.time_ns() - 10**10
-    for _ in range(2):
-        sender.message(long_ago, b"")
-        sender.suspend()
-        sender.resume(Link(), 8, 0)
-    sender.message(time.time_ns(), b"")
-    sender.suspend()
-    assert sender.following == 1
-
-
-def test_sequences_wrap() -> None:
-    link, sender = fresh(best_effort)
-    sender.sequence = (1 << 32) - 2
-    for _ in range(3):
-        sender.message(0, SMALL)
-    sender.message(0, LARGE)
-    answer(link, sender)
-    assert link.numbers == [(1 << 32) - 1, 0, 1, 2]
 
 
 # --- best effort, in parts ------------------------------------------------------------------------------------
@@ -278,34 +187,7 @@ def test_parts_go_as_they_come_once_the_lane_is_right() -> None:
     assert link.sent[-1][2][-1:] == b"z"
 
 
-def test_aborted_message_uses_its_number() -> None:
-    link, flow = Link(), ExportFlow()
-    flow.large = True
-    sender = add(flow, 1, link, 7, Contract())
-    answer(link, sender)
-    flow.begin(BIG)
-    flow.part(memoryview(bytes(10)))
-    flow.abort()
-    flow.abort()
-    assert link.log[-2:] == [("bulk", "open", 7, 1, BIG), ("bulk", "abandon", 7, 1)]
-    sender.message(0, LARGE)
-    assert link.numbers == [2]
-
-
 # --- down-sampling --------------------------------------------------------------------------------------------
-
-
-def test_of_too_many_the_newest_goes_when_its_turn_comes(clock: Clock) -> None:
-    link, sender = fresh(best_effort, Contract(max_rate=10.0))
-    for n in range(10):
-        sender.message(n, bytes([n]))
-        clock.advance(0.008)
-    assert [payload[0] for _, _, payload in link.sent] == [0]
-    clock.advance(0.1)
-    assert [payload[0] for _, _, payload in link.sent] == [0, 9]
-    assert link.stamps == [0, 9], "the time of publication, not that of the turn"
-    assert link.numbers == [1, 2], "what was left out is no gap"
-    assert clock.due == []
 
 
 @pytest.mark.parametrize("hertz", [30.01, 29.99, 30.0])
@@ -343,17 +225,6 @@ def test_rate_is_kept_and_the_newest_is_sent(rate: float, gaps: list[float]) -> 
                 assert last - first <= (went[last] - went[first]) * rate + 0.6 + 1e-3
 
 
-def test_downsampled_large_messages_are_sent_whole(clock: Clock) -> None:
-    link, sender = fresh(best_effort, Contract(max_rate=10.0))
-    for n in range(4):
-        assert not sender.begin(n, BIG)
-        sender.message(n, bytes(BIG))
-    answer(link, sender)
-    clock.advance(0.1)
-    assert link.lanes == ["bulk", "bulk"]
-    assert link.stamps == [0, 3]
-
-
 def test_nothing_more_happens_when_it_is_closed(clock: Clock) -> None:
     link, sender = fresh(best_effort, Contract(max_rate=10.0))
     sender.message(0, b"a")
@@ -375,22 +246,6 @@ def test_nothing_more_happens_when_it_is_closed(clock: Clock) -> None:
 # --- reliable -------------------------------------------------------------------------------------------------
 
 
-def test_bulk_lost_on_the_way_back_uses_the_express_lane(clock: Clock) -> None:
-    link, sender = fresh(reliable)
-    sender.message(0, LARGE)
-    answer(link, sender)
-    clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
-    for _ in range(ROW):
-        sender.message(0, SMALL)
-    assert list(link.fences) == [("bulk", 2)]
-    sender.acknowledged(100)
-    link.log.clear()
-    sender.lane_lost()
-    assert link.log == [("bulk", "discard", 7)] + [
-        ("express", "message", 7, number) for number in range(101, ROW + 2)
-    ]
-
-
 def test_later_acknowledgement_outweighs_the_position() -> None:
     """Of two links that come up at once, the message of the one that is given up comes last."""
     new, (_, sender) = Link(), fresh(reliable)
@@ -400,17 +255,6 @@ def test_later_acknowledgement_outweighs_the_position() -> None:
     sender.suspend()
     sender.resume(new, 8, 1)
     assert new.numbers == [3]
-
-
-def test_downsampled_route_keeps_the_newest_over_a_link_loss(clock: Clock) -> None:
-    old, new = Link(), Link()
-    sender = reliable(old, Contract(reliability=Reliability.RELIABLE, max_rate=10.0))
-    for n in range(3):
-        sender.message(n, bytes([n]))
-    sender.suspend()
-    clock.advance(0.5)
-    sender.resume(new, 8, 1)
-    assert [payload for _, _, payload in new.sent] == [bytes([2])]
 
 
 class FallingLink(RuleBasedStateMachine):

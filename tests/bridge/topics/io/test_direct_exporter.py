@@ -21,7 +21,6 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.statistics import Counters
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.trust.permissions import Permissions
-from tests.ros.node.peers import until
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -206,41 +205,6 @@ async def test_what_is_not_offered_or_not_allowed_is_refused(module: Module) -> 
     )
 
 
-async def test_a_refusal_ends_the_earlier_grant(module: Module) -> None:
-    await module.open()
-    module.found = Unmet(Condition.LISTENING, "loopback")
-    assert (await module.open())["why"] == Condition.LISTENING
-    assert module.granted == []
-
-
-async def test_a_node_that_restarts_while_it_is_asked_is_not_granted(module: Module) -> None:
-    module.gate.clear()
-    opening = asyncio.create_task(module.open())
-    await until(lambda: module.asked)
-    module.change(RegistrationKind.PUBLISHER, "/talker", "http://10.0.0.1:9/", added=True)
-    module.gate.set()
-    assert (await opening)["why"] == Condition.NODE
-    assert module.granted == []
-    # The exports learn the new address later; it counts at once.
-    await module.open()
-    assert module.asked == [URI, "http://10.0.0.1:9/"]
-
-
-async def test_a_restarted_publisher_and_a_namesake_withdraw_grants(module: Module) -> None:
-    await module.open()
-    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=False)
-    module.change(RegistrationKind.PUBLISHER, "/talker", "http://10.0.0.1:9/", added=True)
-    assert module.told[-1] == (1, AGAIN, Want("/chatter", "/talker", "/viewer")._asdict())
-    await module.open()
-    module.told.clear()
-    module.change(RegistrationKind.SUBSCRIBER, "/viewer", "http://10.0.0.1:7/", added=True)
-    assert [what for _, what, _ in module.told] == [AGAIN]
-    assert (await module.open())["why"] == Condition.CALLER_ID
-    module.told.clear()
-    module.change(RegistrationKind.SUBSCRIBER, "/viewer", "http://10.0.0.1:7/", added=False)
-    assert [what for _, what, _ in module.told] == [AGAIN]
-
-
 async def test_only_a_peer_with_a_grant_may_have_a_node_examined(module: Module) -> None:
     module.found = Unmet(Condition.LISTENING, "loopback")
     await module.open(broken=True)
@@ -277,38 +241,6 @@ async def test_connections_end_where_a_host_may_have_vanished(
     assert module.ended == ([(45225, "10.0.0.1")] if ends else [])
 
 
-async def test_only_the_crash_of_a_peers_agent_leaves_its_grants_until_it_is_gone(module: Module) -> None:
-    await module.open()
-    module.sessions[1].link.crashed = True
-    module.sut.link_down(module.sessions[1])
-    assert module.granted == [(1, "/viewer")]
-    module.sut.gone(module.sessions[1])
-    assert module.granted == []
-    await module.open()
-    module.sessions[1].link.crashed = False
-    module.sut.link_down(module.sessions[1])
-    assert module.granted == []
-
-
-async def test_over_a_new_link_a_peer_is_told_to_ask_again_for_what_it_asked_for_before(module: Module) -> None:
-    await module.open()
-    module.sessions[1].link.crashed = True
-    module.sut.link_down(module.sessions[1])
-    module.sut.link_up(module.sessions[1])
-    assert [told[:2] for told in module.told] == [(1, AGAIN)]
-    assert module.granted == [(1, "/viewer")]
-
-
-async def test_what_is_released_while_the_node_is_asked_is_not_granted(module: Module) -> None:
-    module.gate.clear()
-    opening = asyncio.create_task(module.open())
-    await until(lambda: module.asked)
-    module.close()
-    module.gate.set()
-    assert "why" in await opening
-    assert module.granted == []
-
-
 async def test_the_grants_and_the_remembered_refusals_of_a_peer_are_bounded(
     module: Module, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -317,15 +249,6 @@ async def test_the_grants_and_the_remembered_refusals_of_a_peer_are_bounded(
     assert [reply.get("why") for reply in replies] == [None] * 3 + [Condition.LIMIT] * 7
     assert await module.open(2) == {"port": 45225, "probe": ""}, "each peer has its own bound"
     assert len(module.sut._asked[1]) == 6
-
-
-async def test_new_rules_withdraw_and_let_others_try_again(module: Module) -> None:
-    await module.open()
-    module.reload(Transport.RELAY)
-    assert module.granted == []
-    module.reload(Transport.AUTO)
-    assert [told[:2] for told in module.told] == [(1, AGAIN), (1, AGAIN)]
-    assert await module.open() == {"port": 45225, "probe": ""}
 
 
 async def test_a_secured_mesh_has_no_plain_connections_unless_both_allow_it(module: Module) -> None:
@@ -371,15 +294,6 @@ async def test_a_secured_peer_does_not_learn_when_a_topic_that_it_may_not_have_i
     module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
     module.reload(Transport.AUTO)
     assert module.told == []
-
-
-async def test_a_secured_peer_learns_no_more_of_a_topic_after_it_was_withdrawn(module: Module) -> None:
-    module.permit(TrustSettings(direct=True))
-    await module.open()
-    module.offered.clear()
-    module.sut.judge_again(refused=False)
-    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
-    assert (module.granted, module.told) == ([], [])
 
 
 @pytest.mark.parametrize("secured", [True, False])
