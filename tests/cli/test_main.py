@@ -58,6 +58,7 @@ def test_each_command_has_help_and_each_of_a_graph_has_json() -> None:
 
 
 WORDS = {"values": "{}", "value": "1"}
+# These need neither an agent nor a master.
 QUIET = {
     "rmpa explain",
     "rmpa config show",
@@ -68,7 +69,6 @@ QUIET = {
     "rmpa trust status",
     "rmpa web",
 }
-"""These need neither an agent nor a master."""
 
 
 def test_an_error_is_json_too(place: Place) -> None:

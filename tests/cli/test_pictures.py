@@ -159,6 +159,7 @@ FLOWS: Final = stages(Check("contract", CheckLevel.WARN, "3 lost", "`rmpa topic 
 STOPS: Final = stages(
     Check("publisher", CheckLevel.FAIL, "no node of joystick\x1b[2J publishes /cmd", "start it"), name="/cmd"
 )
+# By name: what the agent shows and answers, and what is asked then.
 KINDS: Final[dict[str, tuple[dict[str, Any], tuple[str, ...]]]] = {
     "peers": (
         {"ping": lambda args: PingReply(times=(0.0004,), remote=args["peer"])},  # by GUID: names may be equal
@@ -241,7 +242,6 @@ KINDS: Final[dict[str, tuple[dict[str, Any], tuple[str, ...]]]] = {
         ("site info warehouse --json",),
     ),
 }
-"""By name: what the agent shows and answers, and what is asked then."""
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 aiohttp = pytest.importorskip("aiohttp", reason="the libraries of rmpa[web] are not installed")
 DEADLINE = 30.0
+# Of the Turtlebot, m/s.
 FULL_SPEED = 0.65
-"""Of the Turtlebot, m/s."""
 pytestmark = pytest.mark.timeout(120)
 
 

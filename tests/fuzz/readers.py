@@ -310,6 +310,7 @@ _LEARNT: Final = MessageType.learn(
 )
 _PEER: Final = Guid.of("10.0.0.2", 40002)
 
+# The targets by name.
 READERS: Final[dict[str, Row]] = {
     "beacon": Row(
         [Reader(lambda data: Beacon.parse(data, 0), Beacon.serialize, printable)],
@@ -508,4 +509,3 @@ READERS: Final[dict[str, Row]] = {
         ],
     ),
 }
-"""The targets by name."""

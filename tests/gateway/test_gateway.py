@@ -74,11 +74,11 @@ class Bed:
     def __init__(self, settings: Settings, gateway: GatewaySettings = CONNECT, failures: int = 0) -> None:
         self.events: list[str] = []
         self.failures = failures
+        # How often neighbours still fail to be made.
         self.faults = 0
-        """How often neighbours still fail to be made."""
         self.sessions: list[Any] = []
+        # Of each time that the neighbours were made.
         self.rules: list[tuple[CrossingRule, ...]] = []
-        """Of each time that the neighbours were made."""
         self.settings = replace(settings, gateway=gateway)
         self.gateway = Gateway(self.settings, open_session=cast("Any", self._open), make_neighbours=self._make)
 

@@ -29,8 +29,8 @@ ShellFactory = Callable[..., Ros]
 AgentFactory = Callable[..., Agent]
 ModuleFactory = Callable[..., list[Module]]
 WebFactory = Callable[..., "Web"]
+# Beds that are kept for the next test; agents at rest cost little.
 _BEDS: Final = 3
-"""Beds that are kept for the next test; agents at rest cost little."""
 
 
 @pytest.fixture(autouse=True, scope="package")

@@ -32,8 +32,8 @@ _ROS: Final = (
 )
 _TOOLS: Final = {"rosmaster", "rosnode", "rosparam", "rosservice", "rostopic"}
 _STARTS: Final = 30.0
+# Variables of the interpreter that a fork can have; with others a program is executed.
 _OURS: Final = {"PYTHONUNBUFFERED", "PYTHONPATH", "PYTHONDONTWRITEBYTECODE"}
-"""Variables of the interpreter that a fork can have; with others a program is executed."""
 
 
 class ForkServer:

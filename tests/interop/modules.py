@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     from tests.interop.ros import Ros
 
+# Seconds within which a bed is as it was before a test, or is thrown away.
 _SETTLES: Final = 10.0
-"""Seconds within which a bed is as it was before a test, or is thrown away."""
 
 
 @dataclass(frozen=True, slots=True)

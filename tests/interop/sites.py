@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
 
+# The module of each site.
 MODULES: Final = {"warehouse": "arm", "yard": "base"}
-"""The module of each site."""
 
 
 @dataclass(frozen=True, slots=True)

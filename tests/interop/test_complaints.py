@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 ROBOTS: Final = 7
+# Seconds over which the processor time of agents at rest is counted.
 REST: Final = 4.0
-"""Seconds over which the processor time of agents at rest is counted."""
 
 
 @contextmanager

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]
 
 RUN: Final = "from rmpa.cli.core import core; core()"
+# A core that does not look by itself whether its nodes live.
 RUN_WITHOUT_CHECKS: Final = f"from rmpa.ros import limits; limits.NODE_CHECK_INTERVAL = 1e6; {RUN}"
-"""A core that does not look by itself whether its nodes live."""
 DEADLINE: Final = 40.0
 LAUNCH: Final = """<launch>
   <param name="speed" value="1.5"/>

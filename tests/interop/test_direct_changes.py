@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 CLIENTS: Final = [("roscpp", "rospy"), ("rospy", "roscpp")]
 RATE: Final = 100
+# Messages that may pass while a subscriber is moved: a tenth of a second in general, much more on a busy machine.
 MOVE_GAP: Final = RATE * 2
-"""Messages that may pass while a subscriber is moved: a tenth of a second in general, much more on a busy machine."""
 
 
 def gaps(report: Event) -> int:
@@ -174,10 +174,10 @@ def test_an_ended_subscriber_leaves_nothing_behind(modules: ModuleFactory, clien
     unbroken(flows(steady, 50))
 
 
+# Runs an agent as root without the capabilities by which it could end connections of nodes.
 UNPRIVILEGED: Final = ("setpriv", "--bounding-set=-net_admin,-sys_ptrace", "--inh-caps=-net_admin,-sys_ptrace", "--")
-"""Runs an agent as root without the capabilities by which it could end connections of nodes."""
+# Runs an agent that may end those of processes that it may touch, as one of the nodes' own user.
 ORDINARY: Final = ("setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin", "--")
-"""Runs an agent that may end those of processes that it may touch, as one of the nodes' own user."""
 
 
 def pair(modules: ModuleFactory, subscriber: str, publisher: str) -> tuple[Module, Module, Process, Process]:

@@ -219,14 +219,14 @@ def _echoes(echo: Process) -> None:
     eventually(lambda: echo.output.count("data:") > before + 5, what="rostopic echo goes on")
 
 
+# Seconds for which an agent is stopped: less than the lease of a link at rest, and more.
 PAUSE, HANG = 5.0, 30.0
-"""Seconds for which an agent is stopped: less than the lease of a link at rest, and more."""
+# Seconds in which links rest, on a busy machine too; the protocol takes 5 to 10.
 SOON = 60.0
-"""Seconds in which links rest, on a busy machine too; the protocol takes 5 to 10."""
+# Seconds in which the silence of a link at rest is noticed, on a busy machine too; the protocol takes 11 to 16.
 NOTICED = 30.0
-"""Seconds in which the silence of a link at rest is noticed, on a busy machine too; the protocol takes 11 to 16."""
+# The same of a link in use, of which the protocol promises 1 s: less than any link at rest takes.
 IN_USE = 8.0
-"""The same of a link in use, of which the protocol promises 1 s: less than any link at rest takes."""
 
 
 def links(module: Module) -> dict[str, tuple[bool, float]]:

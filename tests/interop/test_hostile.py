@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.alone, pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(240)]
 
+# Above an agent's own 45 MB, its largest buffers and the proxies one peer may have; one believed length is more.
 _MEMORY = 180 * 1024 * 1024
-"""Above an agent's own 45 MB, its largest buffers and the proxies one peer may have; one believed length is more."""
+# Warnings and errors that one attack may leave in a log: at most 20 a kind of refusal, each five seconds.
 _LINES = 60
-"""Warnings and errors that one attack may leave in a log: at most 20 a kind of refusal, each five seconds."""
 
 
 def listening(module: Module) -> dict[str, str]:

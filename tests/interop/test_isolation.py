@@ -24,8 +24,8 @@ pytestmark = [pytest.mark.alone, pytest.mark.ros, pytest.mark.netns, pytest.mark
 RATE: Final = 1000
 SECONDS: Final = 8
 QUEUE: Final = 5000
+# Milliseconds, on a machine that wakes everybody in time.
 P99: Final = 20.0
-"""Milliseconds, on a machine that wakes everybody in time."""
 
 
 def of_round(number: int) -> dict[str, object]:

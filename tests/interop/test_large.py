@@ -211,8 +211,8 @@ def test_two_publishers_of_large_messages_are_not_mixed(modules: ModuleFactory, 
 
 MBIT = 100
 IMAGE = 1 << 20
+# At 100 Hz.
 COMMANDS = 400
-"""At 100 Hz."""
 RULES = """
 [[contract]]
 topics = ["/urgent"]

@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
+# The same file on every robot: robots leave each other alone.
 ROBOT = """
 [[peer]]
 name = "robot*"
 deny = ["/**"]
 """
-"""The same file on every robot: robots leave each other alone."""
 PC = """
 [[peer]]
 name = "robot*"

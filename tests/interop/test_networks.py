@@ -209,8 +209,8 @@ def test_a_relay_is_not_needed_where_there_is_a_way(lab: Lab, agent: AgentFactor
 
 
 SURE: Final = '[[contract]]\ntopics = ["/sure", "/map"]\nreliability = "reliable"\ndepth = 5000\n'
+# The cable of m1 and m4, and those of the relays m2 and m3 with both: their networks are 1 and 2, and 3 and 4.
 DIRECT, FIRST, SECOND = 0, 1, 2
-"""The cable of m1 and m4, and those of the relays m2 and m3 with both: their networks are 1 and 2, and 3 and 4."""
 
 
 class Triangle:
@@ -373,8 +373,8 @@ def test_cables_relays_and_addresses_change_at_random(
 
 
 IMAGE = 300_000
+# Whose advertisement is larger than a packet.
 MTU_TOPICS = 60
-"""Whose advertisement is larger than a packet."""
 CROWD = """
 import rospy, std_msgs.msg
 rospy.init_node("crowd")

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 KINDS = ("roscpp", "rospy")
+# At 1 kHz.
 COUNT = 10_000
-"""At 1 kHz."""
 
 
 def contract(depth: int, more: str = "") -> str:

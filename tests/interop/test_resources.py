@@ -24,8 +24,8 @@ pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
 
 RESOURCES: Final = Path(__file__).parent / "resources"
 OK, WARN, ERROR, STALE = range(4)
+# Seconds for windows, cool-downs and routes on a shared machine.
 LONG: Final = 40.0
-"""Seconds for windows, cool-downs and routes on a shared machine."""
 
 
 @dataclass

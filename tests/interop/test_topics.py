@@ -283,8 +283,8 @@ def test_a_slow_wire_drops_whole_messages_and_breaks_none(modules: ModuleFactory
 
 
 MB = 1 << 20
+# What an agent may grow by: 32 MiB wait for a stuck subscriber at the most, and buffers for large messages.
 GROWTH = 80 * MB
-"""What an agent may grow by: 32 MiB wait for a stuck subscriber at the most, and buffers for large messages."""
 
 
 def rss(module: Module) -> int:

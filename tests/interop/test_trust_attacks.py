@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
 
+# Every member may do everything: what is refused is refused for another reason.
 OPEN = '[trust]\ndefault = "allow"\n'
-"""Every member may do everything: what is refused is refused for another reason."""
 REASONS = {"plain": 11, "foreign": 15, "expired": 16, "name": 18}
 
 

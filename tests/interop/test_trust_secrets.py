@@ -34,6 +34,7 @@ pytestmark = [pytest.mark.netns, pytest.mark.timeout(180)]
 pytest.importorskip("cryptography")
 
 
+# The files that have each secret, of the module that it belongs to.
 MAY_HOLD: Final = {
     "private key": {files_of.KEY},
     "CA key": {files_of.CA_KEY},
@@ -41,7 +42,6 @@ MAY_HOLD: Final = {
     "key of a token": {files_of.TOKENS},
     "web token": {"web-token"},
 }
-"""The files that have each secret, of the module that it belongs to."""
 COMMANDS: Final = (
     ("peer", "list", "--json"),
     ("peer", "list"),

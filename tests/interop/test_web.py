@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(150)]
 
 CAMERA: Final = Path(__file__).parent / "resources" / "camera.py"
+# Seconds within which a change shows.
 SHOWN: Final = 1.5
-"""Seconds within which a change shows."""
+# Seconds within which a robot is stopped whose driver has gone.
 STOPPED: Final = 1.0
-"""Seconds within which a robot is stopped whose driver has gone."""
+# What an arrow key commands, m/s: its share of the stick, of what the page's slider says at first.
 HELD: Final = 0.6 * 0.15 * DRIVE_SPEED
-"""What an arrow key commands, m/s: its share of the stick, of what the page's slider says at first."""
+# What a talker's live value counts.
 NUMBER: Final = "Number(/message (\\d+)/.exec(document.querySelector('.tree')?.innerText)?.[1])"
-"""What a talker's live value counts."""
 
 
 async def restart(agent: Agent) -> None:

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(150)]
 
 PATHS: Final = ("/", "/static/app.js", "/metrics", "/api/v1/snapshot", "/nothing")
+# WebSocket paths, with the subprotocols that their clients offer.
 SOCKETS: Final = {"/": (), "/rosbridge": (), "/foxglove": ("foxglove.websocket.v1",), "/monitor": (SUBPROTOCOL,)}
-"""WebSocket paths, with the subprotocols that their clients offer."""
 
 
 def attacks(web: Web) -> list[tuple[dict[str, str], str, int, str]]:
@@ -88,6 +88,7 @@ async def test_who_is_not_allowed_gets_nothing_at_any_path(lab: Lab, agent: Agen
 
 MASK: Final = bytes(4)
 TEXT, BINARY, CLOSE = 1, 2, 8
+# Frames that RFC 6455 forbids, with the close code that it wants.
 BROKEN: Final = {
     "reserved bits": (b"\xf1\x80" + MASK, 1002),
     "an unknown opcode": (b"\x83\x80" + MASK, 1002),
@@ -96,11 +97,10 @@ BROKEN: Final = {
     "the continuation of nothing": (b"\x80\x80" + MASK, 1002),
     "text that is no UTF-8": (b"\x81\x82" + MASK + b"\xff\xfe", 1007),
 }
-"""Frames that RFC 6455 forbids, with the close code that it wants."""
+# The header of a frame of 1 TiB.
 HUGE: Final = b"\x81\xff" + struct.pack("!Q", 1 << 40) + MASK
-"""The header of a frame of 1 TiB."""
+# Texts that are no message of a page.
 NO_REQUESTS: Final = ("{", "[]", '{"op": "shutdown"}', '{"op": "ask", "id": 1, "what": ["why"]}', "[" * 60_000)
-"""Texts that are no message of a page."""
 
 
 def frame(text: str) -> bytes:
@@ -280,8 +280,8 @@ async def test_slow_and_broken_handshakes_keep_no_page_out(lab: Lab, agent: Agen
 # --- what others write ---------------------------------------------------------------------------------------------
 
 EVIL: Final = "<img src=x onerror=alert(1)>"
+# A name that a master accepts: it has no space and no colon.
 EVIL_NAME: Final = "/<img/src=x/onerror=alert(1)>"
-"""A name that a master accepts: it has no space and no colon."""
 LINK: Final = "javascript:alert(1)"
 REGISTER: Final = """
 import os, sys, xmlrpc.client
@@ -297,8 +297,8 @@ for done in (
 ):
     assert done[0] == 1, done
 """
+# Elements that none of the pages has by itself.
 MARKUP: Final = "img[src=x], svg[onload], [onerror], b#owned, a[href^='javascript:' i], script:not([src])"
-"""Elements that none of the pages has by itself."""
 
 
 def evil_resource() -> str:

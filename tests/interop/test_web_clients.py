@@ -119,10 +119,10 @@ def example(*words: str | Path) -> Process:
     return Process(["node", home / main, *words], name=str(words[0]))
 
 
+# Each type has a topic of its own below this.
 KINDS: Final = "/kinds"
-"""Each type has a topic of its own below this."""
+# Of the shipped types a third, which has all kinds of fields.
 TYPES: Final = known_types()[::3]
-"""Of the shipped types a third, which has all kinds of fields."""
 
 
 @contextlib.asynccontextmanager
@@ -249,10 +249,10 @@ async def test_the_parameter_example_follows_and_sets_parameters(
 
 # --- roslibpy -------------------------------------------------------------------------------------------------------
 
+# tf2_web_republisher has to run, which is a node in C++ of its own repository.
 NEEDS_A_NODE_OF_ITS_OWN: Final = "tests/ros1/test_tf.py::test_tf_test"
-"""tf2_web_republisher has to run, which is a node in C++ of its own repository."""
+# Where roslibpy's tests connect, without a token.
 ROSBRIDGE_PORT: Final = 9090
-"""Where roslibpy's tests connect, without a token."""
 
 
 @contextlib.asynccontextmanager

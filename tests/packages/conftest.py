@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from lab.bed.processes import Process
 
+# What an agent says of a peer that it has a link to.
 LINKED: Final = r"= {} .*: linked"
-"""What an agent says of a peer that it has a link to."""
 _UP: Final = 60.0
 _seconds = pytest.StashKey[dict[str, dict[str, float]]]()
 
@@ -56,8 +56,8 @@ class Team:
     way: Way
     machines: list[Machine]
     programs: dict[Machine, str] = field(default_factory=dict)
+    # What shows an agent's log: its terminal, or the journal.
     agents: dict[Machine, Process] = field(default_factory=dict)
-    """What shows an agent's log: its terminal, or the journal."""
     seconds: dict[str, float] = field(default_factory=dict)
 
     def install(self, machine: Machine, file: str) -> None:

@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from lab.bed.namespaces import Host
 
 CLONE: Final = Path(__file__).parents[2]
+# Where the talker and the listener of the tests are on a machine.
 NODES: Final = "/srv/nodes"
-"""Where the talker and the listener of the tests are on a machine."""
 _ENTER: Final = CLONE / "scripts/enter-chroot"
 _SOURCES: Final = [CLONE / "lab/nodes", CLONE / "tests/interop/nodes"]
 _PROGRAMS: Final = ("talker", "listener")
+# Seconds until a chroot is built: minutes on a fast line, and arm64's is emulated.
 _BUILT: Final = 900.0
-"""Seconds until a chroot is built: minutes on a fast line, and arm64's is emulated."""
 _BOOT: Final = """
 mount -t sysfs sysfs /sys 2>/dev/null || true
 echo "$1" >/etc/hostname

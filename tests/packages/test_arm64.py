@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 pytestmark = [pytest.mark.packages, pytest.mark.ros, pytest.mark.timeout(1800)]
+# Seconds for what takes ten on a board.
 _SLOW = 240.0
-"""Seconds for what takes ten on a board."""
 
 
 def _unpack(archive: Path, home: Path) -> str:

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+# Words a minute, of one who reads in a second language.
 READING: Final = 200.0
-"""Words a minute, of one who reads in a second language."""
+# Seconds to copy a command into the terminal where it belongs, or to type a short one.
 COPYING: Final = 5.0
-"""Seconds to copy a command into the terminal where it belongs, or to type a short one."""
 _PART: Final = re.compile(
     r"^```(?P<kind>\w+)\n(?P<block>.*?)^```$|^<!-- (?P<hand>ctrl-c|cable|browser)(?:: (?P<what>[^>]*))? -->$|"
     r"^\|(?P<head>(?: \w+ \|)+)\n\|[-|]+\n(?P<rows>(?:\|[^\n]*\|\n)+)",

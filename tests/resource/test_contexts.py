@@ -35,8 +35,8 @@ class Lamp:
     def __init__(self, core: RosCore) -> None:
         self.core = core
         self.problem: Exception | None = None
+        # The context whose function fails.
         self.jammed = ""
-        """The context whose function fails."""
         self.profile = self.place = ""
         self.entered: list[str] = []
         one = self.resource = Resource("lamp", role="acting")

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     from rmpa.runtime.tls import Buffer
 
+# Of the client and of the server.
 Contexts = tuple[ssl.SSLContext, ssl.SSLContext]
-"""Of the client and of the server."""
 NOW = datetime.now(UTC).timestamp()
 
 

@@ -25,8 +25,8 @@ class Slave:
         self.subscriptions: list[list[str]] = []
         self.calls: list[tuple[str, list[XmlRpcValue]]] = []
         self.lists = 0
+        # Whether it refuses to say what it has, as a client library without these methods.
         self.error = False
-        """Whether it refuses to say what it has, as a client library without these methods."""
         self.go = asyncio.Event()
         self.go.set()
         self.at_once = self.most_at_once = 0

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from tests.web.browser.conftest import Site
 
 AXE = Path(__file__).with_name("vendor") / "axe.min.js"
+# Each page, and a text that it shows of the demo.
 PAGES = {
     "": "Nothing is wrong.",
     "module/base": "Found by",
@@ -34,7 +35,6 @@ PAGES = {
     "log": "turn",
     "drive": "The robot may move",
 }
-"""Each page, and a text that it shows of the demo."""
 
 
 async def violations(page: Chromium) -> list[str]:
@@ -47,14 +47,14 @@ async def violations(page: Chromium) -> list[str]:
     return [str(each) for each in found]
 
 
+# What is too small for a finger.
 SMALL = """
 [...document.querySelectorAll('.top a, .top button, main button:not(.field), .module, .concerns a,'
   + ' input:not([type=checkbox]), select')]
   .map((each) => [each.outerHTML.slice(0, 80), each.getBoundingClientRect()])
   .filter(([, box]) => box.width && (box.height < 43.5 || box.width < 43.5)).map(([text]) => text)"""
-"""What is too small for a finger."""
+# Of the page; innerWidth grows with what is too wide.
 WIDTH = "document.documentElement.scrollWidth"
-"""Of the page; innerWidth grows with what is too wide."""
 
 
 @pytest.mark.parametrize("address", PAGES)
@@ -524,8 +524,8 @@ async def test_who_may_only_look_sees_no_way_to_change_anything(site: Site) -> N
     assert await page.run("document.querySelector('input[type=checkbox]').disabled") is True
 
 
+# The modules that are not of this mesh.
 OUTSIDE = "[...document.querySelectorAll('.outside li')]"
-"""The modules that are not of this mesh."""
 
 
 async def test_a_pending_module_is_invited_by_a_button_that_shows_the_line_once(site: Site) -> None:

@@ -23,8 +23,8 @@ from tests.ros.node.peers import DEADLINE, until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+# 4 MB, in which a part that is left out or twice would show.
 PAYLOAD = bytes(range(251)) * 16_000
-"""4 MB, in which a part that is left out or twice would show."""
 
 
 async def no_drain() -> None: ...

@@ -188,6 +188,7 @@ def test_a_token_that_another_user_has_made_is_none(tmp_path: Path, monkeypatch:
 
 
 SECRET: Final = "secret-" * 6
+# Denies the names of the table: what is refused without a right is refused by a rule as well.
 DENIED: Final = NodeRules(
     Permissions(
         TrustSettings(
@@ -204,7 +205,6 @@ DENIED: Final = NodeRules(
         )
     )
 )
-"""Denies the names of the table: what is refused without a right is refused by a rule as well."""
 STRING: Final = {"type": "std_msgs/String"}
 EMPTY: Final = {"type": "std_srvs/Empty"}
 # What each op may do without a right, or the right that it needs; a message; whether a rule can deny its name.

@@ -62,8 +62,8 @@ def denying(**names: tuple[str, ...]) -> NodeRules:
 
 
 RULED = setup().rules
+# May change every parameter but one, not the namespace around it.
 CAREFUL = denying(param=("/motors/limit",))
-"""May change every parameter but one, not the namespace around it."""
 TEXT = MessageType("std_msgs/String")
 TREE: dict[str, ParamValue] = {"speed": {"max": 1.5}, "motors": {"pid": {"p": 3}}, "name": "base"}
 
