@@ -49,21 +49,6 @@ async def test_a_twin_pushes_the_older_node_out_and_only_that(kind: str, shell: 
     await core.close()
 
 
-@pytest.mark.trap(40)
-@KINDS
-async def test_a_killed_node_is_gone_at_a_hint(kind: str, shell: ShellFactory) -> None:
-    core = RosCore(port=0)
-    await core.start()
-    ros = shell(port=core.port)
-    victim = ros.node(kind, "talker", "__name:=victim", topic="/chatter", rate=20, count=0)
-    await until(lambda: "/victim" in core.state().publishers.get("/chatter", {}))
-    await asyncio.to_thread(victim.kill)
-    core.suspect("/victim")
-    await until(lambda: "/victim" not in core.state().nodes)
-    assert "/chatter" not in core.state().publishers
-    await core.close()
-
-
 @pytest.mark.trap(18, 31)
 @KINDS
 async def test_a_stopped_node_is_kept_and_gets_the_latest_update(kind: str, shell: ShellFactory) -> None:
@@ -151,14 +136,6 @@ async def test_a_probe_without_a_service_makes_roscpp_log_nothing(core: RosCore,
     assert await probe(host, port, SERVICE, timeout=DEADLINE, node="/talker") == "", "it has taken those before"
     assert "WARN" not in talker.output
     assert "ERROR" not in talker.output
-
-
-async def test_a_node_that_is_gone(core: RosCore, ros: Ros) -> None:
-    talker = ros.rospy("talker", "__name:=talker", topic="/chatter")
-    await talker.expect_event("up", DEADLINE)
-    host, port = await publisher_at(core)
-    talker.kill()
-    assert await probe(host, port, SERVICE, timeout=DEADLINE, node="/talker") == "connection refused"
 
 
 TOPIC = "/chatter"

@@ -162,13 +162,6 @@ def _peak(pid: int) -> int:
     return int(line.split()[1]) * 1024
 
 
-def test_the_core_is_open_to_this_machine_only(modules: ModuleFactory) -> None:
-    (a,) = modules("a")
-    a.ros.roscpp("talker", topic="/chatter", rate=10)
-    a.wait_topic("/chatter")
-    assert listening(a)["tcp:11311"] == "127.0.0.1"
-
-
 def _tracebacks(module: Module) -> str:
     """What the agent's log has around a traceback; empty if there is none."""
     lines = module.agent.process.lines

@@ -274,14 +274,6 @@ def test_one_that_was_revoked_says_so_and_is_not_pending(gate: Gate) -> None:
     assert told(gate.arm, "base")[0] == "revoked"
 
 
-def test_a_module_that_takes_the_name_of_a_member_is_not_pending(gate: Gate, agent: AgentFactory, lab: Lab) -> None:
-    eve = agent(lab.host("eve", 0), name="pc")
-    one = gate.stranger(gate.base, eve.snapshot().agent.guid.partition("#")[0])
-    assert (one.state, one.invite) == ("foreign", "")
-    assert "do not invite it" in one.last_error
-    assert "linked" in gate.base.rmpa("peer", "info", "pc")[1]
-
-
 @needs_browser
 async def test_the_page_of_the_authority_invites_and_shows_the_new_module_by_itself(gate: Gate) -> None:
     gate.stranger(gate.base, "arm")
