@@ -106,8 +106,10 @@ def test_an_authority_in_a_state_directory_of_its_own_is_not_forgotten(machine: 
     assert f"start with RMPA_STATE_DIR={data} --name sec;" in machine.says("up", "--name", "sec", code=1)
 
 
-@pytest.mark.parametrize("variable", ["RMPA_STATE_DIR", "XDG_STATE_HOME", "HOME"])
-@pytest.mark.parametrize("joined_with_it", [True, False])
+@pytest.mark.parametrize(
+    ("variable", "joined_with_it"),
+    [("RMPA_STATE_DIR", True), ("RMPA_STATE_DIR", False), ("XDG_STATE_HOME", True), ("HOME", False)],
+)
 def test_no_variable_makes_a_start_miss_the_keys_of_this_user(
     machine: Machine, variable: str, joined_with_it: bool
 ) -> None:

@@ -232,16 +232,6 @@ def test_a_thread_that_hangs_does_not_keep_it_from_its_end(ground: Ground) -> No
     assert not agent.is_running()
 
 
-def test_a_profile_that_hangs_ends_it_in_order(ground: Ground) -> None:
-    hangs = "def plain():\n    time.sleep(1000)\nnose.adaptation(apply_timeout='200 ms')\n"
-    run = ground.run(HEAD.replace("def plain(): pass\n", hangs) + TALK)
-    assert run.wait() == 1
-    assert (
-        "rmpa: the function of profile plain has not returned within 0.2 s; the resource ends; mend it" in run.output
-    )
-    assert not list(ground.place.path.glob("**/nose.sock"))
-
-
 def test_told_twice_it_ends_at_once(ground: Ground) -> None:
     hook = '@nose.on("finalize")\ndef last():\n    print("finalizing", flush=True)\n    time.sleep(1000)\n'
     run = ground.run(HEAD + TALK + hook)

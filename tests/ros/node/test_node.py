@@ -467,14 +467,6 @@ async def test_names_are_remapped_and_loopback_is_used_for_a_local_master(core: 
         ]
 
 
-async def test_closing_twice_is_closing_once(core: RosCore) -> None:
-    one = node(core, "n")
-    async with one:
-        await one.close()
-    await one.close()
-    assert one.stopped.is_set()
-
-
 async def test_a_service_is_served_and_called(core: RosCore) -> None:
     async def slowly(request: Any) -> dict[str, int]:
         await asyncio.sleep(0)

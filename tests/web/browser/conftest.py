@@ -58,11 +58,3 @@ async def site(browser: Browser) -> AsyncIterator[Site]:
             yield Site(server, page, runner.addresses[0][1])
     finally:
         await runner.cleanup()
-
-
-@pytest.fixture
-async def second(browser: Browser) -> AsyncIterator[Chromium]:
-    """Another page, of another person."""
-    async with Chromium(browser=browser) as page:
-        await page.look()
-        yield page
