@@ -10,7 +10,7 @@ import re
 import subprocess
 import sys
 import threading
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
 
 import click
 import pytest
@@ -22,13 +22,8 @@ from lab.bed.processes import eventually
 from rmpa.cli import completion
 from rmpa.cli.main import _DECLARED, MEANT, REMOVED_VERBS, VERBS, LazyGroup, cli, main
 from rmpa.core import codes
-from tests.cli.conftest import DEADLINE, with_core
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from rmpa.ros.core.embedded import RosCore
-    from tests.cli.conftest import Place
+from rmpa.ros.core.embedded import RosCore
+from tests.cli.conftest import DEADLINE, Place, with_core
 
 
 def commands(group: LazyGroup, path: str = "rmpa") -> list[tuple[str, str, click.Command]]:

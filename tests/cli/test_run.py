@@ -6,7 +6,8 @@ import json
 import os
 import signal
 import sys
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import psutil
 import pytest
@@ -15,13 +16,8 @@ from lab.bed.processes import Process, eventually
 from rmpa.cli.run import _module_name, prepared
 from rmpa.config.module_name import keep_name
 from rmpa.core.errors import ConfigError
+from tests.cli.conftest import Place
 from tests.interop.ros import free_port
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from tests.cli.conftest import Place
 
 pytestmark = pytest.mark.timeout(120)
 HEAD = """\

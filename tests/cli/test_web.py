@@ -7,22 +7,17 @@ import json
 import os
 import signal
 import socket
+import subprocess
 import sys
 import urllib.error
 import urllib.request
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from tests.cli.conftest import DEADLINE, free_port, until
+import pytest
 
-if TYPE_CHECKING:
-    import subprocess
-    from collections.abc import Callable, Iterator
-
-    import pytest
-
-    from tests.cli.conftest import Machine, Place
+from tests.cli.conftest import DEADLINE, Machine, Place, free_port, until
 
 
 def get(port: int, path: str, token: str = "") -> tuple[int, str]:

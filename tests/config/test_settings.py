@@ -6,7 +6,7 @@ import json
 import tomllib
 from errno import EACCES
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -21,10 +21,8 @@ from rmpa.config.values import HostPort, Multicast, did_you_mean
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Transport
 from rmpa.core.errors import ConfigError
+from tests.config.conftest import Load, Refuse
 from tests.core.example import EXAMPLE, uncommented
-
-if TYPE_CHECKING:
-    from tests.config.conftest import Load, Refuse
 
 
 def test_defaults_and_the_host_name_without_any_source(load: Load) -> None:

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import pytest
 
-from lab.bed.processes import eventually
+from lab.bed.processes import Event, Process, eventually
+from tests.interop.conftest import ModuleFactory
+from tests.interop.modules import Module
 from tests.interop.ros import lacks
-
-if TYPE_CHECKING:
-    from lab.bed.processes import Event, Process
-    from tests.interop.conftest import ModuleFactory
-    from tests.interop.modules import Module
 
 pytestmark = [
     pytest.mark.ros,

@@ -5,20 +5,15 @@ from __future__ import annotations
 import json
 import re
 import signal
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
-from lab.bed.processes import eventually
+from lab.bed.namespaces import Lab
+from lab.bed.processes import Process, eventually
+from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 from tests.interop.modules import Module, flows, whole
 from tests.interop.recordings import recorded, wait_last
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from lab.bed.namespaces import Lab
-    from lab.bed.processes import Process
-    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
 DEPTH = 20

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
@@ -11,14 +11,10 @@ from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.liveness import name_at
 from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.node.service_client import probe
-from rmpa.ros.wire.slave_api import read_bus_info
+from rmpa.ros.wire.slave_api import BusLink, read_bus_info
 from rmpa.ros.wire.tcpros import parse_service_uri
-from tests.interop.conftest import until
-
-if TYPE_CHECKING:
-    from rmpa.ros.wire.slave_api import BusLink
-    from tests.interop.conftest import ShellFactory
-    from tests.interop.ros import Ros
+from tests.interop.conftest import ShellFactory, until
+from tests.interop.ros import Ros
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
 DEADLINE: Final = 90.0

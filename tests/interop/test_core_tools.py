@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import re
 import sys
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
 
 import pytest
 
 from lab.bed.processes import Process, eventually
+from tests.interop.conftest import ShellFactory
 from tests.interop.ros import PYTHON, Ros, free_port
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from tests.interop.conftest import ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]
 

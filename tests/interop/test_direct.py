@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import sys
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import pytest
 
+from lab.bed.namespaces import Lab
 from lab.bed.processes import Process, eventually
 from rmpa.bridge import limits
 from rmpa.observe.control_client import ControlClient
+from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 from tests.interop.modules import Module, flows
 from tests.interop.ros import NODES, lacks
 from tests.interop.transports import (
@@ -29,10 +31,6 @@ from tests.interop.transports import (
     wait_direct_topics,
     wait_relayed,
 )
-
-if TYPE_CHECKING:
-    from lab.bed.namespaces import Lab
-    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(240)]
 TERMS_HERE: Final = """

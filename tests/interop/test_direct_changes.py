@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import time
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
-from lab.bed.processes import eventually
+from lab.bed.namespaces import Host, Lab
+from lab.bed.processes import Event, Process, eventually
+from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 from tests.interop.modules import Module, flows
 from tests.interop.test_direct import stages
 from tests.interop.transports import (
@@ -25,11 +27,6 @@ from tests.interop.transports import (
     wait_direct,
     wait_relayed,
 )
-
-if TYPE_CHECKING:
-    from lab.bed.namespaces import Host, Lab
-    from lab.bed.processes import Event, Process
-    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 CLIENTS: Final = [("roscpp", "rospy"), ("rospy", "roscpp")]

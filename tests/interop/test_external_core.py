@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from typing import Final
 
 import pytest
 
-from lab.bed.processes import eventually
+from lab.bed.agents import Agent
+from lab.bed.namespaces import Lab
+from lab.bed.processes import Process, eventually
+from tests.interop.conftest import AgentFactory, ShellFactory
 from tests.interop.modules import Module, flows
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from lab.bed.agents import Agent
-    from lab.bed.namespaces import Lab
-    from lab.bed.processes import Process
-    from tests.interop.conftest import AgentFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 

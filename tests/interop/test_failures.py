@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import json
 import time
-from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.bed.processes import eventually
+from lab.bed.processes import Process, eventually
+from tests.interop.conftest import ModuleFactory
 from tests.interop.modules import Module, flows
-
-if TYPE_CHECKING:
-    from lab.bed.processes import Process
-    from tests.interop.conftest import ModuleFactory
-    from tests.interop.modules import Module
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(300)]
 

@@ -6,20 +6,17 @@ import re
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.bed.namespaces import Lab
 from lab.bed.processes import Process, eventually, run
 from rmpa.core import limits
 from rmpa.observe.control_client import ControlClient
+from rmpa.observe.snapshot import Snapshot
+from tests.interop.conftest import ModuleFactory
 from tests.interop.modules import Module, flows
 from tests.interop.ros import NODES
-
-if TYPE_CHECKING:
-    from lab.bed.namespaces import Lab
-    from rmpa.observe.snapshot import Snapshot
-    from tests.interop.conftest import ModuleFactory
 
 pytestmark = [pytest.mark.alone, pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(240)]
 

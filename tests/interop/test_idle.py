@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
+from lab.bed.agents import Agent
+from lab.bed.namespaces import Lab
 from lab.bed.processes import eventually
 from lab.usage import wakeups
-
-if TYPE_CHECKING:
-    from lab.bed.agents import Agent
-    from lab.bed.namespaces import Lab
-    from tests.interop.conftest import AgentFactory
+from tests.interop.conftest import AgentFactory
 
 pytestmark = [pytest.mark.netns, pytest.mark.timeout(180)]
 

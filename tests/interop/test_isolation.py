@@ -7,17 +7,14 @@ measured with it, by the publisher that wants to wake up each millisecond, and a
 from __future__ import annotations
 
 from array import array
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import pytest
 
+from lab.bed.processes import Event, Process
 from lab.bed.ros import NODES
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from lab.bed.processes import Event, Process
-    from tests.interop.conftest import ModuleFactory
+from tests.interop.conftest import ModuleFactory
 
 pytestmark = [pytest.mark.alone, pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 

@@ -6,19 +6,14 @@ import hashlib
 import json
 import subprocess
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.bed.processes import eventually
-from tests.interop.modules import flows
+from lab.bed.namespaces import Host
+from lab.bed.processes import Event, Process, eventually
+from tests.interop.conftest import ModuleFactory
+from tests.interop.modules import Module, flows
 from tests.interop.recordings import connected, in_order, recorded, wait_last
-
-if TYPE_CHECKING:
-    from lab.bed.namespaces import Host
-    from lab.bed.processes import Event, Process
-    from tests.interop.conftest import ModuleFactory
-    from tests.interop.modules import Module
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 MB = 1 << 20

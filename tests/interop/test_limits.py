@@ -6,19 +6,16 @@ import json
 import socket
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from lab.bed.agents import Agent
 from lab.bed.processes import DEADLINE
+from tests.interop.conftest import AgentFactory, ShellFactory
 from tests.interop.ros import PYTHON
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from lab.bed.agents import Agent
-    from tests.interop.conftest import AgentFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
 

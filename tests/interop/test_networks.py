@@ -6,24 +6,20 @@ import random
 import shutil
 import subprocess
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import pytest
 
-from lab.bed.processes import eventually
+from lab.bed.namespaces import Host, Lab
+from lab.bed.processes import Event, eventually
 from lab.bed.ros import PYTHON
 from rmpa.observe.control_client import ControlClient
+from tests.interop.conftest import AgentFactory, ShellFactory
 from tests.interop.modules import Module, flows
 from tests.interop.ros import lacks
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from lab.bed.namespaces import Host, Lab
-    from lab.bed.processes import Event
-    from tests.interop.conftest import AgentFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(900)]
 

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import json
 import time
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
+from lab.bed.namespaces import Lab
 from lab.bed.processes import eventually
+from tests.interop.conftest import AgentFactory, ShellFactory
 from tests.interop.modules import Module, flows
 from tests.interop.test_services_across import _calls, _wait_services, _worker
 from tests.trust.io.member_files import SecuredMesh
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from lab.bed.namespaces import Lab
-    from tests.interop.conftest import AgentFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
 

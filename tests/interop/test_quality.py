@@ -5,19 +5,17 @@ from __future__ import annotations
 import json
 import subprocess
 from shutil import which
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
+from lab.bed.agents import Agent
+from lab.bed.namespaces import Lab
 from lab.bed.processes import eventually, run
 from rmpa.observe.why.diagnosis import UNASKED
+from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 from tests.interop.modules import Module, flows
 from tests.interop.ros import PYTHON
-
-if TYPE_CHECKING:
-    from lab.bed.agents import Agent
-    from lab.bed.namespaces import Lab
-    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
 RATE = 50.0

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import itertools
 import time
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import msgspec
 import pytest
 
-from lab.bed.processes import eventually
+from lab.bed.processes import Process, eventually
+from tests.interop.conftest import ModuleFactory
+from tests.interop.modules import Module
 from tests.interop.recordings import connected, recorded, wait_last
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from lab.bed.processes import Process
-    from tests.interop.conftest import ModuleFactory
-    from tests.interop.modules import Module
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 

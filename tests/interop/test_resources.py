@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import pytest
 
 from lab.bed.agents import RMPA, Agent
+from lab.bed.namespaces import Host, Lab
 from lab.bed.processes import Event, Process, eventually
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from lab.bed.namespaces import Host, Lab
-    from tests.interop.conftest import ShellFactory
-    from tests.interop.ros import Ros
+from tests.interop.conftest import ShellFactory
+from tests.interop.ros import Ros
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
 

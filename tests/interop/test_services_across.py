@@ -5,22 +5,18 @@ from __future__ import annotations
 import asyncio
 import signal
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
-from lab.bed.processes import CommandFailed, eventually
+from lab.bed.namespaces import Lab
+from lab.bed.processes import CommandFailed, Event, Process, eventually
 from rmpa.core.errors import RmpaError
+from rmpa.ros.node.node import Node
 from rmpa.ros.types.installed import ServiceType
-from tests.interop.ros import PYTHON
-
-if TYPE_CHECKING:
-    from lab.bed.namespaces import Lab
-    from lab.bed.processes import Event, Process
-    from rmpa.ros.node.node import Node
-    from tests.interop.conftest import ModuleFactory, ShellFactory
-    from tests.interop.modules import Module
-    from tests.interop.ros import Ros
+from tests.interop.conftest import ModuleFactory, ShellFactory
+from tests.interop.modules import Module
+from tests.interop.ros import PYTHON, Ros
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 CLIENTS = ["rospy", "roscpp"]

@@ -7,19 +7,15 @@ from __future__ import annotations
 
 import json
 import time
-from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.bed.processes import eventually
+from lab.bed.namespaces import Lab
+from lab.bed.processes import Event, Process, eventually
+from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 from tests.interop.modules import Module
 from tests.interop.ros import PYTHON
 from tests.interop.transports import reload
-
-if TYPE_CHECKING:
-    from lab.bed.namespaces import Lab
-    from lab.bed.processes import Event, Process
-    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 

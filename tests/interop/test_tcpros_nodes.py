@@ -7,24 +7,21 @@ import json
 import os
 import signal
 import socket
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
+from lab.bed.processes import Process
+from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.http.rpc import call_api
+from rmpa.ros.node.node import Node, Publisher, Received
 from rmpa.ros.node.publication import AcceptedConnection, Publication, PublicationEvents
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import frame_message
 from tests.interop.conftest import framed, until
 from tests.interop.nodes.payload import Pattern
-from tests.interop.ros import PYTHON
-
-if TYPE_CHECKING:
-    from lab.bed.processes import Process
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.node import Node, Publisher, Received
-    from tests.interop.ros import Ros
+from tests.interop.ros import PYTHON, Ros
 
 pytestmark = pytest.mark.ros
 libraries = pytest.mark.parametrize("library", ["rospy", "roscpp"])

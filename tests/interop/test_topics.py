@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import pytest
 
-from lab.bed.processes import eventually
+from lab.bed.namespaces import Lab
+from lab.bed.processes import Event, Process, eventually
+from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 from tests.interop.modules import Module, flows, whole
 from tests.interop.recordings import recorded, wait_last
-
-if TYPE_CHECKING:
-    from lab.bed.namespaces import Lab
-    from lab.bed.processes import Event, Process
-    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
 CLIENTS = ["rospy", "roscpp"]

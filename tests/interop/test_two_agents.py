@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import signal
-from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.interop.conftest import AgentFactory, ShellFactory
 from tests.interop.modules import whole
-
-if TYPE_CHECKING:
-    from tests.interop.conftest import AgentFactory, ShellFactory
 
 
 @pytest.mark.ros

@@ -6,22 +6,19 @@ import asyncio
 import json
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
 from lab.bed.agents import RMPA, Agent
 from lab.bed.chromium import Chromium
 from lab.bed.http_client import http_client
+from lab.bed.namespaces import Lab
 from lab.bed.processes import DEADLINE, Process
 from rmpa.web.monitor.limits import DRIVE_SPEED
+from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory, WebFactory
 from tests.interop.modules import Module
-from tests.interop.web import needs_browser
-
-if TYPE_CHECKING:
-    from lab.bed.namespaces import Lab
-    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory, WebFactory
-    from tests.interop.web import Monitor
+from tests.interop.web import Monitor, needs_browser
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(150)]
 

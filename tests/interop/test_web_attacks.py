@@ -7,7 +7,8 @@ import contextlib
 import json
 import struct
 from collections import Counter
-from typing import TYPE_CHECKING, Final
+from collections.abc import AsyncIterator
+from typing import Final
 from urllib.parse import quote
 
 import aiohttp
@@ -16,20 +17,15 @@ import pytest
 
 from lab.bed.chromium import Chromium
 from lab.bed.http_client import http_client
+from lab.bed.namespaces import Host, Lab
 from lab.bed.processes import DEADLINE
 from rmpa.ros.types.descriptor import Descriptor, ParameterDescriptor, ProfileDescriptor
 from rmpa.web import limits
 from rmpa.web.monitor import limits as monitor_limits
 from rmpa.web.monitor.messages import SUBPROTOCOL
+from tests.interop.conftest import AgentFactory, ModuleFactory, WebFactory
 from tests.interop.ros import PYTHON
-from tests.interop.web import REFUSED, needs_browser
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from lab.bed.namespaces import Host, Lab
-    from tests.interop.conftest import AgentFactory, ModuleFactory, WebFactory
-    from tests.interop.web import Monitor, Web
+from tests.interop.web import REFUSED, Monitor, Web, needs_browser
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(150)]
 

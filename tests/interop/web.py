@@ -7,24 +7,19 @@ import contextlib
 import itertools
 import json
 import time
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Any, Final, Self
 
 import aiohttp
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from lab.bed.agents import RMPA
-from lab.bed.chromium import BINARY
+from lab.bed.agents import RMPA, Agent
+from lab.bed.chromium import BINARY, Chromium
 from lab.bed.processes import DEADLINE, Process
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from tests.web.monitor.patches import apply
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
-    from lab.bed.agents import Agent
-    from lab.bed.chromium import Chromium
 
 PORT: Final = 8480
 REFUSED: Final = "rmpa_web_refused_total"

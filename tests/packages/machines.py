@@ -17,17 +17,14 @@ import hashlib
 import os
 import shutil
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self
+from typing import Final, Self
 
 from lab.bed import namespaces
+from lab.bed.namespaces import Host
 from lab.bed.processes import DEADLINE, BedError, Process, eventually, run
 from lab.bed.ros import words
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from lab.bed.namespaces import Host
 
 CLONE: Final = Path(__file__).parents[2]
 # Where the talker and the listener of the tests are on a machine.

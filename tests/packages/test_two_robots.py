@@ -8,10 +8,11 @@ import re
 import ssl
 import sys
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from http.client import HTTPSConnection
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 import pytest
 
@@ -21,9 +22,6 @@ from tests.packages import machines
 from tests.packages.machines import CLONE, Machine
 from tests.packages.tutorial import COPYING, Step, reading_minutes, shows, steps
 from tests.packages.ways import USER, package, wheel
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 PAGE: Final = (CLONE / "docs/start/two-robots.md").read_text(encoding="utf-8")
 ROBOTS: Final = ("robot1", "robot2")

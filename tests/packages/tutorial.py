@@ -8,11 +8,9 @@ in which such a command runs), ``<!-- cable: robot2 out -->``, ``<!-- browser --
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from typing import Final
 
 # Words a minute, of one who reads in a second language.
 READING: Final = 200.0

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
-from tests.packages.machines import CLONE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from tests.packages.machines import Machine
+from tests.packages.machines import CLONE, Machine
 
 USER: Final = "robot"
 DIST: Final = CLONE / "dist"

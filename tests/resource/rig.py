@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from rmpa.resource.quality import Attribute, Bound, QoSRequest
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rmpa.ros.node.endpoints import Subscriber
-    from rmpa.ros.node.node import Node
+from rmpa.ros.node.endpoints import Subscriber
+from rmpa.ros.node.node import Node
 
 TEXT = "std_msgs/String"
 ARRAY = "diagnostic_msgs/DiagnosticArray"

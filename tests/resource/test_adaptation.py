@@ -1,8 +1,9 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -12,9 +13,6 @@ from rmpa.resource.decision import Alarm, AlarmKind, Decider
 from rmpa.resource.declare import AdaptationSettings, Profile
 from rmpa.resource.quality import MEASURED, Bound, Requirement
 from tests.resource.rig import bound
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 RATE, LATENCY = MEASURED["rate"], MEASURED["latency"]
 ATTRIBUTES = {"rate": RATE, "latency": LATENCY}

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -13,10 +13,6 @@ from rmpa.resource.resource import Resource
 from rmpa.resource.saved import Clients, SavedCoolDown, SavedRequirement, SavedState
 from rmpa.ros.core.embedded import RosCore
 from tests.resource.rig import until
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 NOW = 1_800_000_000_000_000_000
 SECOND = 1_000_000_000

@@ -6,7 +6,8 @@ import asyncio
 import contextlib
 import errno
 import socket
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 
@@ -14,9 +15,6 @@ from rmpa.runtime import accept as acceptor
 from rmpa.runtime import limits
 from rmpa.runtime.accept import Acceptor, Descriptors, Use
 from tests.runtime.descriptors_left import descriptors_left
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 
 class Listening(socket.socket):

@@ -7,7 +7,7 @@ import errno
 import logging
 import math
 import socket
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -22,9 +22,6 @@ from rmpa.runtime.loop import AgentLoop
 from rmpa.runtime.stream import LATER, CollectedSends, Stream, after_read
 from rmpa.runtime.tls import Buffer, unsent
 from tests.runtime.message_streams import End
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 async def until(condition: Callable[[], bool]) -> None:

@@ -6,22 +6,17 @@ import asyncio
 import contextlib
 import random
 import socket
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator, Callable
 
 import pytest
 
 from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError
-from rmpa.core.outbox import URGENT, Outbox, QueuedMessage
+from rmpa.core.outbox import URGENT, Framer, Outbox, QueuedMessage
 from rmpa.mesh.frames import Frame, FrameKind, pack_fragment_header
 from rmpa.runtime.stream import Stream
 from tests.core.outbox_model import Reader, fence, payload, whole
 from tests.runtime.message_streams import STREAMS, close_all
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
-    from rmpa.core.outbox import Framer
 
 Sockets = tuple[socket.socket, socket.socket]
 FRAGMENT = limits.FRAGMENT_BYTES

@@ -7,9 +7,11 @@ import errno
 import math
 import os
 import threading
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import msgspec
 import pytest
@@ -28,10 +30,6 @@ from rmpa.ros.master.registrations import NodeRecord
 from rmpa.ros.wire.xmlrpc import XmlRpcValue, response_pieces
 from tests.ros.core.slaves import Slave
 from tests.ros.node.peers import DEADLINE, until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-    from pathlib import Path
 
 STRING: Final = "std_msgs/String"
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -11,13 +11,10 @@ from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.rpc import call
 from rmpa.ros.node.endpoints import NODE_UNREGISTER_AT_ONCE
-from rmpa.ros.node.node import Node
+from rmpa.ros.node.node import Node, Received
 from rmpa.ros.types.definitions import DefinitionError
 from rmpa.ros.types.messages import MessageError, MessageType
 from tests.ros.node.peers import DEADLINE, STRING, node, until
-
-if TYPE_CHECKING:
-    from rmpa.ros.node.node import Received
 
 
 async def test_messages_go_from_one_node_to_another(core: RosCore) -> None:

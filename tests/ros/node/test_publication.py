@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import socket
 import struct
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator, Callable, Mapping
 
 import pytest
 
@@ -13,9 +13,6 @@ from rmpa.ros.node.listeners import TcprosServer
 from rmpa.ros.node.publication import AcceptedConnection, Publication, PublicationEvents
 from rmpa.ros.wire.tcpros import TopicDescription, frame_message, publisher_header
 from tests.ros.node.peers import LATCHED, STRING, RawSubscriber, until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Mapping
 
 OTHER = TopicDescription("std_msgs/Int32", "da5909fbe378aeaf85e547e830cc1bb7", "int32 data\n")
 

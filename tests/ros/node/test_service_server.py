@@ -3,7 +3,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import struct
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator, Mapping
 
 import pytest
 
@@ -14,9 +14,6 @@ from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import ServiceDescription, encode_header, server_header
 from tests.ros.node.peers import DEADLINE, RawSubscriber, until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Mapping
 
 MD5 = "6a2e34150c00229791cc89ff309fff21"
 ADD = ServiceDescription("rospy_tutorials/AddTwoInts", MD5)

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
+from lab.bed.chromium import Chromium
 from rmpa.web.hub.node_link import Rights
 from rmpa.web.monitor import limits
 from tests.ros.node.peers import until
-
-if TYPE_CHECKING:
-    from lab.bed.chromium import Chromium
-    from tests.web.browser.conftest import Site
+from tests.web.browser.conftest import Site
 
 AXE = Path(__file__).with_name("vendor") / "axe.min.js"
 # Each page, and a text that it shows of the demo.

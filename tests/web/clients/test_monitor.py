@@ -7,21 +7,25 @@ import json
 import struct
 import threading
 import time
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import aiohttp
 import msgspec
 import pytest
 
 from rmpa.core.errors import UnreachableError
+from rmpa.observe.snapshot import Snapshot
 from rmpa.resource.resource import Resource
 from rmpa.resource.runtime import describe
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.web import limits as web_limits
-from rmpa.web.hub.node_link import FULL, READ_ONLY
+from rmpa.web.hub.node_link import FULL, READ_ONLY, Rights
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.server.agent_watch import AgentWatch
@@ -30,14 +34,6 @@ from tests.web.clients.server import running_server
 from tests.web.hub.client import node
 from tests.web.monitor.patches import apply
 from tests.web.snapshots import FULL as SNAPSHOT
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from rmpa.observe.snapshot import Snapshot
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.node import Node
-    from rmpa.web.hub.node_link import Rights
 
 TEXT = MessageType("std_msgs/String")
 TWIST = MessageType("geometry_msgs/Twist")

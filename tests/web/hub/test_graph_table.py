@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
 
 import pytest
 from hypothesis import given, settings
@@ -13,9 +13,6 @@ from rmpa.observe.graph import GraphHistory, GraphRows, ServiceRow, TopicRow
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import Registrations
 from rmpa.web.hub.graph import GraphTable, rows_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 _NODES = ("/a", "/b", "/c")
 _NAMES = ("/x", "/y", "/z/w", "/rosout")

@@ -7,8 +7,10 @@ import json
 import os
 import stat
 import struct
+from collections.abc import Callable
 from contextlib import AsyncExitStack
-from typing import TYPE_CHECKING, Any, Final, Self
+from pathlib import Path
+from typing import Any, Final, Self
 
 import aiohttp
 import pytest
@@ -38,10 +40,6 @@ from rmpa.web.server.process import access_of, url_of
 from tests.ros.node.peers import DEADLINE
 from tests.web.hub.client import node
 from tests.web.server.test_upgrades import running
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 TOKEN = "t" * 43
 HOSTS = own_names(("base",))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, closing, nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import aiohttp
 import msgspec
@@ -16,13 +17,17 @@ import pytest
 from rmpa.config.peer_rules import Access, Effect, PermissionRule
 from rmpa.config.settings import Settings, TrustSettings, WebSettings
 from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.observe.snapshot import Snapshot
 from rmpa.resource import Resource
 from rmpa.resource.runtime import describe
+from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.master.parameters import Parameters
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
+from rmpa.ros.wire.xmlrpc import XmlRpcValue
 from rmpa.trust.permissions import InviteReply, TrustStatus
-from rmpa.web.hub.node_link import EVERYTHING, FULL, READ_ONLY, NodeRules, Rights
+from rmpa.web.hub.hub import Hub
+from rmpa.web.hub.node_link import EVERYTHING, FULL, READ_ONLY, NodeRules, ParamValue, Rights
 from rmpa.web.monitor import questions
 from rmpa.web.monitor.monitor import LogFeed
 from rmpa.web.monitor.questions import Answers
@@ -32,15 +37,6 @@ from tests.ros.node.peers import DEADLINE, until
 from tests.web import snapshots
 from tests.web.hub.client import FakeClient, running_hub
 from tests.web.server.test_upgrades import running
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from rmpa.observe.snapshot import Snapshot
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
-    from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.node_link import ParamValue
 
 RULES = (
     PermissionRule(("*",), effect=Effect.DENY, names={"call": ("/motors/**",), "param": ("/motors/**",)}),

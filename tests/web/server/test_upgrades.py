@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import functools
 import json
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import aiohttp
 import msgspec
@@ -25,9 +26,6 @@ from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup, mak
 from tests.ros.node.peers import DEADLINE, until
 from tests.web.hub.client import local_core
 from tests.web.snapshots import FULL as SNAPSHOT
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
 
 TOKEN = "secret-" * 6
 
