@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import os
 import signal
 import socket
 import subprocess
@@ -65,19 +64,6 @@ def test_it_waits_for_an_agent_and_survives_its_end(place: Place) -> None:
         with running(place, *agent_options()):
             until(lambda: get(port, "/healthz")[0] == 200)
     assert web.returncode == 0
-
-
-def test_up_web_starts_it_again_and_ends_it(place: Place) -> None:
-    port = free_port()
-    place.environ["RMPA_WEB_PORT"] = str(port)
-    with running(place, *agent_options("--web")) as agent:
-        until(lambda: get(port, "/healthz")[0] == 200)
-        first = child_of(agent.pid)
-        os.kill(first, signal.SIGKILL)
-        until(lambda: get(port, "/healthz")[0] == 200)
-        assert child_of(agent.pid) != first
-    assert agent.returncode == 0
-    assert get(port, "/healthz")[0] == 0
 
 
 def test_it_outlives_an_agent_that_is_killed_and_the_next_one_takes_it_over(

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import functools
 import re
-import sys
-import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 pytest.importorskip("cryptography")
 
-from lab.bed.processes import Process, eventually
+from lab.bed.processes import eventually
 from rmpa.discovery.limits import STRANGERS_SHOWN
-from rmpa.trust import limits as trust_limits
 from rmpa.trust.store import CERTIFICATE, KEY
 from tests.interop.modules import Module, flows
-from tests.interop.ros import NODES
 from tests.interop.secured import (
     GROUP,
     UDP_PORT,
@@ -34,7 +30,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from lab.bed.agents import Agent
-    from lab.bed.namespaces import Host, Lab
+    from lab.bed.namespaces import Lab
     from lab.bed.processes import Event
     from rmpa.trust.store import TrustStore
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
@@ -195,44 +191,6 @@ def test_a_dial_without_a_valid_certificate_of_its_own_name_and_protocol_opens_n
 # --- joins ------------------------------------------------------------------------------------------------------
 
 
-def test_tokens_that_were_invented_used_or_have_ended_let_none_in(fortress: Fortress) -> None:
-    token = control(fortress.a.agent, "invite")["token"]
-    answer = fortress.attack("join", token=token, name="eve", invented=True)
-    assert (answer["op"], answer["reason"]) == ("refuse", "token"), answer
-    joined = fortress.attack("join", token=token, name="robot")
-    assert joined["op"] == "grant", joined  # the bearer of a token: that is what it is for
-    again = fortress.attack("join", token=token, name="eve")
-    assert (again["op"], again["reason"]) == ("refuse", "used"), again
-    short = control(fortress.a.agent, "invite", lifetime=1)["token"]
-    time.sleep(1.5)  # a token's time is the wall clock's, in whole seconds
-    for later in (False, True):  # nor if its text is changed to end later: the authority knows when it ends
-        late = fortress.attack("join", token=short, name="eve", later=later)
-        assert (late["op"], late["reason"]) == ("refuse", "late"), late
-    names = {each["name"] for each in control(fortress.a.agent, "status")["members"]}
-    assert names == {"a", "b", "robot"}
-    fortress.held()
-
-
-def test_a_member_in_the_middle_of_a_join_gets_nothing(fortress: Fortress) -> None:
-    """The question is for the certificate of the connection alone on which it was asked."""
-    fortress.mesh.add("eve")
-    store = fortress.mesh.store("eve")
-    invited = control(fortress.a.agent, "invite")
-    files = {"cert": str(store.path(CERTIFICATE)), "private": str(store.path(KEY))}
-    given = {"token": invited["token"], "listen": 40998, "here": fortress.eve.address}
-    with start_attack(fortress.eve, "middle", **given, **files) as middle:
-        bent = str(middle.wait_event("ready", 20.0)["token"])
-        joiner: list[str | Path] = [sys.executable, NODES / "joiner.py", "victim"]
-        with Process(fortress.b.host.command(joiner), commands=True) as victim:
-            victim.tell(bent)
-            assert "not signed with the token's key" in str(victim.wait_event("refused", 60.0)["text"])
-        done = middle.wait_event("done", 60.0)
-    assert (done["authority"], done["reason"]) == ("refuse", "token")
-    assert "victim" not in {each["name"] for each in control(fortress.a.agent, "status")["members"]}
-    joined = fortress.attack("join", token=invited["token"], name="victim")
-    assert joined["op"] == "grant", "the token is still valid"
-
-
 # --- floods -----------------------------------------------------------------------------------------------------
 
 
@@ -280,32 +238,6 @@ def test_slow_handshakes_are_ended_and_hold_no_member_out(fortress: Fortress) ->
 # --- members that do what they may not --------------------------------------------------------------------------
 
 
-def _member(fortress: Fortress, host: Host, agent: AgentFactory, shell: ShellFactory, config: str = OPEN) -> Module:
-    fortress.mesh.add(host.name)
-    member = Module(host, agent(host, name=host.name, config=config, log_level="info"), shell(host))
-    member.agent.wait_peer("a")
-    return member
-
-
-def test_a_revoked_member_is_gone_everywhere_within_a_second(
-    fortress: Fortress, agent: AgentFactory, shell: ShellFactory
-) -> None:
-    eve = _member(fortress, fortress.eve, agent, shell)
-    fortress.b.agent.wait_peer("eve")
-    revoked = time.monotonic()
-    control(fortress.a.agent, "revoke", name="eve")
-    ends = {}
-    for module in (fortress.a, fortress.b):
-        eventually(functools.partial(_is_gone, module, "eve"), 30.0, what=f"eve gone at {module.name}", every=0.02)
-        ends[module.name] = time.monotonic() - revoked
-    assert max(ends.values()) < 1.0, ends
-    eve.agent.kill()
-    eve.agent.restart()  # and it does not come back
-    eventually(lambda: counter(fortress.a.agent, "link.refused.revoked") > 0, what="eve is refused")
-    fortress.held()
-    assert trust_limits.KEY_SPREAD > 0
-
-
 def test_a_former_member_holds_no_module_out_and_is_believed_nothing(
     tmp_path: Path, modules: ModuleFactory, lab: Lab, agent: AgentFactory, shell: ShellFactory
 ) -> None:
@@ -342,7 +274,3 @@ def test_a_former_member_holds_no_module_out_and_is_believed_nothing(
     for module in (fortress.a, fortress.b):
         assert {peer.name for peer in module.agent.snapshot().peers} <= {"a", "b", "away"}
         assert "Traceback" not in module.agent.process.output
-
-
-def _is_gone(module: Module, name: str) -> bool:
-    return not any(peer.name == name and peer.link is not None for peer in module.agent.snapshot().peers)

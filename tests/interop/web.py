@@ -22,7 +22,6 @@ from rmpa.web.monitor.messages import SUBPROTOCOL
 from tests.web.monitor.patches import apply
 
 PORT: Final = 8480
-REFUSED: Final = "rmpa_web_refused_total"
 needs_browser = pytest.mark.skipif(BINARY is None, reason="Chromium is not installed: apt install chromium")
 
 
@@ -79,12 +78,6 @@ class Web:
             await monitor.next("state")
             yield monitor
 
-    @contextlib.asynccontextmanager
-    async def rosbridge(self, http: aiohttp.ClientSession) -> AsyncIterator[Socket]:
-        """A rosbridge client."""
-        async with http.ws_connect(f"ws://{self.host}/rosbridge", headers=self.bearer) as made:
-            yield Socket(made)
-
     async def counts(self, http: aiohttp.ClientSession, name: str, label: str) -> dict[str, float]:
         """The samples of a metric that are not 0, by one label."""
         async with http.get(f"{self.url}/metrics", headers=self.bearer) as response:
@@ -107,11 +100,19 @@ class Web:
             raise AssertionError(f"{name}: {found}") from None
 
 
-class Socket:
-    """A WebSocket with messages of JSON that say by ``op`` what they are."""
+class Monitor:
+    """What a page has: the state, kept up to date, and questions.
+
+    Attributes:
+        hello: The first message.
+        state: The newest.
+    """
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self._socket = socket
+        self.hello: dict[str, Any] = {}
+        self.state: Any = None
+        self._numbers = itertools.count(1)
 
     async def send(self, op: str, **values: Any) -> None:
         """Send a message."""
@@ -127,24 +128,6 @@ class Socket:
                 await self._take(message)
                 if message["op"] in ops:
                     return message
-
-    async def _take(self, message: dict[str, Any]) -> None:
-        """Act on any message."""
-
-
-class Monitor(Socket):
-    """What a page has: the state, kept up to date, and questions.
-
-    Attributes:
-        hello: The first message.
-        state: The newest.
-    """
-
-    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
-        super().__init__(socket)
-        self.hello: dict[str, Any] = {}
-        self.state: Any = None
-        self._numbers = itertools.count(1)
 
     async def ask(self, what: str, **args: Any) -> dict[str, Any]:
         """The server's ``answer``, or its ``failed``."""
