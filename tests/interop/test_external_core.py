@@ -13,6 +13,7 @@ from lab.bed.namespaces import Lab
 from lab.bed.processes import Process, eventually
 from tests.interop.conftest import AgentFactory, ShellFactory
 from tests.interop.modules import Module, flows
+from tests.interop.sites import nodes
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
@@ -37,11 +38,6 @@ def joined(lab: Lab, shell: ShellFactory, agent: AgentFactory) -> Callable[..., 
         return a, b, master
 
     return make
-
-
-def nodes(module: Module) -> set[str]:
-    """What the stock ``rosnode list`` says."""
-    return set(module.ros.tool("rosnode", "list").split())
 
 
 def notes(agent: Agent) -> str:
