@@ -89,13 +89,6 @@ async def node(core: RosCore) -> AsyncIterator[Node]:
         yield made
 
 
-async def until(condition: Callable[[], object], within: float = 40.0) -> None:
-    """Wait in the event loop until something holds."""
-    async with asyncio.timeout(within):
-        while not condition():
-            await asyncio.sleep(0.005)
-
-
 def framed(payload: bytes) -> bytes:
     """A std_msgs/UInt8MultiArray as raw bytes: no dimensions, offset 0."""
     return bytes(8) + struct.pack("<I", len(payload)) + payload

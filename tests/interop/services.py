@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from lab.bed.processes import Event, Process
+from lab.bed.processes import Event, Process, eventually
 from tests.interop.modules import Module
+from tests.interop.ros import Ros
 
 
 def worker(module: Module, kind: str = "rospy", service: str = "/work", *, quiet: bool = False) -> Process:
@@ -27,3 +28,13 @@ def calls(client: Process, line: str, timeout: float = 20.0) -> Event:
     since = client.mark_events()
     client.tell(line)
     return client.wait_event("done", timeout, since=since)
+
+
+def wait_services(ros: Ros, *services: str, there: bool = True) -> None:
+    """Wait until the stock tools list services, or do not."""
+
+    def seen() -> bool:
+        listed = set(ros.tool("rosservice", "list").split())
+        return listed >= set(services) if there else not listed & set(services)
+
+    eventually(seen, what=f"{services} {'in' if there else 'out of'} {ros.host.name}")

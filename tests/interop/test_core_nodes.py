@@ -13,8 +13,9 @@ from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.node.service_client import probe
 from rmpa.ros.wire.slave_api import BusLink, read_bus_info
 from rmpa.ros.wire.tcpros import parse_service_uri
-from tests.interop.conftest import ShellFactory, until
+from tests.interop.conftest import ShellFactory
 from tests.interop.ros import Ros
+from tests.waiting import until
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
 DEADLINE: Final = 90.0

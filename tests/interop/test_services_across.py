@@ -16,7 +16,7 @@ from rmpa.ros.node.node import Node
 from rmpa.ros.types.installed import ServiceType
 from tests.interop.conftest import ModuleFactory, ShellFactory
 from tests.interop.ros import PYTHON, Ros
-from tests.interop.services import caller, calls, worker
+from tests.interop.services import caller, calls, wait_services, worker
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 CLIENTS = ["rospy", "roscpp"]
@@ -33,14 +33,6 @@ service = rospy.Service("/arm/switch", SetBool, switch)
 print("up", flush=True)
 rospy.spin()
 """
-
-
-def _wait_services(ros: Ros, *services: str, there: bool = True) -> None:
-    def seen() -> bool:
-        listed = set(ros.tool("rosservice", "list").split())
-        return listed >= set(services) if there else not listed & set(services)
-
-    eventually(seen, what=f"{services} {'in' if there else 'out of'} {ros.host.name}")
 
 
 @pytest.mark.netns
@@ -81,13 +73,13 @@ def test_a_server_that_is_killed_in_the_middle_of_a_call(modules: ModuleFactory)
     assert "in the middle of the call" in str(done["errors"])
     assert time.monotonic() - began < 20.0, "long before the call's time-out of 60 s"
     server.wait()
-    _wait_services(b.ros, "/work", there=False)
+    wait_services(b.ros, "/work", there=False)
     assert "unavailable" in str(calls(client, "echo 0 10 1 once")["errors"])  # rospy's own words
     other = caller(b, "roscpp", "/steady")
     assert calls(other, "echo 0 10 3 persistent")["same"] == 3
     assert steady.returncode is None
     worker(a, "roscpp", "/work")  # another process, and another library
-    _wait_services(b.ros, "/work")
+    wait_services(b.ros, "/work")
     assert calls(client, "echo 0 10 2 persistent")["same"] == 2
 
 
@@ -117,7 +109,7 @@ def test_a_lost_link_fails_calls_and_its_return_restores_services(modules: Modul
     a.host.outage(1.2)
     b.agent.process.wait_for("link down: a was silent")
     b.agent.wait_peer(a.name)
-    _wait_services(b.ros, "/work")
+    wait_services(b.ros, "/work")
     assert calls(client, "echo 0 10 2 once")["same"] == 2
     client.tell("sleep 15 10 1 once")
     server.wait_event("call", where=lambda event: event["op"] == "sleep")
@@ -127,7 +119,7 @@ def test_a_lost_link_fails_calls_and_its_return_restores_services(modules: Modul
     assert done["ok"] == 0
     assert "/work" in str(done["errors"])
     assert time.monotonic() - began < 8.0
-    _wait_services(b.ros, "/work", there=False)
+    wait_services(b.ros, "/work", there=False)
 
 
 @pytest.mark.netns
@@ -140,7 +132,7 @@ def test_the_stock_tools_say_what_they_say_under_one_roscore(
     answers: list[dict[str, str]] = []
     for here, there in ((alone, alone), (a.ros, b.ros)):
         here.start(PYTHON, "-c", _SWITCH).wait_for("up")
-        _wait_services(there, "/arm/switch")
+        wait_services(there, "/arm/switch")
         said = {
             word: there.tool("rosservice", word, "/arm/switch") for word in ("type", "info", "uri", "node", "args")
         }
@@ -173,7 +165,7 @@ def test_whose_service_is_shown_and_which_stay_home(modules: ModuleFactory) -> N
     a, b, c = modules("a", "b", "c", config=config)
     worker(a, "rospy", "/work")
     worker(a, "rospy", "/secret")
-    _wait_services(c.ros, "/work")
+    wait_services(c.ros, "/work")
     second = worker(b, "rospy", "/work")  # b has its own now, and keeps it
     assert b.ros.tool("rosservice", "node", "/work").strip() == "/worker_work"
     client = caller(c, "rospy", "/work")
@@ -184,7 +176,7 @@ def test_whose_service_is_shown_and_which_stay_home(modules: ModuleFactory) -> N
     )
     assert calls(client, "echo 0 10 1 once")["same"] == 1
     second.interrupt()
-    _wait_services(c.ros, "/work", there=False)
+    wait_services(c.ros, "/work", there=False)
     assert "/secret" not in c.ros.tool("rosservice", "list")
     assert "get_loggers" not in "".join(
         line for line in c.ros.tool("rosservice", "list").splitlines() if "worker" in line

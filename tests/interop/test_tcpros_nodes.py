@@ -19,9 +19,10 @@ from rmpa.ros.node.publication import AcceptedConnection, Publication, Publicati
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import frame_message
-from tests.interop.conftest import framed, until
+from tests.interop.conftest import framed
 from tests.interop.nodes.payload import Pattern
 from tests.interop.ros import PYTHON, Ros
+from tests.waiting import until
 
 pytestmark = pytest.mark.ros
 libraries = pytest.mark.parametrize("library", ["rospy", "roscpp"])

@@ -24,11 +24,12 @@ from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import encode_header, frame_message, subscriber_header
 from tests.bridge.io.proxied import Proxied
-from tests.interop.conftest import AgentFactory, ShellFactory, framed, until
+from tests.interop.conftest import AgentFactory, ShellFactory, framed
 from tests.interop.modules import flows, whole
 from tests.interop.nodes.payload import Pattern
 from tests.interop.ros import PYTHON, Ros
 from tests.ros.node.peers import RawSubscriber
+from tests.waiting import until
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 libraries = pytest.mark.parametrize("library", ["rospy", "roscpp"])

@@ -34,9 +34,10 @@ from rmpa.ros.types.definitions import known_specifications, known_types
 from tests.interop import npm
 from tests.interop.web import PORT, Web
 from tests.ros.types.filled import filled, filled_message
+from tests.waiting import until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Iterator
+    from collections.abc import AsyncIterator, Iterator
     from pathlib import Path
 
     from lab.bed.namespaces import Host, Lab
@@ -82,17 +83,6 @@ def node_of(agent: Agent) -> Node:
 def url(web: Web) -> str:
     """For clients that know only a URL."""
     return f"ws://{web.host}/?token={web.token}"
-
-
-async def until(condition: Callable[[], Any], what: str) -> Any:
-    """Wait until something has happened; return what it is."""
-    try:
-        async with asyncio.timeout(DEADLINE):
-            while not (found := condition()):
-                await asyncio.sleep(0.05)
-    except TimeoutError:
-        raise AssertionError(what) from None
-    return found
 
 
 # --- JavaScript -----------------------------------------------------------------------------------------------------

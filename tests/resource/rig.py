@@ -21,15 +21,6 @@ def bound(attribute: Attribute, **request: Any) -> Bound:
     return QoSRequest(**request).bound(attribute)
 
 
-async def until(true: Callable[[], object], why: str = "it does not come") -> None:
-    try:
-        async with asyncio.timeout(DEADLINE):
-            while not true():
-                await asyncio.sleep(0.01)
-    except TimeoutError:
-        raise AssertionError(why) from None
-
-
 async def listen(node: Node, topic: str, kind: str = TEXT) -> list[Any]:
     """The messages of a topic, which come later."""
     found: list[Any] = []

@@ -23,7 +23,8 @@ from rmpa.resource.runtime import RuntimePart
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import DiagnosticLevel
-from tests.resource.rig import ARRAY, ERROR, OK, WARN, bound, listen, pairs, status, until
+from tests.resource.rig import ARRAY, ERROR, OK, WARN, bound, listen, pairs, status
+from tests.waiting import until
 
 RATE, LATENCY = MEASURED["rate"], MEASURED["latency"]
 ATTRIBUTES = {"rate": RATE, "latency": LATENCY}

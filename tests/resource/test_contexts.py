@@ -23,7 +23,8 @@ from rmpa.resource.resource import Resource
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE
-from tests.resource.rig import ARRAY, DEADLINE, TEXT, listen, until
+from tests.resource.rig import ARRAY, DEADLINE, TEXT, listen
+from tests.waiting import until
 
 
 class Lamp:

@@ -18,7 +18,8 @@ from rmpa.ros.node.endpoints import Subscriber
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import DiagnosticLevel
 from rmpa.ros.types.descriptor import Descriptor
-from tests.resource.rig import OK, STALE, WARN, status, until
+from tests.resource.rig import OK, STALE, WARN, status
+from tests.waiting import until
 
 
 def echo(**options: Any) -> Resource:

@@ -12,7 +12,7 @@ from rmpa.resource.quality import MEASURED
 from rmpa.resource.resource import Resource
 from rmpa.resource.saved import Clients, SavedCoolDown, SavedRequirement, SavedState
 from rmpa.ros.core.embedded import RosCore
-from tests.resource.rig import until
+from tests.waiting import until
 
 NOW = 1_800_000_000_000_000_000
 SECOND = 1_000_000_000

@@ -12,7 +12,7 @@ import pytest
 
 from rmpa.resource.resource import Resource
 from rmpa.resource.tasks import TaskReport, Tasks, restart_delay, stuck_after
-from tests.resource.rig import until
+from tests.waiting import until
 
 
 @pytest.mark.parametrize(

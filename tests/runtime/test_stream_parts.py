@@ -15,6 +15,7 @@ from rmpa.core.errors import LocalProtocolError
 from rmpa.core.outbox import URGENT, Framer, Outbox, QueuedMessage
 from rmpa.mesh.frames import Frame, FrameKind, pack_fragment_header
 from rmpa.runtime.stream import Stream
+from tests import waiting
 from tests.core.outbox_model import Reader, fence, payload, whole
 from tests.runtime.message_streams import STREAMS, close_all
 
@@ -23,10 +24,9 @@ FRAGMENT = limits.FRAGMENT_BYTES
 
 
 async def until(condition: Callable[[], bool], receiver: Receiver | None = None) -> None:
-    async with asyncio.timeout(20):
-        while not condition():
-            assert receiver is None or not receiver.stream.closed, receiver.ends
-            await asyncio.sleep(0.001)
+    """Wait, and say at once if the receiver has ended."""
+    await waiting.until(lambda: condition() or (receiver is not None and receiver.stream.closed))
+    assert condition(), receiver and receiver.ends
 
 
 @pytest.fixture

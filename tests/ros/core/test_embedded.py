@@ -21,7 +21,7 @@ from rmpa.ros.wire.tcpros import TopicDescription, frame_message
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
 from rmpa.runtime.accept import Use
 from tests.ros.core.slaves import Slave
-from tests.ros.node.peers import DEADLINE, until
+from tests.waiting import DEADLINE, until
 
 STRING: Final = "std_msgs/String"
 

@@ -20,7 +20,7 @@ from rmpa.ros.core.liveness import Liveness, Unreachable
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.parameters import GraphChange
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
-from tests.ros.node.peers import DEADLINE, until
+from tests.waiting import DEADLINE, until
 
 # The external core against masters: the embedded one as another program's, and such that do wrong.
 

@@ -29,7 +29,7 @@ from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import NodeRecord
 from rmpa.ros.wire.xmlrpc import XmlRpcValue, response_pieces
 from tests.ros.core.slaves import Slave
-from tests.ros.node.peers import DEADLINE, until
+from tests.waiting import DEADLINE, until
 
 STRING: Final = "std_msgs/String"
 

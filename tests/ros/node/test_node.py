@@ -14,7 +14,8 @@ from rmpa.ros.node.endpoints import NODE_UNREGISTER_AT_ONCE
 from rmpa.ros.node.node import Node, Received
 from rmpa.ros.types.definitions import DefinitionError
 from rmpa.ros.types.messages import MessageError, MessageType
-from tests.ros.node.peers import DEADLINE, STRING, node, until
+from tests.ros.node.peers import STRING, node
+from tests.waiting import DEADLINE, until
 
 
 async def test_messages_go_from_one_node_to_another(core: RosCore) -> None:

@@ -25,9 +25,10 @@ from rmpa.ros.types.definitions import DefinitionError, UnknownTypeError
 from rmpa.ros.types.installed import ServiceType, packages_below
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import TopicDescription
-from tests.ros.node.peers import DEADLINE, node, until
+from tests.ros.node.peers import node
 from tests.ros.types import workspaces
 from tests.ros.types.workspaces import package
+from tests.waiting import DEADLINE, until
 
 
 async def test_a_rate_does_not_drift_and_leaves_out_what_is_past(core: RosCore) -> None:

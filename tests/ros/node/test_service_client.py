@@ -12,8 +12,9 @@ from rmpa.ros.node import service_client as module
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed, probe
 from rmpa.ros.wire.tcpros import ServiceDescription, encode_header, error_header, server_header
 from rmpa.runtime import limits
-from tests.ros.node.peers import DEADLINE, RawServer, RawSubscriber, until
+from tests.ros.node.peers import RawServer, RawSubscriber
 from tests.runtime.descriptors_left import descriptors_left
+from tests.waiting import DEADLINE, until
 
 MD5 = "6a2e34150c00229791cc89ff309fff21"
 ADD = ServiceDescription("rospy_tutorials/AddTwoInts", MD5)

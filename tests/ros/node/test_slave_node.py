@@ -16,7 +16,8 @@ from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.wire.slave_api import METHODS, BusConnection
 from rmpa.ros.wire.tcpros import TopicDescription
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue
-from tests.ros.node.peers import STRING, RawSubscriber, until
+from tests.ros.node.peers import STRING, RawSubscriber
+from tests.waiting import until
 
 
 @pytest.fixture

@@ -13,7 +13,8 @@ from rmpa.core import limits as core_limits
 from rmpa.ros import limits
 from rmpa.ros.node.subscription import PartsTaker, PublisherConnection, Subscription
 from rmpa.ros.wire.tcpros import TopicDescription, encode_header, frame_message, publisher_header
-from tests.ros.node.peers import MD5, STRING, RawPublisher, RawServer, until
+from tests.ros.node.peers import MD5, STRING, RawPublisher, RawServer
+from tests.waiting import until
 
 
 @pytest.fixture(autouse=True)

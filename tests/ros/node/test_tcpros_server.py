@@ -24,7 +24,8 @@ from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import encode_header, frame_message
 from rmpa.ros.wire.xmlrpc import XmlRpcValue
 from rmpa.runtime.accept import Acceptor
-from tests.ros.node.peers import STRING, RawSubscriber, until
+from tests.ros.node.peers import STRING, RawSubscriber
+from tests.waiting import until
 
 
 class Served:

@@ -11,7 +11,7 @@ import pytest
 from lab.bed.chromium import Chromium
 from rmpa.web.hub.node_link import Rights
 from rmpa.web.monitor import limits
-from tests.ros.node.peers import until
+from tests.waiting import until
 from tests.web.browser.conftest import Site
 
 AXE = Path(__file__).with_name("vendor") / "axe.min.js"

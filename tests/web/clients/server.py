@@ -17,7 +17,7 @@ from rmpa.web.clients.clients import MONITOR_PATH, WebSocketClients
 from rmpa.web.hub.node_link import FULL, Rights
 from rmpa.web.monitor.monitor import Monitor
 from rmpa.web.server.agent_watch import AgentWatch
-from tests.ros.node.peers import DEADLINE
+from tests.waiting import DEADLINE
 from tests.web.hub.client import running_hub
 
 

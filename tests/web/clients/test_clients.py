@@ -20,7 +20,8 @@ from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
 from rmpa.web.hub.node_link import FULL
 from rmpa.web.server.process import CertificateFiles, tls_context
-from tests.ros.node.peers import STRING, until
+from tests.ros.node.peers import STRING
+from tests.waiting import until
 from tests.web.clients.server import Client, running_server
 from tests.web.hub.client import listen, subscribed
 

@@ -19,7 +19,7 @@ from rmpa.web import limits
 from rmpa.web.clients.connection import CommandAge, MessageArrival, Session
 from rmpa.web.clients.frame_writer import FairQueue, FrameWriter, MaskCheck, Opcode, frame_header
 from rmpa.web.hub.node_link import READ_ONLY
-from tests.ros.node.peers import DEADLINE, until
+from tests.waiting import DEADLINE, until
 
 # 4 MB, in which a part that is left out or twice would show.
 PAYLOAD = bytes(range(251)) * 16_000

@@ -29,7 +29,7 @@ from rmpa.web.hub.node_link import FULL, READ_ONLY, Rights
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.server.agent_watch import AgentWatch
-from tests.ros.node.peers import DEADLINE, until
+from tests.waiting import DEADLINE, until
 from tests.web.clients.server import running_server
 from tests.web.hub.client import node
 from tests.web.monitor.patches import apply

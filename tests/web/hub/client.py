@@ -14,7 +14,7 @@ from rmpa.ros.node.node import Node
 from rmpa.web.hub.hub import Hub, HubClient
 from rmpa.web.hub.node_link import EVERYTHING, FULL, NodeRules, Rights
 from rmpa.web.hub.topics import ClientPublication, ReceivedMessage
-from tests.ros.node.peers import until
+from tests.waiting import until
 
 _names = itertools.count(1)
 

@@ -19,7 +19,8 @@ from rmpa.ros.types.messages import MessageType
 from rmpa.web import limits
 from rmpa.web.hub.hub import Hub
 from rmpa.web.hub.node_link import CONTROL_REMEDY, READ_ONLY, READ_REMEDY
-from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
+from tests.ros.node.peers import LATCHED, STRING
+from tests.waiting import DEADLINE, until
 from tests.web.hub.client import FakeClient, listen, node, running_hub
 
 ONE, TWO = b"\x03\0\0\0one", b"\x03\0\0\0two"

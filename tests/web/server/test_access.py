@@ -37,7 +37,7 @@ from rmpa.web.server.access import (
     token_from,
 )
 from rmpa.web.server.process import access_of, url_of
-from tests.ros.node.peers import DEADLINE
+from tests.waiting import DEADLINE
 from tests.web.hub.client import node
 from tests.web.server.test_upgrades import running
 

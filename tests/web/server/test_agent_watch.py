@@ -26,7 +26,8 @@ from rmpa.trust.permissions import TrustStatus
 from rmpa.web import limits
 from rmpa.web.hub.hub import Hub
 from rmpa.web.server.agent_watch import AgentFollower, AgentWatch, ControlReader
-from tests.ros.node.peers import DEADLINE, LATCHED, until
+from tests.ros.node.peers import LATCHED
+from tests.waiting import DEADLINE, until
 from tests.web.hub.client import local_core, node
 from tests.web.snapshots import FULL
 

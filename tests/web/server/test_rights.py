@@ -33,7 +33,7 @@ from rmpa.web.monitor.monitor import LogFeed
 from rmpa.web.monitor.questions import Answers
 from rmpa.web.monitor.resources import MessageValues, ResourceWatch
 from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup
-from tests.ros.node.peers import DEADLINE, until
+from tests.waiting import DEADLINE, until
 from tests.web import snapshots
 from tests.web.hub.client import FakeClient, running_hub
 from tests.web.server.test_upgrades import running

@@ -24,7 +24,7 @@ from rmpa.web.server.access import AccessPolicy, own_names
 from rmpa.web.server.agent_watch import AgentWatch
 from rmpa.web.server.app import WebServer
 from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup, make_hub, priority_of
-from tests.ros.node.peers import DEADLINE, until
+from tests.waiting import DEADLINE, until
 from tests.web.hub.client import local_core
 from tests.web.snapshots import FULL as SNAPSHOT
 

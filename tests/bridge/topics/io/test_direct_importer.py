@@ -19,7 +19,7 @@ from rmpa.core.contract import Contracts, Transport
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.core.statistics import Counters
 from rmpa.ros.wire.xmlrpc import RosReply
-from tests.ros.node.peers import until
+from tests.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
