@@ -9,7 +9,6 @@ import json
 import socket
 import ssl
 import threading
-from typing import TYPE_CHECKING
 from unittest import mock
 from urllib.parse import urlsplit
 
@@ -17,15 +16,12 @@ import pytest
 
 pytest.importorskip("cryptography")
 
+from collections.abc import Callable
+from pathlib import Path
+
 from rmpa.discovery.network import list_interfaces
 from rmpa.trust.permissions import host_names, page_hosts
-from tests.cli.conftest import DEADLINE, free_port, until
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from tests.cli.conftest import Machine
+from tests.cli.conftest import DEADLINE, Machine, free_port, until
 
 RULES = """
 [[permission]]

@@ -7,8 +7,9 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import click
 import pytest
 from click.testing import CliRunner
 
@@ -21,9 +22,6 @@ from rmpa.config.settings import SETTINGS, TABLES, json_schema, json_value, sche
 from rmpa.config.values import Multicast
 from rmpa.core.errors import ConfigError
 from tests.core.example import EXAMPLE, uncommented
-
-if TYPE_CHECKING:
-    import click
 
 # Options of ``rmpa up`` about what a gateway has not: a core of its nodes, a page.
 NOT_OF_A_GATEWAY = {"--core", "--master", "--keep", "--web", "--no-web"}

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
 
 import pytest
 
@@ -19,11 +21,6 @@ from tests.examples.test_demo import (
     summary_of,
     wait_for_view,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-    from typing import Any
 
 pytest.importorskip("zenoh", reason="the libraries of rmpa[zenoh] are not installed")
 pytest.importorskip("xxhash", reason="the libraries of rmpa[zenoh] are not installed")

@@ -10,7 +10,9 @@ import re
 import socket
 import sys
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,10 +20,6 @@ from lab.bed.processes import Process
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from tests.examples.test_demo import DEMO, all_linked, flows, views, wait_for_view
 from tests.web.monitor.patches import apply
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 aiohttp = pytest.importorskip("aiohttp", reason="the libraries of rmpa[web] are not installed")
 DEADLINE = 30.0

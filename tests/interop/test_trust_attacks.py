@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import functools
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
 pytest.importorskip("cryptography")
 
-from lab.bed.processes import eventually
+from pathlib import Path
+
+from lab.bed.agents import Agent
+from lab.bed.namespaces import Lab
+from lab.bed.processes import Event, eventually
 from rmpa.discovery.limits import STRANGERS_SHOWN
-from rmpa.trust.store import CERTIFICATE, KEY
+from rmpa.trust.store import CERTIFICATE, KEY, TrustStore
+from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 from tests.interop.modules import Module, flows
 from tests.interop.secured import (
     GROUP,
@@ -25,15 +30,6 @@ from tests.interop.secured import (
     place,
     start_attack,
 )
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from lab.bed.agents import Agent
-    from lab.bed.namespaces import Lab
-    from lab.bed.processes import Event
-    from rmpa.trust.store import TrustStore
-    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
 

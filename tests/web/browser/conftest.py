@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator, Iterator
 
 import pytest
 from aiohttp import web
 
 from lab.bed.chromium import BINARY, Browser, Chromium, running_browser
 from tests.web.monitor.fake_server import FakeServer
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
 
 
 class Site:
