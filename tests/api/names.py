@@ -5,15 +5,13 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
+from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from types import ModuleType
+from typing import Final
 
 import msgspec
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from types import ModuleType
 
 MODULES: Final = ("rmpa", "rmpa.client", "rmpa.resource")
 # What ``with``, ``async with`` and ``async for`` call.

@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import itertools
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import pytest
@@ -17,9 +18,6 @@ from rmpa.core.facts import RouteInfo
 from rmpa.observe.control_server import ControlServer
 from rmpa.observe.graph import GraphRevision
 from tests.observe.samples import SNAPSHOT
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 DEADLINE = 20.0
 PEER = next(peer for peer in SNAPSHOT.peers if peer.state == "linked")

@@ -10,8 +10,9 @@ import subprocess
 import sys
 import textwrap
 import threading
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -19,9 +20,6 @@ import rmpa
 from rmpa import sync
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.http.rpc import call_api
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 DEADLINE = 30.0
 

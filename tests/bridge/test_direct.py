@@ -38,8 +38,9 @@ from rmpa.ros.wire.xmlrpc import RosReply
 from rmpa.runtime import kernel_tcp
 from rmpa.runtime.kernel_tcp import connections, may_end_connections
 from rmpa.trust.permissions import Permissions
-from tests.ros.node.peers import STRING, until
+from tests.ros.node.peers import STRING
 from tests.runtime.capabilities import NET_ADMIN, without
+from tests.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable

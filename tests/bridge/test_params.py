@@ -28,7 +28,7 @@ from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.parameters import leaves
 from rmpa.trust.permissions import Permissions
 from tests.bridge.services.test_calls import Wire
-from tests.ros.node.peers import until
+from tests.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

@@ -15,11 +15,12 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from types import TracebackType
+from typing import Any, TypeVar
 from unittest import mock
 
 import msgspec
@@ -32,10 +33,6 @@ from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node
 from tests.observe.samples import SNAPSHOT
-
-if TYPE_CHECKING:
-    from collections.abc import Coroutine, Iterator
-    from types import TracebackType
 
 DEADLINE = 30.0
 GOLDEN = Path(__file__).with_name("golden")

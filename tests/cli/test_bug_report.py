@@ -9,7 +9,8 @@ import socket
 import sys
 import tarfile
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -18,13 +19,8 @@ from rmpa.cli import bug_report
 from rmpa.cli.main import main
 from rmpa.cli.redact import Redactor, is_secret, without_passwords
 from rmpa.runtime.interpreter import own_command
+from tests.cli.conftest import Place
 from tests.observe.samples import SNAPSHOT
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-    from pathlib import Path
-
-    from tests.cli.conftest import Place
 
 JOIN = "rmpa1-" + "abcdefghijklmnop234567" * 4
 PEM = "-----BEGIN PRIVATE KEY-----\nMIIEvQIBADANBgkq\nhkiG9w0BAQEFAASC\n-----END PRIVATE KEY-----"

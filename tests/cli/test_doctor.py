@@ -8,7 +8,7 @@ import pty
 import socket
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import pytest
 
@@ -16,11 +16,7 @@ from rmpa.cli.doctor import _run
 from rmpa.observe import limits
 from rmpa.observe.doctor.checks import CHECKS
 from rmpa.observe.doctor.repairs import Repair
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from tests.cli.conftest import Place
+from tests.cli.conftest import Place
 
 
 @pytest.fixture

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from rmpa.cli.gateway import load_gateway
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from rmpa.config.settings import Settings
-    from tests.cli.conftest import Place
+from rmpa.config.settings import Settings
+from tests.cli.conftest import Place
 
 SITE = ("gateway", "--site", "warehouse")
 

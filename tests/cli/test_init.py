@@ -8,8 +8,10 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from ipaddress import IPv4Interface
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
@@ -18,18 +20,12 @@ from rmpa.cli.init import Finding, file_text
 from rmpa.cli.init import _interfaces as of_interfaces
 from rmpa.cli.units import config_text
 from rmpa.config.read import load_settings
+from rmpa.config.settings import Settings
 from rmpa.core.identity import peer_name_from
 from rmpa.discovery.network import Interface
 from rmpa.observe import limits
-from tests.cli.conftest import end, free_port, until, with_core
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from rmpa.config.settings import Settings
-    from rmpa.ros.core.embedded import RosCore
-    from tests.cli.conftest import Place
+from rmpa.ros.core.embedded import RosCore
+from tests.cli.conftest import Place, end, free_port, until, with_core
 
 LO = Interface("lo", (IPv4Interface("127.0.0.1/8"),), loopback=True)
 WLAN = Interface("wlan0", (IPv4Interface("192.168.1.5/24"),))

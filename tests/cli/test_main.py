@@ -10,7 +10,7 @@ import re
 import subprocess
 import sys
 import threading
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
 
 import click
 import pytest
@@ -22,13 +22,8 @@ from lab.bed.processes import eventually
 from rmpa.cli import completion
 from rmpa.cli.main import _DECLARED, MEANT, REMOVED_VERBS, VERBS, LazyGroup, cli, main
 from rmpa.core import codes
-from tests.cli.conftest import DEADLINE, with_core
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from rmpa.ros.core.embedded import RosCore
-    from tests.cli.conftest import Place
+from rmpa.ros.core.embedded import RosCore
+from tests.cli.conftest import DEADLINE, Place, with_core
 
 
 def commands(group: LazyGroup, path: str = "rmpa") -> list[tuple[str, str, click.Command]]:
@@ -58,6 +53,7 @@ def test_each_command_has_help_and_each_of_a_graph_has_json() -> None:
 
 
 WORDS = {"values": "{}", "value": "1"}
+# These need neither an agent nor a master.
 QUIET = {
     "rmpa explain",
     "rmpa config show",
@@ -68,7 +64,6 @@ QUIET = {
     "rmpa trust status",
     "rmpa web",
 }
-"""These need neither an agent nor a master."""
 
 
 def test_an_error_is_json_too(place: Place) -> None:

@@ -7,7 +7,7 @@ import pty
 import re
 import subprocess
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import pytest
@@ -17,11 +17,8 @@ from rmpa.config.settings import Settings, WebSettings
 from rmpa.config.values import Multicast
 from rmpa.ros.environment import DEFAULT_MASTER_URI
 from rmpa.trust.permissions import TrustStatus
-from tests.cli.conftest import DEADLINE, free_port
+from tests.cli.conftest import DEADLINE, Place, free_port
 from tests.observe.samples import SNAPSHOT
-
-if TYPE_CHECKING:
-    from tests.cli.conftest import Place
 
 JOYSTICK, PC = SNAPSHOT.peers
 CORE = SNAPSHOT.agent.core_uri.rstrip("/")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import msgspec
 import pytest
@@ -12,15 +13,10 @@ import pytest
 from rmpa.cli.node import _untold
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.core.facts import UnreachableInfo
+from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import NodeFacts, NodeLine, NodePing, PeerNodes
-from tests.cli.conftest import compare, settled, with_core
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.node import Node
-    from tests.cli.conftest import Background, Place, Rmpa
+from rmpa.ros.node.node import Node
+from tests.cli.conftest import Background, Place, Rmpa, compare, settled, with_core
 
 GROUP = ("node",)
 JOY = "http://10.0.0.2:1/"

@@ -9,7 +9,6 @@ import json
 import socket
 import ssl
 import threading
-from typing import TYPE_CHECKING
 from unittest import mock
 from urllib.parse import urlsplit
 
@@ -17,15 +16,12 @@ import pytest
 
 pytest.importorskip("cryptography")
 
+from collections.abc import Callable
+from pathlib import Path
+
 from rmpa.discovery.network import list_interfaces
 from rmpa.trust.permissions import host_names, page_hosts
-from tests.cli.conftest import DEADLINE, free_port, until
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from tests.cli.conftest import Machine
+from tests.cli.conftest import DEADLINE, Machine, free_port, until
 
 RULES = """
 [[permission]]
@@ -106,8 +102,10 @@ def test_an_authority_in_a_state_directory_of_its_own_is_not_forgotten(machine: 
     assert f"start with RMPA_STATE_DIR={data} --name sec;" in machine.says("up", "--name", "sec", code=1)
 
 
-@pytest.mark.parametrize("variable", ["RMPA_STATE_DIR", "XDG_STATE_HOME", "HOME"])
-@pytest.mark.parametrize("joined_with_it", [True, False])
+@pytest.mark.parametrize(
+    ("variable", "joined_with_it"),
+    [("RMPA_STATE_DIR", True), ("RMPA_STATE_DIR", False), ("XDG_STATE_HOME", True), ("HOME", False)],
+)
 def test_no_variable_makes_a_start_miss_the_keys_of_this_user(
     machine: Machine, variable: str, joined_with_it: bool
 ) -> None:

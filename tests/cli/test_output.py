@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import click
 import msgspec
@@ -18,12 +18,8 @@ from rmpa.core import errors
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.core.facts import RouteInfo
 from rmpa.core.log import _Formatter
+from rmpa.ros.types.messages import Plain
 from tests.observe.samples import DIRECT
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from rmpa.ros.types.messages import Plain
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -14,15 +15,9 @@ from rmpa.bridge import limits
 from rmpa.bridge.params import transfer
 from rmpa.cli.param import read_documents, read_yaml, write_yaml
 from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
-from tests.cli.conftest import compare, settled
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from typing import Any
-
-    from rmpa.ros.core.embedded import RosCore
-    from tests.cli.conftest import Place
+from tests.cli.conftest import Place, compare, settled
 
 
 def test_the_verbs(place: Place, core: RosCore) -> None:

@@ -5,21 +5,18 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import msgspec
+import pytest
 
 from rmpa.cli import peer
 from rmpa.cli.options import Selection, summary
 from rmpa.core.errors import RmpaError
 from rmpa.observe.snapshot import ModuleFacts, read_facts, reading
+from tests.cli.conftest import Place
 from tests.cli.test_pictures import refuse
 from tests.observe.samples import SNAPSHOT
-
-if TYPE_CHECKING:
-    import pytest
-
-    from tests.cli.conftest import Place
 
 Agent = Callable[..., None]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import re
 import sys
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Callable
+from typing import Any, Final
 
 import pytest
 from msgspec.structs import replace
@@ -19,17 +20,12 @@ from rmpa.observe.peers import judge_refusal
 from rmpa.observe.sites import SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.snapshot import PeerInfo, PingReply
 from rmpa.observe.why.diagnosis import Diagnosis
+from rmpa.ros.core.embedded import RosCore
 from rmpa.trust.permissions import TrustReason
-from tests.cli.conftest import compare, with_core
+from tests.cli.conftest import Place, compare, with_core
 from tests.cli.test_resource import remote, run, running
 from tests.observe.samples import SNAPSHOT
 from tests.observe.why import test_topics
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rmpa.ros.core.embedded import RosCore
-    from tests.cli.conftest import Place
 
 __all__ = ["remote", "run", "running"]  # fixtures
 FOLLOWED: Final = (
@@ -159,6 +155,7 @@ FLOWS: Final = stages(Check("contract", CheckLevel.WARN, "3 lost", "`rmpa topic 
 STOPS: Final = stages(
     Check("publisher", CheckLevel.FAIL, "no node of joystick\x1b[2J publishes /cmd", "start it"), name="/cmd"
 )
+# By name: what the agent shows and answers, and what is asked then.
 KINDS: Final[dict[str, tuple[dict[str, Any], tuple[str, ...]]]] = {
     "peers": (
         {"ping": lambda args: PingReply(times=(0.0004,), remote=args["peer"])},  # by GUID: names may be equal
@@ -241,7 +238,6 @@ KINDS: Final[dict[str, tuple[dict[str, Any], tuple[str, ...]]]] = {
         ("site info warehouse --json",),
     ),
 }
-"""By name: what the agent shows and answers, and what is asked then."""
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -7,22 +7,17 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import aiohttp
 import pytest
 
+from rmpa.observe.check import Check
 from rmpa.observe.doctor.checks import examine
 from rmpa.runtime import plugins
-from tests.cli.conftest import DEADLINE, free_port
+from tests.cli.conftest import DEADLINE, Place, free_port
 from tests.cli.test_web import running
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from rmpa.observe.check import Check
-    from tests.cli.conftest import Place
 
 HELLO = Path(__file__).parents[2] / "examples/hello"
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 
@@ -16,14 +17,10 @@ from rmpa.resource.quality import at_least, at_most
 from rmpa.resource.reconfigure import read_config
 from rmpa.resource.resource import Resource
 from rmpa.resource.runtime import describe
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.node import Node
+from tests.cli.conftest import Background, Rmpa
 from tests.resource.test_node import echo
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.node import Node
-    from tests.cli.conftest import Background, Rmpa
 
 GROUP = ()
 ARRAY = "diagnostic_msgs/DiagnosticArray"

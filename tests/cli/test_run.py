@@ -6,7 +6,8 @@ import json
 import os
 import signal
 import sys
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import psutil
 import pytest
@@ -15,13 +16,8 @@ from lab.bed.processes import Process, eventually
 from rmpa.cli.run import _module_name, prepared
 from rmpa.config.module_name import keep_name
 from rmpa.core.errors import ConfigError
+from tests.cli.conftest import Place
 from tests.interop.ros import free_port
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from tests.cli.conftest import Place
 
 pytestmark = pytest.mark.timeout(120)
 HEAD = """\
@@ -230,16 +226,6 @@ def test_a_thread_that_hangs_does_not_keep_it_from_its_end(ground: Ground) -> No
     assert run.interrupt() == 1  # the interpreter would wait for the user's own thread for ever
     assert "! of mine does not return; the program ends without it" in run.output
     assert not agent.is_running()
-
-
-def test_a_profile_that_hangs_ends_it_in_order(ground: Ground) -> None:
-    hangs = "def plain():\n    time.sleep(1000)\nnose.adaptation(apply_timeout='200 ms')\n"
-    run = ground.run(HEAD.replace("def plain(): pass\n", hangs) + TALK)
-    assert run.wait() == 1
-    assert (
-        "rmpa: the function of profile plain has not returned within 0.2 s; the resource ends; mend it" in run.output
-    )
-    assert not list(ground.place.path.glob("**/nose.sock"))
 
 
 def test_told_twice_it_ends_at_once(ground: Ground) -> None:

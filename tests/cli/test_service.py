@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -10,16 +12,10 @@ import pytest
 from rmpa.core.errors import RmpaError
 from rmpa.core.facts import ServiceInfo
 from rmpa.core.statistics import SampleSpread
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.node import Node
 from rmpa.ros.types.installed import ServiceType
-from tests.cli.conftest import compare, settled, with_core
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.node import Node
-    from tests.cli.conftest import Background, Place, Rmpa
+from tests.cli.conftest import Background, Place, Rmpa, compare, settled, with_core
 
 GROUP = ("service",)
 

@@ -6,25 +6,21 @@ import asyncio
 import json
 import re
 import signal
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
 
 from rmpa.cli.topic import route_line
 from rmpa.core.facts import RouteInfo
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.endpoints import Publisher
+from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
-from tests.cli.conftest import compare, settled, with_core
+from tests.cli.conftest import Background, Place, Rmpa, compare, settled, with_core
 from tests.ros.types.workspaces import package
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.endpoints import Publisher
-    from rmpa.ros.node.node import Node
-    from tests.cli.conftest import Background, Place, Rmpa
 
 GROUP = ("topic",)
 NO_HEADER = "rmpa: std_msgs/String has no header, so it has no stamp to measure its age by [invalid-value]\n"

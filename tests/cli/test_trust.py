@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import pytest
 
@@ -11,18 +11,13 @@ from rmpa.bridge.policy import PermissionGate
 from rmpa.cli import trust
 from rmpa.config.peer_rules import Access
 from rmpa.config.read import load_settings
+from rmpa.config.settings import Settings
 from rmpa.core.errors import PeerRefused, StartError
 from rmpa.gateway.rules import CrossingRules, ForeignSource, SourceKind
 from rmpa.trust.permissions import Permissions
 from rmpa.trust.store import TrustStore
 from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup
-from tests.cli.conftest import compare
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rmpa.config.settings import Settings
-    from tests.cli.conftest import Place
+from tests.cli.conftest import Place, compare
 
 FILE = """
 [trust.groups]

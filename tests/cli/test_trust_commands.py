@@ -6,19 +6,15 @@ import json
 import re
 import signal
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
 pytest.importorskip("cryptography")
 
-from tests.cli.conftest import DEADLINE, until
+import subprocess
+from collections.abc import Callable
 
-if TYPE_CHECKING:
-    import subprocess
-    from collections.abc import Callable
-
-    from tests.cli.conftest import Machine
+from tests.cli.conftest import DEADLINE, Machine, until
 
 
 def peers(machine: Machine) -> dict[str, str]:

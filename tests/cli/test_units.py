@@ -7,19 +7,15 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 from rmpa.cli.units import CONFIG, config_text, realtime_text, unit_texts
 from rmpa.config.settings import SETTINGS
+from tests.cli.conftest import Machine
 from tests.core.example import EXAMPLE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from tests.cli.conftest import Machine
 
 # Of `systemd-analyze security`, in tenths; 0 is best. docs/guides/running.md#at-boot says what makes it up.
 _EXPOSURE = {"rmpa.service": 20, "rmpa-web.service": 20, "rmpa-gateway.service": 20}

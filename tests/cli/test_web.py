@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import http.client
 import json
-import os
 import signal
 import socket
+import subprocess
 import sys
 import urllib.error
 import urllib.request
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from tests.cli.conftest import DEADLINE, free_port, until
+import pytest
 
-if TYPE_CHECKING:
-    import subprocess
-    from collections.abc import Callable, Iterator
-
-    import pytest
-
-    from tests.cli.conftest import Machine, Place
+from tests.cli.conftest import DEADLINE, Machine, Place, free_port, until
 
 
 def get(port: int, path: str, token: str = "") -> tuple[int, str]:
@@ -70,19 +64,6 @@ def test_it_waits_for_an_agent_and_survives_its_end(place: Place) -> None:
         with running(place, *agent_options()):
             until(lambda: get(port, "/healthz")[0] == 200)
     assert web.returncode == 0
-
-
-def test_up_web_starts_it_again_and_ends_it(place: Place) -> None:
-    port = free_port()
-    place.environ["RMPA_WEB_PORT"] = str(port)
-    with running(place, *agent_options("--web")) as agent:
-        until(lambda: get(port, "/healthz")[0] == 200)
-        first = child_of(agent.pid)
-        os.kill(first, signal.SIGKILL)
-        until(lambda: get(port, "/healthz")[0] == 200)
-        assert child_of(agent.pid) != first
-    assert agent.returncode == 0
-    assert get(port, "/healthz")[0] == 0
 
 
 def test_it_outlives_an_agent_that_is_killed_and_the_next_one_takes_it_over(

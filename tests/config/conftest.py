@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from rmpa.config.read import Loaded, load_settings
 from rmpa.core.errors import ConfigError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 Load = Callable[..., Loaded]
 Refuse = Callable[..., str]

@@ -6,7 +6,6 @@ import math
 import re
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given
@@ -29,10 +28,8 @@ from rmpa.core.contract import (
     Reliability,
     Transport,
 )
+from tests.config.conftest import Load, Refuse
 from tests.core.example import EXAMPLE, uncommented
-
-if TYPE_CHECKING:
-    from tests.config.conftest import Load, Refuse
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "guides" / "contracts.md"
 DIRECT = DOCUMENT.with_name("direct-transport.md")

@@ -7,8 +7,9 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import click
 import pytest
 from click.testing import CliRunner
 
@@ -22,19 +23,16 @@ from rmpa.config.values import Multicast
 from rmpa.core.errors import ConfigError
 from tests.core.example import EXAMPLE, uncommented
 
-if TYPE_CHECKING:
-    import click
-
+# Options of ``rmpa up`` about what a gateway has not: a core of its nodes, a page.
 NOT_OF_A_GATEWAY = {"--core", "--master", "--keep", "--web", "--no-web"}
-"""Options of ``rmpa up`` about what a gateway has not: a core of its nodes, a page."""
 DOCS = Path(__file__).parents[2] / "docs"
 SRC = Path(rmpa.__path__[0])
+# Limits of messages between agents of this release, and of what the command line asks: errors of broken programs.
 BETWEEN_AGENTS = re.compile(
     r"""SOCK_DIAG_|DATA_PAYLOAD_|CONTROL_|KEY_|BEACON_|RECONCILE_|TCPROS_MESSAGE_|CLOCK_|DOCUMENT_|ADVERTISEMENT_
     |ASK_BYTES_|DIRECT_BREAKS_|INSTANCE_ID_""",
     re.VERBOSE,
 )
-"""Limits of messages between agents of this release, and of what the command line asks: errors of broken programs."""
 
 
 @pytest.fixture(scope="module")

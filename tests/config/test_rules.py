@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -13,9 +12,7 @@ from rmpa.config.peer_rules import PeerRule, PolicySettings, ServiceRule
 from rmpa.config.rules import Crossing, CrossingRule, FollowRule, GatewaySettings, Ros2Settings, overlap, untouchable
 from rmpa.config.settings import ParamSettings, ServiceSettings, TimeSettings
 from rmpa.core.contract import Transport
-
-if TYPE_CHECKING:
-    from tests.config.conftest import Load, Refuse
+from tests.config.conftest import Load, Refuse
 
 ROOT = Path(__file__).parents[2]
 

@@ -6,25 +6,22 @@ import json
 import tomllib
 from errno import EACCES
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.config import limits
-from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.read import find_config_file, line_of, parse_config
 from rmpa.config.rules import GatewaySettings
-from rmpa.config.settings import SETTINGS, LaneSettings, RealtimeSettings, Settings, TrustSettings, json_value
+from rmpa.config.settings import SETTINGS, RealtimeSettings, Settings, TrustSettings, json_value
 from rmpa.config.values import HostPort, Multicast, did_you_mean
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Transport
 from rmpa.core.errors import ConfigError
+from tests.config.conftest import Load, Refuse
 from tests.core.example import EXAMPLE, uncommented
-
-if TYPE_CHECKING:
-    from tests.config.conftest import Load, Refuse
 
 
 def test_defaults_and_the_host_name_without_any_source(load: Load) -> None:
@@ -236,56 +233,6 @@ def test_what_is_gone_says_what_to_use(load: Load) -> None:
         load("", environ={"RMPA_FRESH": "1"})
 
 
-def test_every_variable(load: Load) -> None:
-    environ = {
-        "RMPA_NAME": "a",
-        "RMPA_DOMAIN": "3",
-        "RMPA_CORE_HOST": "localhost",
-        "RMPA_CORE_PORT": "1",
-        "RMPA_PORT": "2",
-        "RMPA_INTERFACES": "lo, eth0",
-        "RMPA_SEEDS": "h:1;10.0.0.1",
-        "RMPA_MULTICAST": "239.0.0.1",
-        "RMPA_ALLOW": "/a;/b/**",
-        "RMPA_DENY": "/c",
-        "RMPA_ALLOW_TYPES": "std_msgs/*",
-        "RMPA_DENY_TYPES": "std_msgs/Header",
-        "RMPA_EXPRESS_DSCP": "46",
-        "RMPA_EXPRESS_PRIORITY": "5",
-        "RMPA_BULK_DSCP": "8",
-        "RMPA_BULK_PRIORITY": "1",
-        "RMPA_REALTIME": "1",
-        "RMPA_REALTIME_PRIORITY": "80",
-        "RMPA_REALTIME_LOCK_MEMORY": "no",
-        "RMPA_LOG_LEVEL": "WARNING",
-        "RMPA_LOG_JSON": "yes",
-        "RMPA_RUNTIME_DIR": "/run/x",
-        "RMPA_STATE_DIR": "/var/x",
-        "RMPA_KEEP": "always",
-        "RMPA_AGENT": "other",
-    }
-    loaded = load(environ=environ)
-    assert loaded.notes == ()
-    assert loaded.settings == Settings(
-        name="a",
-        domain=3,
-        core_host="localhost",
-        core_port=1,
-        core_keep="always",
-        port=2,
-        interfaces=("lo", "eth0"),
-        seeds=(HostPort("h", 1), HostPort("10.0.0.1")),
-        multicast=Multicast(True, "239.0.0.1"),
-        policy=PolicySettings(("/a", "/b/**"), ("/c",), ("std_msgs/*",), ("std_msgs/Header",)),
-        lanes=LaneSettings(46, 5, 8, 1),
-        realtime=RealtimeSettings(True, 80, False),
-        log_level="warning",
-        log_json=True,
-        runtime_dir="/run/x",
-        state_dir="/var/x",
-    )
-
-
 @pytest.mark.parametrize(
     ("environ", "expected"),
     [
@@ -303,9 +250,16 @@ def test_every_variable(load: Load) -> None:
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"}, Settings(name="base")),
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, Settings(name="base", interfaces=("lo",))),
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "off"}, Settings(name="base", multicast=Multicast(False))),
+        # Ours, in other ways to write them than those of the table above.
+        ({"RMPA_INTERFACES": "lo, eth0"}, Settings(name="base", interfaces=("lo", "eth0"))),
+        ({"RMPA_MULTICAST": "239.0.0.1"}, Settings(name="base", multicast=Multicast(True, "239.0.0.1"))),
+        (
+            {"RMPA_REALTIME": "1", "RMPA_LOG_LEVEL": "WARNING"},
+            Settings(name="base", realtime=RealtimeSettings(True), log_level="warning"),
+        ),
     ],
 )
-def test_the_ros_environment(load: Load, environ: dict[str, str], expected: Settings) -> None:
+def test_the_environment(load: Load, environ: dict[str, str], expected: Settings) -> None:
     loaded = load(environ=environ)
     assert (loaded.settings, loaded.notes) == (expected, ())
 

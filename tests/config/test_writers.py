@@ -5,8 +5,10 @@ from __future__ import annotations
 import grp
 import os
 import pwd
+from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -14,10 +16,6 @@ from rmpa.config.read import INSECURE, load_settings
 from rmpa.config.writers import other_writer
 from rmpa.core.errors import ConfigError
 from rmpa.gateway.ros2.pairs import TypeMapping
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 STRANGER = 12345
 root = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files to another user")

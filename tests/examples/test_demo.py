@@ -11,8 +11,9 @@ import socket
 import sys
 import urllib.error
 import urllib.request
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import psutil
 import pytest
@@ -22,9 +23,6 @@ from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.resource import ResourceClient, at_least, at_most
 from rmpa.ros.node.node import Node
 from stick import AXIS, BUTTON, EVENT
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 ROOT: Final = Path(__file__).parents[2]
 DEMO: Final = ROOT / "examples" / "turtlebot" / "demo.py"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
 
 import pytest
 
@@ -19,11 +21,6 @@ from tests.examples.test_demo import (
     summary_of,
     wait_for_view,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-    from typing import Any
 
 pytest.importorskip("zenoh", reason="the libraries of rmpa[zenoh] are not installed")
 pytest.importorskip("xxhash", reason="the libraries of rmpa[zenoh] are not installed")
@@ -82,23 +79,3 @@ def test_the_robot_in_the_field_is_driven_from_the_office(tidy: dict[str, str]) 
     assert_gone(processes, ports)
     (restart,) = summary_of(demo)["restarts"]
     assert restart["back_after"] > 0
-
-
-@pytest.mark.parametrize("part", ["router", "field_gateway"])
-def test_each_site_goes_on_alone_and_they_meet_again(tidy: dict[str, str], part: str) -> None:
-    with Process(ARGUMENTS, env=tidy, name="demo-sites") as demo:
-        wait_long(demo, all_there, "messages of both sites")
-        assert f"{part} is killed (kill -9 of its process" in command(tidy, "kill", part)
-        apart = wait_long(
-            demo,
-            lambda view: (
-                view["topics"]["/odom"]["rate"] == 0
-                and states(view)["base"] == "gone"
-                and view["topics"]["/command_information"]["rate"] > 0
-            ),
-            "the field away, and the office that goes on",
-        )
-        command(tidy, "start", part)
-        seconds = apart["seconds"]
-        wait_long(demo, lambda view: view["seconds"] > seconds + 1 and all_there(view), "both sites again")
-        assert demo.interrupt() == 0, demo.output

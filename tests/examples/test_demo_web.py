@@ -4,57 +4,32 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
 import json
 import re
 import socket
 import sys
-import time
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
 
 import pytest
 
 from lab.bed.processes import Process
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from tests.examples.test_demo import DEMO, all_linked, flows, views, wait_for_view
-from tests.web.monitor.patches import apply
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
+pytest.importorskip("aiohttp", reason="the libraries of rmpa[web] are not installed")
 
-aiohttp = pytest.importorskip("aiohttp", reason="the libraries of rmpa[web] are not installed")
+import aiohttp
+
+from tests.web.monitor.page import Page
+
 DEADLINE = 30.0
+# Of the Turtlebot, m/s.
 FULL_SPEED = 0.65
-"""Of the Turtlebot, m/s."""
 pytestmark = pytest.mark.timeout(120)
 
 
-class Page:
-    """What the page at the other end of a WebSocket knows."""
-
-    def __init__(self, connection: Any) -> None:
-        self._connection = connection
-        self.hello: dict[str, Any] = {}
-        self.state: Any = {}
-
-    async def until(self, holds: Callable[[], bool]) -> None:
-        """Read, and draw, until something holds."""
-        async with asyncio.timeout(DEADLINE):
-            while not holds():
-                message = await self._connection.receive_json()
-                if message["op"] == "hello":
-                    self.hello = message
-                elif message["op"] in ("state", "patch"):
-                    patched = apply(self.state, message["patch"]) if message["op"] == "patch" else message["state"]
-                    self.state = patched
-                    await self.send(op="ack", n=message["n"])
-
-    async def send(self, **message: object) -> None:
-        await self._connection.send_json(message)
-
-    def modules(self) -> dict[str, str]:
-        return {name: module["state"] for name, module in self.state.get("modules", {}).items()}
+def modules(page: Page) -> dict[str, str]:
+    return {name: module["state"] for name, module in page.state.get("modules", {}).items()}
 
 
 async def test_its_page_shows_the_modules_and_drives_the_robot(tidy: dict[str, str]) -> None:
@@ -73,21 +48,19 @@ async def test_its_page_shows_the_modules_and_drives_the_robot(tidy: dict[str, s
 
 
 async def watch_and_drive(page: Page, demo: Process, env: dict[str, str]) -> None:
-    await page.until(lambda: page.modules() == {"pc": "here", "joystick": "up", "velocity": "up", "base": "up"})
+    await page.sees(lambda: modules(page) == {"pc": "here", "joystick": "up", "velocity": "up", "base": "up"})
     assert page.hello["agent"] == "pc"
     assert set(page.hello["may"]) == {"control", "drive", "view"}
-    await page.until(lambda: "base>pc" in page.state["flows"] and "base:/base" in page.state["resources"])
+    await page.sees(lambda: "base>pc" in page.state["flows"] and "base:/base" in page.state["resources"])
     # Without the module that computes the orders, the joystick of the page gives them.
     with Process([sys.executable, DEMO, "kill", "velocity"], env=env, name="kill velocity") as kill:
         assert await kill.ended() == 0, kill.output
-    await page.until(lambda: page.modules()["velocity"] != "up")
+    await page.sees(lambda: modules(page)["velocity"] != "up")
     async with asyncio.timeout(DEADLINE):
-        numbers = itertools.count(1)
         while views(demo)[-1]["pose"]["speed"] != FULL_SPEED:
-            made = {"hold": 1, "n": next(numbers), "at": time.monotonic()}  # one machine, one clock
-            await page.send(op="drive", topic="/velocity_order", linear=1, angular=0, **made)
+            await page.drive(1.0, topic="/velocity_order")
             await asyncio.sleep(0.1)  # as a held joystick does
-    await page.send(op="release", hold=1)
+    await page.send("release", hold=1)
     stopped = lambda view: view["pose"]["speed"] == 0  # noqa: E731
     await asyncio.to_thread(wait_for_view, demo, stopped, "a stop")
 
@@ -105,24 +78,16 @@ def test_another_port_is_taken_where_8480_is_in_use(tidy: dict[str, str]) -> Non
     assert int(told[1]) != 8480
 
 
-@pytest.mark.parametrize("flags", [(), ("--json",)])
-def test_without_the_extra_it_says_how_to_get_it(
-    tidy: dict[str, str],
-    tmp_path: Path,
-    flags: tuple[str, ...],
-) -> None:
+def test_without_the_extra_it_says_how_to_get_it(tidy: dict[str, str], tmp_path: Path) -> None:
     place = tmp_path / "site"
     place.mkdir()
     (place / "sitecustomize.py").write_text("import sys\nsys.modules['aiohttp'] = None\n", encoding="utf-8")
     env = {**tidy, "PYTHONPATH": str(place)}
-    with Process([sys.executable, DEMO, "--seconds", "0.1", *flags], env=env, name="demo") as demo:
+    with Process([sys.executable, DEMO, "--seconds", "0.1", "--json"], env=env, name="demo") as demo:
         assert demo.wait(60) == 0, demo.output
     problem = re.compile(
         r"rmpa web: aiohttp not installed; run \S+/python3? -m pip install 'rmpa\[web\]' \[extra-missing\]"
     )
-    first = demo.output.splitlines()[0]
-    if flags:
-        assert json.loads(first)["web"] is None
-        assert problem.fullmatch(json.loads(first)["problem"])
-    else:
-        assert problem.fullmatch(first.removeprefix("No web page: "))
+    first = json.loads(demo.output.splitlines()[0])
+    assert first["web"] is None
+    assert problem.fullmatch(first["problem"])

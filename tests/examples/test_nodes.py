@@ -8,17 +8,15 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
 import rmpa
 from lab.bed.processes import DEADLINE, Process, eventually
 from tests.interop.ros import PYTHON, environment, free_port
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 ROOT: Final = Path(__file__).parents[2]
 NODES: Final = ROOT / "examples" / "nodes"

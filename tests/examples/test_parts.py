@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -16,9 +16,6 @@ from rmpa.ros.types.messages import MessageType
 from robot import Turtlebot, odometry
 from stick import AXIS, BUTTON, EVENT, LinuxJoystick, Recording, StickState
 from unicycle import Pose
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 class Time:

@@ -8,9 +8,10 @@ import shlex
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import pytest
 
@@ -19,9 +20,6 @@ from rmpa.cli.run import load
 from rmpa.cli.values import read_values
 from rmpa.resource.quality import at_least, parse_requirement
 from tests.interop.ros import free_port
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 ROOT: Final = Path(__file__).parents[2]
 FILES: Final = ROOT / "examples" / "resources"

@@ -6,9 +6,10 @@ A row of ``READERS`` is a target: its functions, each with what writes a value a
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from ipaddress import IPv4Address
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import msgspec
 
@@ -43,9 +44,6 @@ from rmpa.trust.tokens import (
     decode_message,
     encode_message,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 _BASE: Final = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")
 _OURS: Final = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
@@ -310,6 +308,7 @@ _LEARNT: Final = MessageType.learn(
 )
 _PEER: Final = Guid.of("10.0.0.2", 40002)
 
+# The targets by name.
 READERS: Final[dict[str, Row]] = {
     "beacon": Row(
         [Reader(lambda data: Beacon.parse(data, 0), Beacon.serialize, printable)],
@@ -508,4 +507,3 @@ READERS: Final[dict[str, Row]] = {
         ],
     ),
 }
-"""The targets by name."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rmpa.bridge.context import PeerNames
 from rmpa.bridge.messages import OpenRoute, decode, encode
@@ -17,9 +18,6 @@ from rmpa.config.values import BadValue, read_bytes_a_second, read_duration, rea
 from rmpa.core.contract import ContractRule, Contracts
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import is_global_name
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 _EXAMPLE = Path(__file__).parents[2] / "src" / "rmpa" / "config" / "rmpa.toml"
 _READERS = (

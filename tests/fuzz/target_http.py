@@ -5,16 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.statistics import Counters
 from rmpa.ros.http.server import HttpConnection, XmlRpcServer
 from rmpa.ros.wire.http import ResponseParser
-from rmpa.ros.wire.xmlrpc import serialize_call, serialize_response
-
-if TYPE_CHECKING:
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+from rmpa.ros.wire.xmlrpc import XmlRpcValue, serialize_call, serialize_response
 
 _CALL = serialize_call("getPid", ["/x"])
 _REPLY = serialize_response([1, "", 5])

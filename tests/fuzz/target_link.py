@@ -33,8 +33,8 @@ _PARTS = b"".join(
 _MARKS = b"".join(
     Frame(kind, route=1, sequence=7).serialize() for kind in (FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED)
 )
+# The beginning of a frame that is handed on as it comes.
 _LONG = pack_data_header(200_000, 1, 1, 9) + bytes(50)
-"""The beginning of a frame that is handed on as it comes."""
 
 SEEDS: list[bytes] = [
     b"",

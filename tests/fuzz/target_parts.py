@@ -47,8 +47,8 @@ class _Subscribers(Any):  # type: ignore[misc] # a double of what is much larger
 
     def __init__(self) -> None:
         self.size = 0
+        # Bytes of the message that comes in parts; -1: none does.
         self.got = -1
-        """Bytes of the message that comes in parts; -1: none does."""
 
     def publish_framed(self, framed: bytes | bytearray | memoryview) -> None:
         if self.got >= 0:

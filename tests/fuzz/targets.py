@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from tests.fuzz.gateway_readers import GATEWAY_READERS
 from tests.fuzz.readers import READERS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
 
 _ROWS = READERS | GATEWAY_READERS
 

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from rmpa.core.errors import PeerRefused
 from rmpa.gateway.rules import ForeignSource, MeshSource, SourceKind
-
-if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
-
-    from rmpa.ros.types.installed import ServiceType
-    from rmpa.ros.types.messages import MessageType
-    from rmpa.ros.wire.tcpros import Buffer, ServiceDescription, TopicDescription
+from rmpa.ros.types.installed import ServiceType
+from rmpa.ros.types.messages import MessageType
+from rmpa.ros.wire.tcpros import Buffer, ServiceDescription, TopicDescription
 
 Key = tuple[SourceKind, str, str]
 

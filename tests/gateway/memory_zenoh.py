@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from rmpa.gateway.zenoh.threads import ZenohReply, ZenohSample
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from rmpa.gateway.zenoh.threads import ZenohQos
-    from rmpa.ros.wire.tcpros import Buffer
+from rmpa.gateway.zenoh.threads import ZenohQos, ZenohReply, ZenohSample
+from rmpa.ros.wire.tcpros import Buffer
 
 
 async def eventually(condition: Callable[[], object], seconds: float = 20.0) -> None:

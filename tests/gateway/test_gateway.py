@@ -3,31 +3,27 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import pytest
 
 from rmpa.config.rules import Crossing, CrossingRule, GatewaySettings
-from rmpa.config.settings import TrustSettings
+from rmpa.config.settings import Settings, TrustSettings
 from rmpa.core.errors import StartError
 from rmpa.gateway import limits
 from rmpa.gateway.gateway import Gateway
+from rmpa.gateway.own_graph import AgentGraph
+from rmpa.gateway.rules import Neighbour
+from rmpa.gateway.zenoh.session import OpenSession
 from rmpa.observe.control_client import ControlClient
 from tests.agent.conftest import pytest_asyncio_loop_factories, settings
 from tests.agent.test_agent import until
 from tests.gateway.memory_zenoh import MemorySession, MemoryZenoh
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Mapping
-
-    from rmpa.config.settings import Settings
-    from rmpa.gateway.own_graph import AgentGraph
-    from rmpa.gateway.rules import Neighbour
-    from rmpa.gateway.zenoh.session import OpenSession
 
 __all__ = ["pytest_asyncio_loop_factories", "settings"]
 CONNECT = GatewaySettings(site="here", connect=("tcp/127.0.0.1:7447",))
@@ -74,11 +70,11 @@ class Bed:
     def __init__(self, settings: Settings, gateway: GatewaySettings = CONNECT, failures: int = 0) -> None:
         self.events: list[str] = []
         self.failures = failures
+        # How often neighbours still fail to be made.
         self.faults = 0
-        """How often neighbours still fail to be made."""
         self.sessions: list[Any] = []
+        # Of each time that the neighbours were made.
         self.rules: list[tuple[CrossingRule, ...]] = []
-        """Of each time that the neighbours were made."""
         self.settings = replace(settings, gateway=gateway)
         self.gateway = Gateway(self.settings, open_session=cast("Any", self._open), make_neighbours=self._make)
 

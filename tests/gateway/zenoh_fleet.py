@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from pathlib import Path
 
+from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.rules import GatewaySettings
 from rmpa.config.settings import Settings, TrustSettings
-from rmpa.gateway.zenoh.session import open_trusted_session
+from rmpa.gateway.zenoh.session import OpenSession, open_trusted_session
 from tests.gateway.zenoh_bed import free_port
 from tests.trust.io.member_files import SecuredMesh
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from rmpa.config.peer_rules import PermissionRule
-    from rmpa.gateway.zenoh.session import OpenSession
 
 
 class Fleet:

@@ -473,8 +473,6 @@ def join(given: Arguments) -> None:
     token = StolenToken(given["token"])
     if given.get("invented"):
         token = StolenToken(token.changed(secret=os.urandom(16)))
-    if given.get("later"):
-        token = StolenToken(token.changed(expires=b"\xff\xff\xff\xff"))
     try:
         answer = join_as(token, given["name"])
     except (EOFError, OSError) as error:
@@ -482,33 +480,9 @@ def join(given: Arguments) -> None:
     say("done", **{key: value for key, value in answer.items() if key not in ("certificate", "keys", "deny", "ca")})
 
 
-def middle(given: Arguments) -> None:
-    """Stand between a joining module and the authority, as a member: ``token``, ``listen``, ``here``.
-
-    ``cert``, ``private``: the member's. The joining module was given the token with our address; what it asks is
-    passed on to the authority.
-    """
-    token = StolenToken(given["token"])
-    server = socket.create_server(("0.0.0.0", given["listen"]))
-    say(
-        "ready", token=token.changed(address=socket.inet_aton(given["here"]), port=given["listen"].to_bytes(2, "big"))
-    )
-    raw, _ = server.accept()
-    raw.settimeout(60.0)
-    context = tls_context(given["cert"], given["private"], alpn="rmpa-join/1", server=True)
-    victim = Talk(context.wrap_socket(raw, server_side=True))
-    asked = victim.receive()
-    with connect(token.address, token.port) as sock, tls_context(alpn="rmpa-join/1").wrap_socket(sock) as on:
-        authority = Talk(on)
-        authority.send(**asked)
-        answer = authority.receive()
-    victim.send(**answer)
-    say("done", authority=answer["op"], reason=answer.get("reason", ""))
-
-
 MODES: dict[str, Callable[[Arguments], None]] = {
     each.__name__: each
-    for each in (record, replay, plain, lure, flood, slow, insider, tell_beacon, knock, former, join, middle)
+    for each in (record, replay, plain, lure, flood, slow, insider, tell_beacon, knock, former, join)
 }
 
 if __name__ == "__main__":

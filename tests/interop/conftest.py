@@ -29,8 +29,8 @@ ShellFactory = Callable[..., Ros]
 AgentFactory = Callable[..., Agent]
 ModuleFactory = Callable[..., list[Module]]
 WebFactory = Callable[..., "Web"]
+# Beds that are kept for the next test; agents at rest cost little.
 _BEDS: Final = 3
-"""Beds that are kept for the next test; agents at rest cost little."""
 
 
 @pytest.fixture(autouse=True, scope="package")
@@ -87,13 +87,6 @@ async def node(core: RosCore) -> AsyncIterator[Node]:
     """A node of ours at our core."""
     async with Node("ours", master_uri=core.uri, environment=RosEnvironment()) as made:
         yield made
-
-
-async def until(condition: Callable[[], object], within: float = 40.0) -> None:
-    """Wait in the event loop until something holds."""
-    async with asyncio.timeout(within):
-        while not condition():
-            await asyncio.sleep(0.005)
 
 
 def framed(payload: bytes) -> bytes:

@@ -9,15 +9,13 @@ import shutil
 import subprocess
 import sys
 import threading
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from lab.bed import processes
 from lab.bed.agents import RMPA, USER
 from lab.bed.ros import PYTHON
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
 
 _AGENT: Final = ("rmpa.cli.main", "rmpa.cli.agent", "rmpa.agent.process", "cryptography.x509", "ssl")
 _ROS: Final = (
@@ -32,8 +30,8 @@ _ROS: Final = (
 )
 _TOOLS: Final = {"rosmaster", "rosnode", "rosparam", "rosservice", "rostopic"}
 _STARTS: Final = 30.0
+# Variables of the interpreter that a fork can have; with others a program is executed.
 _OURS: Final = {"PYTHONUNBUFFERED", "PYTHONPATH", "PYTHONDONTWRITEBYTECODE"}
-"""Variables of the interpreter that a fork can have; with others a program is executed."""
 
 
 class ForkServer:

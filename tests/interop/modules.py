@@ -5,21 +5,18 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from lab.bed.agents import Agent
 from lab.bed.namespaces import Host, Lab
 from lab.bed.processes import DEADLINE, Event, Process, eventually
 from lab.bed.ros import MasterProxy
 from rmpa.core.errors import RmpaError
+from tests.interop.ros import Ros
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from tests.interop.ros import Ros
-
+# Seconds within which a bed is as it was before a test, or is thrown away.
 _SETTLES: Final = 10.0
-"""Seconds within which a bed is as it was before a test, or is thrown away."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,13 +12,13 @@ from typing import Final
 
 import pytest
 
+# Our own programs that use those packages, and the versions that are wanted.
 CLIENTS: Final = Path(__file__).parent / "clients"
-"""Our own programs that use those packages, and the versions that are wanted."""
 _FILES: Final = ("package.json", "package-lock.json")
 _INSTALL: Final = 180.0
 _NODE: Final = 18
+# How npm says that it reaches no registry; any other failure is one of the test.
 _OFFLINE: Final = ("EAI_AGAIN", "ENOTFOUND", "ECONNREFUSED", "ENETUNREACH", "EHOSTUNREACH", "ETIMEDOUT", "ENOTCACHED")
-"""How npm says that it reaches no registry; any other failure is one of the test."""
 
 
 @functools.cache

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import itertools
 import struct
-from typing import TYPE_CHECKING, Final, NamedTuple
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
 
 from lab.bed.processes import DEADLINE, Process, eventually
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 ROW: Final = struct.Struct("<IIQQII")
 _numbers = itertools.count(1)

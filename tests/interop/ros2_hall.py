@@ -38,12 +38,12 @@ RCLPY: Final = """
 enabled = true
 python = "{python}"
 """
+# The workspace of ROS 1 at the gateway: it has an action that ROS 2's test_msgs has too.
 SOURCED: Final = ("env", f"ROS_PACKAGE_PATH={NODES.parent / 'packages'}")
-"""The workspace of ROS 1 at the gateway: it has an action that ROS 2's test_msgs has too."""
+# Where ``scripts/install-ros2`` keeps a venv for each distribution.
 ROS2: Final = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"), "rmpa", "ros2")
-"""Where ``scripts/install-ros2`` keeps a venv for each distribution."""
+# ROS 2 as ``zenoh-ros2-sdk`` speaks it; else ``rclpy`` of the distribution that is named.
 ZENOH: Final = "zenoh"
-"""ROS 2 as ``zenoh-ros2-sdk`` speaks it; else ``rclpy`` of the distribution that is named."""
 
 
 def python_of(distribution: str) -> Path:

@@ -8,9 +8,11 @@ import time
 from dataclasses import dataclass
 from ipaddress import IPv4Address
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from lab.bed.processes import Process
+from lab.bed.agents import Agent
+from lab.bed.namespaces import Host
+from lab.bed.processes import Event, Process
 from rmpa.config import limits as config_limits
 from rmpa.core.identity import Guid
 from rmpa.observe.control_client import ControlClient
@@ -19,11 +21,6 @@ from rmpa.trust import certificates
 from rmpa.trust import limits as trust_limits
 from rmpa.trust.membership import Membership, MeshAuthority, found_mesh, new_key, private_key
 from rmpa.trust.store import MemberFiles, TrustStore
-
-if TYPE_CHECKING:
-    from lab.bed.agents import Agent
-    from lab.bed.namespaces import Host
-    from lab.bed.processes import Event
 
 ATTACKER: Final = Path(__file__).with_name("attacker.py")
 UDP_PORT: Final = config_limits.MULTICAST_PORT

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from lab.bed.gateways import JoinedSites, Site
 from lab.bed.namespaces import Lab
@@ -12,12 +14,8 @@ from lab.bed.processes import DEADLINE, Process
 from tests.interop.modules import Module
 from tests.interop.ros import Ros
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from pathlib import Path
-
+# The module of each site.
 MODULES: Final = {"warehouse": "arm", "yard": "base"}
-"""The module of each site."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,22 +7,17 @@ import shutil
 import signal
 import subprocess
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
 from lab.bed.agents import RMPA
-from lab.bed.processes import eventually, run
-from tests.interop.ros import environment, free_port
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from lab.bed.namespaces import Lab
-    from lab.bed.processes import Process
-    from tests.interop.conftest import ShellFactory
-    from tests.interop.ros import Ros
+from lab.bed.namespaces import Lab
+from lab.bed.processes import Process, eventually, run
+from tests.interop.conftest import ShellFactory
+from tests.interop.ros import Ros, environment, free_port
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(150)]
 

@@ -9,28 +9,25 @@ import os
 import re
 import shutil
 import time
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
+from lab.bed.namespaces import Host, Lab
 from lab.bed.processes import CommandFailed, eventually
 from rmpa.mesh.limits import SILENT_GRACE
+from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 from tests.interop.modules import Module, flows
 from tests.interop.ros import PYTHON
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from lab.bed.namespaces import Host, Lab
-    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 ROBOTS: Final = 7
+# Seconds over which the processor time of agents at rest is counted.
 REST: Final = 4.0
-"""Seconds over which the processor time of agents at rest is counted."""
 
 
 @contextmanager

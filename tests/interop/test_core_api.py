@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
@@ -11,10 +11,8 @@ from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.http.rpc import call
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, brief
+from tests.interop.conftest import ShellFactory
 from tests.interop.ros import free_port
-
-if TYPE_CHECKING:
-    from tests.interop.conftest import ShellFactory
 
 pytestmark = pytest.mark.ros
 

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import re
 import sys
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
 
 import pytest
 
 from lab.bed.processes import Process, eventually
+from tests.interop.conftest import ShellFactory
 from tests.interop.ros import PYTHON, Ros, free_port
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from tests.interop.conftest import ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]
 
 RUN: Final = "from rmpa.cli.core import core; core()"
+# A core that does not look by itself whether its nodes live.
 RUN_WITHOUT_CHECKS: Final = f"from rmpa.ros import limits; limits.NODE_CHECK_INTERVAL = 1e6; {RUN}"
-"""A core that does not look by itself whether its nodes live."""
 DEADLINE: Final = 40.0
 LAUNCH: Final = """<launch>
   <param name="speed" value="1.5"/>
@@ -256,39 +253,3 @@ def test_wtf_finds_nothing_about_the_core(shell: ShellFactory) -> None:
         output = ros.tool("roswtf", timeout=DEADLINE)
         talker.terminate()
     assert "No errors or warnings" in output.partition("Online checks summary")[2], output
-
-
-def test_cleanup_finds_nothing_left_to_do(shell: ShellFactory) -> None:
-    """A killed node is gone by itself; until then `rosnode cleanup` finds it as it does beside rosmaster."""
-    with shell(port=free_port()) as ros:
-        start_ours(ros)
-        talker = ros.rospy("talker", "__name:=victim", topic="/chatter", rate=10, count=0)
-        eventually(lambda: "/victim" in ros.tool("rosnode", "list"), DEADLINE, what="the victim")
-        talker.kill()
-        eventually(lambda: "/victim" not in ros.tool("rosnode", "list"), DEADLINE, what="the victim's purge")
-        assert "/chatter" not in ros.tool("rostopic", "list")
-
-
-def test_what_nodes_log_arrives_at_rosout_agg(shell: ShellFactory) -> None:
-    with shell(port=free_port()) as ros:
-        start_ours(ros)
-        echo = ros.start("rostopic", "echo", "/rosout_agg", name="echo")
-        eventually(lambda: "Subscribers:" in ros.tool("rostopic", "info", "/rosout_agg"), what="echo")
-        bump = ros.tool("rosservice", "list")
-        assert "/rosout" in ros.tool("rosnode", "list"), bump
-        script = (
-            "import rospy\nrospy.init_node('speaker')\nr = rospy.Rate(20)\n"
-            "while not rospy.is_shutdown():\n    rospy.logwarn('heard me')\n    r.sleep()\n"
-        )
-        speaker = ros.start("/usr/bin/python3", "-c", script, name="speaker")
-        echo.wait_for("heard me", DEADLINE)
-        speaker.terminate(DEADLINE)
-
-
-def test_a_second_core_says_so(shell: ShellFactory) -> None:
-    with shell(port=free_port()) as ros:
-        first = start_ours(ros)
-        second = ros.start(sys.executable, "-c", RUN, "-p", str(ros.port))
-        assert second.wait(DEADLINE) == 1
-        assert f"port {ros.port} is already in use" in second.output
-        assert first.terminate(DEADLINE) == 0

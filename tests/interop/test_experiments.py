@@ -18,16 +18,16 @@ from lab.experiments.store import Store
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(300)]
 ROOT: Final = Path(__file__).parents[2]
+# What is enough to see that it works, where the short form has more.
 _ONLY: Final = {"control": ("mode=event",), "scaling": ("modules=2",)}
-"""What is enough to see that it works, where the short form has more."""
+# Those of the suite; the others are of the same shape.
 _SHORT: Final = ("control", "failure")
-"""Those of the suite; the others are of the same shape."""
+# Tables that must have something in them; of the others, each that there is.
 _ROWS: Final = {
     "failure": ("flows", "moments"),
     "scaling": ("joins", "processes", "traffic", "arrivals", "sent"),
     "images": ("commands", "images"),
 }
-"""Tables that must have something in them; of the others, each that there is."""
 
 
 def run(*words: str | Path) -> None:

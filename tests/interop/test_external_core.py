@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from typing import Final
 
 import pytest
 
-from lab.bed.processes import eventually
+from lab.bed.agents import Agent
+from lab.bed.namespaces import Lab
+from lab.bed.processes import Process, eventually
+from tests.interop.conftest import AgentFactory, ShellFactory
 from tests.interop.modules import Module, flows
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from lab.bed.agents import Agent
-    from lab.bed.namespaces import Lab
-    from lab.bed.processes import Process
-    from tests.interop.conftest import AgentFactory, ShellFactory
+from tests.interop.sites import nodes
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
@@ -41,11 +38,6 @@ def joined(lab: Lab, shell: ShellFactory, agent: AgentFactory) -> Callable[..., 
         return a, b, master
 
     return make
-
-
-def nodes(module: Module) -> set[str]:
-    """What the stock ``rosnode list`` says."""
-    return set(module.ros.tool("rosnode", "list").split())
 
 
 def notes(agent: Agent) -> str:

@@ -8,21 +8,18 @@ import shutil
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
 pytest.importorskip("cryptography")
 pytest.importorskip("aiohttp")
 
+from collections.abc import Iterator
+
 from lab.bed.agents import RMPA
-from lab.bed.namespaces import why_no_nat
+from lab.bed.namespaces import Host, Lab, why_no_nat
 from lab.bed.processes import Process, eventually
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from lab.bed.namespaces import Host, Lab
 
 pytestmark = [pytest.mark.netns, pytest.mark.timeout(180)]
 

@@ -7,25 +7,22 @@ measured with it, by the publisher that wants to wake up each millisecond, and a
 from __future__ import annotations
 
 from array import array
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import pytest
 
+from lab.bed.processes import Event, Process
 from lab.bed.ros import NODES
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from lab.bed.processes import Event, Process
-    from tests.interop.conftest import ModuleFactory
+from tests.interop.conftest import ModuleFactory
 
 pytestmark = [pytest.mark.alone, pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 RATE: Final = 1000
 SECONDS: Final = 8
 QUEUE: Final = 5000
+# Milliseconds, on a machine that wakes everybody in time.
 P99: Final = 20.0
-"""Milliseconds, on a machine that wakes everybody in time."""
 
 
 def of_round(number: int) -> dict[str, object]:

@@ -6,19 +6,14 @@ import hashlib
 import json
 import subprocess
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.bed.processes import eventually
-from tests.interop.modules import flows
+from lab.bed.namespaces import Host
+from lab.bed.processes import Event, Process, eventually
+from tests.interop.conftest import ModuleFactory
+from tests.interop.modules import Module, flows
 from tests.interop.recordings import connected, in_order, recorded, wait_last
-
-if TYPE_CHECKING:
-    from lab.bed.namespaces import Host
-    from lab.bed.processes import Event, Process
-    from tests.interop.conftest import ModuleFactory
-    from tests.interop.modules import Module
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 MB = 1 << 20
@@ -109,34 +104,21 @@ def test_each_byte_arrives(modules: ModuleFactory, tmp_path: Path, sending: str)
         assert len(md5s(folder)) == 2
 
 
-def test_a_publisher_that_dies_leaves_no_half_message(modules: ModuleFactory, tmp_path: Path) -> None:
-    a, b = modules("a", "b")
-    heard = listeners_at(b, tmp_path)
-    dying = a.ros.roscpp("teller", topic="/large", wait=1, commands=True)
-    told = wake(dying, 1, list(heard.values()))
-    slow_down(a.host, "lo", "100mbit")
-    half_way(dying, 50 * MB, b)
-    dying.kill()
-    slow_down(a.host, "lo", "10gbit")
-    follows(a, heard, told)
-
-
-def test_an_agent_that_dies_leaves_no_half_message(modules: ModuleFactory, tmp_path: Path) -> None:
+@pytest.mark.parametrize("dies", ["publisher", "agent"])
+def test_what_dies_in_the_middle_leaves_no_half_message(modules: ModuleFactory, tmp_path: Path, dies: str) -> None:
     a, b = modules("a", "b")
     heard = listeners_at(b, tmp_path)
     sender = a.ros.roscpp("teller", topic="/large", wait=1, commands=True)
     told = wake(sender, 1, list(heard.values()))
-    slow_down(a.host, "eth0", "100mbit")
+    cable = "lo" if dies == "publisher" else "eth0"
+    slow_down(a.host, cable, "100mbit")
     half_way(sender, 50 * MB, b)
-    a.agent.kill()
-    slow_down(a.host, "eth0", "10gbit")
-    a.agent.restart()
-    follows(a, heard, told)
-
-
-def follows(module: Module, heard: dict[Path, Process], told: int) -> None:
-    """Let another publisher send a message: each listener gets it, whole, and nothing of the one that broke off."""
-    other = module.ros.rospy("teller", topic="/large", wait=1, source=2, commands=True)
+    (sender if dies == "publisher" else a.agent).kill()
+    slow_down(a.host, cable, "10gbit")
+    if dies == "agent":
+        a.agent.restart()
+    # Another publisher sends a message: each listener gets it, whole, and nothing of the one that broke off.
+    other = a.ros.rospy("teller", topic="/large", wait=1, source=2, commands=True)
     last = wake(other, 2, list(heard.values()))
     other.tell(f"{50 * MB} 1 0")
     for folder, listener in heard.items():
@@ -211,8 +193,8 @@ def test_two_publishers_of_large_messages_are_not_mixed(modules: ModuleFactory, 
 
 MBIT = 100
 IMAGE = 1 << 20
+# At 100 Hz.
 COMMANDS = 400
-"""At 100 Hz."""
 RULES = """
 [[contract]]
 topics = ["/urgent"]
@@ -292,12 +274,3 @@ def test_a_topic_of_small_and_large_messages_keeps_its_order(modules: ModuleFact
         assert lanes(a, "/mixed") == [lane]
     for recorder in recorders:
         in_order(recorded(recorder, tmp_path), told, after=first)
-
-
-def test_a_contract_decides_the_lane(modules: ModuleFactory) -> None:
-    a, b = modules("a", "b", config=RULES)
-    for topic, size, lane in (("/urgent", 200_000, "express"), ("/later", 64, "bulk")):
-        heard = b.ros.roscpp("listener", topic=topic)
-        a.ros.roscpp("talker", topic=topic, size=size, rate=20, wait=1)
-        assert flows(heard, 20)["bad"] == 0
-        assert lanes(a, topic) == lanes(b, topic) == [lane]

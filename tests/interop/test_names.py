@@ -4,27 +4,24 @@ from __future__ import annotations
 
 import json
 import re
-from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.bed.namespaces import Lab
 from lab.bed.processes import eventually
 from rmpa.observe.control_client import ControlClient
+from rmpa.observe.snapshot import PeerInfo
+from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 from tests.interop.modules import Module, flows
 from tests.interop.ros import lacks
 
-if TYPE_CHECKING:
-    from lab.bed.namespaces import Lab
-    from rmpa.observe.snapshot import PeerInfo
-    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
-
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
+# The same file on every robot: robots leave each other alone.
 ROBOT = """
 [[peer]]
 name = "robot*"
 deny = ["/**"]
 """
-"""The same file on every robot: robots leave each other alone."""
 PC = """
 [[peer]]
 name = "robot*"

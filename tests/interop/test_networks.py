@@ -6,24 +6,20 @@ import random
 import shutil
 import subprocess
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import pytest
 
-from lab.bed.processes import eventually
+from lab.bed.namespaces import Host, Lab
+from lab.bed.processes import Event, eventually
 from lab.bed.ros import PYTHON
 from rmpa.observe.control_client import ControlClient
+from tests.interop.conftest import AgentFactory, ShellFactory
 from tests.interop.modules import Module, flows
 from tests.interop.ros import lacks
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from lab.bed.namespaces import Host, Lab
-    from lab.bed.processes import Event
-    from tests.interop.conftest import AgentFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(900)]
 
@@ -195,22 +191,9 @@ def test_services_and_actions_go_by_a_relay_too(lab: Lab, agent: AgentFactory, s
         server.kill()
 
 
-def test_a_relay_is_not_needed_where_there_is_a_way(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:
-    """All on one network: each source appears once, by its own link."""
-    hosts = lab.hosts("a", "b", "r")
-    a, b, r = (Module(h, agent(h, name=h.name, config=RELAY if h.name == "r" else ""), shell(h)) for h in hosts)
-    full_mesh(a, b, r)
-    heard = b.ros.roscpp("listener", topic="/chatter")
-    a.ros.roscpp("talker", topic="/chatter", rate=100)
-    report = flows(heard, 50)
-    assert (report["bad"], report["gaps"], report["doubled"]) == (0, 0, 0)
-    assert b.ros.tool("rostopic", "info", "/chatter").count("/talker") == 1
-    assert b.agent.peers()["a"]["state"] == "linked"
-
-
 SURE: Final = '[[contract]]\ntopics = ["/sure", "/map"]\nreliability = "reliable"\ndepth = 5000\n'
+# The cable of m1 and m4, and those of the relays m2 and m3 with both: their networks are 1 and 2, and 3 and 4.
 DIRECT, FIRST, SECOND = 0, 1, 2
-"""The cable of m1 and m4, and those of the relays m2 and m3 with both: their networks are 1 and 2, and 3 and 4."""
 
 
 class Triangle:
@@ -331,8 +314,7 @@ def test_a_relay_that_leaves_takes_nothing_along(lab: Lab, agent: AgentFactory, 
     assert triangle.via() == other
 
 
-@pytest.mark.parametrize("who", ["m1", "m4"])
-@pytest.mark.parametrize("before", [0.0, 3.0])
+@pytest.mark.parametrize(("who", "before"), [("m1", 0.0), ("m4", 3.0)])
 def test_an_address_that_changes_loses_nothing(
     lab: Lab, agent: AgentFactory, shell: ShellFactory, who: str, before: float
 ) -> None:
@@ -342,11 +324,10 @@ def test_an_address_that_changes_loses_nothing(
     triangle.after(lambda: readdress(module.host, 0, 77, before), 300)
 
 
-@pytest.mark.parametrize("seconds", [30.0, pytest.param(600.0, marks=pytest.mark.long)])
-def test_cables_relays_and_addresses_change_at_random(
-    lab: Lab, agent: AgentFactory, shell: ShellFactory, seconds: float
-) -> None:
+@pytest.mark.long
+def test_cables_relays_and_addresses_change_at_random(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:
     """A way is left at any time, so nothing may be lost."""
+    seconds = 600.0
     triangle, rng = Triangle(lab, agent, shell), random.Random(seconds)
     out: set[int] = set()
     addresses, until = 100, time.monotonic() + seconds
@@ -373,8 +354,8 @@ def test_cables_relays_and_addresses_change_at_random(
 
 
 IMAGE = 300_000
+# Whose advertisement is larger than a packet.
 MTU_TOPICS = 60
-"""Whose advertisement is larger than a packet."""
 CROWD = """
 import rospy, std_msgs.msg
 rospy.init_node("crowd")

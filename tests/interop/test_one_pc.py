@@ -5,16 +5,14 @@ from __future__ import annotations
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
+from lab.bed.namespaces import Lab
 from lab.bed.processes import Process, eventually
 from lab.bed.ros import environment
 from tests.packages.tutorial import shows, steps
-
-if TYPE_CHECKING:
-    from lab.bed.namespaces import Lab
 
 PAGE: Final = (Path(__file__).parents[2] / "docs/start/one-pc.md").read_text(encoding="utf-8")
 TERMINALS: Final = ("one", "two", "three", "four")

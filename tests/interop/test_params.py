@@ -4,24 +4,18 @@ from __future__ import annotations
 
 import ast
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import pytest
 
 from lab.bed.agents import RMPA
-from lab.bed.processes import Process, eventually
+from lab.bed.namespaces import Lab
+from lab.bed.processes import Event, Process, eventually
+from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 from tests.interop.modules import Module
-from tests.interop.ros import PYTHON, free_port, lacks
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from lab.bed.namespaces import Lab
-    from lab.bed.processes import Event
-    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
-    from tests.interop.ros import Ros
+from tests.interop.ros import PYTHON, Ros, free_port, lacks
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(150)]
 Configured = Callable[..., list[Module]]

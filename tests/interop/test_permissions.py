@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import json
 import time
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
+from lab.bed.namespaces import Lab
 from lab.bed.processes import eventually
+from tests.interop.conftest import AgentFactory, ShellFactory
 from tests.interop.modules import Module, flows
-from tests.interop.test_services_across import _calls, _wait_services, _worker
+from tests.interop.services import calls, wait_services, worker
 from tests.trust.io.member_files import SecuredMesh
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from lab.bed.namespaces import Lab
-    from tests.interop.conftest import AgentFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
 
@@ -95,14 +91,14 @@ def test_what_the_permissions_say_crosses_and_a_reload_closes_and_opens_it(
     odom = joystick.ros.rospy("listener", "__name:=display", topic="/odom")
     for module, topic in ((joystick, "/cmd_vel"), (joystick, "/spam"), (base, "/odom"), (base, "/secret")):
         module.ros.rospy("talker", f"__name:=say{topic.replace('/', '_')}", topic=topic, rate=50)
-    _worker(base, "rospy", "/stop")
-    _worker(base, "rospy", "/open_door")
+    worker(base, "rospy", "/stop")
+    worker(base, "rospy", "/open_door")
     flows(cmd_vel)
     flows(odom)
-    _wait_services(joystick.ros, "/stop")
+    wait_services(joystick.ros, "/stop")
     caller = joystick.ros.rospy("caller", service="/stop", wait=True, commands=True)
     caller.wait_event("there")
-    assert _calls(caller, "echo 0 100 5 once")["same"] == 5
+    assert calls(caller, "echo 0 100 5 once")["same"] == 5
 
     # What no rule allows is not there, on either side.
     assert "/rmpa/joystick" not in publishers(base, "/spam")
@@ -137,8 +133,8 @@ def test_what_the_permissions_say_crosses_and_a_reload_closes_and_opens_it(
     assert (code, json.loads(said)["changed"]) == (0, ["[[permission]]"])
     has_remote(base, "/cmd_vel", "joystick", there=False)
     has_remote(joystick, "/odom", "base", there=False)
-    _wait_services(joystick.ros, "/stop", there=False)
-    assert _calls(caller, "echo 0 100 1 once")["ok"] == 0
+    wait_services(joystick.ros, "/stop", there=False)
+    assert calls(caller, "echo 0 100 1 once")["ok"] == 0
     code, said = base.agent.rmpa("trust", "check", "joystick", "publish", "/cmd_vel", "--config", str(file))
     assert (code, said.strip()) == (1, "no: [[permission]] 2 denies publish of '/cmd_vel' to '*'")
 
@@ -146,8 +142,8 @@ def test_what_the_permissions_say_crosses_and_a_reload_closes_and_opens_it(
     assert base.agent.rmpa("reload")[0] == 0
     flows(cmd_vel)
     flows(odom)
-    _wait_services(joystick.ros, "/stop")
-    eventually(lambda: _calls(caller, "echo 0 100 1 once")["ok"] == 1, what="/stop can be called again")
+    wait_services(joystick.ros, "/stop")
+    eventually(lambda: calls(caller, "echo 0 100 1 once")["ok"] == 1, what="/stop can be called again")
 
     # Plain connections where both modules allow them, and only where the permissions let the topic cross.
     for module, config in ((base, BASE), (joystick, JOYSTICK)):

@@ -5,19 +5,17 @@ from __future__ import annotations
 import json
 import subprocess
 from shutil import which
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
+from lab.bed.agents import Agent
+from lab.bed.namespaces import Lab
 from lab.bed.processes import eventually, run
 from rmpa.observe.why.diagnosis import UNASKED
+from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 from tests.interop.modules import Module, flows
 from tests.interop.ros import PYTHON
-
-if TYPE_CHECKING:
-    from lab.bed.agents import Agent
-    from lab.bed.namespaces import Lab
-    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
 RATE = 50.0
@@ -43,7 +41,7 @@ def streaming(modules: ModuleFactory, config: str = "") -> tuple[Module, Module]
     return a, b
 
 
-def test_figures_are_plausible(modules: ModuleFactory) -> None:
+def test_figures_are_plausible_and_hz_bw_and_delay_tell_them_too(modules: ModuleFactory) -> None:
     a, b = streaming(modules)
     route = route_of(b, "/chatter")
     assert (route["peer"], route["state"], route["lost"], route["dropped"]) == (a.name, "open", 0, 0)
@@ -64,10 +62,6 @@ def test_figures_are_plausible(modules: ModuleFactory) -> None:
     link = b.agent.peers()[a.name]["link"]
     assert isinstance(link, dict)
     assert abs(link["clock_offset"]) <= link["clock_error"]
-
-
-def test_hz_bw_and_delay_tell_them_too_without_a_header(modules: ModuleFactory) -> None:
-    a, b = streaming(modules)
     lines: dict[str, dict[str, object]] = {}
     for command in ("hz", "bw", "delay"):
         code, output = b.agent.rmpa("topic", command, f"{a.name}:/chatter", "-n", "50", "--json")

@@ -5,18 +5,15 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
-from lab.bed.agents import RMPA
+from lab.bed.agents import RMPA, Agent
+from lab.bed.namespaces import Lab
 from lab.bed.processes import Process
+from tests.interop.conftest import AgentFactory, ShellFactory
 from tests.packages.tutorial import steps
-
-if TYPE_CHECKING:
-    from lab.bed.agents import Agent
-    from lab.bed.namespaces import Lab
-    from tests.interop.conftest import AgentFactory, ShellFactory
 
 ROOT: Final = Path(__file__).parents[2]
 README: Final = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -8,20 +8,17 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
+from lab.bed.agents import Agent
 from lab.bed.namespaces import Host
 from lab.bed.processes import eventually
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from lab.bed.agents import Agent
-    from tests.interop.conftest import AgentFactory
+from tests.interop.conftest import AgentFactory
 
 FIFO: Final = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
 NOBODY: Final = 65534

@@ -4,26 +4,21 @@ from __future__ import annotations
 
 import itertools
 import time
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import msgspec
 import pytest
 
-from lab.bed.processes import eventually
+from lab.bed.processes import Process, eventually
+from tests.interop.conftest import ModuleFactory
+from tests.interop.modules import Module
 from tests.interop.recordings import connected, recorded, wait_last
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from lab.bed.processes import Process
-    from tests.interop.conftest import ModuleFactory
-    from tests.interop.modules import Module
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 KINDS = ("roscpp", "rospy")
+# At 1 kHz.
 COUNT = 10_000
-"""At 1 kHz."""
 
 
 def contract(depth: int, more: str = "") -> str:
@@ -31,9 +26,14 @@ def contract(depth: int, more: str = "") -> str:
     return f'[[contract]]\ntopics = ["/chatter"]\nreliability = "reliable"\ndepth = {depth}\n{more}'
 
 
-def recorders(module: Module) -> list[Process]:
-    """A recorder of each kind."""
-    return [module.ros.node(kind, "recorder", topic="/chatter", nodelay=True, commands=True) for kind in KINDS]
+def stream(a: Module, b: Module, tmp_path: Path) -> tuple[list[Process], Process, int]:
+    """A recorder of each kind at ``b`` that has nothing yet, a teller at ``a``, and the last number that all have."""
+    heard = [b.ros.node(kind, "recorder", topic="/chatter", nodelay=True, commands=True) for kind in KINDS]
+    teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
+    first = connected(teller, heard)
+    for listener in heard:
+        recorded(listener, tmp_path)
+    return heard, teller, first
 
 
 def route(module: Module) -> dict[str, object]:
@@ -48,11 +48,7 @@ def test_nothing_is_lost_doubled_or_moved(
     modules: ModuleFactory, tmp_path: Path, outage: float, cuts: int, pause: float
 ) -> None:
     a, b = modules("a", "b", config=contract(depth=2 * COUNT))
-    heard = recorders(b)
-    teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
-    first = connected(teller, heard)
-    for listener in heard:
-        recorded(listener, tmp_path)
+    heard, teller, first = stream(a, b, tmp_path)
     teller.tell(f"64 {COUNT} 1000")
     for number in range(cuts):
         time.sleep(pause)
@@ -79,9 +75,8 @@ def test_large_reliable_messages_survive_too(modules: ModuleFactory, tmp_path: P
     a, b = modules("a", "b", config=contract(depth=100))
     for module in (a, b):
         module.host.shape("200mbit")
-    heard = recorders(b)
-    teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
-    last = connected(teller, heard) + 60
+    heard, teller, first = stream(a, b, tmp_path)
+    last = first + 60
     teller.tell("2000000,100,1000 60 10")  # 8 s of the cable's time are 6 s of the teller's
     for _ in range(3):
         time.sleep(1.0)
@@ -96,11 +91,7 @@ def test_large_reliable_messages_survive_too(modules: ModuleFactory, tmp_path: P
 
 def test_losses_beyond_the_buffer_are_counted_exactly(modules: ModuleFactory, tmp_path: Path) -> None:
     a, b = modules("a", "b", config=contract(depth=500))
-    heard = recorders(b)
-    teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
-    first = connected(teller, heard)
-    for listener in heard:
-        recorded(listener, tmp_path)
+    heard, teller, first = stream(a, b, tmp_path)
     teller.tell("64 4000 1000")
     time.sleep(0.5)
     b.host.outage(2.0)
@@ -121,11 +112,9 @@ def test_losses_beyond_the_buffer_are_counted_exactly(modules: ModuleFactory, tm
     b.agent.process.wait_for(rf"(?i)warning.*/chatter.*\b{missing[0]} messages lost")
 
 
-def test_after_an_outage_beyond_the_contract_messages_may_be_lost(modules: ModuleFactory) -> None:
+def test_after_an_outage_beyond_the_contract_messages_may_be_lost(modules: ModuleFactory, tmp_path: Path) -> None:
     a, b = modules("a", "b", config=contract(100_000, 'outage = "4 s"\n'))
-    heard = recorders(b)
-    teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
-    first = connected(teller, heard)
+    heard, teller, first = stream(a, b, tmp_path)
     away: dict[str, object] = {}
 
     def is_away() -> bool:  # asked once: the route is there for the four seconds alone
@@ -154,11 +143,7 @@ def test_after_an_outage_beyond_the_contract_messages_may_be_lost(modules: Modul
 
 def test_a_topic_of_which_the_newest_counts_is_fresh_after_a_cut(modules: ModuleFactory, tmp_path: Path) -> None:
     a, b = modules("a", "b", config='[[contract]]\ntopics = ["/chatter"]\ndepth = 1\n')
-    heard = recorders(b)
-    teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
-    first = connected(teller, heard)
-    for listener in heard:
-        recorded(listener, tmp_path)
+    heard, teller, first = stream(a, b, tmp_path)
     teller.tell(f"64 {COUNT // 2} 1000")
     for _ in range(2):
         time.sleep(1.0)
@@ -176,11 +161,7 @@ def test_a_topic_of_which_the_newest_counts_is_fresh_after_a_cut(modules: Module
 def test_best_effort_loses_nothing_in_a_cut_of_a_second(modules: ModuleFactory, tmp_path: Path) -> None:
     """As under one roscore, whose connections stand such a cut."""
     a, b = modules("a", "b")
-    heard = recorders(b)
-    teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
-    first = connected(teller, heard)
-    for listener in heard:
-        recorded(listener, tmp_path)
+    heard, teller, first = stream(a, b, tmp_path)
     teller.tell("64 400 50")
     for seconds in (0.1, 0.3, 0.5, 1.0):
         time.sleep(0.5)
@@ -191,19 +172,17 @@ def test_best_effort_loses_nothing_in_a_cut_of_a_second(modules: ModuleFactory, 
     assert route(b)["lost"] == 0
 
 
-def test_the_last_word_before_a_cut_still_counts(modules: ModuleFactory) -> None:
+def test_the_last_word_before_a_cut_still_counts(modules: ModuleFactory, tmp_path: Path) -> None:
     """TCP repeats it at once when the cable is in again, if the link is still the same.
 
     After more than half a second TCP repeats so rarely that the silence may end the link first. A topic whose last
     message counts then is reliable or latched.
     """
     a, b = modules("a", "b")
-    heard = recorders(b)
-    teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
-    last = connected(teller, heard) + 1
+    heard, teller, first = stream(a, b, tmp_path)
     b.host.cut()
     teller.tell("64 1 0")
     time.sleep(0.3)
     b.host.restore()
     for listener in heard:
-        wait_last(listener, last)
+        wait_last(listener, first + 1)

@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import pytest
 
 from lab.bed.agents import RMPA, Agent
+from lab.bed.namespaces import Host, Lab
 from lab.bed.processes import Event, Process, eventually
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from lab.bed.namespaces import Host, Lab
-    from tests.interop.conftest import ShellFactory
-    from tests.interop.ros import Ros
+from tests.interop.conftest import ShellFactory
+from tests.interop.ros import Ros
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
 
 RESOURCES: Final = Path(__file__).parent / "resources"
 OK, WARN, ERROR, STALE = range(4)
+# Seconds for windows, cool-downs and routes on a shared machine.
 LONG: Final = 40.0
-"""Seconds for windows, cool-downs and routes on a shared machine."""
 
 
 @dataclass

@@ -7,53 +7,21 @@ from __future__ import annotations
 
 import json
 import time
-from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.bed.processes import eventually
+from lab.bed.namespaces import Lab
+from lab.bed.processes import Process, eventually
+from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 from tests.interop.modules import Module
 from tests.interop.ros import PYTHON
-from tests.interop.transports import reload
-
-if TYPE_CHECKING:
-    from lab.bed.namespaces import Lab
-    from lab.bed.processes import Event, Process
-    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
+from tests.interop.services import caller, calls, worker
+from tests.interop.transports import on_the_network, reload
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 AUTO = '[services]\ntransport = "auto"\n'
 CLIENTS = ["rospy", "roscpp"]
-
-
-def on_network(*modules: Module) -> None:
-    """Let the modules' nodes listen for the network, as without ROS_IP."""
-    for module in modules:
-        module.ros.env["ROS_IP"] = module.host.address
-
-
-def worker(module: Module, kind: str = "rospy", service: str = "/work") -> Process:
-    """Start a server."""
-    name = f"worker{service.replace('/', '_')}"
-    started = module.ros.node(kind, "worker", name=name, service=service, quiet=False)
-    started.wait_event("up")
-    return started
-
-
-def caller(module: Module, kind: str = "rospy", service: str = "/work", **options: object) -> Process:
-    """Start a client, and wait until the service is there for it."""
-    start = module.ros.rospy if kind == "rospy" else module.ros.roscpp
-    started = start("caller", service=service, wait=True, commands=True, **options)  # type: ignore[arg-type]
-    started.wait_event("there")
-    return started
-
-
-def calls(client: Process, line: str, timeout: float = 20.0) -> Event:
-    """Make a client make the calls of its line, and return the outcomes."""
-    since = client.mark_events()
-    client.tell(line)
-    return client.wait_event("done", timeout, since=since)
 
 
 def lookup(module: Module, caller_id: str, service: str = "/work") -> str:
@@ -95,7 +63,7 @@ def wait_address(module: Module, *, other_than: object) -> None:
 @pytest.mark.parametrize(("client", "server"), [("rospy", "roscpp"), ("roscpp", "rospy")])
 def test_calls_go_from_node_to_node(modules: ModuleFactory, server: str, client: str) -> None:
     a, b = modules("a", "b", config=AUTO)
-    on_network(a, b)
+    on_the_network(a, b)
     worker(a, server)
     wait_transport(b, "direct")
     called = caller(b, client)
@@ -113,7 +81,7 @@ def test_calls_go_from_node_to_node(modules: ModuleFactory, server: str, client:
 
 def test_the_graph_does_not_change(modules: ModuleFactory) -> None:
     a, b = modules("a", "b", config=AUTO)
-    on_network(a, b)
+    on_the_network(a, b)
     worker(a)
     own = a.ros.tool("rosservice", "uri", "/work").strip()
     wait_transport(b, "direct")
@@ -133,7 +101,7 @@ def test_the_graph_does_not_change(modules: ModuleFactory) -> None:
 
 def test_a_server_that_restarts_on_another_port_is_found_again(modules: ModuleFactory) -> None:
     a, b = modules("a", "b", config=AUTO)
-    on_network(a, b)
+    on_the_network(a, b)
     for kind in CLIENTS:
         server = worker(a, kind)
         first = wait_transport(b, "direct")["address"]
@@ -153,7 +121,7 @@ def test_a_server_that_restarts_on_another_port_is_found_again(modules: ModuleFa
 @pytest.mark.parametrize("kind", CLIENTS)
 def test_a_call_under_way_fails_within_the_lease_when_the_cable_is_cut(modules: ModuleFactory, kind: str) -> None:
     a, b = modules("a", "b", config=AUTO)
-    on_network(a, b)
+    on_the_network(a, b)
     server = worker(a, kind)
     wait_transport(b, "direct")
     client = caller(b, kind)
@@ -176,7 +144,7 @@ def test_a_call_under_way_fails_within_the_lease_when_the_cable_is_cut(modules: 
 
 def test_calls_go_on_while_the_agent_of_the_server_is_dead(modules: ModuleFactory) -> None:
     a, b = modules("a", "b", config=AUTO)
-    on_network(a, b)
+    on_the_network(a, b)
     worker(a)
     wait_transport(b, "direct")
     client = caller(b)
@@ -206,7 +174,7 @@ def caller_at_loopback(module: Module) -> Process:
 
 def test_a_persistent_call_outlives_the_agent_of_the_client(modules: ModuleFactory) -> None:
     a, b = modules("a", "b", config=AUTO)
-    on_network(a, b)
+    on_the_network(a, b)
     server = worker(a)
     wait_transport(b, "direct")
     client = caller(b)
@@ -227,7 +195,7 @@ def test_a_persistent_call_outlives_the_agent_of_the_client(modules: ModuleFacto
 
 def test_the_transport_follows_the_rules_of_both_modules(modules: ModuleFactory) -> None:
     a, b = modules("a", "b", config=AUTO)
-    on_network(a, b)
+    on_the_network(a, b)
     server = worker(a)
     wait_transport(b, "direct")
     client = caller(b)
@@ -254,13 +222,12 @@ def test_the_transport_follows_the_rules_of_both_modules(modules: ModuleFactory)
     assert "[name" in b.agent.rmpa("why", "/robot/work")[1] or "(name)" in b.agent.rmpa("why", "/robot/work")[1]
 
 
-@pytest.mark.parametrize("kind", CLIENTS)
-def test_a_port_that_a_firewall_closes_is_relayed_soon(modules: ModuleFactory, kind: str) -> None:
+def test_a_port_that_a_firewall_closes_is_relayed_soon(modules: ModuleFactory) -> None:
     a, b = modules("a", "b", config=AUTO)
-    on_network(a, b)
-    worker(a, kind)
+    on_the_network(a, b)
+    worker(a)
     address = str(wait_transport(b, "direct")["address"])
-    client = caller(b, kind)
+    client = caller(b)
     assert calls(client, "echo 0 10 2 once")["same"] == 2
     # The answers of that port get lost, and those of the agent do not.
     a.host.ip("rule", "add", "ipproto", "tcp", "sport", address.rpartition(":")[2], "blackhole")
@@ -281,7 +248,7 @@ def test_a_roscore_answers_all_nodes_alike_so_its_module_is_relayed(
     ros.roscore()
     b = Module(second, agent(second, name="b", config=AUTO, flags=("--core", "external")), ros)
     a.agent.wait_peer("b")
-    on_network(a, b)
+    on_the_network(a, b)
     worker(a)
     worker(b, "roscpp", "/mine")
     wait_transport(b, "relay", "core")

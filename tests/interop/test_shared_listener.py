@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from lab.bed.agents import Agent
+from lab.bed.namespaces import Host, Lab
 from lab.bed.processes import DEADLINE, eventually, run
 from rmpa.core.statistics import Counters
 from rmpa.ros.core.embedded import RosCore
@@ -18,16 +19,10 @@ from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import frame_message
+from tests.interop.conftest import AgentFactory, ShellFactory
 from tests.interop.modules import flows
 from tests.interop.nodes.payload import Pattern
-from tests.interop.ros import PYTHON
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from lab.bed.namespaces import Host, Lab
-    from tests.interop.conftest import AgentFactory, ShellFactory
-    from tests.interop.ros import Ros
+from tests.interop.ros import PYTHON, Ros
 
 BYTES = "std_msgs/UInt8MultiArray"
 HEAD = bytes(8)  # a layout without dimensions, offset 0

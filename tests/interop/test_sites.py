@@ -29,11 +29,11 @@ pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 pytestmark = [pytest.mark.ros, pytest.mark.nat, pytest.mark.timeout(120)]
 
 LONG: Final = 40.0
+# Seconds after which a killed module must be gone at the other site: 0.2 on a machine of its own, see lab/bench.
 _DETECTED: Final = 2.0
-"""Seconds after which a killed module must be gone at the other site: 0.2 on a machine of its own, see lab/bench."""
 LAMP: Final = Path(__file__).parent / "resources" / "lamp.py"
+# Of both gateways.
 RULES: Final = '[[gateway.rule]]\nnames = ["/secret/**"]\ncrossing = "none"\n'
-"""Of both gateways."""
 THERE: Final = ("--peer", "warehouse/arm")
 
 

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import os
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
+from rmpa.ros.core.embedded import RosCore
 from rmpa.runtime.kernel_tcp import connections, end_connections, may_end_connections
+from tests.interop.conftest import AgentFactory
+from tests.interop.ros import Ros
 from tests.interop.test_core_nodes import publisher_at
 from tests.interop.test_realtime import Prefixed, runs
 from tests.ros.node.peers import RawSubscriber
-
-if TYPE_CHECKING:
-    from rmpa.ros.core.embedded import RosCore
-    from tests.interop.conftest import AgentFactory
-    from tests.interop.ros import Ros
-
 
 WITHOUT_NET_ADMIN: Final = ("setpriv", "--bounding-set=-net_admin")
 DEADLINE: Final = 60.0

@@ -7,24 +7,22 @@ import json
 import os
 import signal
 import socket
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
+from lab.bed.processes import Process
+from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.http.rpc import call_api
+from rmpa.ros.node.node import Node, Publisher, Received
 from rmpa.ros.node.publication import AcceptedConnection, Publication, PublicationEvents
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import frame_message
-from tests.interop.conftest import framed, until
+from tests.interop.conftest import framed
 from tests.interop.nodes.payload import Pattern
-from tests.interop.ros import PYTHON
-
-if TYPE_CHECKING:
-    from lab.bed.processes import Process
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.node import Node, Publisher, Received
-    from tests.interop.ros import Ros
+from tests.interop.ros import PYTHON, Ros
+from tests.waiting import until
 
 pytestmark = pytest.mark.ros
 libraries = pytest.mark.parametrize("library", ["rospy", "roscpp"])
@@ -202,22 +200,3 @@ async def test_trap_21_requestTopic_answers_as_rospy_does(node: Node, ros: Ros, 
     assert [type(part) for part in theirs.value] == [type(part) for part in own.value]
     assert theirs.value[:2] == own.value[:2]
     assert (await call_api(node.uri, "requestTopic", "/x", "/other", [["TCPROS"]])).code == -1
-
-
-async def test_our_bytes_are_what_rospy_writes_and_reads(ros: Ros) -> None:
-    kind = MessageType("sensor_msgs/Joy")
-    values: Any = {
-        "header": {"seq": 1, "stamp": {"secs": 2, "nsecs": 3}, "frame_id": "ü"},
-        "axes": [1.5],
-        "buttons": [7],
-    }
-    ours = kind.serialize(kind.make(values))
-    program = (
-        "import io, sys, sensor_msgs.msg as m\n"
-        "joy = m.Joy().deserialize(bytes.fromhex(sys.argv[1]))\n"
-        "buffer = io.BytesIO(); joy.serialize(buffer)\n"
-        "print(buffer.getvalue().hex())\n"
-    )
-    theirs = bytes.fromhex((await tool(ros, PYTHON, "-c", program, ours.hex())).strip())
-    assert theirs == ours
-    assert kind.to_plain(kind.deserialize(theirs)) == values

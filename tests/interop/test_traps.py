@@ -6,13 +6,14 @@ import asyncio
 import itertools
 import logging
 import signal
+from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.bed.processes import eventually
+from lab.bed.agents import Agent
+from lab.bed.processes import Process, eventually
 from rmpa.bridge.messages import Description as About
 from rmpa.bridge.messages import RouteOpened, Source
 from rmpa.core.outbox import ABORT, FIRST, LAST
@@ -23,19 +24,12 @@ from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import encode_header, frame_message, subscriber_header
 from tests.bridge.io.proxied import Proxied
-from tests.interop.conftest import framed, until
+from tests.interop.conftest import AgentFactory, ShellFactory, framed
 from tests.interop.modules import flows, whole
 from tests.interop.nodes.payload import Pattern
-from tests.interop.ros import PYTHON
+from tests.interop.ros import PYTHON, Ros
 from tests.ros.node.peers import RawSubscriber
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from lab.bed.agents import Agent
-    from lab.bed.processes import Process
-    from tests.interop.conftest import AgentFactory, ShellFactory
-    from tests.interop.ros import Ros
+from tests.waiting import until
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 libraries = pytest.mark.parametrize("library", ["rospy", "roscpp"])

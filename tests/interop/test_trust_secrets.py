@@ -34,6 +34,7 @@ pytestmark = [pytest.mark.netns, pytest.mark.timeout(180)]
 pytest.importorskip("cryptography")
 
 
+# The files that have each secret, of the module that it belongs to.
 MAY_HOLD: Final = {
     "private key": {files_of.KEY},
     "CA key": {files_of.CA_KEY},
@@ -41,7 +42,6 @@ MAY_HOLD: Final = {
     "key of a token": {files_of.TOKENS},
     "web token": {"web-token"},
 }
-"""The files that have each secret, of the module that it belongs to."""
 COMMANDS: Final = (
     ("peer", "list", "--json"),
     ("peer", "list"),
@@ -272,14 +272,6 @@ def test_one_that_was_revoked_says_so_and_is_not_pending(gate: Gate) -> None:
     shown = [*(gate.stranger(each, "arm") for each in (gate.base, gate.pc))]  # also once the roster has forgotten it
     assert {(one.state, one.invite) for one in shown} == {("revoked", "")}
     assert told(gate.arm, "base")[0] == "revoked"
-
-
-def test_a_module_that_takes_the_name_of_a_member_is_not_pending(gate: Gate, agent: AgentFactory, lab: Lab) -> None:
-    eve = agent(lab.host("eve", 0), name="pc")
-    one = gate.stranger(gate.base, eve.snapshot().agent.guid.partition("#")[0])
-    assert (one.state, one.invite) == ("foreign", "")
-    assert "do not invite it" in one.last_error
-    assert "linked" in gate.base.rmpa("peer", "info", "pc")[1]
 
 
 @needs_browser

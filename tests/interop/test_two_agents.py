@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import signal
-from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.interop.conftest import AgentFactory, ShellFactory
 from tests.interop.modules import whole
-
-if TYPE_CHECKING:
-    from tests.interop.conftest import AgentFactory, ShellFactory
 
 
 @pytest.mark.ros
@@ -30,12 +27,3 @@ def test_signals_end_it_in_order(agent: AgentFactory, number: signal.Signals) ->
     assert first.process.wait() == 0
     assert first.sockets() == []
     assert "Traceback" not in first.process.output
-
-
-def test_a_socket_left_by_a_killed_agent_does_not_stop_the_next(agent: AgentFactory) -> None:
-    first = agent()
-    first.kill()
-    first.restart()
-    assert isinstance(first.peers(), dict)
-    assert first.terminate() == 0
-    assert first.sockets() == []

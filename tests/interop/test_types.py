@@ -5,25 +5,20 @@ from __future__ import annotations
 import json
 import re
 import subprocess
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import pytest
 
 from lab.bed.agents import RMPA
-from lab.bed.processes import eventually, run
+from lab.bed.processes import Process, eventually, run
 from rmpa.ros.types.definitions import known_text
 from rmpa.ros.types.find import find_message_type, find_service_type
-from tests.interop.modules import flows
+from tests.interop.conftest import ModuleFactory
+from tests.interop.modules import Module, flows
 from tests.interop.ros import NODES, PYTHON, lacks
 from tests.ros.types.genmsg_cases import MESSAGES, SERVICES, VALUES, VALUES_OF
 from tests.ros.types.workspaces import package
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from lab.bed.processes import Process
-    from tests.interop.conftest import ModuleFactory
-    from tests.interop.modules import Module
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
 LONG: Final = 40.0

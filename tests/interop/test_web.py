@@ -6,34 +6,32 @@ import asyncio
 import json
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
 from lab.bed.agents import RMPA, Agent
 from lab.bed.chromium import Chromium
 from lab.bed.http_client import http_client
+from lab.bed.namespaces import Lab
 from lab.bed.processes import DEADLINE, Process
 from rmpa.web.monitor.limits import DRIVE_SPEED
+from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory, WebFactory
 from tests.interop.modules import Module
 from tests.interop.web import needs_browser
-
-if TYPE_CHECKING:
-    from lab.bed.namespaces import Lab
-    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory, WebFactory
-    from tests.interop.web import Monitor
+from tests.web.monitor.page import Page
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(150)]
 
 CAMERA: Final = Path(__file__).parent / "resources" / "camera.py"
+# Seconds within which a change shows.
 SHOWN: Final = 1.5
-"""Seconds within which a change shows."""
+# Seconds within which a robot is stopped whose driver has gone.
 STOPPED: Final = 1.0
-"""Seconds within which a robot is stopped whose driver has gone."""
+# What an arrow key commands, m/s: its share of the stick, of what the page's slider says at first.
 HELD: Final = 0.6 * 0.15 * DRIVE_SPEED
-"""What an arrow key commands, m/s: its share of the stick, of what the page's slider says at first."""
+# What a talker's live value counts.
 NUMBER: Final = "Number(/message (\\d+)/.exec(document.querySelector('.tree')?.innerText)?.[1])"
-"""What a talker's live value counts."""
 
 
 async def restart(agent: Agent) -> None:
@@ -172,7 +170,7 @@ async def test_a_joystick_drives_a_robot_of_another_module_until_its_browser_is_
     await wheels.expect_event("up")
     async with http_client(tablet) as http, looking.monitor(http) as monitor:
         assert "drive" not in monitor.hello["may"]
-        await monitor.send("drive", topic="/cmd_vel", linear=1, angular=0, hold=1, n=1, at=0)
+        await monitor.drive(1.0)
         assert "may not drive" in (await monitor.next("failed"))["error"]
         assert "Publishers: None" in await asyncio.to_thread(arm.ros.tool, "rostopic", "info", "/cmd_vel")
     async with Chromium(tablet) as page:
@@ -285,9 +283,9 @@ async def test_what_is_asked_of_a_peer_is_answered(lab: Lab, modules: ModuleFact
         assert answer["seconds"] < DEADLINE
         assert [event["data"] for event in switch.events("call")] == [True]
         failed = await monitor.ask("call", service="/switch", peer="arm", request={"date": True})
-        assert "date" in failed["error"]
+        assert "date" in failed
         failed = await monitor.ask("call", service="/switch", peer="base", request={})
-        assert "of arm" in failed["error"]
+        assert "of arm" in failed
         assert len(switch.events("call")) == 1
 
         await heard.expect_event("first")
@@ -302,7 +300,7 @@ async def test_what_is_asked_of_a_peer_is_answered(lab: Lab, modules: ModuleFact
         assert "knows no peer 'leg'" in way["stages"][0]["text"]
 
 
-async def parameters(module: Module, peer: str, monitor: Monitor) -> None:
+async def parameters(module: Module, peer: str, monitor: Page) -> None:
     """Set, read and delete a module's parameters as a page does, beside the stock rosparam."""
 
     async def rosparam(*words: str) -> str:
@@ -312,9 +310,9 @@ async def parameters(module: Module, peer: str, monitor: Monitor) -> None:
     assert values["values"]["gains"] == {"p": 1.5}
     assert await rosparam("get", "/gains/p") == "1.5"
     await rosparam("set", "/gains/names", "[a, b]")
-    await monitor.until("params", lambda found: found["values"]["gains"].get("names") == ["a", "b"], peer=peer)
+    await monitor.answered("params", lambda found: found["values"]["gains"].get("names") == ["a", "b"], peer=peer)
     values = await monitor.answered("delete_param", peer=peer, name="/gains/p")
     assert values["values"]["gains"] == {"names": ["a", "b"]}
     assert "/gains/p" not in (await rosparam("list")).split()
-    assert "null" in (await monitor.ask("set_param", peer=peer, name="/gains/i", value=None))["error"]
-    assert "not a name" in (await monitor.ask("set_param", peer=peer, name="gains", value=1))["error"]
+    assert "null" in await monitor.ask("set_param", peer=peer, name="/gains/i", value=None)
+    assert "not a name" in await monitor.ask("set_param", peer=peer, name="gains", value=1)

@@ -34,9 +34,10 @@ from rmpa.ros.types.definitions import known_specifications, known_types
 from tests.interop import npm
 from tests.interop.web import PORT, Web
 from tests.ros.types.filled import filled, filled_message
+from tests.waiting import until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Iterator
+    from collections.abc import AsyncIterator, Iterator
     from pathlib import Path
 
     from lab.bed.namespaces import Host, Lab
@@ -84,17 +85,6 @@ def url(web: Web) -> str:
     return f"ws://{web.host}/?token={web.token}"
 
 
-async def until(condition: Callable[[], Any], what: str) -> Any:
-    """Wait until something has happened; return what it is."""
-    try:
-        async with asyncio.timeout(DEADLINE):
-            while not (found := condition()):
-                await asyncio.sleep(0.05)
-    except TimeoutError:
-        raise AssertionError(what) from None
-    return found
-
-
 # --- JavaScript -----------------------------------------------------------------------------------------------------
 
 
@@ -119,10 +109,10 @@ def example(*words: str | Path) -> Process:
     return Process(["node", home / main, *words], name=str(words[0]))
 
 
+# Each type has a topic of its own below this.
 KINDS: Final = "/kinds"
-"""Each type has a topic of its own below this."""
+# Of the shipped types a third, which has all kinds of fields.
 TYPES: Final = known_types()[::3]
-"""Of the shipped types a third, which has all kinds of fields."""
 
 
 @contextlib.asynccontextmanager
@@ -249,10 +239,10 @@ async def test_the_parameter_example_follows_and_sets_parameters(
 
 # --- roslibpy -------------------------------------------------------------------------------------------------------
 
+# tf2_web_republisher has to run, which is a node in C++ of its own repository.
 NEEDS_A_NODE_OF_ITS_OWN: Final = "tests/ros1/test_tf.py::test_tf_test"
-"""tf2_web_republisher has to run, which is a node in C++ of its own repository."""
+# Where roslibpy's tests connect, without a token.
 ROSBRIDGE_PORT: Final = 9090
-"""Where roslibpy's tests connect, without a token."""
 
 
 @contextlib.asynccontextmanager

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import json
 import subprocess
-from typing import TYPE_CHECKING, Final
+from collections.abc import Collection, Iterable
+from typing import Final
 
-from lab.bed.processes import DEADLINE, Deadline, eventually
+from lab.bed.processes import DEADLINE, Deadline, Event, Process, eventually
+from rmpa.core.facts import SubscriberTransport
 from rmpa.observe.control_client import ControlClient
 from tests.interop.modules import Module, flows
 from tests.interop.ros import PYTHON
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
-
-    from lab.bed.processes import Event, Process
-    from rmpa.core.facts import SubscriberTransport
 
 AUTO: Final = '[bridge]\ntransport = "auto"\n'
 _BUS_INFO: Final = """

@@ -4,30 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
-import json
-import time
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Final, Self
 
 import aiohttp
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from lab.bed.agents import RMPA
-from lab.bed.chromium import BINARY
+from lab.bed.agents import RMPA, Agent
+from lab.bed.chromium import BINARY, Chromium
 from lab.bed.processes import DEADLINE, Process
 from rmpa.web.monitor.messages import SUBPROTOCOL
-from tests.web.monitor.patches import apply
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
-    from lab.bed.agents import Agent
-    from lab.bed.chromium import Chromium
+from tests.web.monitor.page import Page
 
 PORT: Final = 8480
-REFUSED: Final = "rmpa_web_refused_total"
 needs_browser = pytest.mark.skipif(BINARY is None, reason="Chromium is not installed: apt install chromium")
 
 
@@ -75,20 +66,14 @@ class Web:
         await page.wait("document.querySelector('h1') && window.rmpa?.state && !location.search")
 
     @contextlib.asynccontextmanager
-    async def monitor(self, http: aiohttp.ClientSession) -> AsyncIterator[Monitor]:
+    async def monitor(self, http: aiohttp.ClientSession) -> AsyncIterator[Page]:
         """A WebSocket as a page has one, that has its first state."""
         async with http.ws_connect(
             f"ws://{self.host}/monitor", protocols=(SUBPROTOCOL,), headers=self.bearer
         ) as made:
-            monitor = Monitor(made)
-            await monitor.next("state")
-            yield monitor
-
-    @contextlib.asynccontextmanager
-    async def rosbridge(self, http: aiohttp.ClientSession) -> AsyncIterator[Socket]:
-        """A rosbridge client."""
-        async with http.ws_connect(f"ws://{self.host}/rosbridge", headers=self.bearer) as made:
-            yield Socket(made)
+            page = Page(made)
+            await page.sees(lambda: page.state)
+            yield page
 
     async def counts(self, http: aiohttp.ClientSession, name: str, label: str) -> dict[str, float]:
         """The samples of a metric that are not 0, by one label."""
@@ -110,78 +95,3 @@ class Web:
                     await asyncio.sleep(0.1)
         except TimeoutError:
             raise AssertionError(f"{name}: {found}") from None
-
-
-class Socket:
-    """A WebSocket with messages of JSON that say by ``op`` what they are."""
-
-    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
-        self._socket = socket
-
-    async def send(self, op: str, **values: Any) -> None:
-        """Send a message."""
-        await self._socket.send_json({"op": op, **values})
-
-    async def next(self, *ops: str) -> dict[str, Any]:
-        """The next message that is one of these."""
-        async with asyncio.timeout(DEADLINE):
-            while True:
-                frame = await self._socket.receive()
-                assert frame.type is aiohttp.WSMsgType.TEXT, frame
-                message: dict[str, Any] = json.loads(frame.data)
-                await self._take(message)
-                if message["op"] in ops:
-                    return message
-
-    async def _take(self, message: dict[str, Any]) -> None:
-        """Act on any message."""
-
-
-class Monitor(Socket):
-    """What a page has: the state, kept up to date, and questions.
-
-    Attributes:
-        hello: The first message.
-        state: The newest.
-    """
-
-    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
-        super().__init__(socket)
-        self.hello: dict[str, Any] = {}
-        self.state: Any = None
-        self._numbers = itertools.count(1)
-
-    async def ask(self, what: str, **args: Any) -> dict[str, Any]:
-        """The server's ``answer``, or its ``failed``."""
-        number = next(self._numbers)
-        await self.send("ask", id=number, what=what, args=args, at=time.monotonic())
-        while True:
-            message = await self.next("answer", "failed")
-            if message["id"] == number:
-                return message
-
-    async def until(self, what: str, fits: Callable[[Any], bool], **args: Any) -> Any:
-        """The answer's value, asked again until it fits: what it is about may not be there yet."""
-        message: dict[str, Any] = {}
-        try:
-            async with asyncio.timeout(DEADLINE):
-                while "value" not in (message := await self.ask(what, **args)) or not fits(message["value"]):
-                    await asyncio.sleep(0.1)
-        except TimeoutError:
-            raise AssertionError(f"{what} {args}: {message}") from None
-        return message["value"]
-
-    async def answered(self, what: str, **args: Any) -> Any:
-        """The answer's value, asked again until there is one."""
-        return await self.until(what, lambda _: True, **args)
-
-    async def _take(self, message: dict[str, Any]) -> None:
-        match message["op"]:
-            case "hello":
-                self.hello = message
-            case "state":
-                self.state = message["state"]
-            case "patch":
-                self.state = apply(self.state, message["patch"])
-        if "n" in message:
-            await self.send("ack", n=message["n"])

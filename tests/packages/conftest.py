@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
 from lab import results
 from lab.bed import namespaces
 from lab.bed.namespaces import Lab
+from lab.bed.processes import Process
 from tests.packages import machines
 from tests.packages.machines import Machine
 from tests.packages.ways import USER, WAYS, Way, install_package
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from lab.bed.processes import Process
-
+# What an agent says of a peer that it has a link to.
 LINKED: Final = r"= {} .*: linked"
-"""What an agent says of a peer that it has a link to."""
 _UP: Final = 60.0
 _seconds = pytest.StashKey[dict[str, dict[str, float]]]()
 
@@ -56,8 +53,8 @@ class Team:
     way: Way
     machines: list[Machine]
     programs: dict[Machine, str] = field(default_factory=dict)
+    # What shows an agent's log: its terminal, or the journal.
     agents: dict[Machine, Process] = field(default_factory=dict)
-    """What shows an agent's log: its terminal, or the journal."""
     seconds: dict[str, float] = field(default_factory=dict)
 
     def install(self, machine: Machine, file: str) -> None:

@@ -17,26 +17,23 @@ import hashlib
 import os
 import shutil
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self
+from typing import Final, Self
 
 from lab.bed import namespaces
+from lab.bed.namespaces import Host
 from lab.bed.processes import DEADLINE, BedError, Process, eventually, run
 from lab.bed.ros import words
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from lab.bed.namespaces import Host
-
 CLONE: Final = Path(__file__).parents[2]
+# Where the talker and the listener of the tests are on a machine.
 NODES: Final = "/srv/nodes"
-"""Where the talker and the listener of the tests are on a machine."""
 _ENTER: Final = CLONE / "scripts/enter-chroot"
 _SOURCES: Final = [CLONE / "lab/nodes", CLONE / "tests/interop/nodes"]
 _PROGRAMS: Final = ("talker", "listener")
+# Seconds until a chroot is built: minutes on a fast line, and arm64's is emulated.
 _BUILT: Final = 900.0
-"""Seconds until a chroot is built: minutes on a fast line, and arm64's is emulated."""
 _BOOT: Final = """
 mount -t sysfs sysfs /sys 2>/dev/null || true
 echo "$1" >/etc/hostname

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tarfile
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -14,12 +14,9 @@ from tests.interop.ros import Ros
 from tests.packages.machines import Machine
 from tests.packages.ways import USER, bundle
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
 pytestmark = [pytest.mark.packages, pytest.mark.ros, pytest.mark.timeout(1800)]
+# Seconds for what takes ten on a board.
 _SLOW = 240.0
-"""Seconds for what takes ten on a board."""
 
 
 def _unpack(archive: Path, home: Path) -> str:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 import subprocess
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
 
 import pytest
 
@@ -12,10 +14,6 @@ from lab.bed.namespaces import Lab
 from lab.bed.processes import CommandFailed
 from tests.packages.machines import Machine, why_no_systemd
 from tests.packages.ways import USER, package
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 pytestmark = [pytest.mark.packages, pytest.mark.timeout(900)]
 RATE: Final = 100

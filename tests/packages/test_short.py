@@ -8,7 +8,7 @@ from __future__ import annotations
 import platform
 import shutil
 import subprocess
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -19,9 +19,6 @@ from tests.interop.modules import whole
 from tests.interop.ros import Ros
 from tests.packages.machines import Machine, chroot
 from tests.packages.ways import DIST, USER, install_package, purge
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = [pytest.mark.packages, pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(600)]
 

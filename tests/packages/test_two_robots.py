@@ -8,10 +8,11 @@ import re
 import ssl
 import sys
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from http.client import HTTPSConnection
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 import pytest
 
@@ -22,17 +23,14 @@ from tests.packages.machines import CLONE, Machine
 from tests.packages.tutorial import COPYING, Step, reading_minutes, shows, steps
 from tests.packages.ways import USER, package, wheel
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 PAGE: Final = (CLONE / "docs/start/two-robots.md").read_text(encoding="utf-8")
 ROBOTS: Final = ("robot1", "robot2")
+# That the page promises, for reading, typing and what the machines take.
 MINUTES: Final = 15.0
-"""That the page promises, for reading, typing and what the machines take."""
+# Commands that keep their terminal until Ctrl-C.
 _STAYS: Final = re.compile(r"rmpa (up|trust invite|topic (pub|echo))\b")
-"""Commands that keep their terminal until Ctrl-C."""
+# In a terminal an invitation is a whole command, in a pipe the token alone.
 _SECRET: Final = re.compile(r"(?:rmpa trust join )?rmpa1-\w+|\?token=\S+")
-"""In a terminal an invitation is a whole command, in a pipe the token alone."""
 _ONLINE: Final = re.compile(r"sudo apt |sudo /opt/rmpa/bin/pip ")
 _OF_PACKAGE: Final = re.compile(r"sudo apt install \./rmpa_")
 _OF_PIP: Final = re.compile(r"sudo apt install python3-venv|.* /opt/rmpa\b")

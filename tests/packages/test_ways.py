@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
 
 import pytest
 
 from tests.interop.modules import whole
-from tests.packages.conftest import LINKED, around
+from tests.packages.conftest import LINKED, Team, around
 from tests.packages.ways import USER
-
-if TYPE_CHECKING:
-    from tests.packages.conftest import Team
 
 pytestmark = [pytest.mark.packages, pytest.mark.timeout(900)]
 

@@ -8,16 +8,14 @@ in which such a command runs), ``<!-- cable: robot2 out -->``, ``<!-- browser --
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
+# Words a minute, of one who reads in a second language.
 READING: Final = 200.0
-"""Words a minute, of one who reads in a second language."""
+# Seconds to copy a command into the terminal where it belongs, or to type a short one.
 COPYING: Final = 5.0
-"""Seconds to copy a command into the terminal where it belongs, or to type a short one."""
 _PART: Final = re.compile(
     r"^```(?P<kind>\w+)\n(?P<block>.*?)^```$|^<!-- (?P<hand>ctrl-c|cable|browser)(?:: (?P<what>[^>]*))? -->$|"
     r"^\|(?P<head>(?: \w+ \|)+)\n\|[-|]+\n(?P<rows>(?:\|[^\n]*\|\n)+)",

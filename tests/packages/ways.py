@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
-from tests.packages.machines import CLONE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from tests.packages.machines import Machine
+from tests.packages.machines import CLONE, Machine
 
 USER: Final = "robot"
 DIST: Final = CLONE / "dist"
+# Seconds for one command that installs: more than a user is to wait, so that a figure is there in any case.
 _PATIENCE: Final = 180.0
-"""Seconds for one command that installs: more than a user is to wait, so that a figure is there in any case."""
+# The system's; uv has a set of its own, which knows no proxy of this network.
 _CERTIFICATES: Final = "/etc/ssl/certs/ca-certificates.crt"
-"""The system's; uv has a set of its own, which knows no proxy of this network."""
+# What /opt/ros/noetic/setup.bash sets, with the places that Debian's ROS has.
 NOETIC: Final = {
     "ROS_DISTRO": "noetic",
     "ROS_ETC_DIR": "/etc/ros",
@@ -32,7 +29,6 @@ NOETIC: Final = {
     "PYTHONPATH": "/usr/lib/python3/dist-packages",
     "LD_LIBRARY_PATH": "/usr/lib:/usr/lib/x86_64-linux-gnu",
 }
-"""What /opt/ros/noetic/setup.bash sets, with the places that Debian's ROS has."""
 
 
 def _newest(pattern: str) -> Path | None:

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator
 
 import pytest
 
@@ -11,9 +11,6 @@ from rmpa.ros.types.definitions import ARRAY_TYPE
 from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from rmpa.resource.quality import Attribute, Bound, QoSRequest
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rmpa.ros.node.endpoints import Subscriber
-    from rmpa.ros.node.node import Node
+from rmpa.ros.node.endpoints import Subscriber
+from rmpa.ros.node.node import Node
 
 TEXT = "std_msgs/String"
 ARRAY = "diagnostic_msgs/DiagnosticArray"
@@ -22,15 +19,6 @@ OK, WARN, ERROR, STALE = range(4)
 def bound(attribute: Attribute, **request: Any) -> Bound:
     """The bound of a request: ``bound(RATE, at_least="20 Hz", hard=True)``."""
     return QoSRequest(**request).bound(attribute)
-
-
-async def until(true: Callable[[], object], why: str = "it does not come") -> None:
-    try:
-        async with asyncio.timeout(DEADLINE):
-            while not true():
-                await asyncio.sleep(0.01)
-    except TimeoutError:
-        raise AssertionError(why) from None
 
 
 async def listen(node: Node, topic: str, kind: str = TEXT) -> list[Any]:

@@ -1,8 +1,9 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -12,9 +13,6 @@ from rmpa.resource.decision import Alarm, AlarmKind, Decider
 from rmpa.resource.declare import AdaptationSettings, Profile
 from rmpa.resource.quality import MEASURED, Bound, Requirement
 from tests.resource.rig import bound
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 RATE, LATENCY = MEASURED["rate"], MEASURED["latency"]
 ATTRIBUTES = {"rate": RATE, "latency": LATENCY}
@@ -233,13 +231,6 @@ def test_failed_profile_is_excluded_for_its_cool_down() -> None:
     assert one.explain(12.0)[1].excluded == ""
 
 
-def test_failure_reapplies_the_previous_profile() -> None:
-    one = running(1)
-    assert applies(one.pin("fast", 2.0)) == ["fast"]
-    one.pin("", 2.5)
-    assert applies(one.failed("fast", "broken", 3.0)) == ["slow"]
-
-
 def test_first_ended_cool_down_retries() -> None:
     one = Loop(FAST, SLOW)
     one.reconsider("it starts", 0.0)
@@ -315,17 +306,6 @@ def test_failed_choice_is_retried_after_its_cool_down() -> None:
     one.failed("fast", "broken", 12.0)
     finish(one, 12.0)
     assert applies(one.pin("fast", 12.5)) == ["fast"]
-
-
-def test_infeasible_request_raises_one_alarm() -> None:
-    one = running(5)
-    raised = one.require(Requirement("/c", {"latency": bound(LATENCY, at_most=0.001, hard=True)}), 2.0)
-    assert [kind for kind, _, _ in alarms(raised)] == [AlarmKind.NON_ADAPTABLE]
-    finish(one, 2.0)
-    for now in (3.0, 4.0, 5.0):
-        assert one.window({"rate": 40.0}, now) == []
-    assert one.alarm is not None
-    assert any(isinstance(action, Clear) for action in one.release("/c", 6.0))
 
 
 def test_request_while_applying_counts_afterwards() -> None:

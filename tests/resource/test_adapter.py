@@ -3,7 +3,8 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import AsyncIterator, Callable
+from typing import Any
 
 import msgspec
 import pytest
@@ -19,14 +20,11 @@ from rmpa.resource.node import ResourceNode
 from rmpa.resource.quality import MEASURED, Bound, Requirement, at_least, at_most
 from rmpa.resource.resource import Resource
 from rmpa.resource.runtime import RuntimePart
+from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import DiagnosticLevel
-from tests.resource.rig import ARRAY, ERROR, OK, WARN, bound, listen, pairs, status, until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
-    from rmpa.ros.core.embedded import RosCore
+from tests.resource.rig import ARRAY, ERROR, OK, WARN, bound, listen, pairs, status
+from tests.waiting import until
 
 RATE, LATENCY = MEASURED["rate"], MEASURED["latency"]
 ATTRIBUTES = {"rate": RATE, "latency": LATENCY}

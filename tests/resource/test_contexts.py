@@ -6,7 +6,8 @@ import asyncio
 import contextlib
 import math
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import AsyncIterator, Callable
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -19,14 +20,11 @@ from rmpa.resource.node import ResourceNode
 from rmpa.resource.quality import at_least
 from rmpa.resource.reconfigure import DESCRIPTION_TYPE, read_config
 from rmpa.resource.resource import Resource
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.node import Node
 from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE
-from tests.resource.rig import ARRAY, DEADLINE, TEXT, listen, until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.node import Node
+from tests.resource.rig import ARRAY, DEADLINE, TEXT, listen
+from tests.waiting import until
 
 
 class Lamp:
@@ -35,8 +33,8 @@ class Lamp:
     def __init__(self, core: RosCore) -> None:
         self.core = core
         self.problem: Exception | None = None
+        # The context whose function fails.
         self.jammed = ""
-        """The context whose function fails."""
         self.profile = self.place = ""
         self.entered: list[str] = []
         one = self.resource = Resource("lamp", role="acting")

@@ -5,8 +5,9 @@ from __future__ import annotations
 import ast
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -29,9 +30,6 @@ from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import DefinitionError
 from rmpa.ros.types.descriptor import CONFIG_TYPE, Descriptor
 from rmpa.ros.types.messages import MessageType
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 def sonar() -> Resource:

@@ -1,17 +1,13 @@
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING
 
 import pytest
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource.measuring import ObservedQualities, QualityMeasurement, TopicQuality, count_missing
-from rmpa.resource.quality import Bound, Requirement
+from rmpa.resource.quality import Bound, Requirement, Value
 from rmpa.resource.resource import Resource
-
-if TYPE_CHECKING:
-    from rmpa.resource.quality import Value
 
 WALL = 1_700_000_000 * 1_000_000_000
 

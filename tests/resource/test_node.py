@@ -3,7 +3,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -12,15 +12,14 @@ from rmpa.resource.node import TRANSITIONS, ResourceNode, run_all
 from rmpa.resource.quality import at_most
 from rmpa.resource.resource import Resource
 from rmpa.resource.runtime import LifecycleState
+from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.http.rpc import call_api
+from rmpa.ros.node.endpoints import Subscriber
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import DiagnosticLevel
 from rmpa.ros.types.descriptor import Descriptor
-from tests.resource.rig import OK, STALE, WARN, status, until
-
-if TYPE_CHECKING:
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.endpoints import Subscriber
+from tests.resource.rig import OK, STALE, WARN, status
+from tests.waiting import until
 
 
 def echo(**options: Any) -> Resource:

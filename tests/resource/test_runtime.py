@@ -1,14 +1,19 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any, Final
 
 import pytest
 
 from rmpa.core.errors import LocalProtocolError
+from rmpa.resource.declare import Input, Output
 from rmpa.resource.node import ResourceNode, run_all
 from rmpa.resource.resource import Resource
 from rmpa.resource.runtime import Runtime, RuntimePart, describe
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.endpoints import Received
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import SEPARATOR, UnknownTypeError
 from rmpa.ros.types.descriptor import Descriptor
@@ -16,14 +21,6 @@ from rmpa.ros.types.installed import packages_below
 from rmpa.ros.types.messages import MessageError, MessageType
 from rmpa.ros.wire.tcpros import TopicDescription
 from tests.ros.types.workspaces import package
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
-    from pathlib import Path
-
-    from rmpa.resource.declare import Input, Output
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.endpoints import Received
 
 
 @pytest.fixture

@@ -4,17 +4,15 @@ import asyncio
 import re
 import threading
 import time
+from collections.abc import AsyncIterator, Callable
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
 from rmpa.resource.resource import Resource
 from rmpa.resource.tasks import TaskReport, Tasks, restart_delay, stuck_after
-from tests.resource.rig import until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+from tests.waiting import until
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from typing import Final
 
 ROOT: Final = Path(__file__).parents[2]
 NUMBERS: Final = tuple(sorted([*map(str, range(1, 43)), "16a"], key=lambda n: (int(n.rstrip("a")), n)))
+# Traps without a test, and why.
 NOT_YET: Final[dict[str, str]] = {}
-"""Traps without a test, and why."""
 
 
 @functools.cache

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import socket
+from collections.abc import Callable
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import Outbox
 from rmpa.runtime.stream import Stream
-
-if TYPE_CHECKING:
-    import socket
-    from collections.abc import Callable
-
-    from rmpa.runtime.tls import SecureSocket
+from rmpa.runtime.tls import SecureSocket
 
 STREAMS: list[Stream] = []
 

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
+import socket
 import ssl
 import tempfile
 from datetime import UTC, datetime
 from functools import cache
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 from cryptography.hazmat.primitives import serialization
 
-from rmpa.runtime.tls import SecureSocket, TlsHandshake
+from rmpa.runtime.tls import Buffer, SecureSocket, TlsHandshake
 from tests.trust.authority import Authority, new_key
 
-if TYPE_CHECKING:
-    import socket
-
-    from rmpa.runtime.tls import Buffer
-
+# Of the client and of the server.
 Contexts = tuple[ssl.SSLContext, ssl.SSLContext]
-"""Of the client and of the server."""
 NOW = datetime.now(UTC).timestamp()
 
 

@@ -6,7 +6,8 @@ import asyncio
 import contextlib
 import errno
 import socket
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -14,9 +15,7 @@ from rmpa.runtime import accept as acceptor
 from rmpa.runtime import limits
 from rmpa.runtime.accept import Acceptor, Descriptors, Use
 from tests.runtime.descriptors_left import descriptors_left
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+from tests.waiting import until
 
 
 class Listening(socket.socket):
@@ -88,12 +87,6 @@ async def rounds(count: int) -> None:
     """Let the loop go round."""
     for _ in range(count):
         await asyncio.sleep(0)
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(10):
-        while not condition():
-            await asyncio.sleep(0.001)
 
 
 async def test_it_hands_over_what_it_accepts_non_blocking(descriptors: Descriptors) -> None:

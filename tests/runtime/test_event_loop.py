@@ -4,14 +4,11 @@ import asyncio
 import selectors
 import socket
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Coroutine, Iterator
 
 import pytest
 
 from rmpa.runtime.loop import AgentLoop, DirectSelector, sorted_yielding, until, yield_to_data, yielding_to_data
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterator
 
 DEADLINE = 20.0
 Pair = tuple[socket.socket, socket.socket]

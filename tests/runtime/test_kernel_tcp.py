@@ -11,10 +11,11 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 from hypothesis import given
@@ -37,9 +38,6 @@ from rmpa.runtime.kernel_tcp import (
     try_to_end,
 )
 from tests.runtime.capabilities import NET_ADMIN, without
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 DEADLINE: Final = 30.0
 

@@ -13,8 +13,9 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
@@ -23,9 +24,6 @@ from rmpa.runtime import limits, realtime
 from rmpa.runtime.files import set_aside
 from rmpa.runtime.log_writer import LogWriter
 from rmpa.runtime.systemd import restart_text, watchdog_period
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
 
 NOBODY: Final = 65534
 

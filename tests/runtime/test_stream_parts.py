@@ -6,32 +6,27 @@ import asyncio
 import contextlib
 import random
 import socket
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator, Callable
 
 import pytest
 
 from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError
-from rmpa.core.outbox import URGENT, Outbox, QueuedMessage
+from rmpa.core.outbox import URGENT, Framer, Outbox, QueuedMessage
 from rmpa.mesh.frames import Frame, FrameKind, pack_fragment_header
 from rmpa.runtime.stream import Stream
+from tests import waiting
 from tests.core.outbox_model import Reader, fence, payload, whole
 from tests.runtime.message_streams import STREAMS, close_all
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
-    from rmpa.core.outbox import Framer
 
 Sockets = tuple[socket.socket, socket.socket]
 FRAGMENT = limits.FRAGMENT_BYTES
 
 
 async def until(condition: Callable[[], bool], receiver: Receiver | None = None) -> None:
-    async with asyncio.timeout(20):
-        while not condition():
-            assert receiver is None or not receiver.stream.closed, receiver.ends
-            await asyncio.sleep(0.001)
+    """Wait, and say at once if the receiver has ended."""
+    await waiting.until(lambda: condition() or (receiver is not None and receiver.stream.closed))
+    assert condition(), receiver and receiver.ends
 
 
 @pytest.fixture

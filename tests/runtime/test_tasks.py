@@ -7,8 +7,8 @@ import asyncio
 import contextvars
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -16,9 +16,6 @@ import rmpa
 from rmpa.runtime import tasks
 from rmpa.runtime.accept import in_thread
 from rmpa.runtime.tasks import OwnedTasks, end_tasks, keep_task, start_task
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 _SOURCE = Path(rmpa.__file__).parent
 _STARTERS = {"create_task", "ensure_future", "TaskGroup", "start_server", "start_unix_server"}

@@ -18,10 +18,9 @@ from rmpa.runtime.tls import INCOMPLETE, SecureSocket, TlsHandshake
 from tests.runtime.message_streams import End
 from tests.runtime.secure_pairs import SecurePairs, make_context
 from tests.trust.authority import Authority
+from tests.waiting import until
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from tests.runtime.secure_pairs import SecurePairs
 
 pytest.importorskip("cryptography")
@@ -213,12 +212,6 @@ def test_a_foreign_ca_is_told_to_the_other_side(tls: SecurePairs) -> None:
 
 
 pytest.importorskip("cryptography")
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(30):
-        while not condition():
-            await asyncio.sleep(0.001)
 
 
 def ends(tls: SecurePairs, most: int = 1 << 30, there: int = 1 << 30) -> tuple[End, End]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from concurrent.futures import Future
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cbor2
 import msgspec
@@ -13,17 +14,12 @@ import msgspec
 from rmpa.core.errors import RmpaError
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
-from rmpa.web.clients.frame_writer import FairQueue, Opcode
+from rmpa.web.clients.connection import ClientStream
+from rmpa.web.clients.frame_writer import FairQueue, Opcode, OutFrame
 from rmpa.web.hub.graph import GraphService, GraphTopic
 from rmpa.web.hub.hub import HubClient
 from rmpa.web.hub.node_link import EVERYTHING
 from rmpa.web.hub.topics import ReceivedMessage
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rmpa.web.clients.connection import ClientStream
-    from rmpa.web.clients.frame_writer import OutFrame
 
 NOW_NS = 1_700_000_000_000_000_123
 

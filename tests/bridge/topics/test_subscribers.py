@@ -40,7 +40,8 @@ from rmpa.ros.node.publication import Publication
 from rmpa.trust.permissions import Permissions
 from tests.bridge.io.doubles import Link
 from tests.bridge.recorder import Exports, Imports, Out, Send, context
-from tests.ros.node.peers import STRING, until
+from tests.ros.node.peers import STRING
+from tests.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import Callable

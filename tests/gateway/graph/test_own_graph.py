@@ -5,14 +5,15 @@ Whole modules and gateways run in one process, on loopback; what a neighbour of 
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import pytest
 
 from rmpa.agent.agent import Agent
 from rmpa.bridge.policy import is_outside
+from rmpa.config.settings import Settings
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.core.identity import OUTSIDE_GUID
 from rmpa.gateway.foreign import foreign_origin
@@ -21,11 +22,6 @@ from rmpa.gateway.rules import ForeignSource, MeshSource, SourceKind
 from rmpa.ros.wire.tcpros import ServiceDescription, TopicDescription
 from tests.agent.test_agent import Sink, node, until
 from tests.agent.test_services import connect, provider, serving
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
-    from rmpa.config.settings import Settings
 
 STRING_MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
 STRING = TopicDescription("std_msgs/String", STRING_MD5, "string data\n")

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
 from rmpa.bridge.context import BridgeContext
-from rmpa.bridge.policy import OPEN_GATE
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.config.peer_rules import ServiceRule
+from rmpa.config.rules import CrossingRule
 from rmpa.config.settings import ServiceSettings, Settings
 from rmpa.core.contract import Contracts
 from rmpa.core.statistics import Counters
@@ -19,18 +21,11 @@ from rmpa.gateway.rules import CrossingRules
 from rmpa.gateway.sites import topics
 from rmpa.gateway.sites.keys import SiteGateway
 from rmpa.gateway.sites.site import SiteNeighbour
-from rmpa.gateway.sites.topics import SiteContext
+from rmpa.gateway.sites.topics import ImportedTopic, SiteContext
+from rmpa.gateway.topics import ExportedTopic
 from rmpa.ros.wire.tcpros import TopicDescription
 from tests.gateway.memory_graph import MemoryGraph, MemoryTopic
 from tests.gateway.memory_zenoh import MemoryZenoh, eventually
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from rmpa.bridge.policy import PermissionGate
-    from rmpa.config.rules import CrossingRule
-    from rmpa.gateway.sites.topics import ImportedTopic
-    from rmpa.gateway.topics import ExportedTopic
 
 MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
 

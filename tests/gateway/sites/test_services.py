@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import AsyncIterator
+from typing import Any, cast
 
 import pytest
 
@@ -14,15 +15,10 @@ from rmpa.gateway.rules import CrossingRules, ForeignSource, MeshSource, SourceK
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
 from rmpa.gateway.sites.plans import SiteExport, SiteImport
 from rmpa.gateway.sites.services import SiteActions, SiteServices, asked_type, read_description
-from rmpa.ros.wire.tcpros import ServiceDescription
+from rmpa.ros.wire.tcpros import Buffer, ServiceDescription
 from tests.gateway.memory_graph import MemoryGraph, MemoryService
 from tests.gateway.memory_zenoh import MemoryZenoh
 from tests.gateway.sites.site_bed import site_context
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from rmpa.ros.wire.tcpros import Buffer
 
 RUN = "0" * 32
 MOVE = ServiceDescription("std_srvs/Trigger", "937c9679a518e3a18d831e57125ea522", "a/ARequest", "a/AResponse")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import pytest
@@ -20,18 +21,12 @@ from rmpa.gateway.sites.answers import SiteAnswers, WhyQuestion, here_stages, pa
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
 from rmpa.gateway.sites.plans import SiteImport
 from rmpa.observe.check import FAIL, OK, WARN, Check
-from rmpa.observe.sites import REPORT, SITE_INFO, SITE_WHY
+from rmpa.observe.sites import REPORT, SITE_INFO, SITE_WHY, SitesReport
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.wire.tcpros import TopicDescription
 from rmpa.trust.permissions import Permissions
 from tests.gateway.memory_zenoh import eventually as until
-from tests.gateway.sites.site_bed import site_bed
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from rmpa.observe.sites import SitesReport
-    from tests.gateway.sites.site_bed import Site, SiteBed
+from tests.gateway.sites.site_bed import Site, SiteBed, site_bed
 
 TEXT = TopicDescription("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n")
 SCAN = SiteImport(

@@ -191,6 +191,7 @@ def many_nodes(link: Link) -> None:
     )
 
 
+# Each with whether the link survives; ``None``: that depends on how fast it is.
 ATTACKS: tuple[tuple[Callable[[Link], None], bool | None], ...] = (
     (garbage, False),
     (unknown_routes, True),
@@ -209,7 +210,6 @@ ATTACKS: tuple[tuple[Callable[[Link], None], bool | None], ...] = (
     (opens_of_one, None),
     (many_nodes, True),
 )
-"""Each with whether the link survives; ``None``: that depends on how fast it is."""
 
 
 def mesh(here: str, victim: Guid) -> None:

@@ -29,8 +29,8 @@ SET_BOOL = {
     "request_definition": "bool data",
     "response_definition": "bool success\nstring message",
 }
+# What was made, by kind and name: it lives until the process ends.
 _kept: dict[str, Any] = {}
-"""What was made, by kind and name: it lives until the process ends."""
 
 
 def _publish(told: dict[str, Any], router: dict[str, Any]) -> None:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
+from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.http.rpc import call
 from rmpa.ros.http.server import XmlRpcServer
-from rmpa.ros.wire.xmlrpc import RosFault
-
-if TYPE_CHECKING:
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
 
 STRING = "std_msgs/String"
 
@@ -25,8 +22,8 @@ class Slave:
         self.subscriptions: list[list[str]] = []
         self.calls: list[tuple[str, list[XmlRpcValue]]] = []
         self.lists = 0
+        # Whether it refuses to say what it has, as a client library without these methods.
         self.error = False
-        """Whether it refuses to say what it has, as a client library without these methods."""
         self.go = asyncio.Event()
         self.go.set()
         self.at_once = self.most_at_once = 0

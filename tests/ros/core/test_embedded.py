@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import asyncio
 import uuid
-from typing import TYPE_CHECKING, Final, Self
+from collections.abc import AsyncIterator
+from typing import Final, Self
 
 import pytest
 
@@ -18,13 +19,9 @@ from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.wire.tcpros import TopicDescription, frame_message
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
+from rmpa.runtime.accept import Use
 from tests.ros.core.slaves import Slave
-from tests.ros.node.peers import DEADLINE, until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from rmpa.runtime.accept import Use
+from tests.waiting import DEADLINE, until
 
 STRING: Final = "std_msgs/String"
 

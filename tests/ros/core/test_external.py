@@ -5,8 +5,9 @@ import contextlib
 import errno
 import socket
 import threading
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import pytest
 
@@ -17,14 +18,9 @@ from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.external import MASTER_FAREWELL, MASTER_RETRY, ExternalCore
 from rmpa.ros.core.liveness import Liveness, Unreachable
 from rmpa.ros.http.server import XmlRpcServer
+from rmpa.ros.master.parameters import GraphChange
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
-from tests.ros.node.peers import DEADLINE, until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
-    from rmpa.ros.master.parameters import GraphChange
-
+from tests.waiting import DEADLINE, until
 
 # The external core against masters: the embedded one as another program's, and such that do wrong.
 

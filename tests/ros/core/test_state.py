@@ -7,9 +7,11 @@ import errno
 import math
 import os
 import threading
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import msgspec
 import pytest
@@ -27,11 +29,7 @@ from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import NodeRecord
 from rmpa.ros.wire.xmlrpc import XmlRpcValue, response_pieces
 from tests.ros.core.slaves import Slave
-from tests.ros.node.peers import DEADLINE, until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-    from pathlib import Path
+from tests.waiting import DEADLINE, until
 
 STRING: Final = "std_msgs/String"
 

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import errno
 import socket
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator
 
 import pytest
 
@@ -12,9 +12,6 @@ from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, Unreachabl
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call, connect, split_uri
 from rmpa.ros.wire.xmlrpc import serialize_response
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
 
 OK = serialize_response([1, "", 5])
 

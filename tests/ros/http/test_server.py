@@ -4,7 +4,8 @@ import asyncio
 import contextlib
 import os
 import socket
-from typing import TYPE_CHECKING, Final
+from collections.abc import AsyncIterator
+from typing import Final
 
 import pytest
 
@@ -15,9 +16,6 @@ from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.wire.http import HTTP_HEADERS_MAX
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, parse_response, serialize_call, serialize_response
 from rmpa.runtime.accept import raise_file_limit
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
 
 DEADLINE: Final = 10.0
 

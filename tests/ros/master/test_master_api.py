@@ -1,17 +1,13 @@
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING
 
 import pytest
 
 from rmpa.ros import limits
 from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.parameters import GraphChange, GraphState, RegistrationKind, SlaveCall
-from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, serialize_response
-
-if TYPE_CHECKING:
-    from rmpa.ros.wire.xmlrpc import RosReply
+from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, serialize_response
 
 A, B, C = "http://a:1/", "http://b:2/", "http://c:3/"
 STRING = "std_msgs/String"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 from hypothesis import given
@@ -10,12 +10,9 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.master.api import MasterApi
-from rmpa.ros.master.mirror import Call, Mirror, lookup_calls, read_lookups, read_survey, survey_calls
+from rmpa.ros.master.mirror import Call, Mirror, Survey, lookup_calls, read_lookups, read_survey, survey_calls
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
-
-if TYPE_CHECKING:
-    from rmpa.ros.master.mirror import Survey
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 OURS: Final = "http://127.0.0.1:1/"
 THEIRS: Final = "http://127.0.0.1:2/"

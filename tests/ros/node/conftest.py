@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator, Iterator
 
 import pytest
 
@@ -10,9 +10,6 @@ from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 from tests.ros.node.peers import RawSubscriber
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -5,30 +5,20 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from typing import TYPE_CHECKING, ClassVar, Final, Self
+from collections.abc import Mapping
+from typing import ClassVar, Final, Self
 
+from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.node.node import Node
 from rmpa.ros.wire.tcpros import LENGTH, TopicDescription, encode_header, parse_header, publisher_header
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+from rmpa.ros.wire.xmlrpc import XmlRpcValue
+from tests.waiting import DEADLINE
 
 MD5: Final = "992ce8a1687cec8c8bd883ec73ca41d1"
 STRING: Final = TopicDescription("std_msgs/String", MD5, "string data\n")
 LATCHED: Final = TopicDescription("std_msgs/String", MD5, "string data\n", latching=True)
-DEADLINE: Final = 20.0
-
-
-async def until(condition: Callable[[], object]) -> None:
-    """Let the loop turn until something has happened."""
-    async with asyncio.timeout(DEADLINE):
-        while not condition():
-            await asyncio.sleep(0.001)
 
 
 def node(core: RosCore, name: str, **options: object) -> Node:

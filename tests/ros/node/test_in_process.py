@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 from rmpa.core import limits as core_limits
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.subscription import InProcessConnection
-from rmpa.ros.wire.tcpros import LENGTH, TopicDescription
+from rmpa.ros.wire.tcpros import LENGTH, Header, TopicDescription
 from tests.ros.node.peers import LATCHED, STRING
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rmpa.ros.wire.tcpros import Header
 
 OTHER = TopicDescription("std_msgs/Int8", "27ffa0c9c4b8fb8492252bcad9e5c57b", "int8 data\n")
 LARGE = core_limits.CUT_THROUGH_BYTES * 3

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -11,13 +11,11 @@ from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.rpc import call
 from rmpa.ros.node.endpoints import NODE_UNREGISTER_AT_ONCE
-from rmpa.ros.node.node import Node
+from rmpa.ros.node.node import Node, Received
 from rmpa.ros.types.definitions import DefinitionError
 from rmpa.ros.types.messages import MessageError, MessageType
-from tests.ros.node.peers import DEADLINE, STRING, node, until
-
-if TYPE_CHECKING:
-    from rmpa.ros.node.node import Received
+from tests.ros.node.peers import STRING, node
+from tests.waiting import DEADLINE, until
 
 
 async def test_messages_go_from_one_node_to_another(core: RosCore) -> None:
@@ -465,14 +463,6 @@ async def test_names_are_remapped_and_loopback_is_used_for_a_local_master(core: 
             "publications",
             [["/robot/there", "std_msgs/String"]],
         ]
-
-
-async def test_closing_twice_is_closing_once(core: RosCore) -> None:
-    one = node(core, "n")
-    async with one:
-        await one.close()
-    await one.close()
-    assert one.stopped.is_set()
 
 
 async def test_a_service_is_served_and_called(core: RosCore) -> None:

@@ -9,28 +9,26 @@ import signal
 import socket
 import threading
 import time
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
 
 import pytest
 
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.ros import limits
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.endpoints import Received
 from rmpa.ros.node.fetch_type import fetch_type, find_or_fetch
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import DefinitionError, UnknownTypeError
 from rmpa.ros.types.installed import ServiceType, packages_below
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import TopicDescription
-from tests.ros.node.peers import DEADLINE, node, until
+from tests.ros.node.peers import node
 from tests.ros.types import workspaces
 from tests.ros.types.workspaces import package
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.endpoints import Received
+from tests.waiting import DEADLINE, until
 
 
 async def test_a_rate_does_not_drift_and_leaves_out_what_is_past(core: RosCore) -> None:

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import asyncio
 import errno
-from typing import TYPE_CHECKING
+import socket
+from collections.abc import AsyncIterator
 
 import pytest
 
@@ -11,15 +12,9 @@ from rmpa.ros.node import service_client as module
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed, probe
 from rmpa.ros.wire.tcpros import ServiceDescription, encode_header, error_header, server_header
 from rmpa.runtime import limits
-from tests.ros.node.peers import DEADLINE, RawServer, until
+from tests.ros.node.peers import RawServer, RawSubscriber
 from tests.runtime.descriptors_left import descriptors_left
-
-if TYPE_CHECKING:
-    import socket
-    from collections.abc import AsyncIterator
-
-    from tests.ros.node.peers import RawSubscriber
-
+from tests.waiting import DEADLINE, until
 
 MD5 = "6a2e34150c00229791cc89ff309fff21"
 ADD = ServiceDescription("rospy_tutorials/AddTwoInts", MD5)

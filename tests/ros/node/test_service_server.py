@@ -3,7 +3,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import struct
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator, Mapping
 
 import pytest
 
@@ -13,10 +13,8 @@ from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import ServiceDescription, encode_header, server_header
-from tests.ros.node.peers import DEADLINE, RawSubscriber, until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Mapping
+from tests.ros.node.peers import RawSubscriber
+from tests.waiting import DEADLINE, until
 
 MD5 = "6a2e34150c00229791cc89ff309fff21"
 ADD = ServiceDescription("rospy_tutorials/AddTwoInts", MD5)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator, Awaitable, Callable
 
 import pytest
 
@@ -15,13 +15,9 @@ from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.wire.slave_api import METHODS, BusConnection
 from rmpa.ros.wire.tcpros import TopicDescription
-from rmpa.ros.wire.xmlrpc import RosFault, RosReply
-from tests.ros.node.peers import STRING, RawSubscriber, until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable
-
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue
+from tests.ros.node.peers import STRING, RawSubscriber
+from tests.waiting import until
 
 
 @pytest.fixture

@@ -4,20 +4,17 @@ import asyncio
 import contextlib
 import socket
 import struct
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import AsyncIterator, Mapping
+from typing import ClassVar
 
 import pytest
 
 from rmpa.core import limits as core_limits
 from rmpa.ros import limits
-from rmpa.ros.node.subscription import PublisherConnection, Subscription
+from rmpa.ros.node.subscription import PartsTaker, PublisherConnection, Subscription
 from rmpa.ros.wire.tcpros import TopicDescription, encode_header, frame_message, publisher_header
-from tests.ros.node.peers import MD5, STRING, RawPublisher, RawServer, until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Mapping
-
-    from rmpa.ros.node.subscription import PartsTaker
+from tests.ros.node.peers import MD5, STRING, RawPublisher, RawServer
+from tests.waiting import until
 
 
 @pytest.fixture(autouse=True)

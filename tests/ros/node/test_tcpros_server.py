@@ -4,8 +4,8 @@ import errno
 import logging
 import socket
 import struct
+from collections.abc import AsyncIterator
 from ipaddress import IPv4Address, IPv4Network
-from typing import TYPE_CHECKING
 
 import psutil
 import pytest
@@ -22,13 +22,10 @@ from rmpa.ros.node.listeners import LOOPBACK_REST, LoopbackAddresses, SharedList
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import encode_header, frame_message
+from rmpa.ros.wire.xmlrpc import XmlRpcValue
 from rmpa.runtime.accept import Acceptor
-from tests.ros.node.peers import STRING, RawSubscriber, until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+from tests.ros.node.peers import STRING, RawSubscriber
+from tests.waiting import until
 
 
 class Served:

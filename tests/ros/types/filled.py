@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
-from rmpa.ros.types.definitions import known_specifications
+from rmpa.ros.types.definitions import Field, Specification, known_specifications
 from rmpa.ros.types.messages import MessageType
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from rmpa.ros.types.definitions import Field, Specification
 
 
 def filled(known: Mapping[str, Specification], name: str, seed: int) -> dict[str, Any]:

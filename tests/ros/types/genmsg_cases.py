@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+# The md5 sum of each text.
 MESSAGES: Final[dict[str, str]] = {
     "string MODE_AUTO=auto\n": "be98d1fb05f494bd09a5be084fea6144",
     "string    MODE_AUTO   = auto\n": "be98d1fb05f494bd09a5be084fea6144",
@@ -19,8 +20,8 @@ MESSAGES: Final[dict[str, str]] = {
     "byte[] many\nbyte[2] two\nchar[] text\nduration[1] one\ntime[] times\n": "72ff7fd5213f585760069728a4edda1f",
     "int8 a\r\nstring S = b \r\n": "e2314e146ac0819ddd14813fb2e0d5c9",
 }
-"""The md5 sum of each text."""
 
+# The md5 sum, and the full texts of request and response; three empty ones for a text that genmsg refuses.
 SERVICES: Final[dict[str, tuple[str, str, str]]] = {
     "int64 a\n---\nint64 b\n": ("f16097f93022db785b2cc9436c158893", "int64 a\n", "int64 b\n\n"),
     "int64 a\n----\nint64 b\n": ("f16097f93022db785b2cc9436c158893", "int64 a\n", "int64 b\n\n"),
@@ -37,12 +38,12 @@ SERVICES: Final[dict[str, tuple[str, str, str]]] = {
     "int64 a\n": ("019706110004b728d56d8baaa8e32797", "int64 a\n\n", ""),
     "int64 a\n ---\n": ("", "", ""),
 }
-"""The md5 sum, and the full texts of request and response; three empty ones for a text that genmsg refuses."""
 
 VALUES_OF: Final = (
     "byte small\nbyte[] many\nbyte[2] two\nchar letter\nint32[0] none\ntime at\ntime[] times\nduration took\n"
     "float64 real\nfloat32 short\nbool yes\n"
 )
+# Values of a message of the type above, and its bytes in hex; none for values that are refused.
 VALUES: Final[tuple[tuple[dict[str, Any], str], ...]] = (
     ({}, "0000000000000000000000000000000000000000000000000000000000000000000000000000000000"),
     (
@@ -70,4 +71,3 @@ VALUES: Final[tuple[tuple[dict[str, Any], str], ...]] = (
     ({"at": {"secs": 4294967296, "nsecs": 0}}, ""),
     ({"took": {"secs": 2147483648, "nsecs": 0}}, ""),
 )
-"""Values of a message of the type above, and its bytes in hex; none for values that are refused."""

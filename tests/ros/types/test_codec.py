@@ -4,7 +4,8 @@ import base64
 import contextlib
 import math
 import struct
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import cbor2
 import msgspec
@@ -14,16 +15,18 @@ from hypothesis import strategies as st
 
 from rmpa.core.limits import MIB
 from rmpa.ros.types.codec import MessageCodec, codec_for
-from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, known_specifications, known_types, parse_definition
+from rmpa.ros.types.definitions import (
+    SEPARATOR,
+    DefinitionError,
+    Specification,
+    known_specifications,
+    known_types,
+    parse_definition,
+)
 from rmpa.ros.types.messages import MessageError, MessageType
 from rmpa.ros.types.values import WRITTEN_MAX
 from tests.ros.types.filled import filled, read_as
 from tests.ros.types.genmsg_cases import VALUES, VALUES_OF
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from rmpa.ros.types.definitions import Specification
 
 NOW_NS = 5_000_000_007
 

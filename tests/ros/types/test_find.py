@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
@@ -17,9 +18,6 @@ from rmpa.ros.types.find import TYPE_MISSING, find_message_type, find_service_ty
 from rmpa.ros.types.installed import ServiceType, package_folders, packages_below, read_text
 from rmpa.ros.types.messages import MessageType
 from tests.ros.types.workspaces import nothing_installed, package
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 STRING: Final = "992ce8a1687cec8c8bd883ec73ca41d1"
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
+
+import pytest
 
 from rmpa.ros.types import installed
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import pytest
 
 
 def nothing_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.ros.wire.slave_api import BusConnection, BusLink, bus_info, read_bus_info
-
-if TYPE_CHECKING:
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 TALKER: Final = "http://127.0.0.1:36171/"
 

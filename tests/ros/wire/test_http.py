@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import pytest
 
@@ -15,9 +15,6 @@ from rmpa.ros.wire.http import (
     post_request,
     response_head,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 ROSCPP = b"POST / HTTP/1.1\r\nUser-Agent: XMLRPC++ 0.7\r\nHost: 10.0.0.1:11311\r\nContent-Type: text/xml\r\n"
 ROSPY = (

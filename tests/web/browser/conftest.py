@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator, Iterator
 
 import pytest
 from aiohttp import web
 
 from lab.bed.chromium import BINARY, Browser, Chromium, running_browser
 from tests.web.monitor.fake_server import FakeServer
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
 
 
 class Site:
@@ -58,11 +55,3 @@ async def site(browser: Browser) -> AsyncIterator[Site]:
             yield Site(server, page, runner.addresses[0][1])
     finally:
         await runner.cleanup()
-
-
-@pytest.fixture
-async def second(browser: Browser) -> AsyncIterator[Chromium]:
-    """Another page, of another person."""
-    async with Chromium(browser=browser) as page:
-        await page.look()
-        yield page

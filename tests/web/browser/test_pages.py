@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
+from lab.bed.chromium import Chromium
 from rmpa.web.hub.node_link import Rights
 from rmpa.web.monitor import limits
-from tests.ros.node.peers import until
-
-if TYPE_CHECKING:
-    from lab.bed.chromium import Chromium
-    from tests.web.browser.conftest import Site
+from tests.waiting import until
+from tests.web.browser.conftest import Site
 
 AXE = Path(__file__).with_name("vendor") / "axe.min.js"
+# Each page, and a text that it shows of the demo.
 PAGES = {
     "": "Nothing is wrong.",
     "module/base": "Found by",
@@ -34,7 +33,6 @@ PAGES = {
     "log": "turn",
     "drive": "The robot may move",
 }
-"""Each page, and a text that it shows of the demo."""
 
 
 async def violations(page: Chromium) -> list[str]:
@@ -47,14 +45,14 @@ async def violations(page: Chromium) -> list[str]:
     return [str(each) for each in found]
 
 
+# What is too small for a finger.
 SMALL = """
 [...document.querySelectorAll('.top a, .top button, main button:not(.field), .module, .concerns a,'
   + ' input:not([type=checkbox]), select')]
   .map((each) => [each.outerHTML.slice(0, 80), each.getBoundingClientRect()])
   .filter(([, box]) => box.width && (box.height < 43.5 || box.width < 43.5)).map(([text]) => text)"""
-"""What is too small for a finger."""
+# Of the page; innerWidth grows with what is too wide.
 WIDTH = "document.documentElement.scrollWidth"
-"""Of the page; innerWidth grows with what is too wide."""
 
 
 @pytest.mark.parametrize("address", PAGES)
@@ -298,14 +296,6 @@ async def test_topics_that_carry_data_come_first_and_the_filter_looks_among_all(
     assert "/base/quality" not in await page.run("document.querySelector('main').innerText")
 
 
-async def test_one_trouble_of_many_topics_is_one_line(site: Site) -> None:
-    page = await site.open()
-    lost = {"problem": "its peer is away"}
-    await receive(page, {"topics": dict.fromkeys(("/odom", "/velocity_order"), lost)})
-    await page.wait_text("2 topics")
-    assert await page.run("document.querySelectorAll('.concerns li').length") == 1
-
-
 async def test_a_parameter_that_another_node_changes_shows_by_itself(site: Site) -> None:
     page = await site.open("params")
     await page.wait_text("noetic")
@@ -524,8 +514,8 @@ async def test_who_may_only_look_sees_no_way_to_change_anything(site: Site) -> N
     assert await page.run("document.querySelector('input[type=checkbox]').disabled") is True
 
 
+# The modules that are not of this mesh.
 OUTSIDE = "[...document.querySelectorAll('.outside li')]"
-"""The modules that are not of this mesh."""
 
 
 async def test_a_pending_module_is_invited_by_a_button_that_shows_the_line_once(site: Site) -> None:
@@ -577,42 +567,6 @@ async def test_a_robot_moves_only_while_the_stick_is_held(site: Site) -> None:
     assert site.server.speeds[0].linear == 0  # one command alone moves nothing
     assert site.server.speeds[1].linear == pytest.approx(0.6 * 0.15 * limits.DRIVE_SPEED)
     assert site.server.speeds[-1].linear == 0
-
-
-HOLDER = "document.querySelector('.holder').innerText"
-
-
-async def test_one_page_has_the_stick_and_another_one_takes_it_over_by_one_press(
-    site: Site, second: Chromium
-) -> None:
-    first = await site.open("drive")
-    await second.goto(f"http://127.0.0.1:{site.port}/#/drive")
-    for page in (first, second):
-        await page.wait(f"{HOLDER}.includes('is free')")
-    await first.run("document.querySelector('input[type=checkbox]').click()")
-    await first.wait(f"{HOLDER}.includes('This page has the stick')")
-    await second.wait(f"{HOLDER}.includes('10.0.0.7 at pc has the stick, for')")
-    assert await second.run("document.querySelector('input[type=checkbox]').disabled") is True
-    assert await violations(second) == []
-    await first.run("document.querySelector('.stick').focus()")
-    await first.down("ArrowUp")
-    await until(lambda: len(site.server.speeds) > 1)
-    await second.click("Take over")
-    await second.wait(f"{HOLDER}.includes('This page has the stick')")
-    await first.wait_text("10.0.0.8 at pc has taken the stick over")
-    await first.wait("document.querySelector('.stick.off')")
-    await until(lambda: site.server.speeds[-1].linear == 0)
-    count = len(site.server.speeds)
-    await second.run("document.querySelector('.stick').focus()")
-    await second.down("ArrowDown")
-    await until(lambda: site.server.speeds[-1].linear < 0)
-    assert all(speed.linear <= 0 for speed in site.server.speeds[count:])
-    await first.click("Stop the robot")
-    await until(lambda: site.server.speeds[-1].linear == 0)
-    await second.wait_text("has stopped the robot")
-    await second.wait("document.querySelector('.stick.off')")
-    await first.wait(f"{HOLDER}.includes('is free')")
-    assert first.errors == second.errors == []
 
 
 async def test_the_warning_of_late_commands_ends_with_the_hold(site: Site) -> None:

@@ -5,23 +5,20 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from typing import TYPE_CHECKING, Any
+import ssl
+from collections.abc import AsyncIterator, Callable
+from typing import Any
 
 import aiohttp
 from aiohttp import web
 
+from rmpa.ros.core.embedded import RosCore
 from rmpa.web.clients.clients import MONITOR_PATH, WebSocketClients
 from rmpa.web.hub.node_link import FULL, Rights
 from rmpa.web.monitor.monitor import Monitor
-from tests.ros.node.peers import DEADLINE
+from rmpa.web.server.agent_watch import AgentWatch
+from tests.waiting import DEADLINE
 from tests.web.hub.client import running_hub
-
-if TYPE_CHECKING:
-    import ssl
-    from collections.abc import AsyncIterator, Callable
-
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.web.server.agent_watch import AgentWatch
 
 
 class Client:

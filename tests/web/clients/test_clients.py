@@ -9,23 +9,21 @@ import json
 import socket
 import ssl
 import struct
+from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import pytest
+
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
 from rmpa.web.hub.node_link import FULL
 from rmpa.web.server.process import CertificateFiles, tls_context
-from tests.ros.node.peers import STRING, until
+from tests.ros.node.peers import STRING
+from tests.waiting import until
 from tests.web.clients.server import Client, running_server
 from tests.web.hub.client import listen, subscribed
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    import pytest
-
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.node import Node
 
 ONE, TWO = b"\x03\0\0\0one", b"\x03\0\0\0two"
 FOXGLOVE = "foxglove.websocket.v1"

@@ -7,8 +7,9 @@ import contextlib
 import socket
 import struct
 import tracemalloc
+from collections.abc import AsyncIterator
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -18,13 +19,10 @@ from rmpa.web import limits
 from rmpa.web.clients.connection import CommandAge, MessageArrival, Session
 from rmpa.web.clients.frame_writer import FairQueue, FrameWriter, MaskCheck, Opcode, frame_header
 from rmpa.web.hub.node_link import READ_ONLY
-from tests.ros.node.peers import DEADLINE, until
+from tests.waiting import DEADLINE, until
 
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
+# 4 MB, in which a part that is left out or twice would show.
 PAYLOAD = bytes(range(251)) * 16_000
-"""4 MB, in which a part that is left out or twice would show."""
 
 
 async def no_drain() -> None: ...

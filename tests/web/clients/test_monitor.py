@@ -7,37 +7,33 @@ import json
 import struct
 import threading
 import time
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import aiohttp
 import msgspec
 import pytest
 
 from rmpa.core.errors import UnreachableError
+from rmpa.observe.snapshot import Snapshot
 from rmpa.resource.resource import Resource
 from rmpa.resource.runtime import describe
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.web import limits as web_limits
-from rmpa.web.hub.node_link import FULL, READ_ONLY
+from rmpa.web.hub.node_link import FULL, READ_ONLY, Rights
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.server.agent_watch import AgentWatch
-from tests.ros.node.peers import DEADLINE, until
+from tests.waiting import DEADLINE, until
 from tests.web.clients.server import running_server
 from tests.web.hub.client import node
-from tests.web.monitor.patches import apply
+from tests.web.monitor import page as monitor_page
 from tests.web.snapshots import FULL as SNAPSHOT
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from rmpa.observe.snapshot import Snapshot
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.node import Node
-    from rmpa.web.hub.node_link import Rights
 
 TEXT = MessageType("std_msgs/String")
 TWIST = MessageType("geometry_msgs/Twist")
@@ -61,64 +57,12 @@ class Agent:
         return self.snapshot
 
 
-class Page:
-    """What the pages' script does: it keeps the state, and acknowledges each patch."""
+class Page(monitor_page.Page):
+    """A page of a server whose agent the test has in hand."""
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse, agent: Agent) -> None:
-        self.socket = socket
+        super().__init__(socket)
         self.agent = agent
-        self.state: Any = {}
-        self.messages: list[dict[str, Any]] = []
-        self.commands = self.questions = 0
-
-    async def send(self, op: str, **values: Any) -> None:
-        await self.socket.send_str(json.dumps({"op": op, **values}))
-
-    async def drive(self, linear: float, angular: float = 0.0) -> None:
-        """A command of the joystick, made now: both ends have one clock here."""
-        self.commands += 1
-        made = {"hold": 1, "n": self.commands, "at": asyncio.get_running_loop().time()}
-        await self.send("drive", topic="/cmd_vel", linear=linear, angular=angular, **made)
-
-    async def read(self) -> None:
-        message = await self.socket.receive()
-        assert message.type is aiohttp.WSMsgType.TEXT, message
-        values = json.loads(message.data)
-        if values["op"] == "state":
-            self.state = values["state"]
-        elif values["op"] == "patch":
-            self.state = apply(self.state, values["patch"])
-        else:
-            self.messages.append(values)
-            return
-        await self.send("ack", n=values["n"])
-
-    async def sees(self, condition: Any) -> None:
-        """Read until the condition holds."""
-        async with asyncio.timeout(DEADLINE):
-            while not condition():
-                await self.read()
-
-    async def next(self, op: str, **wanted: Any) -> dict[str, Any]:
-        """The first message of this op with these members; it is taken out."""
-
-        def found() -> list[dict[str, Any]]:
-            return [each for each in self.messages if each["op"] == op and wanted.items() <= each.items()]
-
-        await self.sees(found)
-        first = found()[0]
-        self.messages.remove(first)
-        return first
-
-    async def ask(self, what: str, **args: Any) -> Any:
-        """The answer's value, or the text of the error."""
-        self.questions += 1
-        now = asyncio.get_running_loop().time()
-        await self.send("ask", id=self.questions, what=what, args=args, at=now)
-        await self.sees(lambda: any(each.get("id") == self.questions for each in self.messages))
-        [answer] = [each for each in self.messages if each.get("id") == self.questions]
-        self.messages.remove(answer)
-        return answer["value"] if answer["op"] == "answer" else answer["error"]
 
 
 @asynccontextmanager
@@ -160,8 +104,8 @@ async def status_topic(talker: Node, name: str, level: DiagnosticLevel, message:
 
 async def test_a_page_that_may_only_look_gets_the_state_then_its_changes_and_changes_nothing(core: RosCore) -> None:
     async with page_of(core, READ_ONLY) as page:
-        hello = await page.next("hello")
-        assert (hello["agent"], hello["may"]) == (SNAPSHOT.agent.name, [])
+        await page.sees(lambda: page.hello)
+        assert (page.hello["agent"], page.hello["may"]) == (SNAPSHOT.agent.name, [])
         [peer, *_] = SNAPSHOT.peers
         await page.sees(lambda: peer.name in page.state.get("modules", ()))
         page.agent.snapshot = msgspec.structs.replace(page.agent.snapshot, peers=())
@@ -188,7 +132,8 @@ async def test_a_page_is_greeted_although_the_agent_hangs(core: RosCore, monkeyp
     agent = Agent(core.uri)
     agent.released.clear()
     async with page_of(core, agent=agent) as page:
-        assert (await page.next("hello"))["agent"] == ""
+        await page.sees(lambda: page.hello)
+        assert page.hello["agent"] == ""
         agent.released.set()
         await page.sees(lambda: page.state.get("reach", {}).get("ok"))
 
@@ -227,9 +172,7 @@ async def test_parameters_are_read_and_set_and_told_where_another_node_sets_them
 
 async def test_a_service_is_described_and_called(page: Page, talker: Node) -> None:
     await talker.advertise_service("/light", "std_srvs/SetBool", lambda r: {"success": r.data, "message": "as asked"})
-    async with asyncio.timeout(DEADLINE):
-        while isinstance(about := await page.ask("describe", service="/light"), str):  # the hub's graph has it soon
-            await asyncio.sleep(0.01)
+    about = await page.answered("describe", service="/light")  # the hub's graph has it soon
     assert (about["type"], about["request"]) == ("std_srvs/SetBool", {"data": False})
     assert "bool success" in about["text"]
     answer = await page.ask("call", service="/light", request={"data": True})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
@@ -11,10 +11,7 @@ from rmpa.web.foxglove.channels import ChannelTable
 from rmpa.web.foxglove.session import FoxgloveSession
 from rmpa.web.hub.graph import GraphService, GraphTopic
 from rmpa.web.hub.node_link import Rights
-from tests.web.recorder import FakeHub, Recorded, record
-
-if TYPE_CHECKING:
-    from tests.web.recorder import Asked
+from tests.web.recorder import Asked, FakeHub, Recorded, record
 
 ALL = Rights(view=True, control=True)
 CHATTER = GraphTopic("/chatter", ("std_msgs/String",), ("/talker",), ("/listener",))

@@ -6,7 +6,7 @@ import json
 import struct
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import pytest
@@ -15,18 +15,15 @@ from hypothesis import strategies as st
 from msgspec import UNSET
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
-from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.clients.frame_writer import Opcode, OutFrame
 from rmpa.web.foxglove import limits, protocol
 from rmpa.web.foxglove.channels import Channel, FoxgloveService, graph_update
 from rmpa.web.foxglove.protocol import FoxgloveParameter as Parameter
 from rmpa.web.foxglove.protocol import from_parameter, to_parameter
 from rmpa.web.foxglove.session import DECODER, OPS
-
-if TYPE_CHECKING:
-    from rmpa.web.clients.frame_writer import OutFrame
-    from rmpa.web.hub.node_link import ParamValue
-    from tests.web.foxglove.client import Client
-    from tests.web.recorder import Asked
+from rmpa.web.hub.node_link import ParamValue
+from tests.web.foxglove.client import Client
+from tests.web.recorder import Asked
 
 CHATTER = Channel(1, "/chatter", "std_msgs/String", "", "string data")
 KIND: Any = SimpleNamespace(

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from typing import TYPE_CHECKING, Any
+from collections.abc import AsyncIterator, Coroutine
+from typing import Any
 
+from rmpa.core.errors import RmpaError
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node
 from rmpa.web.hub.hub import Hub, HubClient
-from rmpa.web.hub.node_link import EVERYTHING, FULL, Rights
-from tests.ros.node.peers import until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Coroutine
-
-    from rmpa.core.errors import RmpaError
-    from rmpa.web.hub.node_link import NodeRules
-    from rmpa.web.hub.topics import ClientPublication, ReceivedMessage
+from rmpa.web.hub.node_link import EVERYTHING, FULL, NodeRules, Rights
+from rmpa.web.hub.topics import ClientPublication, ReceivedMessage
+from tests.waiting import until
 
 _names = itertools.count(1)
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.observe import limits
@@ -13,9 +13,6 @@ from rmpa.observe.graph import GraphHistory, GraphRows, ServiceRow, TopicRow
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import Registrations
 from rmpa.web.hub.graph import GraphTable, rows_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 _NODES = ("/a", "/b", "/c")
 _NAMES = ("/x", "/y", "/z/w", "/rosout")
@@ -68,7 +65,6 @@ def _act(tables: Registrations, what: str, name: str, node: str, more: str) -> N
 
 
 @given(st.lists(_STEP, max_size=60), st.integers(1, 6))
-@settings(max_examples=300, deadline=None)
 def test_changes_lead_to_the_graph_that_the_master_has(steps: list[tuple[str, str, str, str]], kept: int) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(limits, "GRAPH_HISTORY", kept)

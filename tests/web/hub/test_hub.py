@@ -5,25 +5,23 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 
 from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import SEPARATOR, known_text, parse_definition
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 from rmpa.web import limits
+from rmpa.web.hub.hub import Hub
 from rmpa.web.hub.node_link import CONTROL_REMEDY, READ_ONLY, READ_REMEDY
-from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
+from tests.ros.node.peers import LATCHED, STRING
+from tests.waiting import DEADLINE, until
 from tests.web.hub.client import FakeClient, listen, node, running_hub
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.node import Node
-    from rmpa.web.hub.hub import Hub
 
 ONE, TWO = b"\x03\0\0\0one", b"\x03\0\0\0two"
 SET_BOOL = "std_srvs/SetBool"

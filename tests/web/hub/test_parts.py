@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,9 +13,6 @@ from rmpa.web.hub.node_link import NodeLink
 from rmpa.web.hub.params import ParamMirror
 from rmpa.web.hub.services import read_asset
 from rmpa.web.hub.topics import PayloadBuffers
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.fixture

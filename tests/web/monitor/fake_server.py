@@ -19,9 +19,10 @@ import struct
 import sys
 import time
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import msgspec
 from aiohttp import WSMsgType, web
@@ -36,7 +37,7 @@ from rmpa.trust.permissions import TrustReason, TrustStatus
 from rmpa.web.clients.frame_writer import Opcode
 from rmpa.web.hub.node_link import FULL
 from rmpa.web.hub.topics import ReceivedMessage
-from rmpa.web.monitor.messages import SUBPROTOCOL
+from rmpa.web.monitor.messages import SUBPROTOCOL, Tree
 from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.session import MonitorSession
 from rmpa.web.monitor.state import StateBuilder, details, node_detail, node_key
@@ -44,11 +45,6 @@ from rmpa.web.monitor.sticks import Sticks
 from rmpa.web.server.app import HEADERS
 from tests.web.monitor.test_sticks import Bus
 from tests.web.recorder import FakeHub, PageConnection, Recorded
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rmpa.web.monitor.messages import Tree
 
 FIXTURES = Path(__file__).with_name("fixtures")
 STATIC = Path(__file__).parents[3] / "src/rmpa/web/static"

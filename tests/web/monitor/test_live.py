@@ -136,15 +136,14 @@ def test_few_samples_stay_as_they_are() -> None:
     assert buffer.take() == []
 
 
-@settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
-@given(st.lists(st.tuples(VALUE, VALUE), min_size=40, max_size=150))
+@given(st.lists(st.tuples(VALUE, VALUE), min_size=20, max_size=60))
 def test_the_buffer_is_bounded_and_keeps_the_extremes(rows: list[tuple[float | None, float | None]]) -> None:
-    buffer = SampleBuffer(2, most=16)
+    buffer = SampleBuffer(2, most=8)
     for at, row in enumerate(rows):
         buffer.add(float(at), row)
-        assert len(buffer) <= 33
+        assert len(buffer) <= 17
     moments, *lines = buffer.take()
-    assert len(moments) <= 16
+    assert len(moments) <= 8
     assert moments == sorted(moments, key=lambda moment: moment or 0.0)
     for number, line in enumerate(lines):
         given = [value for row in rows if (value := row[number]) is not None]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import pytest
@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from rmpa.core.facts import RouteInfo, TopicInfo, UnreachableInfo
 from rmpa.core.limits import KIB
-from rmpa.observe.snapshot import Snapshot
+from rmpa.observe.snapshot import PeerInfo, Snapshot
 from rmpa.trust.permissions import TrustStatus
 from rmpa.web import limits as web_limits
 from rmpa.web.monitor import limits, messages, questions, session
@@ -24,9 +24,6 @@ from rmpa.web.monitor.state import StateBuilder, details, module_state
 from tests.web.monitor.fake_server import resources, snapshots
 from tests.web.monitor.patches import apply
 from tests.web.snapshots import AGENT, FULL, LINK, peer
-
-if TYPE_CHECKING:
-    from rmpa.observe.snapshot import PeerInfo
 
 RECORDED = snapshots()
 RESOURCES = resources()

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import random
+from collections.abc import Callable
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -13,9 +14,6 @@ from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.web.hub.topics import ReceivedMessage
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.sticks import Stick, Sticks
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 TOPIC = "/cmd_vel"
 

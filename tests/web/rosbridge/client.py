@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
@@ -10,10 +10,7 @@ from rmpa.ros.types.messages import MessageType
 from rmpa.web.hub.node_link import FULL
 from rmpa.web.rosbridge.protocol import PublishFrames
 from rmpa.web.rosbridge.session import RosbridgeSession
-from tests.web.recorder import FakeHub, Recorded, decoded
-
-if TYPE_CHECKING:
-    from tests.web.recorder import Asked
+from tests.web.recorder import Asked, FakeHub, Recorded, decoded
 
 
 class Client(Recorded):

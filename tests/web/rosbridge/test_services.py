@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from concurrent.futures import Future
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -16,11 +16,8 @@ from rmpa.ros.types.messages import MessageType
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.protocol import decode_png
 from rmpa.web.rosbridge.rosapi import SERVICES
-from tests.web.recorder import NOW_NS
-
-if TYPE_CHECKING:
-    from tests.web.recorder import Asked
-    from tests.web.rosbridge.client import Client
+from tests.web.recorder import NOW_NS, Asked
+from tests.web.rosbridge.client import Client
 
 ADD = "rospy_tutorials/AddTwoInts"
 TWENTY_AND_TWO = b"\x14" + bytes(7) + b"\x02" + bytes(7)

@@ -7,8 +7,10 @@ import json
 import os
 import stat
 import struct
+from collections.abc import Callable
 from contextlib import AsyncExitStack
-from typing import TYPE_CHECKING, Any, Final, Self
+from pathlib import Path
+from typing import Any, Final, Self
 
 import aiohttp
 import pytest
@@ -35,13 +37,9 @@ from rmpa.web.server.access import (
     token_from,
 )
 from rmpa.web.server.process import access_of, url_of
-from tests.ros.node.peers import DEADLINE
+from tests.waiting import DEADLINE
 from tests.web.hub.client import node
 from tests.web.server.test_upgrades import running
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 TOKEN = "t" * 43
 HOSTS = own_names(("base",))
@@ -188,6 +186,7 @@ def test_a_token_that_another_user_has_made_is_none(tmp_path: Path, monkeypatch:
 
 
 SECRET: Final = "secret-" * 6
+# Denies the names of the table: what is refused without a right is refused by a rule as well.
 DENIED: Final = NodeRules(
     Permissions(
         TrustSettings(
@@ -204,7 +203,6 @@ DENIED: Final = NodeRules(
         )
     )
 )
-"""Denies the names of the table: what is refused without a right is refused by a rule as well."""
 STRING: Final = {"type": "std_msgs/String"}
 EMPTY: Final = {"type": "std_srvs/Empty"}
 # What each op may do without a right, or the right that it needs; a message; whether a rule can deny its name.

@@ -7,8 +7,10 @@ import functools
 import secrets
 import socket
 import threading
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any, TypeAlias
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import msgspec
 import pytest
@@ -16,23 +18,18 @@ import pytest
 from rmpa.core.errors import UnreachableError
 from rmpa.observe.control import ControlReply
 from rmpa.observe.control_server import ControlServer
-from rmpa.observe.graph import GraphRevisions
+from rmpa.observe.graph import GraphRevision, GraphRevisions
+from rmpa.observe.snapshot import Snapshot
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.node import Node
 from rmpa.trust.permissions import TrustStatus
 from rmpa.web import limits
+from rmpa.web.hub.hub import Hub
 from rmpa.web.server.agent_watch import AgentFollower, AgentWatch, ControlReader
-from tests.ros.node.peers import DEADLINE, LATCHED, until
+from tests.ros.node.peers import LATCHED
+from tests.waiting import DEADLINE, until
 from tests.web.hub.client import local_core, node
 from tests.web.snapshots import FULL
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-    from pathlib import Path
-
-    from rmpa.observe.graph import GraphRevision
-    from rmpa.observe.snapshot import Snapshot
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.node import Node
-    from rmpa.web.hub.hub import Hub
 
 
 def test_an_agent_that_hangs_is_waited_for_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

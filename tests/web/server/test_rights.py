@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, closing, nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import aiohttp
 import msgspec
@@ -16,31 +17,26 @@ import pytest
 from rmpa.config.peer_rules import Access, Effect, PermissionRule
 from rmpa.config.settings import Settings, TrustSettings, WebSettings
 from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.observe.snapshot import Snapshot
 from rmpa.resource import Resource
 from rmpa.resource.runtime import describe
+from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.master.parameters import Parameters
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
+from rmpa.ros.wire.xmlrpc import XmlRpcValue
 from rmpa.trust.permissions import InviteReply, TrustStatus
-from rmpa.web.hub.node_link import EVERYTHING, FULL, READ_ONLY, NodeRules, Rights
+from rmpa.web.hub.hub import Hub
+from rmpa.web.hub.node_link import EVERYTHING, FULL, READ_ONLY, NodeRules, ParamValue, Rights
 from rmpa.web.monitor import questions
 from rmpa.web.monitor.monitor import LogFeed
 from rmpa.web.monitor.questions import Answers
 from rmpa.web.monitor.resources import MessageValues, ResourceWatch
 from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup
-from tests.ros.node.peers import DEADLINE, until
+from tests.waiting import DEADLINE, until
 from tests.web import snapshots
 from tests.web.hub.client import FakeClient, running_hub
 from tests.web.server.test_upgrades import running
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from rmpa.observe.snapshot import Snapshot
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
-    from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.node_link import ParamValue
 
 RULES = (
     PermissionRule(("*",), effect=Effect.DENY, names={"call": ("/motors/**",), "param": ("/motors/**",)}),
@@ -62,8 +58,8 @@ def denying(**names: tuple[str, ...]) -> NodeRules:
 
 
 RULED = setup().rules
+# May change every parameter but one, not the namespace around it.
 CAREFUL = denying(param=("/motors/limit",))
-"""May change every parameter but one, not the namespace around it."""
 TEXT = MessageType("std_msgs/String")
 TREE: dict[str, ParamValue] = {"speed": {"max": 1.5}, "motors": {"pid": {"p": 3}}, "name": "base"}
 

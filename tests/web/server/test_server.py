@@ -5,23 +5,19 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from rmpa.core.errors import StartError, UnreachableError
+from rmpa.observe.snapshot import Snapshot
 from rmpa.web import limits
 from rmpa.web.server.access import AccessPolicy, own_names
 from rmpa.web.server.agent_watch import AgentWatch
 from rmpa.web.server.app import HEADERS, OPENER_POLICY, WebServer
 from tests.web.snapshots import FULL
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from rmpa.observe.snapshot import Snapshot
 
 DEADLINE = 30.0
 TOKEN = "secret-" * 6

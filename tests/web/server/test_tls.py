@@ -18,7 +18,7 @@ from rmpa.web.server.access import AccessPolicy, own_names
 from rmpa.web.server.agent_watch import AgentWatch
 from rmpa.web.server.app import WebServer
 from rmpa.web.server.process import CertificateFiles, ServerCertificate, certificate_files, tls_context
-from tests.ros.node.peers import DEADLINE
+from tests.waiting import DEADLINE
 from tests.web.snapshots import FULL as SNAPSHOT
 
 if TYPE_CHECKING:

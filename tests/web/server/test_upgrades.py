@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import functools
 import json
+import struct
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import aiohttp
 import msgspec
@@ -22,12 +24,9 @@ from rmpa.web.server.access import AccessPolicy, own_names
 from rmpa.web.server.agent_watch import AgentWatch
 from rmpa.web.server.app import WebServer
 from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup, make_hub, priority_of
-from tests.ros.node.peers import DEADLINE, until
+from tests.waiting import DEADLINE, until
 from tests.web.hub.client import local_core
 from tests.web.snapshots import FULL as SNAPSHOT
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
 
 TOKEN = "secret-" * 6
 
@@ -98,17 +97,33 @@ async def test_a_token_in_the_url_opens_a_websocket(session: aiohttp.ClientSessi
                 await until(functools.partial(core.publishers, topic))
 
 
-async def test_a_client_whose_frames_are_not_masked_is_disconnected(
-    server: WebServer, session: aiohttp.ClientSession
+MASK = bytes(4)
+
+
+@pytest.mark.parametrize(
+    ("frame", "code", "reason"),
+    [
+        pytest.param(frame_header(Opcode.TEXT, 2) + b"{}", 1002, "message", id="without a mask"),
+        pytest.param(b"\xf1\x80" + MASK, 1002, "message", id="reserved bits"),
+        pytest.param(b"\x83\x80" + MASK, 1002, "message", id="an unknown opcode"),
+        pytest.param(b"\x09\x80" + MASK, 1002, "message", id="a ping in pieces"),
+        pytest.param(b"\x89\xfe\x00\x7e" + MASK + bytes(126), 1002, "message", id="a ping that is too long"),
+        pytest.param(b"\x80\x80" + MASK, 1002, "message", id="the continuation of nothing"),
+        pytest.param(b"\x81\x82" + MASK + b"\xff\xfe", 1007, "message", id="text that is no UTF-8"),
+        pytest.param(b"\x81\xff" + struct.pack("!Q", 1 << 40) + MASK, 1009, "message_size", id="the header of 1 TiB"),
+    ],
+)
+async def test_a_client_whose_frames_are_broken_is_disconnected(
+    server: WebServer, session: aiohttp.ClientSession, frame: bytes, code: int, reason: str
 ) -> None:
-    """RFC 6455, section 5.1: the server closes the connection, with 1002."""
+    """RFC 6455, section 5: the server closes the connection, with the code that it says."""
     async with handshake(server, "dGhlIHNhbXBsZSBub25jZQ==") as (reader, writer):
         assert (await reader.readuntil(b"\r\n\r\n")).startswith(b"HTTP/1.1 101")
-        writer.write(frame_header(Opcode.TEXT, 2) + b"{}")
+        writer.write(frame)
         received = await reader.read()
-    assert received[2:4] == (1002).to_bytes(2, "big")
+    assert received[2:4] == code.to_bytes(2, "big")
     assert b"status" not in received  # the frame itself was not answered
-    assert await refused_for(session, server, "message")
+    assert await refused_for(session, server, reason)
 
 
 async def test_a_client_beyond_the_bound_is_told_so_and_requests_are_served(
