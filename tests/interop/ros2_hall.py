@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from lab.bed.agents import Agent
-from lab.bed.gateways import ROUTER_PORT, GatewayProcess
+from lab.bed.gateways import ROUTER_PORT, GatewayProcess, python_of
 from lab.bed.namespaces import Lab
 from lab.bed.processes import Event, Process
 from tests.interop.modules import Module
@@ -40,15 +39,8 @@ python = "{python}"
 """
 SOURCED: Final = ("env", f"ROS_PACKAGE_PATH={NODES.parent / 'packages'}")
 """The workspace of ROS 1 at the gateway: it has an action that ROS 2's test_msgs has too."""
-ROS2: Final = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"), "rmpa", "ros2")
-"""Where ``scripts/install-ros2`` keeps a venv for each distribution."""
 ZENOH: Final = "zenoh"
 """ROS 2 as ``zenoh-ros2-sdk`` speaks it; else ``rclpy`` of the distribution that is named."""
-
-
-def python_of(distribution: str) -> Path:
-    """The Python of a distribution of ROS 2, which may not be there."""
-    return ROS2 / distribution / "bin" / "python"
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.bed.gateways import python_of
 from lab.bed.processes import eventually
-from tests.interop.ros2_hall import LONG, Hall, OtherEnd, python_of, running_hall
+from tests.interop.ros2_hall import LONG, Hall, OtherEnd, running_hall
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -167,10 +167,6 @@ def test_sixty_topics_come_and_go(hall: Hall, node: OtherEnd) -> None:
     hall.robot.wait_no_topic("/many/t59", LONG)
 
 
-def children_of(pid: int) -> list[int]:
-    return [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text("ascii").split()]
-
-
 def test_a_half_that_is_killed_is_started_again(hall: Hall, node: OtherEnd) -> None:
     with (
         hall.robot.ros.rospy("talker", topic="/on", type="String", rate=20),
@@ -179,10 +175,7 @@ def test_a_half_that_is_killed_is_started_again(hall: Hall, node: OtherEnd) -> N
         node.do("subscribe", topic="/on")
         node.process.wait_event("heard", LONG, where=lambda e: e["topic"] == "/on")
         for _ in range(3):
-            gateway = hall.gateway.process.pid
-            halves = [pid for each in (gateway, *children_of(gateway)) for pid in children_of(each)]
-            half = next(p for p in halves if b"half.child" in Path(f"/proc/{p}/cmdline").read_bytes())
-            os.kill(half, signal.SIGKILL)
+            os.kill(hall.gateway.half(), signal.SIGKILL)
             since = node.process.mark_events()
             node.process.wait_event("heard", LONG, where=lambda e: e["topic"] == "/on", since=since)
             before = len(listener.events("text"))
