@@ -3,7 +3,8 @@
 * ``source TOPIC``, ``sink TOPIC``: as ``source.py`` and ``sink.py``, see ``node.serve_rounds`` and ``node.Notes``;
 * ``relay FROM TO [FROM TO]...``: publishes on what it hears, as bytes: the least that a node of rclpy can do;
 * ``crowd``: at each line ``NODES TOPICS PREFIX`` that many nodes, each with that many publishers; then ``made`` with
-  the ns before the first of them.
+  the ns before the first of them;
+* ``watch``: at each line ``TOPIC`` then ``there`` with the ns when its publisher and that one's node are known.
 
 All are in the default executor, and their messages are std_msgs/msg/UInt8MultiArray, reliable, depth 100.
 """
@@ -13,7 +14,6 @@ import struct
 import sys
 import threading
 import time
-from functools import partial
 from typing import Any
 
 import rclpy
@@ -71,17 +71,26 @@ def crowd() -> None:
         say("made", ns=begun)
 
 
+def watch(node: Any) -> None:
+    """Say when topics are there."""
+    for (topic,) in commands():
+        while not any(each.node_name[0] != "_" for each in node.get_publishers_info_by_topic(topic)):
+            time.sleep(0.005)
+        say("there", topic=topic, ns=time.monotonic_ns())
+
+
 def main() -> None:
     """Run until we are ended."""
     role, *topics = sys.argv[1:]
+    roles = {"source": source, "sink": sink, "relay": relay, "watch": watch}
     if role == "crowd":
         say("up")
         crowd()
         return
     rclpy.init()
     node = rclpy.create_node(f"{role}_{threading.get_native_id()}")
-    partial({"source": source, "sink": sink, "relay": relay}[role], node)(*topics)
     say("up")
+    roles[role](node, *topics)
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
 

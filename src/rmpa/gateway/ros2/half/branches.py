@@ -29,7 +29,7 @@ class FoxyHandle:
         self.pointer = handle.pointer
 
     def __getattr__(self, name: str) -> Any:
-        return partial(self._call, self._FUNCTIONS[name])
+        return partial(self._call, self._FUNCTIONS.get(name, name))
 
     def _call(self, function: str, *args: Any) -> Any:
         with self.of as capsule:
