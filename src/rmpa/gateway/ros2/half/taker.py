@@ -61,6 +61,9 @@ class Taker:
         self._info: Any = None
         self._rcl: Any = None
         self._array: Any = None
+        # The arguments of a take behind the subscription, and where it leaves the GID.
+        self._into: tuple[int, int, None] = (0, 0, None)
+        self._gid_at = self._gid_size = 0
 
     def check(self, node: Any, message_type: Any, qos: Any, handle_of: Any) -> None:
         """Publish to ourselves, and see which way gives the publisher's GID."""
@@ -104,13 +107,16 @@ class Taker:
         except (OSError, AttributeError):
             return False
         self._rcl.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p]
-        self._info = _message_info(*layout)()
+        kind = _message_info(*layout)
+        self._info = kind()
+        self._gid_at, self._gid_size = ctypes.addressof(self._info) + kind.gid.offset, layout[0]
         utils = ctypes.CDLL(loaded("librcutils.so"))
         utils.rcutils_get_default_allocator.restype = _Allocator
         allocator = utils.rcutils_get_default_allocator()
         self._array = _ByteArray()
         for field in _ALLOCATOR:
             setattr(self._array, field, getattr(allocator, field))
+        self._into = ctypes.addressof(self._array), ctypes.addressof(self._info), None
         return True
 
     def take(self, handle: Any, message_type: Any) -> tuple[Any, bytes, int, int] | None:
@@ -127,8 +133,7 @@ class Taker:
             number = info.get("publication_sequence_number") if isinstance(info, dict) else 0
             stamp = info["source_timestamp"] if isinstance(info, dict) else 0
             return data, _gid_bytes(gid), stamp, number or 0
-        pointer = handle.pointer
-        if self._rcl(pointer, ctypes.byref(self._array), ctypes.byref(self._info), None):
+        if self._rcl(handle.pointer, *self._into):
             return None
         info = self._info
         array, data = self._array, None
@@ -136,7 +141,7 @@ class Taker:
             data = ctypes.string_at(array.buffer, array.length)
         else:
             data = (ctypes.c_uint8 * array.length).from_address(ctypes.addressof(array.buffer.contents))
-        return data, bytes(info.gid), info.source_stamp, getattr(info, "sequence", 0)
+        return data, ctypes.string_at(self._gid_at, self._gid_size), info.source_stamp, getattr(info, "sequence", 0)
 
     def is_own(self, gid: bytes) -> bool:
         """Whether a message is of a publisher of this process."""
