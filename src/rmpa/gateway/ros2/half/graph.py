@@ -16,8 +16,12 @@ _WHOLE_PERIOD = 5.0
 # Seconds between two looks at names where no change is told, and between two looks at the least.
 _POLL_PERIOD = 0.25
 _LEAST_PERIOD = 0.05
-# The name of a node of which an endpoint was heard before the node (rcl's graph).
-_UNKNOWN = "_NODE_NAME_UNKNOWN_"
+# The names of the node of an endpoint that has none, or of which it is not known yet (rmw_dds_common).
+_NAMELESS = ("_NODE_NAME_UNKNOWN_", "_CREATED_BY_BARE_DDS_APP_")
+# Seconds within which that is known: twice the period at which DDS repeats what was lost.
+_NAMING_PERIOD = 6.0
+# Hexadecimal digits of a GID that the participant of DDS has.
+_PARTICIPANT = 24
 _INFINITE = 2**63 - 1
 _POLICIES = {
     "reliability": {1: "RELIABLE", 2: "BEST_EFFORT"},
@@ -36,6 +40,8 @@ class Watcher:
         self._names: Any = None
         self._known: dict[str, dict[str, Any]] = {}
         self._nodes: Any = None
+        # When an endpoint without a node was seen first, by GID.
+        self._nameless: dict[str, float] = {}
         self._looked = self._whole = self._earliest = 0.0
 
     def due(self, *, told: bool, changed: bool) -> float:
@@ -74,6 +80,8 @@ class Watcher:
                     found[key] = _told(key, "SS", owner, name, kind_of, _service_hash(kind_of), {})
         added = [each for key, each in found.items() if key not in self._known]
         removed = [key for key in self._known if key not in found]
+        if not again:
+            self._nameless.clear()
         self._known = found
         if added or removed or shown != self._nodes:
             self._nodes = shown
@@ -87,11 +95,17 @@ class Watcher:
             ("MS", self._node.get_subscriptions_info_by_topic(name)),
         ):
             for info in infos:
-                gid = "" if info.node_name.startswith(_UNKNOWN) else bytes(info.endpoint_gid).hex()
+                gid = bytes(info.endpoint_gid).hex()
                 if gid in self._known:
                     yield self._known[gid]
                     continue
                 owner = info.node_namespace.rstrip("/") + "/" + info.node_name
+                if info.node_name.startswith(_NAMELESS):
+                    # Programs of plain DDS have no node; what names that of others may be late by seconds.
+                    if time.monotonic() < self._nameless.setdefault(gid, time.monotonic()) + _NAMING_PERIOD:
+                        yield {"gid": ""}
+                        continue
+                    owner = "/dds_" + gid[_PARTICIPANT - 8 : _PARTICIPANT]
                 type_hash = str(getattr(info, "topic_type_hash", "") or "")
                 yield _told(gid, kind, owner, name, info.topic_type, type_hash, _told_qos(info.qos_profile))
 
