@@ -82,7 +82,7 @@ def watch(node: Any) -> None:
 def main() -> None:
     """Run until we are ended."""
     role, *topics = sys.argv[1:]
-    roles = {"source": source, "sink": sink, "relay": relay, "watch": watch}
+    roles: dict[str, Any] = {"source": source, "sink": sink, "relay": relay, "watch": watch}
     if role == "crowd":
         say("up")
         crowd()

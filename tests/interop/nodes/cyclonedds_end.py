@@ -24,7 +24,7 @@ RELIABLE = Qos(Policy.Reliability.Reliable(duration(seconds=1)), Policy.History.
 
 
 @dataclass
-class String(IdlStruct, typename="std_msgs::msg::dds_::String_"):
+class String(IdlStruct, typename="std_msgs::msg::dds_::String_"):  # type: ignore[call-arg, misc]
     data: str
 
 
