@@ -106,14 +106,14 @@ def test_nothing_comes_back_as_an_echo(hall: Hall, node: OtherEnd) -> None:
 
 
 def test_a_failing_and_a_slow_service_end_nothing(hall: Hall, node: OtherEnd) -> None:
-    """#277, #340: after a call that fails the next one works; a call of 8 s is waited for."""
+    """#277, #340: after a call that fails the next one works; a call of 20 s is waited for."""
     with hall.robot.ros.rospy("switch", service="/broken", fail="it is out of order"):
         in_ros2(node, "services", "/broken")
         assert node.ask("call", "answered", service="/broken", data=True, within=3.0)["error"] == "no response"
     with hall.robot.ros.rospy("switch", service="/whole"):
         in_ros2(node, "services", "/whole")
         assert node.ask("call", "answered", service="/whole", data=True)["success"] is True
-    node.do("serve", service="/slow2", delay=8.0)
+    node.do("serve", service="/slow2", delay=20.0)
     eventually(lambda: "/slow2" in hall.robot.ros.tool("rosservice", "list").split(), LONG, what="/slow2 in ROS 1")
     assert "from ROS 2" in hall.robot.ros.tool("rosservice", "call", "/slow2", "false")
 

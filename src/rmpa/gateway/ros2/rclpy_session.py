@@ -53,6 +53,7 @@ _PROTOCOL: Final = 1
 _HEAD: Final = struct.Struct("<IBI")
 _CALL: Final = struct.Struct("<Q")
 _STAMPS: Final = struct.Struct("<qq")
+_MESSAGE: Final = ord("M")
 # Bytes of the head behind the length.
 _SHORT: Final = 5
 # Seconds for the child's first frame: DDS libraries load slowly on small computers.
@@ -341,14 +342,16 @@ class RclpySession:
             end = at + size + 4
             if len(data) < end:
                 return at, end - at
-            self._frame(chr(operation), number, bytes(data[at + _HEAD.size : end]))
+            body = data[at + _HEAD.size : end]
+            if operation == _MESSAGE:
+                self._message(number, body)
+            else:
+                self._frame(chr(operation), number, bytes(body))
             at = end
         return at, 0
 
     def _frame(self, operation: str, number: int, body: bytes) -> None:
-        if operation == "M":
-            self._message(number, body)
-        elif operation == "Q":
+        if operation == "Q":
             self._query(number, body)
         elif operation == "A":
             self._answered(body)
@@ -482,17 +485,17 @@ class RclpySession:
             self._create(number, made)
         return self._clients[key]
 
-    def _message(self, number: int, body: bytes) -> None:
+    def _message(self, number: int, body: memoryview) -> None:
         key = self._keys.get(number)
         if key is None:
             return
-        size = body[0]
-        real, at = body[1 : 1 + size], 1 + size
+        at = 1 + body[0]
+        real = bytes(body[1:at])
         stamp, sequence = _STAMPS.unpack_from(body, at)
         gid, of = self._gids.get(real, (real[:GID_BYTES].ljust(GID_BYTES, b"\0"), key))
         if of != key:
             return  # of a publisher with another definition of the type, which has a subscription of its own
-        sample = ZenohSample(key, body[at + _STAMPS.size :], Ros2Attachment(sequence, stamp, gid).serialize())
+        sample = ZenohSample(key, bytes(body[at + _STAMPS.size :]), Ros2Attachment(sequence, stamp, gid).serialize())
         for take in tuple(self._subscribers.get(key, ())):
             take(sample)
 
