@@ -5,6 +5,8 @@ Messages have numbers: what is heard is heard once.
 
 from __future__ import annotations
 
+import os
+import signal
 from collections import Counter
 from typing import TYPE_CHECKING
 
@@ -140,6 +142,12 @@ def test_latched_topics_of_modules_and_of_ros2_are_kept_for_late_ones(hall: Hall
     node.do("subscribe", topic="/tf_kept", latched=True)
     eventually(lambda: len(heard(node, "/tf_kept")) >= 2, LONG, what="what two modules keep")
     assert sorted(heard(node, "/tf_kept")) == ["of module 0", "of module 1"]
+    os.kill(hall.gateway.half(), signal.SIGKILL)
+    late = hall.node("late2")
+    late.do("subscribe", topic="/tf_kept", latched=True)
+    eventually(lambda: len(heard(late, "/tf_kept")) >= 2, FORGOTTEN, what="it by the next half")
+    assert sorted(heard(late, "/tf_kept")) == ["of module 0", "of module 1"]
+    late.process.end()
 
 
 def test_services_of_a_far_module_and_of_ros2(hall: Hall, node: OtherEnd) -> None:

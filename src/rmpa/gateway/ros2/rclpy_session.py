@@ -130,6 +130,8 @@ class RclpyPublisher:
                     self._used.add(number)
                     self._session.outbox.set_terms(number, self._qos.messages)
                 dropped += self._session.write("M", number, payload)
+                if self._session.is_latched(number):
+                    self._session.kept[number] = payload
         self.dropped += dropped
         return dropped
 
@@ -197,6 +199,7 @@ class RclpySession:
         problem: Why there is no child; empty: there is one.
         outbox: What waits for the child, by endpoint.
         publishers: Those that are open.
+        kept: The last message of each latched endpoint, for a child that is started again.
     """
 
     # More than twelve fields: the child with its stream, what is declared, what ROS 2 has, and the calls under way.
@@ -226,6 +229,7 @@ class RclpySession:
         self._by_gid: dict[bytes, int] = {}
         self._clients: dict[str, int] = {}
         self.publishers: set[RclpyPublisher] = set()
+        self.kept: dict[int, bytes] = {}
         self._subscribers: dict[str, list[Callable[[ZenohSample], None]]] = {}
         self._servers: dict[str, Callable[[RclpyQuery], object]] = {}
         self._watcher: Callable[[str, bool], None] | None = None
@@ -279,6 +283,8 @@ class RclpySession:
         self.problem = ""
         for number, endpoint in self._declared.items():
             self._create(number, endpoint)
+            if number in self.kept:
+                self.write("M", number, self.kept[number])
 
     def _no_rclpy(self, why: str) -> StartError:
         return StartError("ROS 2's half", f"{self._python}: {why}", code="no-rclpy")
@@ -394,6 +400,7 @@ class RclpySession:
 
         def end() -> None:
             del self._declared[number], self._keys[number], self._by_gid[gid]
+            self.kept.pop(number, None)
             self.outbox.discard(number)
             self.say(shown_in_ros2(endpoint.name, endpoint.node.name), "")
             self.write("-", number, b"")
@@ -414,6 +421,10 @@ class RclpySession:
     def number_of(self, gid: bytes) -> int | None:
         """The endpoint with this GID."""
         return self._by_gid.get(gid)
+
+    def is_latched(self, number: int) -> bool:
+        """Whether an endpoint keeps its last message for late ones."""
+        return self._declared[number].qos.latched
 
     def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> RclpyPublisher:
         """A publisher for the declared endpoints of a key; ``on_matching`` tells whether ROS 2 subscribes."""
