@@ -11,8 +11,12 @@ Both sites have the same addresses, as sites behind NAT do.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
+
+import psutil
 
 from lab.bed.agents import RMPA, Agent
 from lab.bed.processes import CommandFailed, Process, eventually
@@ -22,7 +26,6 @@ from rmpa.observe.control_client import ControlClient, choose_agent
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from contextlib import ExitStack
-    from pathlib import Path
 
     from lab.bed.namespaces import Host, Lab
 
@@ -30,6 +33,8 @@ if TYPE_CHECKING:
 ROUTER_PORT: Final = 7447
 # The mesh port of the router of secured sites, which lets modules of all sites join.
 AUTHORITY_PORT: Final = 40001
+# Where ``scripts/install-ros2`` keeps a venv for each distribution.
+_ROS2: Final = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"), "rmpa", "ros2")
 # The third byte of the addresses at every site.
 SUBNET: Final = 1
 
@@ -51,6 +56,16 @@ class GatewayProcess(Agent):
         """
         with ControlClient(choose_agent(self.env, self.name).path) as client:
             return client.call(GATEWAY_REPORT, dict[str, object])
+
+    def half(self) -> int:
+        """The process id of its half in ROS 2, while that runs."""
+        children = psutil.Process(self.pid).children(recursive=True)
+        return next(each.pid for each in children if any("half.child" in word for word in each.cmdline()))
+
+
+def python_of(distribution: str) -> Path:
+    """The Python of a distribution of ROS 2, which may not be there."""
+    return _ROS2 / distribution / "bin" / "python"
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from lab.bench import (
     idle,
     load,
     radio,
+    ros2,
     roundtrips,
     services,
     startup,
@@ -49,6 +50,7 @@ class Measurement:
 
 _WEB: Final = "rmpa web beside foxglove-sdk's server"
 _GATEWAY: Final = "sites joined by gateways, beside a bare pair of Zenoh programs"
+_ROS2: Final = "the gateway to ROS 2 by rclpy, beside a relay of rclpy"
 MEASUREMENTS: Final[dict[str, Measurement]] = {
     # What of path cannot start here is left out.
     "path": Measurement("how late a message is, on every path", roundtrips.path, (), ENTRIES),
@@ -61,6 +63,7 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     "services": Measurement("a service call through two agents, and a direct one", services.measure),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
     "gateway": Measurement(_GATEWAY, gateway.measure, (why_no_ros, gateway.why_no_sites), gateway.PARTS),
+    "ros2": Measurement(_ROS2, ros2.measure, (why_no_ros, why_no_hosts, ros2.why_no_ros2), ros2.PARTS),
     "web": Measurement(_WEB, web.measure, (why_no_ros, why_no_web), web.PARTS),
 }
 
@@ -75,7 +78,7 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     metavar="KEYS",
     help="path: these contenders, comma-separated (lab/bench/contenders.py has them); "
     f"web: of {', '.join(web.PARTS)}; gateway: of {', '.join(gateway.PARTS)}; "
-    f"radio: of {', '.join(radio.PARTS)}.",
+    f"radio: of {', '.join(radio.PARTS)}; ros2: of {', '.join(ros2.PARTS)}.",
 )
 def bench(names: tuple[str, ...], quick: bool, file: Path | None, only: str) -> None:
     """Measure what is named below (default: all of it, in this order); results are written to lab/results."""

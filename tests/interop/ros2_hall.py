@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -11,14 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from lab.bed.agents import Agent
-from lab.bed.gateways import ROUTER_PORT, GatewayProcess
+from lab.bed.gateways import ROUTER_PORT, GatewayProcess, python_of
 from lab.bed.namespaces import Lab
 from lab.bed.processes import Event, Process
+from lab.bed.ros import NODES as LAB_NODES
 from tests.interop.modules import Module
 from tests.interop.ros import NODES, Ros
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from lab.bed.namespaces import Host
 
@@ -40,15 +40,8 @@ python = "{python}"
 """
 # The workspace of ROS 1 at the gateway: it has an action that ROS 2's test_msgs has too.
 SOURCED: Final = ("env", f"ROS_PACKAGE_PATH={NODES.parent / 'packages'}")
-# Where ``scripts/install-ros2`` keeps a venv for each distribution.
-ROS2: Final = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"), "rmpa", "ros2")
 # ROS 2 as ``zenoh-ros2-sdk`` speaks it; else ``rclpy`` of the distribution that is named.
 ZENOH: Final = "zenoh"
-
-
-def python_of(distribution: str) -> Path:
-    """The Python of a distribution of ROS 2, which may not be there."""
-    return ROS2 / distribution / "bin" / "python"
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +73,7 @@ class Hall:
     home: Path
     stack: ExitStack
     way: str = ZENOH
+    more: tuple[Module, ...] = ()
 
     def node(self, name: str, *words: str) -> OtherEnd:
         """Start a ROS 2 node on the other host."""
@@ -87,17 +81,23 @@ class Hall:
             return self.end("ros2_end", self.robot.host.address)
         return self.end("rclpy_end", name, *words, python=python_of(self.way))
 
-    def end(self, program: str, *words: str, python: Path = Path(sys.executable)) -> OtherEnd:
+    def relay(self, *topics: str) -> None:
+        """Start a ROS 2 node that publishes the bytes that it hears on a topic on another one."""
+        self.end("rclpy_node", "relay", *topics, python=python_of(self.way), folder=LAB_NODES)
+
+    def end(self, program: str, *words: str, python: Path = Path(sys.executable), folder: Path = NODES) -> OtherEnd:
         """Start a program of ``nodes/`` on the other host."""
-        env = {"PATH": "/usr/bin:/bin", "HOME": str(self.home), "PYTHONPATH": f"{NODES}:{NODES.parents[2]}/lab/nodes"}
-        argv = self.other.command([python, NODES / f"{program}.py", *words])
+        env = {"PATH": "/usr/bin:/bin", "HOME": str(self.home), "PYTHONPATH": f"{NODES}:{LAB_NODES}"}
+        argv = self.other.command([python, folder / f"{program}.py", *words])
         process = self.stack.enter_context(Process(argv, env=env, name=program, commands=True))
         process.wait_event("up", LONG)
         return OtherEnd(process)
 
 
 @contextmanager
-def running_hall(home: Path, config: str = "", *, way: str = ZENOH, gateway_config: str = "") -> Iterator[Hall]:
+def running_hall(
+    home: Path, config: str = "", *, way: str = ZENOH, gateway_config: str = "", more: Sequence[str] = ()
+) -> Iterator[Hall]:
     """Start the module and its gateway, and join them.
 
     Args:
@@ -105,19 +105,22 @@ def running_hall(home: Path, config: str = "", *, way: str = ZENOH, gateway_conf
         config: Text of the module's ``rmpa.toml``.
         way: To ROS 2.
         gateway_config: More text of the gateway's.
+        more: Names of further modules, each on a host of its own.
     """
     text = CONFIG if way == ZENOH else RCLPY.format(python=python_of(way))
     with ExitStack() as stack:
         lab = stack.enter_context(Lab())
-        robot, other = lab.hosts("robot", "other")
-        agent = stack.enter_context(Agent(robot, home, name="robot", config=config))
+        *hosts, other = lab.hosts("robot", *more, "other")
+        agents = [stack.enter_context(Agent(host, home, name=host.name, config=config)) for host in hosts]
         gateway = stack.enter_context(
-            GatewayProcess(robot, home, name="gate", config=text + gateway_config, prefix=SOURCED)
+            GatewayProcess(hosts[0], home, name="gate", config=text + gateway_config, prefix=SOURCED)
         )
-        for one in (agent, gateway):
+        for one in (*agents, gateway):
             one.start()
-        for one in (agent, gateway):
+        for one in (*agents, gateway):
             one.wait_ready()
-        agent.wait_peer(gateway.name)
-        module = Module(robot, agent, stack.enter_context(Ros(robot, home, 11311)))
-        yield Hall(module, gateway, other, home, stack, way)
+        modules = []
+        for agent in agents:
+            agent.wait_peer(gateway.name)
+            modules.append(Module(agent.host, agent, stack.enter_context(Ros(agent.host, home, 11311))))
+        yield Hall(modules[0], gateway, other, home, stack, way, tuple(modules[1:]))

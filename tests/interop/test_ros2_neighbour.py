@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
 
-from lab.bed.gateways import ROUTER_PORT
+from lab.bed.gateways import ROUTER_PORT, python_of
 from lab.bed.processes import Event, Process, eventually
 from rmpa.gateway.ros2.conversion import ActionPair
 from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.messages import MessageType
 from tests.interop.ros import lacks
-from tests.interop.ros2_hall import LONG, ZENOH, Hall, OtherEnd, python_of, running_hall
+from tests.interop.ros2_hall import LONG, ZENOH, Hall, OtherEnd, running_hall
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -256,7 +256,10 @@ class ExportedTopic:
     def _matching(self, terms: tuple[str, ZenohQos], there: bool) -> None:
         if terms == self._terms and not self._closed:  # else it is of an earlier publisher
             self.wanted = there
-            self._was_wanted = self._was_wanted or there
+            if there and not self._was_wanted:
+                self._was_wanted = True
+                if self._last is not None:
+                    self._admit(self._last)
             self._judge()
 
     def _judge(self) -> None:
@@ -320,6 +323,11 @@ class ExportedTopic:
             if repeated:
                 return  # the publisher was connected anew, and gave its last message again
             self._last = payload
+        if self._was_wanted:
+            self._admit(payload)  # else its publisher was only asked for its header: a cache must not keep that
+
+    def _admit(self, payload: bytes) -> None:
+        """Send a message as soon as the limits let it, or leave it out."""
         if self._limits is not None:
             now = time.monotonic()
             if not self._limits.admit(now, len(payload)):

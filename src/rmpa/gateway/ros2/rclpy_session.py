@@ -53,6 +53,7 @@ _PROTOCOL: Final = 1
 _HEAD: Final = struct.Struct("<IBI")
 _CALL: Final = struct.Struct("<Q")
 _STAMPS: Final = struct.Struct("<qq")
+_MESSAGE: Final = ord("M")
 # Bytes of the head behind the length.
 _SHORT: Final = 5
 # Seconds for the child's first frame: DDS libraries load slowly on small computers.
@@ -129,6 +130,8 @@ class RclpyPublisher:
                     self._used.add(number)
                     self._session.outbox.set_terms(number, self._qos.messages)
                 dropped += self._session.write("M", number, payload)
+                if self._session.is_latched(number):
+                    self._session.kept[number] = payload
         self.dropped += dropped
         return dropped
 
@@ -196,6 +199,7 @@ class RclpySession:
         problem: Why there is no child; empty: there is one.
         outbox: What waits for the child, by endpoint.
         publishers: Those that are open.
+        kept: The last message of each latched endpoint, for a child that is started again.
     """
 
     # More than twelve fields: the child with its stream, what is declared, what ROS 2 has, and the calls under way.
@@ -225,6 +229,7 @@ class RclpySession:
         self._by_gid: dict[bytes, int] = {}
         self._clients: dict[str, int] = {}
         self.publishers: set[RclpyPublisher] = set()
+        self.kept: dict[int, bytes] = {}
         self._subscribers: dict[str, list[Callable[[ZenohSample], None]]] = {}
         self._servers: dict[str, Callable[[RclpyQuery], object]] = {}
         self._watcher: Callable[[str, bool], None] | None = None
@@ -278,6 +283,8 @@ class RclpySession:
         self.problem = ""
         for number, endpoint in self._declared.items():
             self._create(number, endpoint)
+            if number in self.kept:
+                self.write("M", number, self.kept[number])
 
     def _no_rclpy(self, why: str) -> StartError:
         return StartError("ROS 2's half", f"{self._python}: {why}", code="no-rclpy")
@@ -341,14 +348,16 @@ class RclpySession:
             end = at + size + 4
             if len(data) < end:
                 return at, end - at
-            self._frame(chr(operation), number, bytes(data[at + _HEAD.size : end]))
+            body = data[at + _HEAD.size : end]
+            if operation == _MESSAGE:
+                self._message(number, body)
+            else:
+                self._frame(chr(operation), number, bytes(body))
             at = end
         return at, 0
 
     def _frame(self, operation: str, number: int, body: bytes) -> None:
-        if operation == "M":
-            self._message(number, body)
-        elif operation == "Q":
+        if operation == "Q":
             self._query(number, body)
         elif operation == "A":
             self._answered(body)
@@ -391,6 +400,7 @@ class RclpySession:
 
         def end() -> None:
             del self._declared[number], self._keys[number], self._by_gid[gid]
+            self.kept.pop(number, None)
             self.outbox.discard(number)
             self.say(shown_in_ros2(endpoint.name, endpoint.node.name), "")
             self.write("-", number, b"")
@@ -411,6 +421,10 @@ class RclpySession:
     def number_of(self, gid: bytes) -> int | None:
         """The endpoint with this GID."""
         return self._by_gid.get(gid)
+
+    def is_latched(self, number: int) -> bool:
+        """Whether an endpoint keeps its last message for late ones."""
+        return self._declared[number].qos.latched
 
     def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> RclpyPublisher:
         """A publisher for the declared endpoints of a key; ``on_matching`` tells whether ROS 2 subscribes."""
@@ -482,17 +496,17 @@ class RclpySession:
             self._create(number, made)
         return self._clients[key]
 
-    def _message(self, number: int, body: bytes) -> None:
+    def _message(self, number: int, body: memoryview) -> None:
         key = self._keys.get(number)
         if key is None:
             return
-        size = body[0]
-        real, at = body[1 : 1 + size], 1 + size
+        at = 1 + body[0]
+        real = bytes(body[1:at])
         stamp, sequence = _STAMPS.unpack_from(body, at)
         gid, of = self._gids.get(real, (real[:GID_BYTES].ljust(GID_BYTES, b"\0"), key))
         if of != key:
             return  # of a publisher with another definition of the type, which has a subscription of its own
-        sample = ZenohSample(key, body[at + _STAMPS.size :], Ros2Attachment(sequence, stamp, gid).serialize())
+        sample = ZenohSample(key, bytes(body[at + _STAMPS.size :]), Ros2Attachment(sequence, stamp, gid).serialize())
         for take in tuple(self._subscribers.get(key, ())):
             take(sample)
 

@@ -40,22 +40,21 @@ import struct
 import sys
 import threading
 import time
+from functools import partial
 from typing import Any
 
+from .branches import distribution, event_callbacks, handle_of, look_at_events
 from .graph import Watcher, read_qos
 from .taker import Taker, ignore
+from .waits import GraphGuard, Waits
 
 PROTOCOL = 1
 _HEAD = struct.Struct("<IBI")
 _CALL = struct.Struct("<Q")
 _STAMPS = struct.Struct("<qq")
 _SHORT = 5
-# Seconds between two looks at ROS 2's graph, and between two that ask for the endpoints of every topic.
-_LOOK_PERIOD = 0.25
 # The namespace of the nodes that gateways show.
 _OWN = "/rmpa/"
-# The distributions by the first release of rclpy that is of a later one.
-_RCLPY_BELOW = (("foxy", 2), ("humble", 4), ("iron", 5), ("jazzy", 8), ("kilted", 10))
 # Messages of which it is known that their echo has not come; for rclpys that do not tell a message's publisher.
 _ECHOES = 10000
 
@@ -67,11 +66,14 @@ class Pipe:
         self._sock = sock
         self._lock = threading.Lock()
 
-    def send(self, operation: str, number: int, *parts: bytes) -> None:
+    def send(self, operation: str, number: int, *parts: Any) -> None:
         """Write one frame; a gateway that is slow is waited for, so that queues of ROS 2 decide what is dropped."""
         size = sum(map(len, parts))
+        head = _HEAD.pack(size + _SHORT, ord(operation), number)
         with self._lock:
-            self._sock.sendall(b"".join((_HEAD.pack(size + _SHORT, ord(operation), number), *parts)))
+            sent = self._sock.sendmsg((head, *parts))
+            if sent < _HEAD.size + size:
+                self._sock.sendall(b"".join((head, *parts))[sent:])
 
     def say(self, operation: str, number: int, **fields: Any) -> None:
         """Write one frame of JSON."""
@@ -87,14 +89,13 @@ class Pipe:
         return chr(operation), number, self._exactly(size - _SHORT)
 
     def _exactly(self, size: int) -> bytes:
-        data = bytearray(size)
-        view = memoryview(data)
-        while view:
-            count = self._sock.recv_into(view)
-            if not count:
+        data = self._sock.recv(size, socket.MSG_WAITALL)
+        while len(data) < size:
+            more = self._sock.recv(size - len(data), socket.MSG_WAITALL)
+            if not more:
                 raise EOFError
-            view = view[count:]
-        return bytes(data)
+            data += more
+        return data
 
 
 def load_type(name: str) -> Any:
@@ -125,12 +126,13 @@ def load_type(name: str) -> Any:
 class Made:
     """One publisher, subscription, server or client that was made for the gateway."""
 
-    def __init__(self, number: int, kind: str, name: str, node: Any, entity: Any, kind_of: Any) -> None:
+    def __init__(self, number: int, kind: str, name: str, node: Any, entity: Any, handle: Any, kind_of: Any) -> None:
         self.number = number
         self.kind = kind
         self.name = name
         self.node = node
         self.entity = entity
+        self.handle = handle
         self.type = kind_of
         # Of a server: the header of each call that waits; of a client: the calls by rcl's numbers.
         self.calls: dict[int, Any] = {}
@@ -146,7 +148,8 @@ class Half:
         self._rclpy = rclpy
         self._native = rclpy_implementation
         self._context = rclpy.Context()
-        rclpy.init(args=[], context=self._context, domain_id=domain)
+        os.environ["ROS_DOMAIN_ID"] = str(domain)  # Foxy has no argument for it
+        rclpy.init(args=[], context=self._context)
         self._nodes: dict[str, tuple[Any, list[int]]] = {}
         self._own = self._make_node(_OWN + name)
         self._endpoints: dict[int, Made] = {}
@@ -155,9 +158,11 @@ class Half:
         self._waiting: collections.Counter[int] = collections.Counter()
         self._lock = threading.Lock()
         self._wake = rclpy.guard_condition.GuardCondition(None, None, context=self._context)
-        self._wait_set: Any = None
+        self._wake_handle = handle_of(self._native, self._wake)
+        self._waits: Any = None
         self.taker = Taker()
         self._graph = Watcher(self._own, link.say)
+        self._guard = GraphGuard(self._own)
         self._requests = 0
         # Messages of our own that have not come back yet, by topic and hash.
         self._echoes: collections.Counter[tuple[str, int]] = collections.Counter()
@@ -166,12 +171,12 @@ class Half:
         """Say what this is."""
         from std_msgs.msg import String
 
-        self.taker.check(self._own, String, read_qos({}))
+        self.taker.check(self._own, String, read_qos({}), partial(handle_of, self._native))
         self._link.say(
             "H",
             0,
             protocol=PROTOCOL,
-            distribution=_distribution(),
+            distribution=distribution(),
             rmw=self._native.rclpy_get_rmw_implementation_identifier(),
             python="%d.%d" % sys.version_info[:2],
             gids=self.taker.gids,
@@ -214,6 +219,10 @@ class Half:
             self._call(number, body)
         elif operation == "A":
             self._answer(number, body)
+        with self._lock:
+            self._waiting[number] -= 1
+            if not self._waiting[number]:
+                del self._waiting[number]
 
     def _make_node(self, name: str) -> Any:
         namespace, _, base = name.rpartition("/")
@@ -245,30 +254,26 @@ class Half:
             self._link.say("!", number, text=str(error) or type(error).__name__)
             return
         users.append(number)
-        self._endpoints[number] = Made(number, kind, asked["name"], node, entity, kind_of)
-        self._wait_set = None
+        handle = handle_of(self._native, entity)
+        self._endpoints[number] = Made(number, kind, asked["name"], node, entity, handle, kind_of)
+        self._waits = None
         self._link.say("+", number)
 
     def _events(self, number: int, publishes: bool) -> Any:
         """Callbacks that tell of a QoS that fits no other endpoint."""
-        try:
-            from rclpy import event_handler as events
-        except ImportError:  # before Iron
-            from rclpy import qos_event as events
 
         def incompatible(info: Any) -> None:
             policy = str(getattr(info.last_policy_kind, "name", info.last_policy_kind))
             policy = policy.replace("RMW_QOS_POLICY_", "").lower()
             self._link.say("!", number, policy=policy, count=info.total_count)
 
-        made = events.PublisherEventCallbacks if publishes else events.SubscriptionEventCallbacks
-        return made(incompatible_qos=incompatible, use_default_callbacks=False)
+        return event_callbacks(publishes, incompatible)
 
     def _destroy(self, number: int) -> None:
         endpoint = self._endpoints.pop(number, None)
         if endpoint is None:
             return
-        self._wait_set = None
+        self._waits = None
         node = endpoint.node
         destroy = {
             "MP": node.destroy_publisher,
@@ -294,7 +299,7 @@ class Half:
             if not endpoint.entity.service_is_ready():
                 raise LookupError("no server of ROS 2 is there")
             request = deserialize_message(body[_CALL.size :], endpoint.type.Request)
-            endpoint.calls[endpoint.entity.handle.send_request(request)] = call
+            endpoint.calls[endpoint.handle.send_request(request)] = call
         except Exception as error:
             self._link.send("A", number, call, b"\0", str(error).encode())
 
@@ -306,58 +311,32 @@ class Half:
         if endpoint is None or header is None or not body[_CALL.size]:
             return  # ROS 2 has no response that says that a call has failed
         response = deserialize_message(body[_CALL.size + 1 :], endpoint.type.Response)
-        endpoint.entity.handle.service_send_response(response, header)
+        endpoint.handle.service_send_response(response, header)
 
     def spin(self) -> None:
         """Take what arrives, do what was asked, and look at the graph, for ever."""
-        due = 0.0
+        takes = {"MS": self._messages, "SC": self._responses, "SS": self._requests_of}
+        changed = True
         while True:
-            now = time.monotonic()
-            if now >= due:
-                due = now + _LOOK_PERIOD
-                self._graph.look(now)
-                self._look_at_events()
-            self._wait(due - now)
+            now, told = time.monotonic(), bool(self._guard.pointer)
+            if now >= self._graph.due(told=told, changed=changed):
+                changed = self._graph.look(now, changed=changed)
+                look_at_events(self._native, self._context, [each.entity for each in self._endpoints.values()])
+            if self._waits is None:
+                self._waits = Waits(
+                    self._native, self._context, self._endpoints.values(), self._wake_handle, self._guard
+                )
+            ready = self._waits.wait(self._graph.due(told=told, changed=changed) - now)
+            changed = changed or self._waits.graph_changed
+            for endpoint in ready:
+                takes[endpoint.kind](endpoint)
             while self._tasks:
-                operation, number, body = self._tasks.popleft()
-                self._do(operation, number, body)
-                with self._lock:
-                    self._waiting[number] -= 1
-                    if not self._waiting[number]:
-                        del self._waiting[number]
-
-    def _wait(self, timeout: float) -> None:
-        kinds: dict[str, list[Made]] = {"MS": [], "SS": [], "SC": []}
-        for endpoint in self._endpoints.values():
-            if endpoint.kind in kinds:
-                kinds[endpoint.kind].append(endpoint)
-        counts = [len(kinds[kind]) for kind in ("MS", "SC", "SS")]
-        if self._wait_set is None:
-            self._wait_set = self._native.WaitSet(counts[0], 1, 0, counts[1], counts[2], 0, self._context.handle)
-        wait_set = self._wait_set
-        wait_set.clear_entities()
-        for endpoint in kinds["MS"]:
-            wait_set.add_subscription(endpoint.entity.handle)
-        for endpoint in kinds["SC"]:
-            wait_set.add_client(endpoint.entity.handle)
-        for endpoint in kinds["SS"]:
-            wait_set.add_service(endpoint.entity.handle)
-        wait_set.add_guard_condition(self._wake.handle)
-        wait_set.wait(max(0, int(timeout * 1e9)))
-        for kind, word, take in (
-            ("MS", "subscription", self._messages),
-            ("SC", "client", self._responses),
-            ("SS", "service", self._requests_of),
-        ):
-            if kinds[kind]:
-                ready = set(wait_set.get_ready_entities(word))
-                for endpoint in kinds[kind]:
-                    if endpoint.entity.handle.pointer in ready:
-                        take(endpoint)
+                self._do(*self._tasks.popleft())
 
     def _messages(self, endpoint: Made) -> None:
+        take, handle, kind_of = self.taker.take, endpoint.handle, endpoint.type
         for _ in range(16):  # then the others have their turn
-            taken = self.taker.take(endpoint.entity, endpoint.type)
+            taken = take(handle, kind_of)
             if taken is None:
                 return
             data, gid, stamp, number = taken
@@ -377,7 +356,7 @@ class Half:
     def _responses(self, endpoint: Made) -> None:
         from rclpy.serialization import serialize_message
 
-        header, response = endpoint.entity.handle.take_response(endpoint.type.Response)
+        header, response = endpoint.handle.take_response(endpoint.type.Response)
         if header is None:
             return
         number = getattr(header, "request_id", header).sequence_number
@@ -388,43 +367,12 @@ class Half:
     def _requests_of(self, endpoint: Made) -> None:
         from rclpy.serialization import serialize_message
 
-        request, header = endpoint.entity.handle.service_take_request(endpoint.type.Request)
+        request, header = endpoint.handle.service_take_request(endpoint.type.Request)
         if request is None:
             return
         self._requests += 1
         endpoint.calls[self._requests] = getattr(header, "request_id", header)
         self._link.send("Q", endpoint.number, _CALL.pack(self._requests), serialize_message(request))
-
-    def _look_at_events(self) -> None:
-        handlers = [
-            handler
-            for endpoint in self._endpoints.values()
-            for handler in getattr(endpoint.entity, "event_handlers", ())
-        ]
-        if not handlers:
-            return
-        wait_set = self._native.WaitSet(0, 0, 0, 0, 0, len(handlers), self._context.handle)
-        wait_set.clear_entities()
-        for handler in handlers:
-            handler.add_to_wait_set(wait_set)
-        wait_set.wait(0)
-        for handler in handlers:
-            if handler.is_ready(wait_set):
-                handler.callback(handler.take_data())
-
-
-def _distribution() -> str:
-    """The distribution of ROS 2, by its variable or the release of rclpy."""
-    named = os.environ.get("ROS_DISTRO", "").lower()
-    if named:
-        return named
-    try:
-        from importlib.metadata import version
-
-        release = [int(part) for part in version("rclpy").split(".")[:2]]
-    except Exception:
-        return ""
-    return next((name for name, below in _RCLPY_BELOW if release[0] < below), "")
 
 
 def main() -> int:

@@ -9,6 +9,8 @@ from typing import Any
 
 # Bytes of a GUID of DDS that its participant has (DDSI-RTPS 9.3.1).
 _PARTICIPANT = 12
+# Bytes from which on a message is not copied.
+_LARGE = 65536
 # The fields of rcutils_allocator_t, pointers all.
 _ALLOCATOR = ("allocate", "deallocate", "reallocate", "zero_allocate", "state")
 
@@ -59,12 +61,16 @@ class Taker:
         self._info: Any = None
         self._rcl: Any = None
         self._array: Any = None
+        # The arguments of a take behind the subscription, and where it leaves the GID.
+        self._into: tuple[int, int, None] = (0, 0, None)
+        self._gid_at = self._gid_size = 0
 
-    def check(self, node: Any, message_type: Any, qos: Any) -> None:
+    def check(self, node: Any, message_type: Any, qos: Any, handle_of: Any) -> None:
         """Publish to ourselves, and see which way gives the publisher's GID."""
         name = "/rmpa/_gid_check_%d" % os.getpid()
         subscription = node.create_subscription(message_type, name, ignore, qos, raw=True)
         publisher = node.create_publisher(message_type, name, qos)
+        handle = handle_of(subscription)
         try:
             own = self._own_gid(node, name)
             for layout in (None, (16, True), (24, True), (24, False)):
@@ -73,7 +79,7 @@ class Taker:
                 for _ in range(20):
                     publisher.publish(b"\0\1\0\0\0\0\0\0")
                     time.sleep(0.02)
-                    taken = self.take(subscription, message_type)
+                    taken = self.take(handle, message_type)
                     if taken is not None:
                         self.gids = bool(own) and taken[1][: len(own)] == own
                         break
@@ -96,23 +102,28 @@ class Taker:
     def _use(self, layout: tuple[int, bool]) -> bool:
         try:
             # rclpy has loaded it; where wheels have it elsewhere the symbols are in the process.
-            rcl = ctypes.CDLL(_loaded("librcl.so"))
+            rcl = ctypes.CDLL(loaded("librcl.so"))
             self._rcl = rcl.rcl_take_serialized_message
         except (OSError, AttributeError):
             return False
         self._rcl.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p]
-        self._info = _message_info(*layout)()
-        utils = ctypes.CDLL(_loaded("librcutils.so"))
+        kind = _message_info(*layout)
+        self._info = kind()
+        self._gid_at, self._gid_size = ctypes.addressof(self._info) + kind.gid.offset, layout[0]
+        utils = ctypes.CDLL(loaded("librcutils.so"))
         utils.rcutils_get_default_allocator.restype = _Allocator
         allocator = utils.rcutils_get_default_allocator()
         self._array = _ByteArray()
         for field in _ALLOCATOR:
             setattr(self._array, field, getattr(allocator, field))
+        self._into = ctypes.addressof(self._array), ctypes.addressof(self._info), None
         return True
 
-    def take(self, subscription: Any, message_type: Any) -> tuple[bytes, bytes, int, int] | None:
-        """The next message of a subscription with GID, source stamp (ns) and number; ``None``: there is none."""
-        handle = subscription.handle
+    def take(self, handle: Any, message_type: Any) -> tuple[Any, bytes, int, int] | None:
+        """The next message of a subscription with GID, source stamp (ns) and number; ``None``: there is none.
+
+        The bytes of a large one hold until the next is taken.
+        """
         if self._info is None:
             taken = handle.take_message(message_type, True)
             if taken is None:
@@ -122,12 +133,15 @@ class Taker:
             number = info.get("publication_sequence_number") if isinstance(info, dict) else 0
             stamp = info["source_timestamp"] if isinstance(info, dict) else 0
             return data, _gid_bytes(gid), stamp, number or 0
-        pointer = handle.pointer
-        if self._rcl(pointer, ctypes.byref(self._array), ctypes.byref(self._info), None):
+        if self._rcl(handle.pointer, *self._into):
             return None
         info = self._info
-        data = ctypes.string_at(self._array.buffer, self._array.length)
-        return data, bytes(info.gid), info.source_stamp, getattr(info, "sequence", 0)
+        array, data = self._array, None
+        if array.length < _LARGE:
+            data = ctypes.string_at(array.buffer, array.length)
+        else:
+            data = (ctypes.c_uint8 * array.length).from_address(ctypes.addressof(array.buffer.contents))
+        return data, ctypes.string_at(self._gid_at, self._gid_size), info.source_stamp, getattr(info, "sequence", 0)
 
     def is_own(self, gid: bytes) -> bool:
         """Whether a message is of a publisher of this process."""
@@ -140,7 +154,7 @@ def _gid_bytes(gid: Any) -> bytes:
     return bytes(gid["data"] if isinstance(gid, dict) else gid)
 
 
-def _loaded(name: str) -> str:
+def loaded(name: str) -> str:
     """The path of a library that this process has loaded: in wheels its name has a hash behind."""
     stem = name.split(".", maxsplit=1)[0]
     with open("/proc/self/maps") as maps:
