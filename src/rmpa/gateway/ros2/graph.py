@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.format import Ros2Qos
     from rmpa.gateway.ros2.link import Declared, Ros2Link
     from rmpa.gateway.ros2.types import Ros2Types
+    from rmpa.gateway.zenoh.threads import ZenohReply
 
 # The name of ROS 2 among the sites, in rules and in the names of proxies; it is ``{module}`` too.
 SITE: Final = ROS2
@@ -364,19 +365,20 @@ class Ros2TypeAsker:
         server = await self._wait(f"{endpoint.node.name}/{SERVICE}", EntityKind.SERVICE, endpoint.node)
         if server is None:
             raise NoConversion(self._unknown(endpoint))
-        self._asked += 1
-        gid = gid_of(f"{self._nodes.own_name}/{SERVICE}")
-        replies = await self._session.get(
-            server.key(),
-            type_request(endpoint.type, endpoint.type_hash),
-            Ros2Attachment(self._asked, time.time_ns(), gid).serialize(),
-            timeout=limits.ROS2_SERVICE_WAIT,
-            all_complete=True,
-        )
-        answer = first_answer(replies)
+        answer = await self.call(server, type_request(endpoint.type, endpoint.type_hash))
         if answer is None or not answer.ok:
             raise NoConversion(f"{server.name} does not answer; {self._unknown(endpoint)}")
         return parse_type_response(answer.payload)
+
+    async def call(self, server: Ros2Endpoint, request: bytes) -> ZenohReply | None:
+        """Call one of the services that each node has; ``None``: it has not answered in time."""
+        self._asked += 1
+        gid = gid_of(f"{self._nodes.own_name}/{SERVICE}")
+        attachment = Ros2Attachment(self._asked, time.time_ns(), gid).serialize()
+        wait = limits.ROS2_SERVICE_WAIT
+        return first_answer(
+            await self._session.get(server.key(), request, attachment, timeout=wait, all_complete=True)
+        )
 
     async def _wait(self, name: str, kind: EntityKind, node: Ros2Node) -> Ros2Endpoint | None:
         """An endpoint of a node, once it is there; ``None`` if it does not appear."""

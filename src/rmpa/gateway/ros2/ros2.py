@@ -5,18 +5,21 @@ from __future__ import annotations
 import logging
 import os
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
 from rmpa.agent.trust import trust_store
+from rmpa.config.peer_rules import Access
 from rmpa.core.contract import Contracts
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.actions import Ros2Actions
 from rmpa.gateway.ros2.format import Ros2Endpoint, graph_key
 from rmpa.gateway.ros2.graph import SITE
+from rmpa.gateway.ros2.parameters import Ros2Parameters
 from rmpa.gateway.ros2.rclpy_session import RclpySession, shown_in_ros2
 from rmpa.gateway.ros2.services import Ros2Context, Ros2Services
 from rmpa.gateway.ros2.topics import Ros2Topics
@@ -24,7 +27,7 @@ from rmpa.gateway.ros2.types import DISTRIBUTIONS
 from rmpa.gateway.rules import CrossingRules, SourceKind
 from rmpa.gateway.topics import flow
 from rmpa.observe.check import FAIL, OK, WARN, Check
-from rmpa.observe.sites import REPORT, SITE_INFO, WHY, SiteInfo, SiteSourceInfo, SitesReport
+from rmpa.observe.sites import PARAM, REPORT, SITE_INFO, WHY, SiteInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.why.diagnosis import Diagnosis, until_failure
 
 if TYPE_CHECKING:
@@ -78,6 +81,7 @@ class Ros2Neighbour:
         context = self.context = Ros2Context(graph, session, settings, contracts or Contracts())
         self.topics = Ros2Topics(context) if find is None else Ros2Topics(context, find)
         self.services = Ros2Services(context)
+        self.parameters = Ros2Parameters(context)
         # Actions take all topics and services of actions, so that no other part carries them.
         self._parts: tuple[_Part, ...] = (Ros2Actions(context), self.services, self.topics)
         # By proxy.
@@ -192,6 +196,9 @@ class Ros2Neighbour:
             visible = any(self.permissions.tells(asker, kind, name) for kind in SourceKind)
             ways = self.ways(name, site, module) if visible and args.get("service") is not True else []
             return [*ways, *(await self.sites.answer(what, args, asker) if self.sites is not None else ())]
+        if what == PARAM and site == SITE:
+            denial = partial(self.permissions.denial, asker, access=Access.CALL)
+            return await self.parameters.answer(args, denial if asker else lambda _: "")
         if what == REPORT or (what == SITE_INFO and site == SITE):
             report = await self._report(asker)
             if what == SITE_INFO:
