@@ -17,6 +17,7 @@
 * ``{"do": "hear", "topic", "kind", "qos", "delay"}``: subscribe to any type; then ``heard`` with ``data``, the
   message as text, its ``size``, and ``number``. ``{"do": "unhear", "topic"}`` ends it;
 * ``{"do": "declare", "name", "value"}``: a parameter; ``{"do": "value", "name"}``: then ``value`` with ``value``;
+* ``{"do": "log", "text"}``: to /rosout, for good;
 * ``{"do": "now"}``: then ``now`` with ``seconds``, by the node's clock.
 
 Events beside: ``up``; ``goal`` and ``cancel`` of the server; ``done`` after each line.
@@ -141,6 +142,10 @@ class End:
     def value(self, name: str) -> None:
         value = self.node.get_parameter(name).value
         say("value", value=value.tolist() if isinstance(value, array) else value)
+
+    def log(self, text: str) -> None:
+        logger = self.node.get_logger()
+        self.kept["log"] = self.node.create_timer(0.2, lambda: logger.info(text), clock=Clock())
 
     def now(self) -> None:
         say("now", seconds=self.node.get_clock().now().nanoseconds / 1e9)

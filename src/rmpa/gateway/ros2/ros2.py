@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 _log: Final = logging.getLogger(__name__)
 _RULES: Final = "change [[gateway.rule]] in the rmpa.toml of the gateway, and reload it"
 _DROPPED: Final = "were dropped by a full queue"
+_LIMITED: Final = "were left out for the rule's rate or size"
 _UNCONVERTED: Final = "could not be converted"
 
 
@@ -283,7 +284,7 @@ def _out_stages(export: ExportedTopic, dialect: Ros2Dialect, problems: Mapping[s
     waiting = f", {export.waiting} wait" if export.waiting else ""
     losses = (
         (export.dropped, _DROPPED),
-        (export.limited, "were left out for the rule's rate or size"),
+        (export.limited, _LIMITED),
         (dialect.unconverted, _UNCONVERTED),
     )
     yield flow("sent", f"{export.messages} messages were sent{waiting}", export.messages, losses)
@@ -305,6 +306,7 @@ def _in_stages(imported: Ros2Import, publisher: Ros2Publisher) -> Iterator[Check
     losses = (
         (imported.sequences.lost, "were lost on the way, by their numbers"),
         (publisher.dropped, _DROPPED),
+        (imported.limited, _LIMITED),
         (imported.unconverted, _UNCONVERTED),
         (imported.early.dropped, "came before a node subscribed"),
     )
