@@ -22,11 +22,12 @@ from rmpa.cli.completion import completes, peers
 from rmpa.cli.graph import suggestion
 from rmpa.cli.options import Options, agent_verb, argument, flag, graph_verb
 from rmpa.cli.output import Painted, Table, json_text, size, warn
+from rmpa.config.rules import ROS2
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.facts import FollowedInfo
 from rmpa.core.identity import is_legal_name, resolve_name
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.operations import PeerParams, parameters_in
+from rmpa.observe.operations import PeerParams, Ros2Params, parameters_in
 from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ peer_option: Final = click.option(
     "--peer",
     metavar="PEER",
     shell_complete=completes(peers),
-    help="The parameters of this peer's module (or its GUID).",
+    help="The parameters of this peer's module (or its GUID); ros2/NODE: of a node of ROS 2.",
 )
 
 
@@ -130,7 +131,7 @@ class MasterParams:
             raise self.master.unreachable() from None
 
 
-ParamStore: TypeAlias = MasterParams | PeerParams
+ParamStore: TypeAlias = MasterParams | PeerParams | Ros2Params
 
 
 def with_namespaces(name: str) -> list[str]:
@@ -154,13 +155,14 @@ def open_store(peer: str | None, options: Options) -> ParamStore:
         return MasterParams(options.master())
     if options.master_uri is not None:
         raise ConfigError("--peer", "a peer is asked through this machine's agent, not at a master", "leave one out")
-    if "/" in peer:
+    site, slash, node = peer.partition("/")
+    if slash and site != ROS2:
         remedy = "run `rmpa param` at that site, or have a service, a latched topic or dynamic_reconfigure bring it"
         raise RmpaError(f"{peer}: parameters do not cross between sites; {remedy}", code="not-offered")
     client = options.client(observe_limits.CONTROL_HANDLER_TIMEOUT)
     if context := click.get_current_context(silent=True):
         context.with_resource(client)
-    return PeerParams(client, peer)
+    return Ros2Params(client, f"/{node.strip('/')}") if slash else PeerParams(client, peer)
 
 
 def split_peer(peer: str | None, text: str) -> tuple[str | None, str]:

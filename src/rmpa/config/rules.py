@@ -342,10 +342,14 @@ class CrossingRule:
         "The name here of what comes in; {site}, {module} and {name} are replaced.",
     )
     rate: float | None = setting(
-        None, RATE, "Messages a second of each topic that goes out; others are dropped, and counted."
+        None,
+        RATE,
+        "Messages a second of each topic that goes out, or comes from ROS 2; others are counted.",
     )
     size: int | None = setting(
-        None, BYTES_A_SECOND, "Bytes a second of each topic that goes out; others are dropped, and counted."
+        None,
+        BYTES_A_SECOND,
+        "Bytes a second of each topic that goes out, or comes from ROS 2; others are counted.",
     )
 
 
@@ -355,7 +359,8 @@ def _make_crossing(values: dict[str, Any]) -> CrossingRule:
         example = 'one has names = ["/camera/**"] and rate = 2, or crossing = "none"'
         raise BadValue("a rule that selects nothing", example)
     for key, useful in (("name", Crossing.IN), ("rate", Crossing.OUT), ("size", Crossing.OUT)):
-        if key in values and rule.crossing not in (Crossing.BOTH, useful):
+        ros2 = useful is Crossing.OUT and ROS2 in rule.sites and rule.crossing is Crossing.IN
+        if key in values and rule.crossing not in (Crossing.BOTH, useful) and not ros2:
             what = "comes in" if useful is Crossing.IN else "goes out"
             remedy = f"leave {key} out, or write crossing = {useful.value!r}"
             raise BadValue(f"{key} is about what {what}, and nothing does", remedy, at=(key,))

@@ -111,8 +111,8 @@ class CrossingDecision:
         allowed: Whether it may.
         why: The rule that decided, as text.
         name: The name here of what comes in; empty if it may not cross.
-        rate: Messages a second of what goes out; ``None``: no limit.
-        size: Bytes a second of what goes out; ``None``: no limit.
+        rate: Messages a second of what goes out, or comes from ROS 2; ``None``: no limit.
+        size: Bytes a second of it; ``None``: no limit.
         addressed: Whether what goes out does not go to all other sites alike: ``outgoing_to`` decides for each.
     """
 
@@ -237,6 +237,7 @@ class CrossingRules:
             source: The source by its name there.
         """
         site, module, here, why = source.site, source.module or source.site, source.name, _NO_RULE
+        rate = size = None
         if site == ROS2 and here in PLUMBING and not any(here in rule.names for _, rule in self._rules):
             return CrossingDecision(
                 False, f"{here} is of each ROS 2 node; a gateway.rule that names it lets it cross"
@@ -246,6 +247,8 @@ class CrossingRules:
             why = _named(number, rule)
             if rule.crossing not in (Crossing.BOTH, Crossing.IN):
                 return CrossingDecision(False, f"{why} lets it not come in")
+            if site == ROS2:  # what comes from another site was limited there
+                rate, size = rule.rate, rule.size
             here = rule.name.replace("{name}", here).replace("{site}", site).replace("{module}", module)
         if not is_global_name(here):
             return CrossingDecision(False, f"{why} names it {here!r}, which is no global name of ROS")
@@ -256,7 +259,7 @@ class CrossingRules:
         if not judged.allowed:
             self._gate.refused(access, site, here, judged)
             return CrossingDecision(False, judged.rule)
-        return CrossingDecision(True, why, here)
+        return CrossingDecision(True, why, here, rate, size)
 
     def _fitting(self, module: str, name: str, site: str | None = None) -> Iterator[tuple[int, CrossingRule]]:
         for number, rule in self._rules:

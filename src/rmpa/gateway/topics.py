@@ -88,6 +88,11 @@ class TopicLimits:
             None if each is None else TokenBucket(each, max(1.0, each * _LIMIT_BURST)) for each in (rate, size)
         )
 
+    @classmethod
+    def of(cls, rate: float | None, size: int | None) -> TopicLimits | None:
+        """The limits; ``None``: there is none."""
+        return None if rate is None and size is None else cls(rate, size)
+
     def admit(self, now: float, size: int) -> bool:
         """Whether a message of ``size`` bytes may cross at ``now`` (monotonic seconds)."""
         if all(bucket.has(now, amount) for bucket, amount in self._buckets(size)):
@@ -146,7 +151,7 @@ class ExportedTopic:
         self._graph = graph
         self._session = session
         self._dialect = dialect
-        self._limits = TopicLimits(rate, size) if rate is not None or size is not None else None
+        self._limits = TopicLimits.of(rate, size)
         self.about: TopicDescription | None = None
         self.wanted = False
         self.problem = ""

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge import nodes as node_requests
 from rmpa.bridge.params import transfer
+from rmpa.config.rules import ROS2
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.facts import ContractTerm, FollowedInfo
@@ -18,6 +20,7 @@ from rmpa.core.identity import OWN_NODE, is_global_name, is_meant
 from rmpa.observe import limits
 from rmpa.observe.control import ReloadReply
 from rmpa.observe.graph import GraphRevision
+from rmpa.observe.sites import PARAM
 from rmpa.observe.snapshot import INFO, ModuleFacts, PingReply, Snapshot
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.environment import NodeLine, PeerNodes
@@ -37,6 +40,7 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot_builder import SnapshotBuilder
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
+_T = TypeVar("_T")
 Args = dict[str, Any]
 
 
@@ -214,6 +218,14 @@ def parameters_in(key: str, value: XmlRpcValue) -> list[tuple[str, XmlRpcValue]]
     return found
 
 
+def _passed_on(client: ControlClient, operation: str, kind: type[_T], **args: Any) -> _T:
+    """The answer of another agent, to which this one only passes the question on: so it refuses nothing itself."""
+    try:
+        return client.call(operation, kind, **args)
+    except PeerRefused as error:
+        raise RmpaError(error.reason, code=error.code) from None
+
+
 @dataclass(frozen=True, slots=True)
 class PeerParams:
     """The parameters of a peer's module, through both agents; each call blocks.
@@ -263,9 +275,45 @@ class PeerParams:
         return parse_response(transfer.text_of(self._ask(what, **args)).encode())
 
     def _ask(self, what: str, **args: str) -> object:
-        try:
-            return self.client.call("param", dict[str, Any], peer=self.peer, what=what, **args)
-        except PeerRefused as error:
-            raise RmpaError(
-                error.reason, code=error.code
-            ) from None  # this agent only passes on the answer of the peer's agent
+        return _passed_on(self.client, "param", dict[str, Any], peer=self.peer, what=what, **args)
+
+
+@dataclass(frozen=True, slots=True)
+class Ros2Params:
+    """The parameters of a node of ROS 2, through a gateway; as ``PeerParams``. ``/a.b`` is ROS 2's ``a.b``.
+
+    Args:
+        client: Asks this machine's agent.
+        node: The node, ``/like/this``.
+    """
+
+    client: ControlClient
+    node: str
+
+    @property
+    def title(self) -> str:
+        """The node, for error texts."""
+        return self.node
+
+    def get(self, key: str) -> XmlRpcValue:
+        """A value, or those of a namespace by name; errors as for ``PeerParams``."""
+        value: XmlRpcValue = self._ask(key=key[1:])
+        return value
+
+    def names(self) -> list[str]:
+        """The names of all parameters, in order."""
+        return [f"/{name}" for name in self._ask() or ()]
+
+    def set(self, key: str, value: XmlRpcValue) -> int:
+        """Set a parameter, or each member of a dictionary: all or none; return the number."""
+        self._ask(key=key[1:], text=json.dumps(value, default=str))
+        return len(list(leaves(key, value)))
+
+    def delete(self, key: str) -> None:
+        """Delete a parameter, which few nodes allow."""
+        self._ask(key=key[1:], text="null")
+
+    def _ask(self, **args: str) -> Any:
+        asked = {"site": ROS2, "node": self.node, **args}
+        text = _passed_on(self.client, "site", str, what=PARAM, args=asked)
+        return json.loads(text) if text else None

@@ -27,6 +27,8 @@ REPORT: Final = "site.report"
 SITE_INFO: Final = "site.info"
 # The request for the ways of a topic or a service through gateways: ``{name, site, module, service}``.
 SITE_WHY: Final = "site.why"
+# The request for parameters of a node of ROS 2: ``{site, node}``, with ``key`` and ``text`` as the gateway has them.
+PARAM: Final = "site.param"
 _SOURCES: Final = Needs(
     (Access.SUBSCRIBE, Access.CALL),
     "each topic and service; of this site the asking module's own alone. Sites and modules are named to all",
@@ -34,8 +36,9 @@ _SOURCES: Final = Needs(
 _WAYS: Final = Needs(
     (Access.SUBSCRIBE, Access.CALL), "the topic or service, by its name here; what leaves is the asking module's own"
 )
+_PARAMETERS: Final = Needs((Access.CALL,), "a service of parameters of ROS 2, such as `/node/get_parameters`")
 # The questions about other sites.
-QUESTIONS: Final = (REPORT, SITE_INFO, SITE_WHY)
+QUESTIONS: Final = (REPORT, SITE_INFO, SITE_WHY, PARAM)
 
 
 class SiteAnswerer(Protocol):
@@ -71,6 +74,7 @@ class SiteRequests:
         self.answerer, rpc = gateway, self._bridge.rpc
         rpc.on_request(REPORT, partial(self._answer_peer, gateway, REPORT), _SOURCES)
         rpc.on_request(SITE_INFO, partial(self._answer_peer, gateway, SITE_INFO), _SOURCES)
+        rpc.on_request(PARAM, partial(self._answer_peer, gateway, PARAM), _PARAMETERS)
         rpc.on_request(SITE_WHY, partial(self._answer_peer, gateway, SITE_WHY), _WAYS)
 
     async def answer(self, args: Args) -> Any:

@@ -11,22 +11,34 @@
   ``ended`` with ``status`` and ``result``;
 * ``{"do": "cancel"}``: the goal that was sent last; then ``cancelling`` with ``code``;
 * ``{"do": "sensor", "topic"}``: publish std_msgs/msg/String with best effort, 20 a second;
-* ``{"do": "strict", "topic"}``: subscribe reliably and transient local.
+* ``{"do": "strict", "topic"}``: subscribe reliably and transient local;
+* ``{"do": "tell", "topic", "kind", "fields", "rate", "size"}``: publish any type, once or for good;
+  ``size``: so many bytes in ``data``. ``{"do": "untell", "topic"}`` ends it;
+* ``{"do": "hear", "topic", "kind", "qos", "delay"}``: subscribe to any type; then ``heard`` with ``data``, the
+  message as text, its ``size``, and ``number``. ``{"do": "unhear", "topic"}`` ends it;
+* ``{"do": "declare", "name", "value"}``: a parameter; ``{"do": "value", "name"}``: then ``value`` with ``value``;
+* ``{"do": "log", "text"}``: to /rosout, for good;
+* ``{"do": "now"}``: then ``now`` with ``seconds``, by the node's clock.
 
 Events beside: ``up``; ``goal`` and ``cancel`` of the server; ``done`` after each line.
 """
 
+import importlib
+import itertools
 import json
 import sys
 import threading
 import time
+from array import array
 from typing import Any
 
 import rclpy
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.utilities import remove_ros_args
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 from test_msgs.action import Fibonacci
@@ -35,6 +47,20 @@ from node import say
 
 STEP = 0.05
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def load(name: str) -> Any:
+    package, kind, base = name.split("/")
+    return getattr(importlib.import_module(f"{package}.{kind}"), base)
+
+
+def filled(message: Any, fields: dict[str, Any]) -> Any:
+    for name, value in fields.items():
+        if isinstance(value, dict):
+            filled(getattr(message, name), value)
+        else:
+            setattr(message, name, value)
+    return message
 
 
 class End:
@@ -75,6 +101,55 @@ class End:
 
     def strict(self, topic: str) -> None:
         self.subscribe(topic, latched=True)
+
+    def tell(self, topic: str, kind: str, fields: Any, rate: float = 0, size: int = 0) -> None:
+        message = filled(load(kind)(), fields)
+        if size:
+            message.data = array("B", b"x" * size)
+        publisher = self.node.create_publisher(load(kind), topic, QoSProfile(depth=10))
+        self.kept["tell " + topic] = publisher
+        if rate:
+            timer = self.node.create_timer(1 / rate, lambda: publisher.publish(message), clock=Clock())
+            self.kept["timer " + topic] = timer
+        else:
+            publisher.publish(message)
+
+    def untell(self, topic: str) -> None:
+        timer = self.kept.pop("timer " + topic, None)
+        if timer is not None:
+            self.node.destroy_timer(timer)
+        self.node.destroy_publisher(self.kept.pop("tell " + topic))
+
+    def hear(self, topic: str, kind: str, qos: str = "", delay: float = 0.0) -> None:
+        count = itertools.count(1)
+
+        def take(message: Any) -> None:
+            data = getattr(message, "data", ())
+            data = data if hasattr(data, "__len__") else ()
+            text = str(message) if len(data) < 1000 else ""
+            say("heard", topic=topic, data=text, size=len(data), number=next(count))
+            time.sleep(delay)
+
+        best = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        terms = best if qos == "best" else QoSProfile(depth=10)
+        self.kept["hear " + topic] = self.node.create_subscription(load(kind), topic, take, terms)
+
+    def unhear(self, topic: str) -> None:
+        self.node.destroy_subscription(self.kept.pop("hear " + topic))
+
+    def declare(self, name: str, value: Any) -> None:
+        self.node.declare_parameter(name, value)
+
+    def value(self, name: str) -> None:
+        value = self.node.get_parameter(name).value
+        say("value", value=value.tolist() if isinstance(value, array) else value)
+
+    def log(self, text: str) -> None:
+        logger = self.node.get_logger()
+        self.kept["log"] = self.node.create_timer(0.2, lambda: logger.info(text), clock=Clock())
+
+    def now(self) -> None:
+        say("now", seconds=self.node.get_clock().now().nanoseconds / 1e9)
 
     def serve(self, service: str, delay: float = 0.0) -> None:
         def answer(request: Any, response: Any) -> Any:
@@ -171,8 +246,9 @@ class End:
 
 
 def main() -> None:
-    rclpy.init()
-    end = End(sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "/count")
+    rclpy.init(args=sys.argv)
+    words = remove_ros_args(sys.argv)
+    end = End(words[1], words[2] if len(words) > 2 else "/count")
     executor = MultiThreadedExecutor(4)
     executor.add_node(end.node)
     threading.Thread(target=executor.spin, daemon=True).start()

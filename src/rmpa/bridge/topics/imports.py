@@ -37,6 +37,7 @@ from rmpa.bridge.messages import (
     is_crossing_name,
 )
 from rmpa.bridge.peer_offers import ImportBook
+from rmpa.bridge.policy import is_outside
 from rmpa.bridge.topics.import_route import RemoteTopic
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
@@ -305,7 +306,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
 
         Time has one source: one node of the followed peer, or one of this module.
         """
-        if entry.origin is not None:
+        if entry.origin is not None and not is_outside(entry.origin):  # the gateway itself brings what is outside
             return "time does not come by a relay", False
         decision = self._out.context.policy.judge_clock(self.peer_name(entry.peer))
         if not decision.allowed:

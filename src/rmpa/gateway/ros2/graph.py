@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.format import Ros2Qos
     from rmpa.gateway.ros2.link import Declared, Ros2Link
     from rmpa.gateway.ros2.types import Ros2Types
+    from rmpa.gateway.zenoh.threads import ZenohReply
+    from rmpa.ros.wire.tcpros import Buffer
 
 # The name of ROS 2 among the sites, in rules and in the names of proxies; it is ``{module}`` too.
 SITE: Final = ROS2
@@ -261,6 +263,7 @@ class OwnRos2Nodes:
         self._domain = domain
         self._gid_bytes = gid_bytes
         self._numbers = itertools.count()
+        self._calls = itertools.count(1)
         self._nodes: dict[str, tuple[Ros2Node, Declared]] = {}
         self._uses: Counter[str] = Counter()
 
@@ -287,6 +290,11 @@ class OwnRos2Nodes:
         self.gids.add(gid)
         return OwnEndpoint(self, endpoint, gid)
 
+    async def call(self, key: str, gid: bytes, request: Buffer, within: float) -> ZenohReply | None:
+        """Call a service of ROS 2 as the client with a GID; ``None``: it gave no answer in ``within`` seconds."""
+        attachment = Ros2Attachment(next(self._calls), time.time_ns(), gid).serialize()
+        return first_answer(await self.session.get(key, request, attachment, timeout=within, all_complete=True))
+
     def release(self, node: Ros2Node) -> None:
         """One endpoint of a node was taken back; the node's token goes with the last."""
         self._uses[node.name] -= 1
@@ -309,19 +317,16 @@ class Ros2TypeAsker:
     """Asks for types; at most ``limits.ROS2_ASKS_MAX`` nodes at one time.
 
     Args:
-        session: The Zenoh session.
         nodes: Our nodes in ROS 2's graph.
         ros2: ROS 2's graph.
         types: The types of ROS 2's distribution.
     """
 
-    def __init__(self, session: Ros2Link, nodes: OwnRos2Nodes, ros2: Ros2Graph, types: Ros2Types) -> None:
-        self._session = session
+    def __init__(self, nodes: OwnRos2Nodes, ros2: Ros2Graph, types: Ros2Types) -> None:
         self._nodes = nodes
         self._ros2 = ros2
         self._types = types
         self._appeared = asyncio.Event()
-        self._asked = 0
         self._asking = 0
 
     def appeared(self) -> None:
@@ -364,19 +369,15 @@ class Ros2TypeAsker:
         server = await self._wait(f"{endpoint.node.name}/{SERVICE}", EntityKind.SERVICE, endpoint.node)
         if server is None:
             raise NoConversion(self._unknown(endpoint))
-        self._asked += 1
-        gid = gid_of(f"{self._nodes.own_name}/{SERVICE}")
-        replies = await self._session.get(
-            server.key(),
-            type_request(endpoint.type, endpoint.type_hash),
-            Ros2Attachment(self._asked, time.time_ns(), gid).serialize(),
-            timeout=limits.ROS2_SERVICE_WAIT,
-            all_complete=True,
-        )
-        answer = first_answer(replies)
+        answer = await self.call(server, type_request(endpoint.type, endpoint.type_hash))
         if answer is None or not answer.ok:
             raise NoConversion(f"{server.name} does not answer; {self._unknown(endpoint)}")
         return parse_type_response(answer.payload)
+
+    async def call(self, server: Ros2Endpoint, request: bytes) -> ZenohReply | None:
+        """Call one of the services that each node has; ``None``: it has not answered in time."""
+        gid = gid_of(f"{self._nodes.own_name}/{SERVICE}")
+        return await self._nodes.call(server.key(), gid, request, limits.ROS2_SERVICE_WAIT)
 
     async def _wait(self, name: str, kind: EntityKind, node: Ros2Node) -> Ros2Endpoint | None:
         """An endpoint of a node, once it is there; ``None`` if it does not appear."""

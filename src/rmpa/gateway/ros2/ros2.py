@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
 from rmpa.agent.trust import trust_store
+from rmpa.config.peer_rules import Access
 from rmpa.core.contract import Contracts
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.actions import Ros2Actions
 from rmpa.gateway.ros2.format import Ros2Endpoint, graph_key
 from rmpa.gateway.ros2.graph import SITE
+from rmpa.gateway.ros2.parameters import Ros2Parameters
 from rmpa.gateway.ros2.rclpy_session import RclpySession, shown_in_ros2
 from rmpa.gateway.ros2.services import Ros2Context, Ros2Services
 from rmpa.gateway.ros2.topics import Ros2Topics
@@ -24,7 +28,7 @@ from rmpa.gateway.ros2.types import DISTRIBUTIONS
 from rmpa.gateway.rules import CrossingRules, SourceKind
 from rmpa.gateway.topics import flow
 from rmpa.observe.check import FAIL, OK, WARN, Check
-from rmpa.observe.sites import REPORT, SITE_INFO, SITE_WHY, SiteInfo, SiteSourceInfo, SitesReport
+from rmpa.observe.sites import PARAM, REPORT, SITE_INFO, SITE_WHY, SiteInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.why.diagnosis import Diagnosis, until_failure
 
 if TYPE_CHECKING:
@@ -46,6 +50,7 @@ if TYPE_CHECKING:
 _log: Final = logging.getLogger(__name__)
 _RULES: Final = "change [[gateway.rule]] in the rmpa.toml of the gateway, and reload it"
 _DROPPED: Final = "were dropped by a full queue"
+_LIMITED: Final = "were left out for the rule's rate or size"
 _UNCONVERTED: Final = "could not be converted"
 
 
@@ -78,6 +83,7 @@ class Ros2Neighbour:
         context = self.context = Ros2Context(graph, session, settings, contracts or Contracts())
         self.topics = Ros2Topics(context) if find is None else Ros2Topics(context, find)
         self.services = Ros2Services(context)
+        self.parameters = Ros2Parameters(context)
         # Actions take all topics and services of actions, so that no other part carries them.
         self._parts: tuple[_Part, ...] = (Ros2Actions(context), self.services, self.topics)
         # By proxy.
@@ -192,6 +198,9 @@ class Ros2Neighbour:
             visible = any(self.permissions.tells(asker, kind, name) for kind in SourceKind)
             ways = self.ways(name, site, module) if visible and args.get("service") is not True else []
             return [*ways, *(await self.sites.answer(what, args, asker) if self.sites is not None else ())]
+        if what == PARAM and site == SITE:
+            denial = partial(self.permissions.denial, asker, access=Access.CALL)
+            return await self.parameters.answer(args, denial if asker else lambda _: "")
         if what == REPORT or (what == SITE_INFO and site == SITE):
             report = await self._report(asker)
             if what == SITE_INFO:
@@ -253,7 +262,9 @@ def _way(stages: tuple[Check, ...], name: str, node: str, peer: str, to: str) ->
 
 def _out_stages(export: ExportedTopic, dialect: Ros2Dialect, problems: Mapping[str, str]) -> Iterator[Check]:
     yield Check("rule", OK, dialect.why)
-    if problem := export.problem or problems.get(shown_in_ros2(export.source.here, export.source.proxy)):
+    if problem := export.problem or (
+        problems.get(shown_in_ros2(dialect.endpoint.endpoint)) if dialect.endpoint is not None else ""
+    ):
         yield Check("type", FAIL, problem)
     if dialect.endpoint is None:
         text = f"ROS 2 has no {export.source.type}; its publisher is being asked for the definition"
@@ -276,7 +287,7 @@ def _out_stages(export: ExportedTopic, dialect: Ros2Dialect, problems: Mapping[s
     waiting = f", {export.waiting} wait" if export.waiting else ""
     losses = (
         (export.dropped, _DROPPED),
-        (export.limited, "were left out for the rule's rate or size"),
+        (export.limited, _LIMITED),
         (dialect.unconverted, _UNCONVERTED),
     )
     yield flow("sent", f"{export.messages} messages were sent{waiting}", export.messages, losses)
@@ -285,7 +296,9 @@ def _out_stages(export: ExportedTopic, dialect: Ros2Dialect, problems: Mapping[s
 def _in_stages(imported: Ros2Import, publisher: Ros2Publisher) -> Iterator[Check]:
     here, there = imported.decision.name, imported.first
     yield Check("rule", OK, imported.decision.why)
-    if problem := imported.problem or publisher.topic.problem:
+    own = imported.declared
+    in_ros2 = imported.part.context.problems.get(shown_in_ros2(own), "") if own is not None else ""
+    if problem := imported.problem or publisher.topic.problem or in_ros2:
         yield Check("type", FAIL, problem)
     kept = ", transient local" if publisher.latched else ""
     yield Check("type", OK, f"{there.type} of ROS 2 is {imported.ros1_type} here{kept}")
@@ -298,6 +311,7 @@ def _in_stages(imported: Ros2Import, publisher: Ros2Publisher) -> Iterator[Check
     losses = (
         (imported.sequences.lost, "were lost on the way, by their numbers"),
         (publisher.dropped, _DROPPED),
+        (imported.limited, _LIMITED),
         (imported.unconverted, _UNCONVERTED),
         (imported.early.dropped, "came before a node subscribed"),
     )
@@ -323,12 +337,16 @@ def make_ros2_neighbour(graph: AgentGraph, session: Ros2Link, settings: Settings
 
 
 def pythons(chosen: str, environ: Mapping[str, str]) -> list[str]:
-    """The Pythons that may be ROS 2's: the chosen one alone, else each ``python3`` of PATH, then the system's."""
+    """The Pythons that may be ROS 2's: the chosen one alone, else each ``python3`` of PATH, then the system's.
+
+    A gateway in isolated mode has a Python of its own (the bundle), which is not ROS 2's even if it could import it.
+    """
     if chosen:
         return [chosen]
     folders = [*environ.get("PATH", "").split(os.pathsep), "/usr/bin"]
     found = dict.fromkeys(Path(folder).resolve() / "python3" for folder in folders if folder.startswith("/"))
-    return [str(each) for each in found if os.access(each, os.X_OK)]
+    own = Path(sys.executable).resolve() if sys.flags.isolated else None
+    return [str(each) for each in found if os.access(each, os.X_OK) and each.resolve() != own]
 
 
 async def open_rclpy_session(settings: Settings) -> RclpySession:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import struct
+import time
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
@@ -25,7 +26,7 @@ from rmpa.gateway.ros2.graph import SITE, gid_of, mismatch, valid_name
 from rmpa.gateway.ros2.pairs import Ros2Pairs
 from rmpa.gateway.ros2.types import Ros2Sequences
 from rmpa.gateway.rules import ForeignSource, SourceKind
-from rmpa.gateway.topics import ExportedTopic
+from rmpa.gateway.topics import ExportedTopic, TopicLimits
 from rmpa.gateway.zenoh.threads import BoundedQueue
 from rmpa.ros.types.find import find_message_type, type_of_header
 from rmpa.ros.wire.tcpros import TopicDescription
@@ -229,8 +230,14 @@ class Ros2Import:
         self._qos = Ros2Qos()
         self.sequences = Ros2Sequences()
         self.early: BoundedQueue[tuple[bytes, int, bytes]] = BoundedQueue(_ROS2_EARLY_MESSAGES, _ROS2_EARLY_BYTES)
-        self.unconverted = 0
+        self.unconverted = self.limited = 0
+        self._limits = TopicLimits.of(decision.rate, decision.size)
         self._lingering: asyncio.TimerHandle | None = None
+
+    @property
+    def declared(self) -> Ros2Endpoint | None:
+        """The gateway's subscription in ROS 2; ``None``: there is none."""
+        return self._subscribed[1].endpoint if self._subscribed is not None else None
 
     @property
     def idle(self) -> bool:
@@ -391,6 +398,9 @@ class Ros2Import:
             body: Buffer = self.conversion.to_ros1(payload)
         except ConversionError as error:
             self._fail(str(error))
+            return
+        if self._limits is not None and not publisher.latched and not self._limits.admit(time.monotonic(), len(body)):
+            self.limited += 1
             return
         publisher.received += 1
         if self._has_seq:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
+import struct
 from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -340,6 +341,12 @@ SERVICE_TYPE: Final = "type_description_interfaces/srv/GetTypeDescription"
 _REQUEST: Final = f"{SERVICE_TYPE}_Request"
 _RESPONSE: Final = f"{SERVICE_TYPE}_Response"
 _PARTS: Final = {
+    "rcl_interfaces/srv/ListParameters_Request": "string[] prefixes; uint64 depth",
+    "rcl_interfaces/srv/ListParameters_Response": "rcl_interfaces/ListParametersResult result",
+    "rcl_interfaces/srv/GetParameters_Request": "string[] names",
+    "rcl_interfaces/srv/GetParameters_Response": "rcl_interfaces/ParameterValue[] values",
+    "rcl_interfaces/srv/SetParametersAtomically_Request": "rcl_interfaces/Parameter[] parameters",
+    "rcl_interfaces/srv/SetParametersAtomically_Response": "rcl_interfaces/SetParametersResult result",
     _REQUEST: "string type_name; string type_hash; bool include_type_sources",
     _RESPONSE: (
         "bool successful; string failure_reason; type_description_interfaces/TypeDescription type_description;"
@@ -358,7 +365,8 @@ _ARRAY, _BOUNDED, _UNBOUNDED = 48, 96, 144
 
 
 @functools.cache
-def _store() -> Typestore:
+def service_store() -> Typestore:
+    """The types with requests and responses of the services that each node of ROS 2 has and the gateway calls."""
     types = Ros2Types("jazzy")
     for name, text in _PARTS.items():
         [fields] = get_types_from_msg(text.replace(";", "\n"), name).values()
@@ -366,10 +374,26 @@ def _store() -> Typestore:
     return types.store
 
 
+def read_response(raw: Buffer, name: str) -> Any:
+    """The response of a service that each node has; garbage behind it is let be, as rmw_fastrtps pads messages.
+
+    Raises:
+        RemoteProtocolError: It is malformed or too large.
+    """
+    if len(raw) > limits.ROS2_DESCRIPTION_MAX:
+        raise RemoteProtocolError(f"{name} has {len(raw)} bytes; at most {limits.ROS2_DESCRIPTION_MAX}")
+    kind = service_store().get_msgdef(name)
+    try:
+        read = kind.deserialize_cdr_le if raw[1] else kind.deserialize_cdr_be
+        return read(bytes(raw[4:]), 0, kind.cls, service_store())[0]
+    except (SerdeError, ValueError, IndexError, AssertionError, OverflowError, struct.error) as error:
+        raise RemoteProtocolError(f"{name} is malformed: {error}") from error
+
+
 def type_request(name: str, type_hash: str) -> bytes:
     """The CDR of a request for the description of ``package/msg/Name`` with a hash."""
-    message = _store().types[_REQUEST](type_name=name, type_hash=type_hash, include_type_sources=False)
-    return bytes(_store().serialize_cdr(message, _REQUEST))
+    message = service_store().types[_REQUEST](type_name=name, type_hash=type_hash, include_type_sources=False)
+    return bytes(service_store().serialize_cdr(message, _REQUEST))
 
 
 def parse_type_response(raw: Buffer) -> dict[str, Any]:
@@ -379,12 +403,7 @@ def parse_type_response(raw: Buffer) -> dict[str, Any]:
         RemoteProtocolError: It is malformed, too large, or has a field that neither side's ROS has; or the node does
             not know the type, and the text says why.
     """
-    if len(raw) > limits.ROS2_DESCRIPTION_MAX:
-        raise RemoteProtocolError(f"a type's description has {len(raw)} bytes; at most {limits.ROS2_DESCRIPTION_MAX}")
-    try:
-        message: Any = _store().deserialize_cdr(bytes(raw), _RESPONSE)
-    except (SerdeError, ValueError, IndexError, AssertionError, OverflowError) as error:
-        raise RemoteProtocolError(f"a type's description is malformed: {error}") from error
+    message = read_response(raw, _RESPONSE)
     if not message.successful:
         raise RemoteProtocolError(f"the node does not describe the type: {message.failure_reason[:200]}")
     described = message.type_description
