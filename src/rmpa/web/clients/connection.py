@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import inspect
 import logging
+import operator
 import socket
 from abc import abstractmethod
 from collections import deque
@@ -27,7 +29,7 @@ from rmpa.web.clients.frame_writer import FairQueue, FrameWriter, Opcode, OutFra
 from rmpa.web.hub.hub import HubClient
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from aiohttp import web
 
@@ -53,13 +55,27 @@ _Entry: TypeAlias = "Callable[[float], Iterable[OutFrame]]"
 _AGE_PINGS: Final = 4
 
 
-def struct_of(method: Callable[..., None], **config: Any) -> type[msgspec.Struct]:
-    """The struct of what a client sends for a method to be called: its fields are the method's keywords.
+def ops_of(
+    session: type[Session], rename: Callable[[str], str], *, tagged: bool = False
+) -> dict[str, type[msgspec.Struct]]:
+    """The structs of what clients send, by op: for each method ``op_NAME`` of a session.
 
     Args:
-        method: Its keyword arguments are the fields, with their types and defaults.
-        config: Of the struct.
+        session: The keyword arguments of its methods are the fields, with their types and defaults.
+        rename: The protocol's name of an op or a field.
+        tagged: Whether the struct itself says the op, in its field ``op``.
     """
+    names = {rename(name.removeprefix("op_")): name for name in vars(session) if name.startswith("op_")}
+    tags: dict[str, Any] = {op: {"tag_field": "op", "tag": op} if tagged else {} for op in names}
+    return {op: _struct_of(getattr(session, name), rename=rename, **tags[op]) for op, name in names.items()}
+
+
+def decoder_of(ops: Mapping[str, type[msgspec.Struct]]) -> msgspec.json.Decoder[msgspec.Struct]:
+    """Decodes any message of tagged ops."""
+    return msgspec.json.Decoder(functools.reduce(operator.or_, ops.values()))
+
+
+def _struct_of(method: Callable[..., None], **config: Any) -> type[msgspec.Struct]:
     hints = get_type_hints(method, include_extras=True)
     keywords = [each for each in inspect.signature(method).parameters.values() if each.kind is each.KEYWORD_ONLY]
     fields = [

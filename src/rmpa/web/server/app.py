@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from importlib.abc import Traversable
 
-    from aiohttp.typedefs import Handler, Middleware
+    from aiohttp.typedefs import Handler
 
     from rmpa.web.clients.clients import WebSocketClients
     from rmpa.web.server.agent_watch import AgentWatch
@@ -159,7 +159,7 @@ class WebServer:
         Raises:
             StartError: The address cannot be used.
         """
-        app = web.Application(middlewares=[self._middleware()])
+        app = web.Application(middlewares=[self._middleware])
         for path in self._pages:
             app.router.add_get(path, self._page)
         app.router.add_get("/metrics", self._metrics)
@@ -217,26 +217,23 @@ class WebServer:
             self._table.abort_all()
         await self._watch.close()
 
-    def _middleware(self) -> Middleware:
-        @web.middleware
-        async def middleware(request: web.Request, handler: Handler) -> web.StreamResponse:
-            request[_JUDGED] = True
-            connection = _connection(request)
+    @web.middleware
+    async def _middleware(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        request[_JUDGED] = True
+        connection = _connection(request)
+        if connection is not None:
+            connection.request_begins()
+        try:
+            response = await self._respond(request, handler)
+        finally:
             if connection is not None:
-                connection.request_begins()
-            try:
-                response = await self._respond(request, handler)
-            finally:
-                if connection is not None:
-                    connection.request_ends()
-            if not response.prepared:
-                response.headers.update(HEADERS)
-                response.headers.update(self._sharing(request))
-                if is_loopback(host_name(request.host) or ""):
-                    response.headers.update((OPENER_POLICY,))
-            return response
-
-        return middleware
+                connection.request_ends()
+        if not response.prepared:
+            response.headers.update(HEADERS)
+            response.headers.update(self._sharing(request))
+            if is_loopback(host_name(request.host) or ""):
+                response.headers.update((OPENER_POLICY,))
+        return response
 
     async def _respond(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         verdict = self._policy.judge(self._facts(request))
