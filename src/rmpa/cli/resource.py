@@ -101,13 +101,11 @@ class ResourceGraph:
                 raise RmpaError(f"no resource {printable(str(wanted))}; {hint}", code="unknown-name")
         found = tuple(each for each in found if each.peer is None) or found
         if not found:
-            raise RmpaError(
-                "there is no resource; `rmpa run` runs one, `rmpa resource list` shows all", code="unknown-name"
-            )
+            problem = "there is no resource; `rmpa run` runs one, `rmpa resource list` shows all"
+            raise RmpaError(problem, code="unknown-name")
         if len(found) > 1:
-            raise RmpaError(
-                f"there are {', '.join(printable(str(each)) for each in found)}; {remedy}", code="several-fit"
-            )
+            problem = f"there are {', '.join(printable(str(each)) for each in found)}; {remedy}"
+            raise RmpaError(problem, code="several-fit")
         return found[0]
 
     async def hear(self, each: Iterable[SeenResource], name: str, kind: str = _TEXT) -> dict[SeenResource, Any]:
@@ -145,9 +143,8 @@ class ResourceGraph:
         service = GraphName(f"{one.path}/set_parameters", one.peer)
         server = self.graph.require_service(service)
         if one.peer is None and proxied_peer(server) is not None:
-            raise RmpaError(
-                f"service {service} is another module's; {one} does not offer it", code="resource-trouble"
-            )
+            problem = f"service {service} is another module's; {one} does not offer it"
+            raise RmpaError(problem, code="resource-trouble")
         pairs: Any = [{"name": name, "value": value} for name, value in values.items()]
         try:
             await self.node.call_service(service.name, ServiceType(SERVICE_TYPE), {"config": {"strs": pairs}})

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Payload, Rights
     from rmpa.web.hub.topics import ReceivedMessage
+    from rmpa.web.server.access import GuardedConnection
 
 _log = logging.getLogger(__name__)
 # Pings without an answer, behind which no further one is sent: they wait as the client's frames do.
@@ -251,7 +252,7 @@ class ClientConnection:
         # Messages and answers that were written.
         self.sent = 0
         self._heard = 0
-        self._received: Callable[[], int] = int
+        self._guard: GuardedConnection | None = None
         self._arrival = MessageArrival()
         self._age: CommandAge | None = None
         self._wake = asyncio.Event()
@@ -317,11 +318,16 @@ class ClientConnection:
         """Bytes that wait, here and behind the queue."""
         return self.queue.bytes + self._waiting
 
+    @property
+    def _received(self) -> int:
+        """Bytes that the client has sent; 0 where they are not counted."""
+        return self._guard.received if self._guard is not None else 0
+
     async def run(
         self,
         request: web.Request,
         socket_: FrameSocket,
-        upgraded: Callable[[web.Request], Callable[[], int]],
+        guard: GuardedConnection | None,
         refused: Callable[[str, str], None],
     ) -> None:
         """Serve the client until it has gone.
@@ -329,7 +335,7 @@ class ClientConnection:
         Args:
             request: Asks for the WebSocket.
             socket_: Not prepared yet.
-            upgraded: Called when the handshake is done; what it returns counts the bytes that the client has sent.
+            guard: What guards the connection and counts what the client has sent; ``None``: nothing does.
             refused: ``(reason, text)``: called if the client is disconnected for one of ``clients.CLIENT_REFUSALS``.
 
         Raises:
@@ -341,8 +347,10 @@ class ClientConnection:
         tasks: list[asyncio.Task[None]] = []
         try:
             writer = await socket_.prepare(request)
-            self._received = upgraded(request)
-            self._arrival.message_ended(self._received())
+            if guard is not None:
+                guard.upgrade(self.unmasked)
+                self._guard = guard
+            self._arrival.message_ended(self._received)
             self._transport = request.transport
             if self._transport is None:
                 return  # it went during the handshake
@@ -379,7 +387,7 @@ class ClientConnection:
             if message.type in (WSMsgType.PING, WSMsgType.PONG):
                 self._arrival.control_frame(len(message.data))
             else:
-                self._arrival.message_ended(self._received())
+                self._arrival.message_ended(self._received)
             if message.type == WSMsgType.ERROR:
                 self._failed(message.data)
             if self._gone:
@@ -416,7 +424,7 @@ class ClientConnection:
         silent, heard, waiting = 0, (-1, 0), 0
         while silent < _SILENT_LOOKS:
             await asyncio.sleep(limits.PING_INTERVAL / 2)
-            now, received = self._waiting, self._received()
+            now, received = self._waiting, self._received
             if self._arrival.takes_too_long(received, self.now()):
                 self.end(WSCloseCode.POLICY_VIOLATION, "a message did not end in time", "message")
                 return

@@ -343,7 +343,7 @@ class GuardedConnection(asyncio.Protocol):
         self._enter(ConnectionPhase.IDLE)
 
     def upgrade(self, on_unmasked: Callable[[], None]) -> None:
-        """The connection is a WebSocket from now on.
+        """The connection is a WebSocket from now on: the limits of requests do not hold any more.
 
         Args:
             on_unmasked: Called when a frame of the client is not masked; it and all after it is dropped.

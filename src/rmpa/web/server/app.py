@@ -36,7 +36,7 @@ from rmpa.web.server.access import (
 
 if TYPE_CHECKING:
     import ssl
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
     from importlib.abc import Traversable
 
     from aiohttp.typedefs import Handler
@@ -150,8 +150,6 @@ class WebServer:
         self._runner: web.AppRunner | None = None
         self._table: ConnectionTable | None = None
         self._servers: list[asyncio.Server] = []
-        if sockets is not None:
-            sockets.upgraded = _upgraded
 
     async def start(self) -> None:
         """Listen.
@@ -261,7 +259,7 @@ class WebServer:
     async def _upgrade(self, request: web.Request, sockets: WebSocketClients) -> web.StreamResponse:
         """Serve a WebSocket until it has ended."""
         try:
-            return await sockets.handle(request)
+            return await sockets.handle(request, _connection(request))
         except web.HTTPBadRequest as error:  # of aiohttp's handshake
             text = (error.text or "").partition("\n")[0][:_SHOWN]
             sockets.refuse(request.remote or "?", "handshake", text)
@@ -371,15 +369,6 @@ def _connection(request: web.Request) -> GuardedConnection | None:
     transport = request.transport
     protocol = transport.get_protocol() if transport is not None else None
     return protocol if isinstance(protocol, GuardedConnection) else None
-
-
-def _upgraded(request: web.Request, on_unmasked: Callable[[], None]) -> Callable[[], int]:
-    """The limits of requests do not hold for the connection any more; returns what counts its bytes."""
-    connection = _connection(request)
-    if connection is None:
-        return int
-    connection.upgrade(on_unmasked)
-    return lambda: connection.received
 
 
 def _is_for_people(request: web.Request) -> bool:
