@@ -145,14 +145,16 @@ def _agreed(plan: Sequence[Repair], options: Options, *, yes: bool) -> bool:
 
 def _run(repair: Repair) -> bool:
     """Run one command; what it prints goes to standard error. Return whether it succeeded."""
-    problem, out, limit = "", sys.stderr.fileno(), limits.DOCTOR_REPAIR
+    problem, limit = "", limits.DOCTOR_REPAIR
     try:
         if repair.do:
             repair.do()
         elif shutil.which(repair.words[0]) is None:
             problem = f"there is no {repair.words[0]} here; run it as root without it"
-        elif code := subprocess.run(repair.words, stdout=out, check=False, timeout=limit).returncode:  # noqa: S603 - as shown
-            problem = f"exit code {code}"
+        else:
+            out = sys.stderr.fileno()
+            code = subprocess.run(repair.words, stdout=out, check=False, timeout=limit).returncode  # noqa: S603 - as shown
+            problem = f"exit code {code}" if code else ""
     except subprocess.TimeoutExpired:
         problem = f"it did not end within {limit:.0f} s"
     except OSError as error:

@@ -6,7 +6,7 @@ import contextlib
 import re
 import signal
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
 import msgspec
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 # Seconds between two lines of figures, as rostopic has it.
 TICK: Final = 1.0
+_T = TypeVar("_T")
 _Table: TypeAlias = list[tuple[str, list[str]]]
 _REMEDY: Final = "start one with `rmpa up` or `rmpa core`, or name it with --master"
 
@@ -360,8 +361,8 @@ def run_stream(body: Callable[[], Coroutine[object, object, None]]) -> None:
         asyncio.run(run())
 
 
-async def with_node(master: Master, name: str, body: Callable[[Node], Awaitable[None]]) -> None:
-    """Run ``body`` with a node of a unique name at a master.
+async def with_node(master: Master, name: str, body: Callable[[Node], Awaitable[_T]]) -> _T:
+    """What ``body`` returns, run with a node of a unique name at a master.
 
     Raises:
         UnreachableError: The master does not answer.
@@ -374,7 +375,7 @@ async def with_node(master: Master, name: str, body: Callable[[Node], Awaitable[
     except UnreachableError:
         raise master.unreachable() from None
     try:
-        await body(node)
+        return await body(node)
     finally:
         await node.close()
 

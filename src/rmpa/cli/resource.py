@@ -8,7 +8,7 @@ import functools
 import time
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rmpa.bridge.policy import OUTSIDE_GUID
 from rmpa.cli.completion import graph_of, of_peer
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from rmpa.ros.node.endpoints import Received
     from rmpa.ros.node.node import Node
 
+_T = TypeVar("_T")
 _TEXT: Final = "std_msgs/String"
 # Seconds for a latched message: the route of another module's topic has to open first.
 _ANSWER: Final = 3.0
@@ -152,22 +153,22 @@ class ResourceGraph:
             raise RmpaError(printable(f"{one}: {error.reason}"), code=error.code) from None
 
 
-def run_with_resources(options: Options, body: Callable[[ResourceGraph], Awaitable[None]]) -> None:
-    """Find all resources of the graph that the options name, and run ``body`` with them."""
-    asyncio.run(with_resources(options.master(), body))
+def run_with_resources(options: Options, body: Callable[[ResourceGraph], Awaitable[_T]]) -> _T:
+    """What ``body`` returns, run with all resources of the graph that the options name."""
+    return asyncio.run(with_resources(options.master(), body))
 
 
-async def with_resources(master: Master, body: Callable[[ResourceGraph], Awaitable[None]]) -> None:
-    """Find all resources of a master's graph, and run ``body`` with them."""
+async def with_resources(master: Master, body: Callable[[ResourceGraph], Awaitable[_T]]) -> _T:
+    """What ``body`` returns, run with all resources of a master's graph."""
     graph = await read_graph(master)
     snapshot = await asyncio.to_thread(master.snapshot, topics=())
     peers = snapshot.peers if snapshot is not None else ()
     sites = {peer.name for peer in peers if peer.guid == OUTSIDE_GUID} - {ROS2}  # other sites that a gateway joins
 
-    async def within(node: Node) -> None:
-        await body(ResourceGraph(node, graph, await find_resources(node, graph, sites)))
+    async def within(node: Node) -> _T:
+        return await body(ResourceGraph(node, graph, await find_resources(node, graph, sites)))
 
-    await with_node(master, "rmpa_resource", within)
+    return await with_node(master, "rmpa_resource", within)
 
 
 async def find_resources(node: Node, graph: Graph, sites: Iterable[str] = ()) -> tuple[SeenResource, ...]:
@@ -335,19 +336,16 @@ def alarm_echo(resource: str | None, count: int | None, options: Options) -> Non
 
 
 async def _echo(master: Master, resource: str | None, count: int | None, *, as_json: bool) -> None:
-    only: list[SeenResource] = []
-    if resource is not None:
+    async def pick(graph: ResourceGraph) -> SeenResource:
+        return graph.pick(resource)
 
-        async def pick(graph: ResourceGraph) -> None:
-            only.append(graph.pick(resource))
-
-        await with_resources(master, pick)
+    only = await with_resources(master, pick) if resource is not None else None
     printed = 0
     enough = asyncio.get_running_loop().create_future()
 
     def take(path: str, received: Received) -> None:
         nonlocal printed
-        if only and received.caller_id != only[0].caller:
+        if only is not None and received.caller_id != only.caller:
             return
         for status in received.message.status:
             if enough.done():
@@ -367,7 +365,11 @@ async def _echo(master: Master, resource: str | None, count: int | None, *, as_j
                 for topic in graph.publishers.keys() - known:
                     path = topic.removesuffix("/alarms")
                     found = path != topic and graph.types.get(topic) == ARRAY_TYPE
-                    if found and f"{path}/{TOPIC}" in graph.publishers and (not only or path == only[0].path):
+                    if (
+                        found
+                        and f"{path}/{TOPIC}" in graph.publishers
+                        and path == (only.path if only is not None else path)
+                    ):
                         known.add(topic)
                         await node.subscribe(topic, MessageType(ARRAY_TYPE), functools.partial(take, path))
             if not known and not warned:
