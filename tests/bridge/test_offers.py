@@ -19,7 +19,6 @@ from rmpa.bridge.topics.exports import LocalSource
 from rmpa.config.peer_rules import PeerRule, PolicySettings
 from rmpa.config.settings import LimitSettings, ServiceSettings
 from rmpa.core.contract import Contracts
-from rmpa.core.facts import CROWDED
 from tests.bridge.recorder import (
     Exports,
     Imports,

@@ -28,7 +28,6 @@ from rmpa.config.peer_rules import Access, Effect, PeerRule, PermissionRule, Pol
 from rmpa.config.read import load_settings
 from rmpa.config.settings import ServiceSettings, TimeSettings, TrustSettings
 from rmpa.core.contract import Contract, Contracts
-from rmpa.core.facts import DENIED
 from rmpa.core.identity import NEVER_CROSSING
 from rmpa.core.statistics import Counters
 from rmpa.ros.wire.tcpros import ServiceDescription

@@ -143,11 +143,11 @@ def test_latched_topics_of_modules_and_of_ros2_are_kept_for_late_ones(hall: Hall
     eventually(lambda: len(heard(node, "/tf_kept")) >= 2, LONG, what="what two modules keep")
     assert sorted(heard(node, "/tf_kept")) == ["of module 0", "of module 1"]
     os.kill(hall.gateway.half(), signal.SIGKILL)
-    late = hall.node("late2")
-    late.do("subscribe", topic="/tf_kept", latched=True)
-    eventually(lambda: len(heard(late, "/tf_kept")) >= 2, FORGOTTEN, what="it by the next half")
-    assert sorted(heard(late, "/tf_kept")) == ["of module 0", "of module 1"]
-    late.process.end()
+    again = hall.node("late2")
+    again.do("subscribe", topic="/tf_kept", latched=True)
+    eventually(lambda: len(heard(again, "/tf_kept")) >= 2, FORGOTTEN, what="it by the next half")
+    assert sorted(heard(again, "/tf_kept")) == ["of module 0", "of module 1"]
+    again.process.end()
 
 
 def test_services_of_a_far_module_and_of_ros2(hall: Hall, node: OtherEnd) -> None:

@@ -20,20 +20,18 @@ from rmpa.cli.completion import topics
 from rmpa.cli.graph import read_name, suggestion
 from rmpa.cli.main import verb
 from rmpa.cli.options import Options, agent_verb, argument, config_option, flag, json_verb, setting_options
-from rmpa.cli.output import Painted, Table, paint_level, print_error, printable, warn
+from rmpa.cli.output import Painted, Table, begin_log, paint_level, print_error, printable, warn
 from rmpa.config.module_name import GATEWAY_SUFFIX, NameSource, choose_name, keep_name, state_dir
 from rmpa.config.read import load_settings
 from rmpa.config.settings import SETTINGS, json_value, schema_text, toml_value
 from rmpa.core import codes
 from rmpa.core.errors import ConfigError, RmpaError
-from rmpa.core.log import configure_logging
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, WARN
 from rmpa.observe.control import ReloadReply
 from rmpa.observe.control_client import find_agents
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.runtime.log_writer import LogWriter
-from rmpa.runtime.systemd import in_journal
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -232,10 +230,7 @@ def up(quiet: bool, **options: object) -> int:
     load = partial(load_settings, options, dict(os.environ), host_name=socket.gethostname())
     loaded = load()
     writer = LogWriter(sys.stderr.fileno())
-    journal = in_journal(os.environ, sys.stderr.fileno())
-    configure_logging(loaded.settings.log_level, writer, as_json=loaded.settings.log_json, in_journal=journal)
-    for note in loaded.notes:
-        _log.warning("! %s [doubtful-setting]", note)
+    journal = begin_log(loaded.settings, loaded.notes, _log, writer)
     chosen = choose_name(loaded.names)
     if chosen.source is NameSource.KEPT:
         _log.info("= the module is %s, as at its first start (%s)", chosen.name, loaded.given["name"])

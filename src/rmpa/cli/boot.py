@@ -22,6 +22,7 @@ from rmpa.cli.machine import (
     entries,
     modules_in,
     own_program,
+    refused,
     remove_folder,
 )
 from rmpa.cli.options import Options, flag, json_verb
@@ -49,7 +50,7 @@ from rmpa.config.module_name import (
 )
 from rmpa.config.read import line_of, load_settings, parse_config
 from rmpa.config.settings import Settings
-from rmpa.core.errors import ConfigError, RmpaError, StartError
+from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import peer_name_from, peer_name_problem
 from rmpa.runtime.systemd import INSTALL, is_set_up
 
@@ -129,13 +130,8 @@ def choose_user(program: str) -> str:
         return USER
     owner = Path(program).resolve().stat().st_uid
     if owner == 0:
-        problem = f"other users than root cannot run {program}"
-        raise StartError(
-            "rmpa service install",
-            problem,
-            "install it elsewhere, such as in /opt/rmpa; or --user root",
-            code="service-unit",
-        )
+        remedy = "install it elsewhere, such as in /opt/rmpa; or --user root"
+        raise refused("install", f"other users than root cannot run {program}", remedy)
     return pwd.getpwuid(owner).pw_name
 
 
@@ -190,21 +186,18 @@ def service_install(
       rmpa service install --dry-run               what would be done?
       sudo rmpa service install --root /mnt/image  for a machine that is not running
     """
-    root = root.rstrip("/")
-    check_machine(root, "install", dry=dry_run)
+    machine = _machine("install", root, options, dry=dry_run)
+    root = machine.root
     if name and (problem := peer_name_problem(name)):
         raise ConfigError("--name", problem)
     program = own_program()
-    machine = Machine(root, dry=dry_run, tell=(lambda _: None) if options.as_json else click.echo)
     before = former(os.environ, root)
     packaged = program == PACKAGED and machine.packaged
     if packaged and user:
         raise ConfigError("--user", "the package's units have the user rmpa", "change it by: systemctl edit rmpa")
     wanted = [UNITS["up"], *([UNITS["web"]] if web else []), *([UNITS["gateway"]] if gateway else [])]
     if re.search(r"[\x00-\x1f\x7f'\"\\]", program):
-        raise StartError(
-            "rmpa service install", f"systemd cannot start {program!r}", "install it elsewhere", code="service-unit"
-        )
+        raise refused("install", f"systemd cannot start {program!r}", "install it elsewhere")
     for unit in wanted:
         machine.check_unmasked(unit)
     _check_parts(machine, before, web=web, gateway=gateway)  # reads the settings: below they are sound
@@ -230,6 +223,13 @@ def service_install(
     return 0
 
 
+def _machine(verb: str, root: str, options: Options, *, dry: bool) -> Machine:
+    """The machine that a verb changes, once it is known that it can be changed."""
+    root = root.rstrip("/")
+    check_machine(root, verb, dry=dry)
+    return Machine(root, dry=dry, tell=(lambda _: None) if options.as_json else click.echo)
+
+
 def _check_name(machine: Machine, before: Former, name: str) -> None:
     """Check that ``--name`` says no other name than the settings, which outweigh the name that is kept.
 
@@ -243,10 +243,8 @@ def _check_name(machine: Machine, before: Former, name: str) -> None:
     data = config.read_bytes()
     said = parse_config(data, config).get(("name",))
     if said not in (None, name):
-        line = line_of(data.decode("utf-8-sig"), ("name",))
-        raise ConfigError(
-            "name", f"{said} outweighs --name {name}", "write it there, or remove the line", config, line
-        )
+        problem, line = f"{said} outweighs --name {name}", line_of(data.decode("utf-8-sig"), ("name",))
+        raise ConfigError("name", problem, "write it there, or remove the line", config, line)
 
 
 def _check_parts(machine: Machine, before: Former, *, web: bool, gateway: bool) -> None:
@@ -274,28 +272,21 @@ def _check_parts(machine: Machine, before: Former, *, web: bool, gateway: bool) 
     if holder := program_at(settings.core_port):
         problem = f"{holder} has port {settings.core_port}, which the agent's core needs"
         if not machine.dry:
-            raise StartError("rmpa service install", problem, "end it first", code="service-unit")
+            raise refused("install", problem, "end it first")
         machine.note(f"! {problem}: end it first")
 
 
 def _make_user(machine: Machine, user: str) -> None:
     below = ["--prefix", machine.root] if machine.root else []
-    if not machine.has_group():
+    if machine.number("group", GROUP) is None:
         machine.run(f"make the group {GROUP}", "groupadd", *below, "--system", GROUP)
     if user != USER:
-        if not machine.root and not _is_user(user):
+        if not machine.root and machine.number("passwd", user) is None:
             raise ConfigError("--user", f"there is no user {user}", "leave it out, and the user rmpa is made")
         return
     if machine.ids(user) is None:
         home = ["--home-dir", STATE, "--no-create-home", "--shell", "/usr/sbin/nologin"]
         machine.run(f"make the user {user}", "useradd", *below, "--system", "--gid", GROUP, *home, user)
-
-
-def _is_user(name: str) -> bool:
-    try:
-        return bool(pwd.getpwnam(name))
-    except KeyError:
-        return False
 
 
 def _make_config(machine: Machine, before: Former) -> None:
@@ -379,9 +370,8 @@ def _start(machine: Machine, wanted: Sequence[str], changed: Sequence[str]) -> N
             if again:
                 machine.systemctl("restart", unit)
         except RmpaError as error:
-            raise RmpaError(
-                "\n".join([str(error), *(f"  {line}" for line in _log(unit))]), code="service-unit"
-            ) from None
+            text = "\n".join([str(error), *(f"  {line}" for line in _log(unit))])
+            raise RmpaError(text, code="service-unit") from None
 
 
 def _shown(unit: str) -> dict[str, str]:
@@ -520,16 +510,15 @@ def service_uninstall(purge: bool, yes: bool, dry_run: bool, root: str, options:
       sudo rmpa service uninstall --purge --yes   in a script
       rmpa service uninstall --dry-run
     """
-    root = root.rstrip("/")
-    check_machine(root, "uninstall", dry=dry_run)
-    machine = Machine(root, dry=dry_run, tell=(lambda _: None) if options.as_json else click.echo)
+    machine = _machine("uninstall", root, options, dry=dry_run)
+    root = machine.root
     if purge and machine.packaged:
-        raise StartError(
-            "rmpa service uninstall", "the package has settings and state", "sudo apt purge rmpa", code="service-unit"
-        )
+        raise refused("uninstall", "the package has settings and state", "sudo apt purge rmpa")
     if purge and not (yes or dry_run) and not confirm(f"Remove {CONFIG} and all of {STATE}, keys too?"):
         raise ConfigError("rmpa service uninstall", "nothing was removed", code="not-confirmed")
-    parts = [unit for unit in UNITS.values() if _is_installed(machine, unit)]
+    units = ((unit, machine.path(f"{UNIT_FOLDER}/{unit}")) for unit in UNITS.values())
+    # One that was written by hand stays.
+    parts = [unit for unit, path in units if (_is_made(path) if path.is_file() else machine.has_packaged(unit))]
     if parts:
         machine.systemctl("disable", *([] if root else ["--now"]), *parts)
     removed = _remove_made(machine, (*UNITS.values(), REALTIME_FILE))
@@ -550,12 +539,6 @@ def service_uninstall(purge: bool, yes: bool, dry_run: bool, root: str, options:
         machine.note("nothing is installed")
     options.show({"units": parts, "changes": machine.changes, "dry_run": dry_run})
     return 0
-
-
-def _is_installed(machine: Machine, unit: str) -> bool:
-    """Whether a unit is one that ``install`` or a package has made, and not one that was written by hand."""
-    path = machine.path(f"{UNIT_FOLDER}/{unit}")
-    return _is_made(path) if path.is_file() else machine.has_packaged(unit)
 
 
 def _is_made(path: Path) -> bool:
@@ -589,5 +572,5 @@ def _purge(machine: Machine) -> None:
     below = ["--prefix", machine.root] if machine.root else []
     if machine.ids(USER) is not None:
         machine.run(f"remove the user {USER}", "userdel", *below, USER)
-    if machine.has_group():
+    if machine.number("group", GROUP) is not None:
         machine.run(f"remove the group {GROUP}", "groupdel", *below, GROUP)

@@ -145,22 +145,20 @@ def _agreed(plan: Sequence[Repair], options: Options, *, yes: bool) -> bool:
 
 def _run(repair: Repair) -> bool:
     """Run one command; what it prints goes to standard error. Return whether it succeeded."""
+    problem, limit = "", limits.DOCTOR_REPAIR
     try:
         if repair.do:
             repair.do()
-            return True
-    except OSError as error:
-        warn(f"{repair}: {error.strerror}", "failed")
-        return False
-    if shutil.which(repair.words[0]) is None:
-        warn(f"{repair}: there is no {repair.words[0]} here; run it as root without it", "failed")
-        return False
-    out, limit = sys.stderr.fileno(), limits.DOCTOR_REPAIR
-    try:
-        code = subprocess.run(repair.words, stdout=out, check=False, timeout=limit).returncode  # noqa: S603 - as shown
+        elif shutil.which(repair.words[0]) is None:
+            problem = f"there is no {repair.words[0]} here; run it as root without it"
+        else:
+            out = sys.stderr.fileno()
+            code = subprocess.run(repair.words, stdout=out, check=False, timeout=limit).returncode  # noqa: S603 - as shown
+            problem = f"exit code {code}" if code else ""
     except subprocess.TimeoutExpired:
-        warn(f"{repair}: it did not end within {limit:.0f} s", "failed")
-        return False
-    if code:
-        warn(f"{repair}: exit code {code}", "failed")
-    return not code
+        problem = f"it did not end within {limit:.0f} s"
+    except OSError as error:
+        problem = error.strerror or str(error)
+    if problem:
+        warn(f"{repair}: {problem}", "failed")
+    return not problem

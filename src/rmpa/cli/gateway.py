@@ -15,16 +15,14 @@ import click
 from rmpa.cli.main import LazyGroup, verb
 from rmpa.cli.module import check_gateway, find_module
 from rmpa.cli.options import config_option, setting_options
-from rmpa.cli.output import warn
+from rmpa.cli.output import begin_log, warn
 from rmpa.config.module_name import GATEWAY_SUFFIX
 from rmpa.config.read import load_settings
 from rmpa.config.settings import WebSettings
 from rmpa.core.errors import ConfigError, StartError
 from rmpa.core.identity import peer_name_from
-from rmpa.core.log import configure_logging
 from rmpa.observe.control_client import ControlClient, find_agents
 from rmpa.runtime.log_writer import LogWriter
-from rmpa.runtime.systemd import in_journal
 from rmpa.trust.permissions import TrustStatus
 
 if TYPE_CHECKING:
@@ -90,10 +88,7 @@ def gateway(context: click.Context, /, **options: object) -> int:
     loaded = load()
     _check_agents(loaded.settings)
     writer = LogWriter(sys.stderr.fileno())
-    journal = in_journal(os.environ, sys.stderr.fileno())
-    configure_logging(loaded.settings.log_level, writer, as_json=loaded.settings.log_json, in_journal=journal)
-    for note in loaded.notes:
-        _log.warning("! %s [doubtful-setting]", note)
+    begin_log(loaded.settings, loaded.notes, _log, writer)
     gc.disable()  # as in rmpa up: the start takes a third less time; the agent turns it on again
     from rmpa.gateway.gateway import run
 

@@ -6,7 +6,7 @@ import contextlib
 import re
 import signal
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
 import msgspec
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 # Seconds between two lines of figures, as rostopic has it.
 TICK: Final = 1.0
+_T = TypeVar("_T")
 _Table: TypeAlias = list[tuple[str, list[str]]]
 _REMEDY: Final = "start one with `rmpa up` or `rmpa core`, or name it with --master"
 
@@ -174,9 +175,8 @@ def find_peer(snapshot: Snapshot, wanted: str) -> PeerInfo:
             return info
     names = [info.name for info in snapshot.peers]
     known = f"known are {', '.join(names)}" if names else "no peer is known yet"
-    raise RmpaError(
-        f"{snapshot.agent.name} knows no peer {wanted!r}; {suggestion(wanted, names, known)}", code="unknown-name"
-    )
+    problem = f"{snapshot.agent.name} knows no peer {wanted!r}; {suggestion(wanted, names, known)}"
+    raise RmpaError(problem, code="unknown-name")
 
 
 def require_peer(master: Master, graph: Graph, wanted: GraphName) -> None:
@@ -193,15 +193,13 @@ def require_peer(master: Master, graph: Graph, wanted: GraphName) -> None:
         raise master.no_agent()
     known = {peer.name for peer in snapshot.peers}
     if wanted.peer == snapshot.agent.name and wanted.peer not in known:
-        raise RmpaError(
-            f"{wanted.peer} is this module itself: leave it out and write {wanted.name}", code="invalid-value"
-        )
+        problem = f"{wanted.peer} is this module itself: leave it out and write {wanted.name}"
+        raise RmpaError(problem, code="invalid-value")
     # Of a module of another site, SITE/MODULE, the agent knows the site.
     peer = find_peer(snapshot, wanted.peer.partition("/")[0])
     if peer.name not in wanted.peer:
-        raise RmpaError(
-            f"{wanted.peer} is the GUID of {peer.name}: write {peer.name}:{wanted.name}", code="invalid-value"
-        )
+        problem = f"{wanted.peer} is the GUID of {peer.name}: write {peer.name}:{wanted.name}"
+        raise RmpaError(problem, code="invalid-value")
 
 
 def origin_json(node: str) -> dict[str, str]:
@@ -336,9 +334,8 @@ async def read_graph(master: Master) -> Graph:
         publishers, subscribers, services = msgspec.convert(tables, tuple[_Table, _Table, _Table])
         known = {name: kind for name, kind in msgspec.convert(types, list[tuple[str, str]]) if kind != "*"}
     except msgspec.ValidationError:
-        raise RmpaError(
-            f"{master.uri} answers getSystemState with something else; is it a ROS master?", code="protocol-error"
-        ) from None
+        problem = f"{master.uri} answers getSystemState with something else; is it a ROS master?"
+        raise RmpaError(problem, code="protocol-error") from None
     names = [{name: sorted(nodes) for name, nodes in table} for table in (publishers, subscribers, services)]
     return Graph(names[0], names[1], known, names[2])
 
@@ -364,8 +361,8 @@ def run_stream(body: Callable[[], Coroutine[object, object, None]]) -> None:
         asyncio.run(run())
 
 
-async def with_node(master: Master, name: str, body: Callable[[Node], Awaitable[None]]) -> None:
-    """Run ``body`` with a node of a unique name at a master.
+async def with_node(master: Master, name: str, body: Callable[[Node], Awaitable[_T]]) -> _T:
+    """What ``body`` returns, run with a node of a unique name at a master.
 
     Raises:
         UnreachableError: The master does not answer.
@@ -378,7 +375,7 @@ async def with_node(master: Master, name: str, body: Callable[[Node], Awaitable[
     except UnreachableError:
         raise master.unreachable() from None
     try:
-        await body(node)
+        return await body(node)
     finally:
         await node.close()
 

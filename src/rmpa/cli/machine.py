@@ -74,9 +74,8 @@ class Machine:
 
     def systemctl(self, *words: str) -> None:
         """Run ``systemctl`` on the machine."""
-        self.run(
-            f"run systemctl {' '.join(words)}", "systemctl", *(["--root", self.root] if self.root else []), *words
-        )
+        below = ["--root", self.root] if self.root else []
+        self.run(f"run systemctl {' '.join(words)}", "systemctl", *below, *words)
 
     def write(self, place: str, text: str) -> bool:
         """Write a file unless it has this text already; return whether it has another one now."""
@@ -96,10 +95,11 @@ class Machine:
 
     def ids(self, user: str) -> tuple[int, int] | None:
         """The numbers of a user and of the units' group; ``None``: one of them is not there."""
-        uid, gid = self._number("passwd", user), self._number("group", GROUP)
+        uid, gid = self.number("passwd", user), self.number("group", GROUP)
         return None if uid is None or gid is None else (uid, gid)
 
-    def _number(self, database: str, name: str) -> int | None:
+    def number(self, database: str, name: str) -> int | None:
+        """The number of a user (``passwd``) or a group (``group``); ``None``: it is not there."""
         if not self.root:
             try:
                 return pwd.getpwnam(name).pw_uid if database == "passwd" else grp.getgrnam(name).gr_gid
@@ -110,10 +110,6 @@ class Machine:
         except OSError:
             return None
         return next((int(entry[2]) for entry in entries if entry[0] == name and len(entry) > 2), None)
-
-    def has_group(self) -> bool:
-        """Whether the units' group is there."""
-        return self._number("group", GROUP) is not None
 
     @property
     def packaged(self) -> bool:
@@ -133,6 +129,11 @@ class Machine:
             raise StartError(f"{UNIT_FOLDER}/{unit}", "the unit is masked", remedy, code="service-unit")
 
 
+def refused(verb: str, problem: str, remedy: str, code: str = "service-unit") -> StartError:
+    """The error of ``rmpa service VERB``."""
+    return StartError(f"rmpa service {verb}", problem, remedy, code=code)
+
+
 def check_machine(root: str, verb: str, *, dry: bool) -> None:
     """Check that this machine can be changed.
 
@@ -144,17 +145,10 @@ def check_machine(root: str, verb: str, *, dry: bool) -> None:
             raise ConfigError("--root", f"{root} is no folder")
     elif not _BOOTED.is_dir() or shutil.which("systemctl") is None:
         problem = "this machine was not started by systemd (a container?)"
-        raise StartError(
-            f"rmpa service {verb}",
-            problem,
-            "have `rmpa up` started by what starts programs here",
-            code="service-unit",
-        )
+        raise refused(verb, problem, "have `rmpa up` started by what starts programs here")
     if os.geteuid() and not root and not dry:
         words = [own_program(), *sys.argv[1:]] if sys.argv[1:2] == ["service"] else [own_program(), "service", verb]
-        raise StartError(
-            f"rmpa service {verb}", "only root may change the machine", f"sudo {' '.join(words)}", code="root-needed"
-        )
+        raise refused(verb, "only root may change the machine", f"sudo {' '.join(words)}", "root-needed")
 
 
 def own_program() -> str:
@@ -168,12 +162,8 @@ def own_program() -> str:
         if path.name == "rmpa" and path.is_file() and os.access(path, os.X_OK):
             packaged = Path(PACKAGED)
             return PACKAGED if packaged.exists() and packaged.samefile(path) else str(path.absolute())
-    raise StartError(
-        "rmpa",
-        f"there is no program rmpa in {prefix}/bin",
-        "install it there, or use the bundle",
-        code="service-unit",
-    )
+    problem = f"there is no program rmpa in {prefix}/bin"
+    raise StartError("rmpa", problem, "install it there, or use the bundle", code="service-unit")
 
 
 def entries(state: Path) -> list[Path]:
@@ -230,9 +220,8 @@ def copy_state(state: Path, place: Path, ids: tuple[int, int] | None, without: C
     except OSError as error:
         if new is not None:
             shutil.rmtree(new, ignore_errors=True)
-        raise StartError(
-            str(place), f"{state} cannot be copied there: {error}", "nothing was copied", code="directory-unusable"
-        ) from None
+        problem = f"{state} cannot be copied there: {error}"
+        raise StartError(str(place), problem, "nothing was copied", code="directory-unusable") from None
 
 
 def _copy_files(state: Path, new: Path, without: Collection[str]) -> None:

@@ -15,7 +15,7 @@ import os
 import re
 import sys
 from itertools import takewhile
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from importlib.metadata import EntryPoint
 
+_Function = TypeVar("_Function", bound="Callable[..., Any]")
 # By the words behind ``rmpa``: the module of ``rmpa.cli``, and the line that the help of the group shows.
 #
 # ``rmpa topic list`` is the function ``topic_list`` of its module.
@@ -321,14 +322,19 @@ class LazyGroup(PlacedHelp, click.Group):
             formatter.write_dl(lines)
 
 
+def decorated(function: _Function, parameters: Sequence[Callable[[_Function], _Function]]) -> _Function:
+    """A function with these arguments and options of click, which its help shows in this order."""
+    for parameter in reversed(parameters):
+        function = parameter(function)
+    return function
+
+
 def verb(*parameters: Callable[..., Any], **settings: Any) -> Callable[[Callable[..., Any]], click.Command]:
     """Make a command of a function: ``help_of`` its docstring, and these arguments and options in order."""
 
     def decorate(function: Callable[..., Any]) -> click.Command:
-        command = function
-        for parameter in reversed(parameters):
-            command = parameter(command)
-        return click.command(cls=PlacedHelp, **help_of(function.__doc__), **settings)(command)
+        made = click.command(cls=PlacedHelp, **help_of(function.__doc__), **settings)
+        return made(decorated(function, parameters))
 
     return decorate
 
@@ -519,33 +525,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: Sequence[str] | None) -> int:
+    """Run it; an error is printed, as JSON too if ``--json`` was given."""
     try:
-        code = cli.main(args=arguments, prog_name="rmpa", standalone_mode=False)
+        done = cli.main(args=arguments, prog_name="rmpa", standalone_mode=False)
     except click.ClickException as error:
         if isinstance(error, click.NoSuchOption):
             from rmpa.config.schema import REMOVED
 
             if remedy := REMOVED.get(error.option_name):
                 error = click.UsageError(f"No such option: {error.option_name}; {remedy}", error.ctx)
-        text = error.format_message()
+        text, code, status = error.format_message(), "usage", error.exit_code
         if isinstance(error, click.exceptions.NoArgsIsHelpError):
             click.echo(text, err=True)
-            return _failed(arguments, text, "usage", error.exit_code)
-        error.format_message = lambda: f"{text} [usage]"  # type: ignore[method-assign]
-        error.show()
-        return _failed(arguments, text, "usage", error.exit_code)
+        else:
+            error.format_message = lambda: f"{text} [usage]"  # type: ignore[method-assign]
+            error.show()
     except (click.Abort, KeyboardInterrupt):
         return 130
     except RmpaError as error:
         from rmpa.cli.output import print_error
 
-        print_error(error, error.code)
-        return _failed(arguments, str(error), error.code, 2 if isinstance(error, ConfigError) else 1)
-    return code if isinstance(code, int) else 0
-
-
-def _failed(arguments: Sequence[str] | None, text: str, code: str, status: int) -> int:
-    """Print an error as JSON too if ``--json`` was given; return the exit code."""
+        text, code, status = str(error), error.code, 2 if isinstance(error, ConfigError) else 1
+        print_error(error, code)
+    else:
+        return done if isinstance(done, int) else 0
     if wants_json(sys.argv[1:] if arguments is None else arguments):
         from rmpa.cli.output import print_json  # it imports msgspec, which --help does without
 

@@ -74,13 +74,13 @@ class Module:
             StartError: There is none.
         """
         if self.state is None:
-            raise StartError(
-                "the state directory",
-                "is not known: there is no home",
-                "set RMPA_STATE_DIR",
-                code="no-state-directory",
-            )
+            what, problem = "the state directory", "is not known: there is no home"
+            raise StartError(what, problem, "set RMPA_STATE_DIR", code="no-state-directory")
         return self.state
+
+    def refused(self, problem: str, remedy: str, code: str) -> StartError:
+        """The error of a command that the module's part in a mesh does not allow."""
+        return StartError(f"the module {self.name}", problem, remedy, code=code)
 
     @property
     def store(self) -> TrustStore:
@@ -112,7 +112,7 @@ class Module:
         check_library()
         if not self.store.exists:
             remedy = "make a mesh: rmpa trust init; or join one: rmpa trust join TOKEN"
-            raise StartError(f"the module {self.name}", "has joined no secured mesh", remedy, code="not-a-member")
+            raise self.refused("has joined no secured mesh", remedy, "not-a-member")
         from rmpa.runtime.loop import SystemClock
         from rmpa.trust.membership import Membership
 
@@ -130,9 +130,7 @@ class Module:
         if not self.store.is_authority:
             place = self.store.load_authority()
             where = f"do it at {place.name}" if place is not None and place.name else "do it at the authority"
-            raise StartError(
-                f"the module {self.name}", "is not the authority of its mesh", where, code="not-authority"
-            )
+            raise self.refused("is not the authority of its mesh", where, "not-authority")
         return MeshAuthority(membership)
 
     def refuse_member(self, leaving: str) -> None:
@@ -147,9 +145,7 @@ class Module:
         check_library()
         if self.store.exists:
             remedy = f"rmpa trust status shows it; rmpa trust leave {leaving}"
-            raise StartError(
-                f"the module {self.name}", "is a member of a secured mesh already", remedy, code="already-a-member"
-            )
+            raise self.refused("is a member of a secured mesh already", remedy, "already-a-member")
 
 
 def find_module(
@@ -223,9 +219,8 @@ def check_gateway(settings: Settings) -> None:
         raise ConfigError("gateway.router", "a router that listens nowhere", "add --listen tls/0.0.0.0:7447")
     if not (it.connect or it.listen) and by_zenoh:
         example = "tcp/localhost:7447 for rmw_zenohd here" if it.ros2.enabled else "tls/fleet.example:7447"
-        raise ConfigError(
-            "rmpa gateway", "there is no connection to other sites", f"add --connect, such as {example}"
-        )
+        problem = "there is no connection to other sites"
+        raise ConfigError("rmpa gateway", problem, f"add --connect, such as {example}")
 
 
 def check_web() -> None:
@@ -250,9 +245,8 @@ def _check_libraries(program: str, extra: str, libraries: Mapping[str, str]) -> 
     """
     missing = [package for name, package in libraries.items() if not _is_there(name)]
     if missing:
-        raise ConfigError(
-            program, f"{' and '.join(missing)} not installed", f"run {missing_extra(extra)}", code="extra-missing"
-        )
+        problem = f"{' and '.join(missing)} not installed"
+        raise ConfigError(program, problem, f"run {missing_extra(extra)}", code="extra-missing")
 
 
 def _is_there(name: str) -> bool:

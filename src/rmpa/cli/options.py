@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import click
 
 from rmpa.cli.completion import agents, completes
-from rmpa.cli.main import verb
+from rmpa.cli.main import decorated, verb
 from rmpa.config.settings import SETTINGS
 
 if TYPE_CHECKING:
@@ -94,9 +94,8 @@ def count_option(what: str) -> Callable[[_Function], _Function]:
 
 def ping_options(function: _Function) -> _Function:
     """Decorate with ``--count`` and ``--interval`` of a ping."""
-    every = click.option(
-        "-i", "--interval", type=FiniteRange(0.01), default=1.0, show_default=True, help="Seconds between."
-    )
+    seconds = FiniteRange(0.01)
+    every = click.option("-i", "--interval", type=seconds, default=1.0, show_default=True, help="Seconds between.")
     count = click.option("-c", "--count", type=click.IntRange(1), help="Stop after so many. [default: at Ctrl-C]")
     return count(every(function))
 
@@ -166,9 +165,7 @@ def _as_options(*declared: Callable[..., Any]) -> Callable[[Callable[..., _T]], 
         def command(*, as_json: bool, agent: str | None = None, master: str | None = None, **arguments: object) -> _T:
             return function(**arguments, options=Options(as_json, agent, master))
 
-        for option in reversed(declared):
-            command = option(command)
-        return command
+        return decorated(command, declared)
 
     return decorate
 
@@ -186,9 +183,8 @@ def setting_options(
     settings = [s for command in commands for s in SETTINGS if s.option and s.command == command]
 
     def decorate(command: _Function) -> _Function:
-        for setting in reversed([setting for setting in settings if setting.name not in without]):
-            command = _setting_option(setting, (defaults or {}).get(setting.name))(command)
-        return command
+        wanted = [setting for setting in settings if setting.name not in without]
+        return decorated(command, [_setting_option(each, (defaults or {}).get(each.name)) for each in wanted])
 
     return decorate
 
@@ -274,12 +270,8 @@ def selection_options(function: Callable[..., _T]) -> Callable[..., _T]:
     def command(*, match: str, peer: str, limit: int | None, everything: bool, **arguments: object) -> _T:
         return function(**arguments, selection=Selection(match, peer, limit, everything))
 
-    for option in reversed(
-        (
-            click.option("--match", default="", metavar="PATTERN", help="Only names like this: '*/scan', 'arm?'."),
-            click.option("--peer", default="", metavar="PATTERN", help="Only of modules with names like this."),
-            *limit_options,
-        )
-    ):
-        command = option(command)
-    return command
+    match_option = click.option(
+        "--match", default="", metavar="PATTERN", help="Only names like this: '*/scan', 'arm?'."
+    )
+    peer_option = click.option("--peer", default="", metavar="PATTERN", help="Only of modules with names like this.")
+    return decorated(command, (match_option, peer_option, *limit_options))

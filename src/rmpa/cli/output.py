@@ -6,6 +6,7 @@ Colours are click's: it drops them where standard output is no terminal, and eve
 from __future__ import annotations
 
 import math
+import os
 import sys
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -19,6 +20,11 @@ from rmpa.core.errors import ConfigError, with_places
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
+    from logging import Logger
+    from typing import TextIO
+
+    from rmpa.config.settings import Settings
+    from rmpa.runtime.log_writer import LogWriter
 
 _INDENT: Final = "    "
 # Of the levels of ``rmpa doctor`` and ``rmpa why``, on a terminal; of all others yellow.
@@ -51,6 +57,18 @@ class Table:
 
 # Lines and tables; control characters in lines and cells are escaped when they are printed.
 Text: TypeAlias = "str | Table | Iterable[Text]"
+
+
+def begin_log(settings: Settings, notes: Iterable[str], log: Logger, to: TextIO | LogWriter) -> bool:
+    """Log as the settings say, first the notes on them; return whether the journal of systemd takes the lines."""
+    from rmpa.core.log import configure_logging
+    from rmpa.runtime.systemd import in_journal
+
+    journal = in_journal(os.environ, sys.stderr.fileno())
+    configure_logging(settings.log_level, to, as_json=settings.log_json, in_journal=journal)
+    for note in notes:
+        log.warning("! %s [doubtful-setting]", note)
+    return journal
 
 
 def print_text(*text: Text) -> None:

@@ -116,10 +116,8 @@ class MasterParams:
         reply = self._call(method, key)
         if reply.code != 1:
             known = {name for full in self.names() for name in with_namespaces(full)}
-            raise RmpaError(
-                f"{self.title} has no parameter {key}; {suggestion(key, known, '`rmpa param list`')}",
-                code="unknown-name",
-            )
+            problem = f"{self.title} has no parameter {key}; {suggestion(key, known, '`rmpa param list`')}"
+            raise RmpaError(problem, code="unknown-name")
         return reply
 
     def _call(self, method: str, *params: XmlRpcValue) -> RosReply:
@@ -294,10 +292,8 @@ def read_documents(text: str, where: str) -> list[XmlRpcValue]:
     """
     if len(text) > ros_limits.HTTP_BODY_MAX:
         bound = f"{ros_limits.HTTP_BODY_MAX} ({ros_limits.HTTP_BODY_MAX >> 20} MiB)"
-        raise RmpaError(
-            f"{where}: {len(text)} characters, above the {bound} that a core takes at once; split it",
-            code="limit-reached",
-        )
+        said = f"{where}: {len(text)} characters, above the {bound} that a core takes at once; split it"
+        raise RmpaError(said, code="limit-reached")
     try:
         documents = list(yaml.load_all(text, _Loader))
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -492,9 +488,8 @@ def param_load(file: str, namespace: str, peer: str | None, options: Options) ->
 def _placed(document: XmlRpcValue, namespace: str, file: str) -> tuple[str, XmlRpcValue]:
     """The namespace of a document, and its parameters."""
     if not isinstance(document, dict):
-        raise RmpaError(
-            f"{file}: a document is {str(document)[:60]!r}, not a dictionary of parameters", code="invalid-value"
-        )
+        problem = f"{file}: a document is {str(document)[:60]!r}, not a dictionary of parameters"
+        raise RmpaError(problem, code="invalid-value")
     value = dict(document)
     inner = value.pop("_ns", "")
     if not isinstance(inner, str):
@@ -516,9 +511,8 @@ def _text(file: str) -> str:
     try:
         return _read(file).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise RmpaError(
-            f"{file}: byte {error.start} is not UTF-8; set binary data with -b", code="invalid-value"
-        ) from None
+        problem = f"{file}: byte {error.start} is not UTF-8; set binary data with -b"
+        raise RmpaError(problem, code="invalid-value") from None
 
 
 @agent_verb()

@@ -99,14 +99,12 @@ def _set_verb(what: str, auto: str) -> Callable[[Callable[..., Any]], click.Comm
 
     def offered(ctx: click.Context, _: str) -> Iterable[str]:
         """The profiles or contexts of the resource that stands before them in the line."""
-        found: list[str] = []
 
-        async def body(graph: ResourceGraph) -> None:
+        async def names(graph: ResourceGraph) -> list[str]:
             one = graph.pick(ctx.params.get("resource")).descriptor
-            found.extend(each.name for each in (one.profiles if what == "profile" else one.contexts))
+            return [each.name for each in (one.profiles if what == "profile" else one.contexts)]
 
-        run_with_resources(Options(False, ctx.params.get("agent"), ctx.params.get("master")), body)
-        return found
+        return run_with_resources(Options(False, ctx.params.get("agent"), ctx.params.get("master")), names)
 
     complete = completes(offered, "rmpa.ros.node.node")
     name = click.argument("name", required=False, metavar=f"[{what.upper()}]", shell_complete=complete)

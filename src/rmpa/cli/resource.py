@@ -8,7 +8,7 @@ import functools
 import time
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rmpa.cli.completion import graph_of, of_peer
 from rmpa.cli.graph import GraphName, read_graph, read_name, run_stream, suggestion, with_node
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from rmpa.ros.node.endpoints import Received
     from rmpa.ros.node.node import Node
 
+_T = TypeVar("_T")
 _TEXT: Final = "std_msgs/String"
 # Seconds for a latched message: the route of another module's topic has to open first.
 _ANSWER: Final = 3.0
@@ -100,13 +101,11 @@ class ResourceGraph:
                 raise RmpaError(f"no resource {printable(str(wanted))}; {hint}", code="unknown-name")
         found = tuple(each for each in found if each.peer is None) or found
         if not found:
-            raise RmpaError(
-                "there is no resource; `rmpa run` runs one, `rmpa resource list` shows all", code="unknown-name"
-            )
+            problem = "there is no resource; `rmpa run` runs one, `rmpa resource list` shows all"
+            raise RmpaError(problem, code="unknown-name")
         if len(found) > 1:
-            raise RmpaError(
-                f"there are {', '.join(printable(str(each)) for each in found)}; {remedy}", code="several-fit"
-            )
+            problem = f"there are {', '.join(printable(str(each)) for each in found)}; {remedy}"
+            raise RmpaError(problem, code="several-fit")
         return found[0]
 
     async def hear(self, each: Iterable[SeenResource], name: str, kind: str = _TEXT) -> dict[SeenResource, Any]:
@@ -144,9 +143,8 @@ class ResourceGraph:
         service = GraphName(f"{one.path}/set_parameters", one.peer)
         server = self.graph.require_service(service)
         if one.peer is None and proxied_peer(server) is not None:
-            raise RmpaError(
-                f"service {service} is another module's; {one} does not offer it", code="resource-trouble"
-            )
+            problem = f"service {service} is another module's; {one} does not offer it"
+            raise RmpaError(problem, code="resource-trouble")
         pairs: Any = [{"name": name, "value": value} for name, value in values.items()]
         try:
             await self.node.call_service(service.name, ServiceType(SERVICE_TYPE), {"config": {"strs": pairs}})
@@ -154,22 +152,22 @@ class ResourceGraph:
             raise RmpaError(printable(f"{one}: {error.reason}"), code=error.code) from None
 
 
-def run_with_resources(options: Options, body: Callable[[ResourceGraph], Awaitable[None]]) -> None:
-    """Find all resources of the graph that the options name, and run ``body`` with them."""
-    asyncio.run(with_resources(options.master(), body))
+def run_with_resources(options: Options, body: Callable[[ResourceGraph], Awaitable[_T]]) -> _T:
+    """What ``body`` returns, run with all resources of the graph that the options name."""
+    return asyncio.run(with_resources(options.master(), body))
 
 
-async def with_resources(master: Master, body: Callable[[ResourceGraph], Awaitable[None]]) -> None:
-    """Find all resources of a master's graph, and run ``body`` with them."""
+async def with_resources(master: Master, body: Callable[[ResourceGraph], Awaitable[_T]]) -> _T:
+    """What ``body`` returns, run with all resources of a master's graph."""
     graph = await read_graph(master)
     snapshot = await asyncio.to_thread(master.snapshot, topics=())
     peers = snapshot.peers if snapshot is not None else ()
     sites = {peer.name for peer in peers if peer.guid == OUTSIDE_GUID} - {ROS2}  # other sites that a gateway joins
 
-    async def within(node: Node) -> None:
-        await body(ResourceGraph(node, graph, await find_resources(node, graph, sites)))
+    async def within(node: Node) -> _T:
+        return await body(ResourceGraph(node, graph, await find_resources(node, graph, sites)))
 
-    await with_node(master, "rmpa_resource", within)
+    return await with_node(master, "rmpa_resource", within)
 
 
 async def find_resources(node: Node, graph: Graph, sites: Iterable[str] = ()) -> tuple[SeenResource, ...]:
@@ -337,19 +335,16 @@ def alarm_echo(resource: str | None, count: int | None, options: Options) -> Non
 
 
 async def _echo(master: Master, resource: str | None, count: int | None, *, as_json: bool) -> None:
-    only: list[SeenResource] = []
-    if resource is not None:
+    async def pick(graph: ResourceGraph) -> SeenResource:
+        return graph.pick(resource)
 
-        async def pick(graph: ResourceGraph) -> None:
-            only.append(graph.pick(resource))
-
-        await with_resources(master, pick)
+    only = await with_resources(master, pick) if resource is not None else None
     printed = 0
     enough = asyncio.get_running_loop().create_future()
 
     def take(path: str, received: Received) -> None:
         nonlocal printed
-        if only and received.caller_id != only[0].caller:
+        if only is not None and received.caller_id != only.caller:
             return
         for status in received.message.status:
             if enough.done():
@@ -369,7 +364,11 @@ async def _echo(master: Master, resource: str | None, count: int | None, *, as_j
                 for topic in graph.publishers.keys() - known:
                     path = topic.removesuffix("/alarms")
                     found = path != topic and graph.types.get(topic) == ARRAY_TYPE
-                    if found and f"{path}/{TOPIC}" in graph.publishers and (not only or path == only[0].path):
+                    if (
+                        found
+                        and f"{path}/{TOPIC}" in graph.publishers
+                        and path == (only.path if only is not None else path)
+                    ):
                         known.add(topic)
                         await node.subscribe(topic, MessageType(ARRAY_TYPE), functools.partial(take, path))
             if not known and not warned:

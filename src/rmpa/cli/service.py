@@ -73,9 +73,8 @@ async def _lookup(master: Master, name: str) -> str:
     except UnreachableError:
         raise master.unreachable() from None
     if reply.code != 1:
-        raise RmpaError(
-            f"no service {name} is registered at {master.uri}; `rmpa service list` shows all", code="unknown-name"
-        )
+        problem = f"no service {name} is registered at {master.uri}; `rmpa service list` shows all"
+        raise RmpaError(problem, code="unknown-name")
     return str(reply.value)
 
 

@@ -440,9 +440,8 @@ class _Delay(_Figures):
             stamp = received.message.header.stamp
             self.delays.append((received.stamp_ns - stamp.sec * 1_000_000_000 - stamp.nanosec) / 1e9)
         elif self.master.agent is None or proxied_peer(received.caller_id) is None:
-            raise RmpaError(
-                f"{received.kind.name} has no header, so it has no stamp to measure its age by", code="invalid-value"
-            )
+            problem = f"{received.kind.name} has no header, so it has no stamp to measure its age by"
+            raise RmpaError(problem, code="invalid-value")
 
     def values(self, routes: tuple[RouteInfo, ...]) -> dict[str, object]:
         """Seconds; without headers those of the agent, if there is one remote source."""

@@ -275,13 +275,9 @@ def _renew_files(module: Module) -> int:
 
     membership, known = module.membership(), module.store.load_authority()
     if known is None:
+        problem = "was never linked with this module: its address is not known"
         remedy = "start the agent (rmpa up), or join again: rmpa trust invite at the authority"
-        raise StartError(
-            "the authority",
-            "was never linked with this module: its address is not known",
-            remedy,
-            code="not-a-member",
-        )
+        raise StartError("the authority", problem, remedy, code="not-a-member")
     asyncio.run(renew_at_authority(membership, known.address, known.port))
     return int(membership.certificate.expires)
 
@@ -326,15 +322,9 @@ def trust_leave(module: Module, options: Options, yes: bool) -> None:
       rmpa trust leave --yes   in a script
     """
     if not module.store.exists:
-        raise StartError(
-            f"the module {module.name}",
-            "has joined no secured mesh",
-            "there is nothing to remove",
-            code="not-a-member",
-        )
-    what = "its keys"
-    if module.store.is_authority:
-        what = "the AUTHORITY's keys: the mesh ends when its certificates do"
+        raise module.refused("has joined no secured mesh", "there is nothing to remove", "not-a-member")
+    is_authority = module.store.is_authority
+    what = "the AUTHORITY's keys: the mesh ends when its certificates do" if is_authority else "its keys"
     if not yes and not confirm(f"Remove {module.name} from its mesh, with {what}?"):
         raise ConfigError("rmpa trust leave", "nothing was removed", code="not-confirmed")
     removed = module.store.remove()

@@ -37,7 +37,7 @@ _DESCRIPTIONS: Final = {
     "gateway": "RMPA gateway: joins this network's modules with other sites and with ROS 2",
 }
 _UNIT: Final = """\
-{header}[Unit]
+[Unit]
 Description={description}
 {documentation}# Interfaces that come later are followed: there is no need for network-online.target.
 After=network.target{after}
@@ -123,18 +123,16 @@ _HEADING: Final = """\
 """
 
 
-def unit_texts(program: str = PACKAGED, user: str = USER, header: str = "") -> dict[str, str]:
+def unit_texts(program: str = PACKAGED, user: str = USER) -> dict[str, str]:
     """The units, by their file's name.
 
     Args:
         program: The absolute path of ``rmpa``.
         user: The user whose rights they have; its group is ``GROUP`` in any case.
-        header: Comment lines above each.
     """
     quoted = program.replace("%", "%%").replace(" ", "\\x20")
     return {
         unit: _UNIT.format(
-            header=header,
             description=_DESCRIPTIONS[command],
             documentation="Documentation=man:rmpa(1)\n" if program == PACKAGED else "",
             after="" if command == "up" else f" {UNITS['up']}",

@@ -13,12 +13,11 @@ import click
 
 from rmpa.cli.module import agent_settings, check_web, find_module
 from rmpa.cli.options import Options, agent_verb, config_option, flag
+from rmpa.cli.output import begin_log
 from rmpa.config.read import INSECURE
 from rmpa.config.settings import WebSettings
 from rmpa.config.values import HOST, BadValue
 from rmpa.core.errors import ConfigError
-from rmpa.core.log import configure_logging
-from rmpa.runtime.systemd import in_journal
 from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
@@ -92,11 +91,8 @@ def web(config: str | None, insecure: bool, check: bool, options: Options, **giv
     if check:
         options.show({}, "the settings can be used")
         return 0
-    journal = in_journal(os.environ, sys.stderr.fileno())
-    configure_logging(setup.settings.log_level, sys.stderr, as_json=setup.settings.log_json, in_journal=journal)
     said = [f"--insecure: {INSECURE['trust.insecure']}"] if insecure else []
-    for note in (*module.loaded.notes, *said):
-        _log.warning("! %s [doubtful-setting]", note)
+    begin_log(setup.settings, (*module.loaded.notes, *said), _log, sys.stderr)
     from rmpa.web.server.process import serve
 
     def announce(url: str, access: TokenAccess) -> None:

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 
 _SYSTEM: Final = Path("/run/rmpa")
-_REMEDY: Final = "set RMPA_RUNTIME_DIR to a directory of your own"
 
 
 def runtime_dir(environ: Mapping[str, str], setting: str = "") -> Path:
@@ -95,6 +94,12 @@ def closed_to_us() -> str:
         return ""
 
 
+def _unusable(path: Path, problem: str) -> StartError:
+    return StartError(
+        str(path), problem, "set RMPA_RUNTIME_DIR to a directory of your own", code="directory-unusable"
+    )
+
+
 def make_runtime_dir(place: Path, group: int | None = None) -> None:
     """Make the directory, for this user alone, or for one group too.
 
@@ -109,22 +114,18 @@ def make_runtime_dir(place: Path, group: int | None = None) -> None:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
         info = place.lstat()
         if not stat.S_ISDIR(info.st_mode):
-            raise StartError(str(place), "is not a directory", _REMEDY, code="directory-unusable")
+            raise _unusable(place, "is not a directory")
         if info.st_uid != os.geteuid():
-            raise StartError(
-                str(place), f"belongs to user {info.st_uid}, not to us", _REMEDY, code="directory-unusable"
-            )
+            raise _unusable(place, f"belongs to user {info.st_uid}, not to us")
         if info.st_mode & stat.S_ISVTX:  # such as /tmp, which would be closed to all others
-            raise StartError(str(place), "is shared by all users", _REMEDY, code="directory-unusable")
+            raise _unusable(place, "is shared by all users")
         if group is not None:
             os.chown(place, -1, group)
             place.chmod(0o750)
         elif info.st_mode & 0o077:
             place.chmod(0o700)
     except OSError as error:
-        raise StartError(
-            str(place), f"cannot be made: {error.strerror}", _REMEDY, code="directory-unusable"
-        ) from None
+        raise _unusable(place, f"cannot be made: {error.strerror}") from None
 
 
 class NameLock:
@@ -146,9 +147,7 @@ class NameLock:
             try:
                 fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
             except OSError as error:
-                raise StartError(
-                    str(self.path), f"cannot be opened: {error.strerror}", _REMEDY, code="directory-unusable"
-                ) from None
+                raise _unusable(self.path, f"cannot be opened: {error.strerror}") from None
             try:
                 fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
@@ -156,9 +155,8 @@ class NameLock:
                 os.close(fd)
                 whose = f" (pid {pid})" if pid else ""
                 problem = f"an agent named {name!r} already runs on this machine{whose}"
-                raise StartError(
-                    "rmpa up", problem, "stop it, or give this one a --name of its own", code="name-in-use"
-                ) from None
+                remedy = "stop it, or give this one a --name of its own"
+                raise StartError("rmpa up", problem, remedy, code="name-in-use") from None
             if self._still_there(fd):
                 break
             os.close(fd)  # the last holder removed the file after it was opened here

@@ -128,9 +128,8 @@ class ControlServer:
         """Bind and serve. The socket of an agent that was killed is replaced, since its name's lock is ours."""
         if len(os.fsencode(self.path)) > limits.CONTROL_PATH_MAX:
             problem = f"longer than the {limits.CONTROL_PATH_MAX} bytes that a socket's path may have"
-            raise StartError(
-                str(self.path), problem, "set RMPA_RUNTIME_DIR to a shorter directory", code="directory-unusable"
-            )
+            remedy = "set RMPA_RUNTIME_DIR to a shorter directory"
+            raise StartError(str(self.path), problem, remedy, code="directory-unusable")
         sock = await asyncio.to_thread(self._bind)
         self._acceptor = Acceptor(sock, self._connected, name="control socket", use=Use.LINK)
         self._acceptor.start()
@@ -150,9 +149,8 @@ class ControlServer:
             sock.listen(128)
         except OSError as error:
             sock.close()
-            raise StartError(
-                str(self.path), f"cannot be bound: {error.strerror}", code="directory-unusable"
-            ) from None
+            problem = f"cannot be bound: {error.strerror}"
+            raise StartError(str(self.path), problem, code="directory-unusable") from None
         return sock
 
     async def close(self) -> None:
@@ -248,9 +246,8 @@ class ControlServer:
                 return ControlReply(ok=False, error=text)
             self.counters.add("control.failed")
             _log.exception("! control handler %s failed", request)
-            return ControlReply(
-                ok=False, error=f"the agent failed at {request.op}", remedy="its log says why", code="internal-error"
-            )
+            text = f"the agent failed at {request.op}"
+            return ControlReply(ok=False, error=text, remedy="its log says why", code="internal-error")
 
     @staticmethod
     async def _send(writer: asyncio.StreamWriter, reply: ControlReply) -> None:

@@ -52,7 +52,7 @@ def _texts(*values: Values) -> dict[str, str]:
     return found
 
 
-def _scaled(value: float | None, scale: float = 1.0) -> float | None:
+def _scaled(value: float | None, scale: float) -> float | None:
     return None if value is None else value * scale
 
 
@@ -108,15 +108,8 @@ def link_values(info: PeerInfo) -> dict[str, str]:
 
 def service_values(info: ServiceInfo) -> dict[str, str]:
     """The figures of a service's calls across the mesh."""
-    known: Values = {
-        "node": info.node,
-        "state": info.state,
-        "type": info.type,
-        "calls": info.calls,
-        "failed": info.failed,
-        "under way": info.active,
-        "last problem": info.problem,
-    }
+    known: Values = {name: getattr(info, name) for name in ("node", "state", "type", "calls", "failed")}
+    known |= {"under way": info.active, "last problem": info.problem}
     return _texts(known, _milliseconds("latency", info.latency, "p50", "p99", "max"))
 
 
@@ -270,9 +263,7 @@ def _called(services: Iterable[ServiceInfo], new: Callable[[str, dict[str, int]]
     """The services that were called. New failures are one warning: a server may fail calls on purpose."""
     for service in services:
         if service.calls:
-            name = (
-                f"rmpa: {service.peer}: service {service.name}" if service.peer else f"rmpa: service {service.name}"
-            )
+            name = f"rmpa: {f'{service.peer}: ' if service.peer else ''}service {service.name}"
             count = new(name, {"calls": service.calls, "failed": service.failed})
             text = f"{count['calls']} calls" + (f", {service.active} under way" if service.active else "")
             if count["failed"]:
@@ -331,9 +322,8 @@ def _agent(snapshot: Snapshot) -> Check:
     linked = sum(info.state == _LINKED for info in snapshot.peers)
     notes, files = list(snapshot.notes), snapshot.agent.files
     if files is not None and files.near and not files.problem:
-        notes.append(
-            f"{files.open} of {files.limit} file descriptors are open; {open_files_advice(snapshot.agent.pid)}"
-        )
+        advice = open_files_advice(snapshot.agent.pid)
+        notes.append(f"{files.open} of {files.limit} file descriptors are open; {advice}")
     level = FAIL if files is not None and files.problem else WARN if notes else OK
     text = "; ".join(notes) or f"{linked} of {len(snapshot.peers)} known peers linked"
     return Check(HERE, level, text, evidence=agent_values(snapshot, linked))

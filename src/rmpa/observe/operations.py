@@ -13,7 +13,7 @@ from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge import nodes as node_requests
 from rmpa.bridge.params import transfer
 from rmpa.config.rules import ROS2
-from rmpa.config.values import did_you_mean
+from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.facts import ContractTerm, FollowedInfo
 from rmpa.core.identity import OWN_NODE, is_global_name, is_meant
@@ -165,12 +165,11 @@ class ControlOperations:
         if len(fitting) == 1:
             return fitting[0]
         if fitting:
-            raise PeerRefused(
-                self.name, f"{len(fitting)} peers are named {peer}", "name one by its GUID", code="several-fit"
-            )
-        similar = did_you_mean(peer, [session.link.name for session in sessions])
+            problem = f"{len(fitting)} peers are named {peer}"
+            raise PeerRefused(self.name, problem, "name one by its GUID", code="several-fit")
         remedy = "`rmpa peer list` shows which modules are there, and why one is not linked"
-        raise UnreachableError("linked peer", repr(peer), f"did you mean {similar}?" if similar else remedy)
+        names = [session.link.name for session in sessions]
+        raise UnreachableError("linked peer", repr(peer), suggestion(peer, names, remedy))
 
 
 def _request(args: Args, known: Collection[str]) -> str:
@@ -181,8 +180,7 @@ def _request(args: Args, known: Collection[str]) -> str:
     """
     what = str(args.get("what", ""))
     if what not in known:
-        similar = did_you_mean(what, known)
-        raise ConfigError("what", f"{what!r} is no question", f"did you mean {similar}?" if similar else "")
+        raise ConfigError("what", f"{what!r} is no question", suggestion(what, known, ""))
     return what
 
 

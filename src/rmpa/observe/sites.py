@@ -71,11 +71,13 @@ class SiteRequests:
 
     def serve(self, gateway: SiteAnswerer) -> None:
         """Answer as a gateway from now on."""
-        self.answerer, rpc = gateway, self._bridge.rpc
-        rpc.on_request(REPORT, partial(self._answer_peer, gateway, REPORT), _SOURCES)
-        rpc.on_request(SITE_INFO, partial(self._answer_peer, gateway, SITE_INFO), _SOURCES)
-        rpc.on_request(PARAM, partial(self._answer_peer, gateway, PARAM), _PARAMETERS)
-        rpc.on_request(SITE_WHY, partial(self._answer_peer, gateway, SITE_WHY), _WAYS)
+        self.answerer = gateway
+
+        def answer(what: str, asker: PeerSession, args: Args) -> Awaitable[object]:
+            return gateway.answer(what, args, asker.link.name)
+
+        for what, needs in ((REPORT, _SOURCES), (SITE_INFO, _SOURCES), (SITE_WHY, _WAYS), (PARAM, _PARAMETERS)):
+            self._bridge.rpc.on_request(what, partial(answer, what), needs)
 
     async def answer(self, args: Args) -> Any:
         """The operation ``site``: ``what`` (one of ``QUESTIONS``) and its ``args``.
@@ -120,20 +122,13 @@ class SiteRequests:
                 self._liked[site] = str(session.link.guid)
                 return value
         self._liked.pop(site, None)
-        raise problem or UnreachableError(
-            "gateway",
-            "any linked peer",
-            "start one with `rmpa gateway`; `rmpa peer list` shows the links. In a secured mesh "
-            "`relays` of [trust] names the gateways that are believed",
-        )
+        remedy = "start one with `rmpa gateway`; `rmpa peer list` shows the links"
+        remedy += ". In a secured mesh `relays` of [trust] names the gateways that are believed"
+        raise problem or UnreachableError("gateway", "any linked peer", remedy)
 
     def _believed(self) -> list[PeerSession]:
         """The linked peers whose word about other sites counts: any member could answer as a gateway."""
         return [at for at in self._bridge.sessions.linked() if self._bridge.gate.may_relay(at.link.name)]
-
-    @staticmethod
-    def _answer_peer(gateway: SiteAnswerer, what: str, asker: PeerSession, args: Args) -> Awaitable[object]:
-        return gateway.answer(what, args, asker.link.name)
 
 
 class SiteModuleInfo(msgspec.Struct, frozen=True, kw_only=True):

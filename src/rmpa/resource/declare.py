@@ -396,7 +396,7 @@ def read_contract(where: str, terms: Mapping[str, object]) -> Contract:
     return Contract(**rules[0].values)  # type: ignore[arg-type] # as ContractRule.values promises
 
 
-def read_enum(kind: type[Any], text: str, where: str, problem: str = "is not known here") -> Any:
+def read_enum(kind: type[Any], text: str, where: str) -> Any:
     """Find the member of an ``Enum`` by its value.
 
     Raises:
@@ -404,7 +404,7 @@ def read_enum(kind: type[Any], text: str, where: str, problem: str = "is not kno
     """
     known = [item.value for item in kind]
     if text not in known:
-        _refuse_unknown(where, f"{text!r} {problem}", text, known)
+        _refuse_unknown(where, f"{text!r} is not known here", text, known)
     return kind(text)
 
 

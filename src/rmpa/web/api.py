@@ -58,20 +58,6 @@ _TITLES: Final = {
 }
 
 
-class Problem(msgspec.Struct, kw_only=True, frozen=True):
-    """Why a request has no result (RFC 9457).
-
-    Attributes:
-        title: What happened, the same for all errors of this status.
-        status: The HTTP status.
-        detail: What happened with this request, and what to do.
-    """
-
-    title: str
-    status: int
-    detail: str
-
-
 class RestResponse(NamedTuple):
     """An HTTP response: status, body, its type, further headers, and of a problem its ``detail``."""
 
@@ -83,8 +69,8 @@ class RestResponse(NamedTuple):
 
 
 def problem(status: int, detail: str, headers: tuple[tuple[str, str], ...] = ()) -> RestResponse:
-    """The problem details of a status, as a response."""
-    body = msgspec.json.encode(Problem(title=_TITLES[status], status=status, detail=detail))
+    """Why a request has no result (RFC 9457): ``detail`` says what happened, and what to do."""
+    body = msgspec.json.encode({"title": _TITLES[status], "status": status, "detail": detail})
     return RestResponse(status, body, "application/problem+json", headers, detail)
 
 
@@ -245,19 +231,11 @@ def metrics(snapshot: Snapshot | None) -> Iterator[Metric]:
     discards = [(labels(reason=reason), count) for reason, count in reasons]
     yield Metric("rmpa_discards", "What was refused or dropped, by its reason.", "counter", discards)
     yield from _peers(snapshot, peers)
-    yield from _links(
-        snapshot.taken, [(labels(peer=each.name), each.link) for each in peers if each.link is not None]
-    )
-    yield from _routes(
-        snapshot.taken,
-        [
-            (labels(topic=topic, peer=each.peer, node=each.node, direction=each.direction), each)
-            for topic, each in routes
-        ],
-    )
-    yield from _services(
-        [(labels(service=each.name, peer=each.peer, direction=each.direction), each) for each in services]
-    )
+    links = [(labels(peer=each.name), each.link) for each in peers if each.link is not None]
+    yield from _links(snapshot.taken, links)
+    routed = [(labels(topic=name, peer=x.peer, node=x.node, direction=x.direction), x) for name, x in routes]
+    yield from _routes(snapshot.taken, routed)
+    yield from _services([(labels(service=x.name, peer=x.peer, direction=x.direction), x) for x in services])
     help_ = "Peers, routes, services and reasons left out for their number."
     yield Metric("rmpa_metrics_omitted", help_, "gauge", omitted)
 

@@ -387,5 +387,5 @@ async def test_a_page_invites_pending_modules_alone_and_tells_no_log_the_token(
             told = await answers.answer("invite", {"name": "arm"})
             assert told == {"line": f"rmpa trust join rmpa1-{number}", "until": 9}
     assert authority.asked == [{"what": "invite", "name": "arm"}] * 2  # the authority replaces the open token
-    assert questions.QUESTIONS["invite"][0] == "control"
+    assert questions.QUESTIONS["invite"] == "control"
     assert "rmpa1-" not in caplog.text

@@ -242,9 +242,8 @@ def judge_unit(unit: Mapping[str, str]) -> Check:
         text = f"rmpa.service is {unit['ActiveState']}, and does not start with the machine"
         return Check("boot", WARN, text, START if is_set_up(unit) else INSTALL)
     if unit["ActiveState"] == "inactive":
-        return Check(
-            "boot", WARN, "rmpa.service starts with the machine, and was stopped", "sudo systemctl start rmpa"
-        )
+        text = "rmpa.service starts with the machine, and was stopped"
+        return Check("boot", WARN, text, "sudo systemctl start rmpa")
     return Check("boot", OK, f"rmpa.service is {unit['ActiveState']}, and starts with the machine")
 
 
@@ -473,17 +472,11 @@ def _host_name(shell: RosShell, remedy: str) -> tuple[Any, ...]:
     if name == "localhost":
         return OK, "nodes are reached by this machine's address"
     if not addresses:
-        return (
-            FAIL,
-            f"{begin}, and that name cannot be resolved",
-            f"put '127.0.1.1 {name}' into /etc/hosts, or {remedy}",
-        )
+        remedy = f"put '127.0.1.1 {name}' into /etc/hosts, or {remedy}"
+        return FAIL, f"{begin}, and that name cannot be resolved", remedy
     if not shell.is_here(name):
-        return (
-            FAIL,
-            f"{begin}, which resolves to {addresses[0]}: not this machine",
-            f"correct /etc/hosts, or {remedy}",
-        )
+        text = f"{begin}, which resolves to {addresses[0]}: not this machine"
+        return FAIL, text, f"correct /etc/hosts, or {remedy}"
     return OK, f"{name} is this machine ({addresses[0]})"
 
 

@@ -166,10 +166,8 @@ def hear(interfaces: Iterable[Interface], group: str, port: int, listen: float =
     try:
         receiver = open_receiver(group, port)
     except OSError as error:
-        problem = f"cannot be opened ({error.strerror})"
-        raise StartError(
-            f"UDP port {port}", problem, "`ss -ulnp` shows the program that has it", code="port-in-use"
-        ) from None
+        problem, remedy = f"cannot be opened ({error.strerror})", "`ss -ulnp` shows the program that has it"
+        raise StartError(f"UDP port {port}", problem, remedy, code="port-in-use") from None
     found: dict[str, MulticastEcho] = {}
     with receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, discovery_limits.MULTICAST_TTL)

@@ -183,11 +183,8 @@ def of_mode(directory: Path, forbidden: int, mode: str) -> Iterator[Repair | Che
     except OSError:
         return
     bits = stat.S_IMODE(info.st_mode)
-    if (
-        info.st_uid != os.geteuid()
-        or not stat.S_ISDIR(info.st_mode)
-        or not (bits & forbidden or bits & 0o700 != 0o700)
-    ):
+    is_wrong = bits & forbidden or bits & 0o700 != 0o700
+    if info.st_uid != os.geteuid() or not stat.S_ISDIR(info.st_mode) or not is_wrong:
         return
     text, command = f"has the mode {bits:04o}", ("chmod", f"u+rwx,{mode}", str(directory))
     if bits & stat.S_ISVTX:
@@ -226,7 +223,7 @@ def of_leavings(place: Path) -> Iterator[Repair]:
         command = ("sh", "-c", f"cd {shlex.quote(str(place))} && for name in {' '.join(dead)}; {each}")
         shown = ", ".join(dead[:_SHOWN]) + (", …" if len(dead) > _SHOWN else "")
         text = f"{len(dead)} agents were killed, and have left their sockets and locks: {shown}"
-    yield Repair("directory", str(place), text, command, _ANEW, do=partial(_remove_all, place, dead))
+    yield Repair("directory", str(place), text, command, _ANEW, do=partial(_remove, place, dead))
 
 
 def _are_ours(place: int, name: str) -> bool:
@@ -239,24 +236,20 @@ def _are_ours(place: int, name: str) -> bool:
     return kinds and sock.st_uid == lock.st_uid == os.geteuid()
 
 
-def _remove_all(directory: Path, names: Iterable[str]) -> None:
-    for name in names:
-        _remove(directory, name)
-
-
-def _remove(directory: Path, name: str) -> None:
+def _remove(directory: Path, names: Iterable[str]) -> None:
     with _opened(directory) as place:
-        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-        lock = os.open(f"{name}.lock", flags, dir_fd=place)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            there = os.stat(f"{name}.lock", dir_fd=place, follow_symlinks=False)
-            if not (os.path.samestat(os.fstat(lock), there) and _are_ours(place, name)):
-                raise OSError(errno.ESTALE, "it has changed meanwhile")
-            os.unlink(f"{name}.sock", dir_fd=place)
-            os.unlink(f"{name}.lock", dir_fd=place)
-        finally:
-            os.close(lock)
+        for name in names:
+            flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+            lock = os.open(f"{name}.lock", flags, dir_fd=place)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                there = os.stat(f"{name}.lock", dir_fd=place, follow_symlinks=False)
+                if not (os.path.samestat(os.fstat(lock), there) and _are_ours(place, name)):
+                    raise OSError(errno.ESTALE, "it has changed meanwhile")
+                os.unlink(f"{name}.sock", dir_fd=place)
+                os.unlink(f"{name}.lock", dir_fd=place)
+            finally:
+                os.close(lock)
 
 
 def _is_held(lock: Path, locks: str) -> bool:

@@ -132,10 +132,8 @@ def _at_client(peer: str, service: str, wire: str, info: ServiceInfo | None, her
     if info.hidden:
         remedy = "change [services] or [[peer]] in this module's rmpa.toml, and `rmpa reload`"
         if not info.hidden.startswith("policy"):
-            remedy = (
-                "a graph has one provider for each service; give one of them another name (prefix or remap_in of "
-            )
-            remedy += "[[peer]])"
+            remedy = "a graph has one provider for each service; "
+            remedy += "give one of them another name (prefix or remap_in of [[peer]])"
         yield Check("shown", FAIL, f"it is not shown here: {info.hidden}", remedy)
     yield Check("shown", OK, f"it is {service} here{f' (its {wire})' if wire not in ('', service) else ''}")
     if not here.registered:
@@ -183,10 +181,8 @@ def diagnose_module(snapshot: Snapshot, name: str, told: ModuleFacts | None = No
     own, peer = snapshot.agent, find_peer(snapshot, name)
     shown, stages = peer.name if peer is not None else name, peer_stages(snapshot, name)
     if is_meant(name, own.name, own.guid):
-        shown, stages = (
-            own.name,
-            (Check("peer", OK, f"{own.name} is this module ({own.guid}); its agent has answered"),),
-        )
+        answered = Check("peer", OK, f"{own.name} is this module ({own.guid}); its agent has answered")
+        shown, stages = own.name, (answered,)
     elif peer is not None:
         stages = until_failure(chain(stages, _module(snapshot, peer, told, refusal)))
     return Diagnosis.of(stages, name=shown, peer=shown, to=own.name, kind="module")

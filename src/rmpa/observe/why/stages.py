@@ -127,10 +127,8 @@ def peer_stages(snapshot: Snapshot, name: str) -> tuple[Check, ...]:
         text += f"known are {', '.join(known)}" if known else "it knows no peer at all"
         similar = did_you_mean(name, known)
         remedy = f"did you mean {similar}? If not, " if similar else ""
-        remedy += (
-            f"see that `rmpa up` runs there with --domain {agent.domain}; `rmpa doctor` on both checks multicast, "
-            "and --seed HOST:PORT reaches it where there is none"
-        )
+        remedy += f"see that `rmpa up` runs there with --domain {agent.domain}; `rmpa doctor` on both checks "
+        remedy += "multicast, and --seed HOST:PORT reaches it where there is none"
         return (Check("peer", FAIL, text, remedy),)
     if peer.state == "conflict":
         return (_conflict(peer, FAIL),)
@@ -152,9 +150,8 @@ def _relay(peer: PeerInfo, relay: PeerInfo | None) -> Check:
 
 
 def _conflict(peer: PeerInfo, level: CheckLevel) -> Check:
-    texts, remedies = zip(
-        *(conflict.partition("; ")[::2] for conflict in peer.conflicts or (peer.state,)), strict=True
-    )
+    conflicts = peer.conflicts or (peer.state,)
+    texts, remedies = zip(*(conflict.partition("; ")[::2] for conflict in conflicts), strict=True)
     remedy = "; ".join(filter(None, remedies)) or "give each module a --name and an address of its own"
     return Check("peer", level, "; ".join(texts), remedy)
 
@@ -178,15 +175,11 @@ def _link(peer: PeerInfo) -> Check:
         text += f": its beacons come (the last {peer.beacon_ago:.1f} s ago), but there is no TCP connection"
     if peer.state == "refused":
         return Check("link", FAIL, text, "do what the text says; both sides are asked again by themselves")
-    remedy = (
-        "its beacons have stopped too: is the machine on, and its cable or Wi-Fi connected? If so, "
-        if peer.beacon_ago is None or peer.beacon_ago > _SILENT
-        else ""
-    )
-    remedy += (
-        f"see that TCP to {peer.guid.partition('#')[0]} is open on both machines (a firewall? give it a fixed port "
-        "with --port), and that the machines reach each other: `rmpa doctor`"
-    )
+    remedy = ""
+    if peer.beacon_ago is None or peer.beacon_ago > _SILENT:
+        remedy = "its beacons have stopped too: is the machine on, and its cable or Wi-Fi connected? If so, "
+    remedy += f"see that TCP to {peer.guid.partition('#')[0]} is open on both machines (a firewall? give it a fixed "
+    remedy += "port with --port), and that the machines reach each other: `rmpa doctor`"
     return Check("link", FAIL, text, remedy)
 
 

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import inspect
 import logging
+import operator
 import socket
 from abc import abstractmethod
 from collections import deque
@@ -27,7 +29,7 @@ from rmpa.web.clients.frame_writer import FairQueue, FrameWriter, Opcode, OutFra
 from rmpa.web.hub.hub import HubClient
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from aiohttp import web
 
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Payload, Rights
     from rmpa.web.hub.topics import ReceivedMessage
+    from rmpa.web.server.access import GuardedConnection
 
 _log = logging.getLogger(__name__)
 # Pings without an answer, behind which no further one is sent: they wait as the client's frames do.
@@ -53,13 +56,27 @@ _Entry: TypeAlias = "Callable[[float], Iterable[OutFrame]]"
 _AGE_PINGS: Final = 4
 
 
-def struct_of(method: Callable[..., None], **config: Any) -> type[msgspec.Struct]:
-    """The struct of what a client sends for a method to be called: its fields are the method's keywords.
+def ops_of(
+    session: type[Session], rename: Callable[[str], str], *, tagged: bool = False
+) -> dict[str, type[msgspec.Struct]]:
+    """The structs of what clients send, by op: for each method ``op_NAME`` of a session.
 
     Args:
-        method: Its keyword arguments are the fields, with their types and defaults.
-        config: Of the struct.
+        session: The keyword arguments of its methods are the fields, with their types and defaults.
+        rename: The protocol's name of an op or a field.
+        tagged: Whether the struct itself says the op, in its field ``op``.
     """
+    names = {rename(name.removeprefix("op_")): name for name in vars(session) if name.startswith("op_")}
+    tags: dict[str, Any] = {op: {"tag_field": "op", "tag": op} if tagged else {} for op in names}
+    return {op: _struct_of(getattr(session, name), rename=rename, **tags[op]) for op, name in names.items()}
+
+
+def decoder_of(ops: Mapping[str, type[msgspec.Struct]]) -> msgspec.json.Decoder[msgspec.Struct]:
+    """Decodes any message of tagged ops."""
+    return msgspec.json.Decoder(functools.reduce(operator.or_, ops.values()))
+
+
+def _struct_of(method: Callable[..., None], **config: Any) -> type[msgspec.Struct]:
     hints = get_type_hints(method, include_extras=True)
     keywords = [each for each in inspect.signature(method).parameters.values() if each.kind is each.KEYWORD_ONLY]
     fields = [
@@ -235,7 +252,7 @@ class ClientConnection:
         # Messages and answers that were written.
         self.sent = 0
         self._heard = 0
-        self._received: Callable[[], int] = int
+        self._guard: GuardedConnection | None = None
         self._arrival = MessageArrival()
         self._age: CommandAge | None = None
         self._wake = asyncio.Event()
@@ -301,11 +318,16 @@ class ClientConnection:
         """Bytes that wait, here and behind the queue."""
         return self.queue.bytes + self._waiting
 
+    @property
+    def _received(self) -> int:
+        """Bytes that the client has sent; 0 where they are not counted."""
+        return self._guard.received if self._guard is not None else 0
+
     async def run(
         self,
         request: web.Request,
         socket_: FrameSocket,
-        upgraded: Callable[[web.Request], Callable[[], int]],
+        guard: GuardedConnection | None,
         refused: Callable[[str, str], None],
     ) -> None:
         """Serve the client until it has gone.
@@ -313,7 +335,7 @@ class ClientConnection:
         Args:
             request: Asks for the WebSocket.
             socket_: Not prepared yet.
-            upgraded: Called when the handshake is done; what it returns counts the bytes that the client has sent.
+            guard: What guards the connection and counts what the client has sent; ``None``: nothing does.
             refused: ``(reason, text)``: called if the client is disconnected for one of ``clients.CLIENT_REFUSALS``.
 
         Raises:
@@ -325,8 +347,10 @@ class ClientConnection:
         tasks: list[asyncio.Task[None]] = []
         try:
             writer = await socket_.prepare(request)
-            self._received = upgraded(request)
-            self._arrival.message_ended(self._received())
+            if guard is not None:
+                guard.upgrade(self.unmasked)
+                self._guard = guard
+            self._arrival.message_ended(self._received)
             self._transport = request.transport
             if self._transport is None:
                 return  # it went during the handshake
@@ -363,7 +387,7 @@ class ClientConnection:
             if message.type in (WSMsgType.PING, WSMsgType.PONG):
                 self._arrival.control_frame(len(message.data))
             else:
-                self._arrival.message_ended(self._received())
+                self._arrival.message_ended(self._received)
             if message.type == WSMsgType.ERROR:
                 self._failed(message.data)
             if self._gone:
@@ -400,7 +424,7 @@ class ClientConnection:
         silent, heard, waiting = 0, (-1, 0), 0
         while silent < _SILENT_LOOKS:
             await asyncio.sleep(limits.PING_INTERVAL / 2)
-            now, received = self._waiting, self._received()
+            now, received = self._waiting, self._received
             if self._arrival.takes_too_long(received, self.now()):
                 self.end(WSCloseCode.POLICY_VIOLATION, "a message did not end in time", "message")
                 return

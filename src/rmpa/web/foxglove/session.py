@@ -5,8 +5,6 @@ It decodes no message: payloads cross as they come from TCPROS.
 
 from __future__ import annotations
 
-import functools
-import operator
 from collections import Counter
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -16,7 +14,7 @@ import msgspec
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name, is_type_name
 from rmpa.core.timers import TokenBucket
-from rmpa.web.clients.connection import ClientStream, Session, struct_of
+from rmpa.web.clients.connection import ClientStream, Session, decoder_of, ops_of
 from rmpa.web.foxglove import limits, protocol
 from rmpa.web.foxglove.protocol import ENCODING, ERROR, WARNING, message, status
 from rmpa.web.hub.params import CLOCK, CLOCK_TYPE, clock_ns
@@ -377,7 +375,8 @@ class FoxgloveSession(Session):
 
     def _readable(self, names: protocol.Names) -> tuple[str, ...]:
         """Those that the client may read, each once; the others are refused."""
-        _check_names(names)
+        for name in names:
+            protocol.check_name(name)
         found: list[str] = []
 
         def take(name: str) -> None:
@@ -414,22 +413,11 @@ class FoxgloveSession(Session):
             self.connection.push(protocol.parameter_values(shown))
 
 
-def _check_names(names: Iterable[str]) -> None:
-    for name in names:
-        protocol.check_name(name)
-
-
 def _camel(name: str) -> str:
-    first, *further = name.removeprefix("op_").removesuffix("_").split("_")
+    first, *further = name.removesuffix("_").split("_")
     return first + "".join(map(str.capitalize, further))
 
 
 # The fields of each JSON message of a client.
-OPS: Final = {
-    _camel(name): struct_of(method, tag_field="op", tag=_camel(name), rename=_camel)
-    for name, method in vars(FoxgloveSession).items()
-    if name.startswith("op_")
-}
-DECODER: Final[msgspec.json.Decoder[msgspec.Struct]] = msgspec.json.Decoder(
-    functools.reduce(operator.or_, OPS.values())
-)
+OPS: Final = ops_of(FoxgloveSession, _camel, tagged=True)
+DECODER: Final = decoder_of(OPS)

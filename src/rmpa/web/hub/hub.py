@@ -235,11 +235,11 @@ class HubClient:
         self.hub.link.rules.check_param(name, value)
         return value
 
-    async def get_params(self, names: tuple[str, ...] = (), prefix: str = "/") -> Mapping[str, ParamValue]:
-        """The values of ``names`` that are there; without names those of all parameters below ``prefix``."""
+    async def get_params(self, names: tuple[str, ...] = ()) -> Mapping[str, ParamValue]:
+        """The values of ``names`` that are there; without names those of all parameters."""
         self._check_view("read parameters")
         await self.hub.params.loaded.wait()
-        return self.hub.link.rules.visible(self.hub.params.values(names, prefix))
+        return self.hub.link.rules.visible(self.hub.params.values(names, "/"))
 
     def set_param(self, name: str, value: ParamValue) -> Coroutine[Any, Any, None]:
         """Set a parameter; see ``ParamMirror.set``."""
@@ -304,9 +304,6 @@ class HubClient:
     def check_command(self, what: str) -> None:
         """Refuse also what may be too old."""
         self.check_control(what)
-        self._check_age()
-
-    def _check_age(self) -> None:
         if text := self.late():
             raise RmpaError(f"{text}; send it again; command_age_ms of [web] sets the bound")
 

@@ -203,11 +203,11 @@ def _same(one: object, other: object) -> bool:
     return type(one) is type(other) and one == other
 
 
-def value_at(tree: object, name: str) -> object:
-    """The value that a name has in a tree of parameters; ``MISSING`` where it has none."""
+def value_at(tree: object, name: str, missing: object = MISSING) -> object:
+    """The value that a name has in a tree of parameters; ``missing`` where it has none."""
     for part in filter(None, name.split("/")):
         if not isinstance(tree, Mapping) or part not in tree:
-            return MISSING
+            return missing
         tree = tree[part]
     return tree
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import functools
 import hashlib
 import logging
 import math
 import time
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
@@ -25,11 +23,12 @@ from rmpa.observe.snapshot import ModuleFacts
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.descriptor import SERVICE_TYPE
 from rmpa.trust.permissions import InviteReply
+from rmpa.web.hub.params import value_at
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.state import module_facts, node_key
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Mapping
 
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
@@ -47,9 +46,12 @@ def shown_node(own: str) -> str:
 
 
 Args: TypeAlias = dict[str, Any]  # the edge: each question has its own
-_Answer: TypeAlias = "Callable[[Answers, Args], Awaitable[Any]]"
-# All questions: the right (``Rights``) that a page needs for each, and what answers it.
-QUESTIONS: Final[dict[str, tuple[str, _Answer]]] = {}
+# All questions, each with the right (``Rights``) that a page needs for it; the method ``_QUESTION`` answers it.
+QUESTIONS: Final = {
+    **dict.fromkeys(("why", "agent", "contract", "node", "describe"), ""),
+    **dict.fromkeys(("params", "param_names"), "view"),
+    **dict.fromkeys(("set_param", "delete_param", "invite", "call", "profile", "context", "configure"), "control"),
+}
 _CALL_TIMEOUT: Final = 30.0
 _READ_TIMEOUT: Final = 5.0
 _KINDS: Final = ("topic", "service", "module")
@@ -57,16 +59,6 @@ _KINDS: Final = ("topic", "service", "module")
 _SET_PARAMETERS: Final = "set_parameters"
 # The lists of a ``dynamic_reconfigure/Config`` by the types of parameters.
 _LISTS: Final = {"bool": "bools", "int": "ints", "double": "doubles", "str": "strs"}
-
-
-def question(what: str, *, needs: str = "") -> Callable[[_Answer], _Answer]:
-    """A method of ``Answers`` that answers the question ``what``; with an empty ``needs`` every page may ask it."""
-
-    def add(method: _Answer) -> _Answer:
-        QUESTIONS[what] = needs, method
-        return method
-
-    return add
 
 
 class Answers:
@@ -94,13 +86,12 @@ class Answers:
         Raises:
             RmpaError: There is none, or the rules deny it; the text says why.
         """
-        return await QUESTIONS[what][1](self, args)
+        return await getattr(self, f"_{what}")(args)
 
     def close(self) -> None:
         """End the threads, once what the agent was asked is answered or has timed out."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
-    @question("why")
     async def _why(self, args: Args) -> Any:
         kind = args.get("kind")
         if kind not in _KINDS:
@@ -110,16 +101,13 @@ class Answers:
         name, peer = _name(args, "name"), _text(args, "peer")
         return await self._control_call("why", name=name, peer=peer or None, service=kind == "service")
 
-    @question("agent")
     async def _agent(self, args: Args) -> Any:
         answer = await self._control_call("agent", peer=_text(args, "peer"))
         return module_facts(msgspec.convert(answer, ModuleFacts))
 
-    @question("contract")
     async def _contract(self, args: Args) -> Any:
         return await self._control_call("contract", topic=_name(args, "topic"), type_name=_text(args, "type"))
 
-    @question("node")
     async def _node(self, args: Args) -> Any:
         """The facts about a node, with names of nodes as pages have them."""
         name, peer = _name(args, "name"), _text(args, "peer")
@@ -146,7 +134,6 @@ class Answers:
 
         return await asyncio.get_running_loop().run_in_executor(self._threads, ask)
 
-    @question("describe")
     async def _describe(self, args: Args) -> Any:
         kind = await self._type_of(self._service(args))
         empty = codec_for(kind.request)
@@ -157,7 +144,6 @@ class Answers:
             "request": msgspec.json.decode(empty.json(memoryview(example))),
         }
 
-    @question("params", needs="view")
     async def _params(self, args: Args) -> Any:
         """All parameters that the rules let a page see, with their digest; none to a page that ``has`` that one.
 
@@ -174,19 +160,16 @@ class Answers:
         await _in_time(self._hub.params.loaded.wait())
         return self._hub.params.tree
 
-    @question("param_names", needs="view")
     async def _param_names(self, _args: Args) -> Any:
         await self._own_params()
         names = islice(self._hub.params.values((), "/"), 5000)
         return {"names": sorted(self._hub.link.rules.visible(dict.fromkeys(names)))}
 
-    @question("set_param", needs="control")
     async def _set_param(self, args: Args) -> Any:
         if args.get("value") is None:
             raise ConfigError("value", "a parameter cannot be null", "delete it instead")
         return await self._change(args, args["value"])
 
-    @question("delete_param", needs="control")
     async def _delete_param(self, args: Args) -> Any:
         if _name(args, "name") == "/":
             raise ConfigError("name", "the root holds every parameter", "name the one that you mean")
@@ -201,7 +184,8 @@ class Answers:
                 # The peer judges what this module may do, and knows nothing of rmpa web. Where it hides some of its
                 # parameters from this module, a page changes none of them: what a namespace holds is not known.
                 if rules.permissions is not None:
-                    rules.check_param_change(name, functools.partial(_value_at, params.get("/")), value)
+                    tree = params.get("/")
+                    rules.check_param_change(name, lambda each: cast("ParamValue", value_at(tree, each, None)), value)
                 if value is None:
                     params.delete(name)
                 else:
@@ -218,7 +202,6 @@ class Answers:
             await _in_time(self._hub.params.set(name, cast("ParamValue", kept)))
         return await self._params(args)
 
-    @question("invite", needs="control")
     async def _invite(self, args: Args) -> Any:
         """An invitation for a module that is pending; the answer is a secret, for the page that asks alone."""
         name = _text(args, "name")
@@ -232,7 +215,6 @@ class Answers:
         _log.info("= a page has made an invitation for %s", name)
         return {"line": f"rmpa trust join {made.token}", "until": made.expires}
 
-    @question("call", needs="control")
     async def _call(self, args: Args) -> Any:
         service = self._service(args)
         request = args.get("request", {})
@@ -244,15 +226,12 @@ class Answers:
         values = codec_for(kind.response).json(memoryview(response))
         return {"response": msgspec.json.decode(values), "seconds": round(took, 6)}
 
-    @question("profile", needs="control")
     async def _profile(self, args: Args) -> Any:
         return await self._choose(args, "profile")
 
-    @question("context", needs="control")
     async def _context(self, args: Args) -> Any:
         return await self._choose(args, "context")
 
-    @question("configure", needs="control")
     async def _configure(self, args: Args) -> Any:
         resource, name, value = _name(args, "resource"), _text(args, "name"), args.get("value")
         facts = self._resources.facts.get(node_key(_text(args, "peer"), resource))
@@ -264,8 +243,9 @@ class Answers:
             raise ConfigError(name, f"{str(value)[:40]!r} is no value of the type {kind}")
         config = await self._reconfigure(args, {_LISTS[kind]: [{"name": name, "value": value}]})
         taken = next((each["value"] for each in config[_LISTS[kind]] if each["name"] == name), value)
-        kept = taken == value
-        text = f"{name} is {_written(taken)}" + ("" if kept else f": {_written(value)} is beyond its bounds")
+        text = f"{name} is {_written(taken)}" + (
+            "" if taken == value else f": {_written(value)} is beyond its bounds"
+        )
         return {"value": taken, "text": text}
 
     async def _reconfigure(self, args: Args, config: Args) -> Args:
@@ -315,12 +295,6 @@ async def _in_time(done: Awaitable[Any]) -> None:
             await done
     except TimeoutError:
         raise UnreachableError("parameters of the core", "its API", "is it busy? ask again") from None
-
-
-def _value_at(tree: Any, name: str) -> ParamValue:
-    for part in filter(None, name.split("/")):
-        tree = tree.get(part) if isinstance(tree, Mapping) else None
-    return cast("ParamValue", tree)
 
 
 def _as_before(name: str, present: object, value: object) -> object:

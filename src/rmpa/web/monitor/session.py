@@ -7,7 +7,6 @@ import contextlib
 import dataclasses
 import functools
 import logging
-import operator
 import struct
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
 
@@ -18,7 +17,7 @@ from msgspec import Meta
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name
 from rmpa.core.timers import TokenBucket
-from rmpa.web.clients.connection import Session, struct_of
+from rmpa.web.clients.connection import Session, decoder_of, ops_of
 from rmpa.web.clients.frame_writer import Opcode
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import VERSION, Tree, WatchState, difference
@@ -377,7 +376,7 @@ class MonitorSession(Session):
         """A question or an order that has one answer; ``at`` is as of ``drive``."""
         if what not in QUESTIONS:
             raise RemoteProtocolError(f"there is no question {what[:40]!a}")
-        needed = QUESTIONS[what][0]
+        needed = QUESTIONS[what]
         if needed and not getattr(self._may, needed):
             self._refuse(id, *(_NO_TOKEN if needed == "view" else _NO_CONTROL))
         elif needed == "control" and now - at > limits.ORDER_AGE:
@@ -537,11 +536,5 @@ def _check_topic(topic: str) -> None:
 
 
 # The members of each message of a page (docs/design/monitor-protocol.md).
-OPS: Final = {
-    name.removeprefix("op_"): struct_of(method, tag_field="op", tag=name.removeprefix("op_"))
-    for name, method in vars(MonitorSession).items()
-    if name.startswith("op_")
-}
-DECODER: Final[msgspec.json.Decoder[msgspec.Struct]] = msgspec.json.Decoder(
-    functools.reduce(operator.or_, OPS.values())
-)
+OPS: Final = ops_of(MonitorSession, str, tagged=True)
+DECODER: Final = decoder_of(OPS)

@@ -183,16 +183,9 @@ class StateBuilder:
         """The modules that are not of this mesh; for one that a page can invite here with ``here``."""
         here = snapshot.trust is not None and snapshot.trust.is_authority
         for one in snapshot.strangers:
-            entry = _told({
-                "name": one.name,
-                "state": one.state,
-                "address": one.guid.partition("#")[0],
-                "since": snapshot.taken - one.since_ago,
-                "text": one.last_error,
-                "invite": one.invite,
-                "here": here,
-            })  # fmt: skip
-            yield f"{one.guid} {one.name}", entry
+            entry = {"address": one.guid.partition("#")[0], "since": snapshot.taken - one.since_ago}
+            entry |= {"text": one.last_error, "here": here, **_as_told(one, "name", "state", "invite")}
+            yield f"{one.guid} {one.name}", _told(entry)
 
     def _rates(
         self, name: str, taken: float, link: LinkInfo, links: Mapping[str, tuple[tuple[float, int, int], list[float]]]
@@ -295,27 +288,19 @@ def _module(peer: PeerInfo, taken: float, rates: Sequence[float]) -> Tree:
         "state": state,
         "since": taken - ago,
         "error": "; ".join(filter(None, ("" if link else peer.last_error, *peer.conflicts))),
-        "code": peer.code,
-        "guid": peer.guid,
-        "source": peer.source,
-        "via": peer.via,
-        "topics_in": peer.topics_in,
-        "topics_out": peer.topics_out,
         "hidden": [bound.text for bound in peer.beyond],
-        "direct_in": peer.direct_in,
-        "direct_out": peer.direct_out,
+        **_as_told(peer, "code", "guid", "source", "via", "topics_in", "topics_out", "direct_in", "direct_out"),
         **dict(zip(("bytes_in", "bytes_out"), rates, strict=False)),
     }
     if link is not None:
-        entry |= {
-            "remote": link.remote,
-            "rtt": link.rtt,
-            "offset": link.clock_offset,
-            "offset_error": link.clock_error,
-            "queued": link.queued,
-            "dropped": link.dropped,
-        }
+        entry |= {"offset": link.clock_offset, "offset_error": link.clock_error}
+        entry |= _as_told(link, "remote", "rtt", "queued", "dropped")
     return _told(entry, zeros=True)
+
+
+def _as_told(facts: object, *names: str) -> dict[str, Any]:
+    """Facts that a page is shown under the names, and as the values, that their owner gives them."""
+    return {name: getattr(facts, name) for name in names}
 
 
 def _told(entry: Mapping[str, object], *, zeros: bool = False) -> Tree:
@@ -329,17 +314,8 @@ def service_key(service: ServiceInfo) -> str:
 
 
 def _service(service: ServiceInfo) -> Tree:
-    return _told({
-        "name": service.name,
-        "module": service.peer,
-        "node": service.node,
-        "type": service.type,
-        "state": service.state,
-        "calls": service.calls,
-        "failed": service.failed,
-        "transport": service.transport,
-        "problem": service.problem or service.hidden,
-    })  # fmt: skip
+    told = _as_told(service, "name", "node", "type", "state", "calls", "failed", "transport")
+    return _told(told | {"module": service.peer, "problem": service.problem or service.hidden})
 
 
 def node_key(module: str, node: str) -> str:

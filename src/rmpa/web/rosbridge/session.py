@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 from rmpa.core.errors import RmpaError
 from rmpa.ros.types.codec import MessageCodec, codec_for
-from rmpa.web.clients.connection import ClientStream, Session, struct_of
+from rmpa.web.clients.connection import ClientStream, Session, ops_of
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.protocol import (
     Assembler,
@@ -560,8 +560,4 @@ def _fragment_size(size: float | None) -> int | None:
 
 
 # The fields of each op.
-OPS: Final = {
-    name.removeprefix("op_"): struct_of(method, rename=lambda field: field.removesuffix("_"))
-    for name, method in vars(RosbridgeSession).items()
-    if name.startswith("op_")
-}
+OPS: Final = ops_of(RosbridgeSession, lambda name: name.removesuffix("_"))

@@ -172,11 +172,8 @@ class AccessPolicy:
 
 
 def _foreign(whose: str) -> AccessRefused:
-    return AccessRefused(
-        "origin",
-        403,
-        f"pages of {whose} may not read from this server; open its own pages instead, or list it as origins of [web]",
-    )
+    remedy = "open its own pages instead, or list it as origins of [web]"
+    return AccessRefused("origin", 403, f"pages of {whose} may not read from this server; {remedy}")
 
 
 def bearer(authorization: str | None) -> str | None:
@@ -238,10 +235,8 @@ def token_from(path: Path) -> tuple[str, bool]:
         with os.fdopen(fd, "w", encoding="ascii") as file:
             file.write(f"{token}\n")
     except OSError as error:
-        problem = f"the token's file cannot be used: {error.strerror}"
-        raise StartError(
-            str(path), problem, "choose another one with --token-file", code="directory-unusable"
-        ) from None
+        problem, remedy = f"the token's file cannot be used: {error.strerror}", "choose another one with --token-file"
+        raise StartError(str(path), problem, remedy, code="directory-unusable") from None
     return token, True
 
 
@@ -348,7 +343,7 @@ class GuardedConnection(asyncio.Protocol):
         self._enter(ConnectionPhase.IDLE)
 
     def upgrade(self, on_unmasked: Callable[[], None]) -> None:
-        """The connection is a WebSocket from now on.
+        """The connection is a WebSocket from now on: the limits of requests do not hold any more.
 
         Args:
             on_unmasked: Called when a frame of the client is not masked; it and all after it is dropped.

@@ -36,10 +36,10 @@ from rmpa.web.server.access import (
 
 if TYPE_CHECKING:
     import ssl
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
     from importlib.abc import Traversable
 
-    from aiohttp.typedefs import Handler, Middleware
+    from aiohttp.typedefs import Handler
 
     from rmpa.web.clients.clients import WebSocketClients
     from rmpa.web.server.agent_watch import AgentWatch
@@ -150,8 +150,6 @@ class WebServer:
         self._runner: web.AppRunner | None = None
         self._table: ConnectionTable | None = None
         self._servers: list[asyncio.Server] = []
-        if sockets is not None:
-            sockets.upgraded = _upgraded
 
     async def start(self) -> None:
         """Listen.
@@ -159,7 +157,7 @@ class WebServer:
         Raises:
             StartError: The address cannot be used.
         """
-        app = web.Application(middlewares=[self._middleware()])
+        app = web.Application(middlewares=[self._middleware])
         for path in self._pages:
             app.router.add_get(path, self._page)
         app.router.add_get("/metrics", self._metrics)
@@ -217,26 +215,23 @@ class WebServer:
             self._table.abort_all()
         await self._watch.close()
 
-    def _middleware(self) -> Middleware:
-        @web.middleware
-        async def middleware(request: web.Request, handler: Handler) -> web.StreamResponse:
-            request[_JUDGED] = True
-            connection = _connection(request)
+    @web.middleware
+    async def _middleware(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        request[_JUDGED] = True
+        connection = _connection(request)
+        if connection is not None:
+            connection.request_begins()
+        try:
+            response = await self._respond(request, handler)
+        finally:
             if connection is not None:
-                connection.request_begins()
-            try:
-                response = await self._respond(request, handler)
-            finally:
-                if connection is not None:
-                    connection.request_ends()
-            if not response.prepared:
-                response.headers.update(HEADERS)
-                response.headers.update(self._sharing(request))
-                if is_loopback(host_name(request.host) or ""):
-                    response.headers.update((OPENER_POLICY,))
-            return response
-
-        return middleware
+                connection.request_ends()
+        if not response.prepared:
+            response.headers.update(HEADERS)
+            response.headers.update(self._sharing(request))
+            if is_loopback(host_name(request.host) or ""):
+                response.headers.update((OPENER_POLICY,))
+        return response
 
     async def _respond(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         verdict = self._policy.judge(self._facts(request))
@@ -264,7 +259,7 @@ class WebServer:
     async def _upgrade(self, request: web.Request, sockets: WebSocketClients) -> web.StreamResponse:
         """Serve a WebSocket until it has ended."""
         try:
-            return await sockets.handle(request)
+            return await sockets.handle(request, _connection(request))
         except web.HTTPBadRequest as error:  # of aiohttp's handshake
             text = (error.text or "").partition("\n")[0][:_SHOWN]
             sockets.refuse(request.remote or "?", "handshake", text)
@@ -374,15 +369,6 @@ def _connection(request: web.Request) -> GuardedConnection | None:
     transport = request.transport
     protocol = transport.get_protocol() if transport is not None else None
     return protocol if isinstance(protocol, GuardedConnection) else None
-
-
-def _upgraded(request: web.Request, on_unmasked: Callable[[], None]) -> Callable[[], int]:
-    """The limits of requests do not hold for the connection any more; returns what counts its bytes."""
-    connection = _connection(request)
-    if connection is None:
-        return int
-    connection.upgrade(on_unmasked)
-    return lambda: connection.received
 
 
 def _is_for_people(request: web.Request) -> bool:

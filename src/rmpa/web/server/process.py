@@ -132,9 +132,8 @@ def tls_context(files: CertificateFiles) -> ssl.SSLContext | None:
     try:
         context.load_cert_chain(files.cert, files.key or None, password=_no_password)
     except FileNotFoundError as error:
-        raise StartError(
-            error.filename or files.cert, "there is no such file", "see cert and key of [web]", code="web-certificate"
-        ) from None
+        what, remedy = error.filename or files.cert, "see cert and key of [web]"
+        raise StartError(what, "there is no such file", remedy, code="web-certificate") from None
     except (OSError, ValueError) as error:  # an SSLError is an OSError
         text = getattr(error, "reason", None) or getattr(error, "strerror", None) or str(error)
         remedy = "the certificate and its unencrypted private key are wanted, as PEM"
@@ -288,12 +287,8 @@ def access_of(web: WebSettings, module: str, environ: Mapping[str, str], state: 
     place = state_dir(environ, state or None)
     folder = module_dir(place, module) if place is not None else None
     if not web.token_file and folder is None:
-        raise StartError(
-            "rmpa web",
-            "there is no state directory for the token",
-            "choose a --token-file",
-            code="no-state-directory",
-        )
+        problem = "there is no state directory for the token"
+        raise StartError("rmpa web", problem, "choose a --token-file", code="no-state-directory")
     file = Path(web.token_file) if web.token_file or folder is None else folder / "web-token"
     token, is_new = token_from(file)
     return TokenAccess(token, file, is_new)
@@ -337,14 +332,8 @@ async def serve(
     watch = AgentWatch(reader, read_whole=reader.read_whole)
     hub = make_hub(watch, web.port, setup.rules)
     monitor = Monitor(hub, watch, agent=agent)
-    sockets = WebSocketClients(
-        hub,
-        f"RMPA {setup.module or socket.gethostname()}",
-        setup.rights,
-        priority_of(hub, setup.settings.make_contracts()),
-        monitor,
-        other_protocols(),
-    )
+    name, priority = f"RMPA {setup.module or socket.gethostname()}", priority_of(hub, setup.settings.make_contracts())
+    sockets = WebSocketClients(hub, name, setup.rights, priority, monitor, other_protocols())
     certificate = ServerCertificate(setup.files)
     server = WebServer(watch, setup.policy, web.listen, sockets, web.ports, certificate.context)
     try:

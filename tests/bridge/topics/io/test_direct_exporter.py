@@ -21,7 +21,6 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.statistics import Counters
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.trust.permissions import Permissions
-from tests.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import Callable
