@@ -13,15 +13,17 @@ from rmpa.runtime.loop import yield_to_data, yielding_to_data
 from rmpa.trust.permissions import TrustReason, not_of_this_mesh
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
+    from rmpa.bridge.facts import BridgeFacts
     from rmpa.bridge.sessions import PeerSession
     from rmpa.core.identity import Identity
     from rmpa.core.timers import Yielder
+    from rmpa.discovery.discovery import Discovery
     from rmpa.discovery.endpoints import PeerView
     from rmpa.discovery.packet_filter import Stranger
+    from rmpa.mesh.io.mesh import Mesh
     from rmpa.mesh.peering import Peer
-    from rmpa.observe.snapshot_builder import AgentParts
     from rmpa.trust.permissions import TrustStatus
 
 # The state of a module that is heard, or refuses this one, because it is not of this mesh.
@@ -104,19 +106,29 @@ class Peers:
 
     Args:
         name: This module's.
-        parts: The parts of the agent.
+        endpoint: As of ``AgentParts``.
+        facts: What the bridge tells.
+        restart: As of ``AgentParts``.
     """
 
-    def __init__(self, name: str, parts: AgentParts) -> None:
+    def __init__(
+        self,
+        name: str,
+        endpoint: Callable[[], tuple[Identity, Mesh, Discovery] | None],
+        facts: BridgeFacts,
+        restart: Callable[[], str],
+    ) -> None:
         self._name = name
-        self._parts = parts
+        self._endpoint = endpoint
+        self._facts = facts
+        self._restart = restart
 
     def infos(self, trust: TrustStatus | None) -> tuple[tuple[PeerInfo, ...], tuple[PeerInfo, ...]]:
         """Every peer that is known, and the modules that are not of this mesh; both by name."""
-        if (endpoint := self._parts.endpoint()) is None:
+        if (endpoint := self._endpoint()) is None:
             return (), ()
         (identity, mesh, discovery), now = endpoint, time.monotonic()
-        links = {session.link.guid: session for session in self._parts.facts.bridge.sessions.linked()}
+        links = {session.link.guid: session for session in self._facts.bridge.sessions.linked()}
         roster = {view.run.identity.guid: view for view in discovery.peers(yielding_to_data)}
         yield_to_data()
         statuses = {status.identity.guid: status for status in mesh.peers()}
@@ -126,7 +138,7 @@ class Peers:
             for guid in yielding_to_data(known_guids)
         ]
         known, relayed = {info.instance: info for info in infos}, {}
-        for origin, via, topics in self._parts.facts.relayed():  # the membership may know of these modules too
+        for origin, via, topics in self._facts.relayed():  # the membership may know of these modules too
             blank = PeerInfo(name=origin.name, guid=origin.guid, instance=origin.instance, state="", since_ago=0.0)
             changes = {"state": "relayed", "via": via, "topics_in": topics}
             relayed[origin.instance] = msgspec.structs.replace(known.get(origin.instance, blank), **changes)
@@ -157,12 +169,12 @@ class Peers:
             state, since = "linked", session.link.since or now
         elif status is not None and status.foreign is not None:
             next_attempt = None
-            state, last_error, invite = judge_refusal(status.foreign, self._name, self._parts.restart())
+            state, last_error, invite = judge_refusal(status.foreign, self._name, self._restart())
         elif run is not None and view is not None and not view.present:
             state, since = "conflict", run.since
         elif status is not None and status.refused is not None and status.state == "refused":
             state = REVOKED if status.refused.code == TrustReason.REVOKED else "refused"
-        crossing = self._parts.facts.peer(session) if session is not None else {}
+        crossing = self._facts.peer(session) if session is not None else {}
         conflicts = (*(view.conflicts if view is not None else ()), *crossing.pop("conflicts", ()))
         return PeerInfo(
             name=identity.name,

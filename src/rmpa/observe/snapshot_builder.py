@@ -71,7 +71,7 @@ class SnapshotBuilder:
         self._cpu: float | None = None
         self._cpu_known = self._began = time.monotonic()
         self._started = time.time()
-        self._peers = Peers(settings.name, parts)
+        self._peers = Peers(settings.name, parts.endpoint, parts.facts, parts.restart)
 
     def reload(self, settings: Settings) -> None:
         """Use other settings from now on."""
