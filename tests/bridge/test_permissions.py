@@ -12,14 +12,17 @@ from rmpa.bridge import limits
 from rmpa.bridge.context import Names
 from rmpa.bridge.messages import (
     Advertise,
+    AdvertiseServices,
     Description,
     OpenRoute,
     OpenService,
     RouteClosed,
     ServiceClosed,
+    ServiceOffer,
     Source,
     TopicOffer,
 )
+from rmpa.bridge.peer_offers import DENIED
 from rmpa.bridge.policy import PermissionGate, Policy
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.topics.exports import LocalSource
@@ -198,6 +201,22 @@ def test_only_services_that_a_peer_may_call_are_offered_and_a_reload_ends_its_ca
     assert reasons == ["the permissions there do not let joystick call /stop"]
     here.service_exports.advertise()
     assert here.service_exports.local(1, "/go") == "/go"
+
+
+def test_only_services_that_a_peer_may_serve_are_shown_and_another_peer_may_take_the_place() -> None:
+    here = Secured(allow("arm", serve="/ik"))
+    for peer in (1, 2):
+        here.service_imports.advertised(peer, AdvertiseServices((ServiceOffer("/ik", "/n"),), (), full=True))
+    first, second = here.service_imports.get(1, "/ik"), here.service_imports.get(2, "/ik")
+    assert first is not None
+    assert second is not None
+    assert (first.shown, first.cause, second.shown) == (False, DENIED, True)
+    assert here.service_imports.hidden(first) == "no [[permission]] lets joystick serve /ik"
+    assert here.counters["permission.serve"] == 1
+    here.gate.reload(TrustSettings(rules=(allow("joystick", serve="/ik"),)))
+    for _ in here.service_imports.apply_rules(here.rules):
+        pass
+    assert (first.shown, second.shown) == (True, False)
 
 
 # --- whole maps with relays ---------------------------------------------------------------------------------------

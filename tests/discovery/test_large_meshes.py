@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
@@ -104,6 +105,15 @@ def test_many_newcomers_are_answered_by_one_multicast() -> None:
     sent = agent.run(MEMBERS / limits.ANSWERS_PER_SECOND + 0.7)
     assert not answers(sent)
     assert 1 <= len(multicasts(sent)) <= 2
+
+
+def test_heartbeats_come_every_five_seconds_in_a_mesh_of_any_size() -> None:
+    agent = Agent()
+    agent.run(1.0)
+    agent.meet(300, linked=True)
+    beats = [b for b in multicasts(agent.run(60.0)) if b.kind is BeaconKind.HEARTBEAT]
+    assert 12 <= len(beats) <= 14
+    assert {b.lease_ms for b in beats} == {1000 * core_limits.PEER_LEASE}
 
 
 def test_forged_peers_never_displace_one_that_was_linked(monkeypatch: pytest.MonkeyPatch) -> None:

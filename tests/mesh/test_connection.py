@@ -34,17 +34,6 @@ def test_handshake_control_data_and_bye_in_pieces(time: Time, chunk: int) -> Non
     assert dialler.last() == ("closed", "shutting down")
 
 
-def test_every_split_of_the_handshake_in_two_is_the_same(time: Time) -> None:
-    whole = Side(DIALLER, LOW, time).take_output()
-    for cut in range(1, len(whole)):
-        acceptor = Side(ACCEPTOR, HIGH, time)
-        consumed, wanted = acceptor.receive(memoryview(whole[:cut]), time.now)
-        assert consumed == 0
-        assert wanted == (len(whole) if cut >= 24 else 0)
-        assert acceptor.receive(memoryview(whole), time.now) == (len(whole), 0)
-        assert acceptor.events[0][0] == "hello"
-
-
 def test_a_peer_that_says_much_at_once_leaves_others_their_turn(acceptor: Side, dialler: Side, time: Time) -> None:
     said = [b'{"op":"x","n":%d}' % number for number in range(2 * limits.FRAMES_AT_ONCE + 1)]
     wire = memoryview(b"".join(map(dialler.pack_control, said)))
@@ -132,23 +121,6 @@ def test_garbage_on_the_port(time: Time, header: bytes) -> None:
     acceptor = Side(ACCEPTOR, HIGH, time)
     with pytest.raises(RemoteProtocolError):
         acceptor.receive(memoryview(header), time.now)
-
-
-def test_keepalive_holds_an_idle_link(dialler: Side, acceptor: Side, time: Time) -> None:
-    pings = 0
-    while time.now < 200.0:
-        due = min(t for s in (dialler, acceptor) if (t := s.next_timer()) is not None)
-        time.now = due
-        for mine in (dialler, acceptor):
-            mine.handle_timer(time.now)
-            pings += bool(mine.output)
-        exchange(dialler, acceptor, time)
-    assert dialler.state is ConnectionState.UP
-    assert acceptor.state is ConnectionState.UP
-    assert pings < 100 * 5.5  # one side pings at 4 Hz, the other's pongs keep it, and it pings once a second
-    estimate = dialler.clock.estimate(time.now)
-    assert estimate is not None
-    assert abs(estimate[0]) <= estimate[1]
 
 
 @pytest.mark.parametrize("first", ["timer", "bytes"])

@@ -396,13 +396,6 @@ def test_forged_peers_do_not_starve_a_waiting_one() -> None:
     assert network.linked() == ["high"]
 
 
-def test_many_real_peers_at_once_are_not_held_up() -> None:
-    crowd = [stranger(number) for number in range(255)]
-    network = Network(*crowd)
-    network.find(*crowd)
-    assert (len(network.linked()), network.now) == (255, 0.0)
-
-
 def test_a_stranger_that_leaves_the_line_is_not_dialled() -> None:
     peering = of(LOW)
     crowd = [stranger(number) for number in range(limits.DIAL_STRANGERS_BURST + 2)]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.discovery.membership import PeerEvent
-    from rmpa.mesh.frames import FrameKind, Lane
+    from rmpa.mesh.frames import Lane
     from rmpa.mesh.io.link import PeerLink
     from tests.simulation.network import Address, World
 
@@ -77,10 +77,7 @@ class MeshPeer(RosterPeer):
             LinkHandlers(
                 ours(self.link_up),
                 ours(self.link_down),
-                ours(self.control),
-                ours(self.mark),
-                ours(self.clock_known),
-                ours(self.lane_lost),
+                *[lambda *_: None] * 4,  # nothing but links is looked at
             ),
             clock=SimClock(self.world),
             rng=rng.random,
@@ -144,18 +141,6 @@ class MeshPeer(RosterPeer):
         self.note(f"= link {link.id} down {link.identity}: {reason}")
         self.roster.link_down(link.guid, self.world.now, link.identity.instance)
         self.flush()
-
-    def control(self, link: PeerLink, payload: bytes) -> None:
-        """A control frame; nothing here."""
-
-    def mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
-        """An acknowledgement or the answer to a fence; nothing here."""
-
-    def clock_known(self, link: PeerLink) -> None:
-        """The peer's clock is known better; nothing here."""
-
-    def lane_lost(self, link: PeerLink) -> None:
-        """The bulk lane fell; nothing here."""
 
     # --- events of discovery --------------------------------------------------------------------------------
 

@@ -36,11 +36,9 @@ class MeshScenario(Scenario):
 
     kind = "mesh"
 
-    def __init__(
-        self, seed: int, count: int, *, keep: bool = False, calm: bool = False, make_peer: type[MeshPeer] = MeshPeer
-    ) -> None:
+    def __init__(self, seed: int, count: int, *, keep: bool = False, calm: bool = False) -> None:
         self.calm = calm
-        super().__init__(seed, count, make_peer, keep=keep)
+        super().__init__(seed, count, MeshPeer, keep=keep)
 
     def prepare(self) -> None:
         """A firewall in one of four networks."""

@@ -8,23 +8,25 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import random
 from functools import partial
-from typing import TYPE_CHECKING, Final, Self, cast
+from typing import TYPE_CHECKING, Final, cast
 
 from rmpa.bridge.bridge import Bridge
 from rmpa.config.settings import Settings
 from rmpa.core.contract import ContractRule, Reliability
 from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits as mesh_limits
-from tests.bridge.io.links import LinkEnd
-from tests.bridge.io.nodes import Core, Listener, Speaker, stages
-from tests.bridge.io.two_bridges import Side, made_up
+from tests.bridge.io.nodes import Core
+from tests.bridge.io.two_bridges import Side, World, made_up
 from tests.bridge.io.virtual import VirtualLoop, run
 
 if TYPE_CHECKING:
-    from rmpa.mesh.io.link import PeerLink
+    import random
+    from collections.abc import Iterable, Sequence
+
     from rmpa.ros.core.embedded import RosCore
+    from tests.bridge.io.links import LinkEnd
+    from tests.bridge.io.nodes import Listener, Speaker
 
 PERIOD: Final = 0.02
 SURE: Final = ContractRule(("/sure", "/map"), (), {"reliability": Reliability.RELIABLE, "depth": 5000})
@@ -54,7 +56,7 @@ class Module(Side):
         self.identity = Identity(guid, self.identity.instance, self.name)
 
 
-class Paths:
+class Paths(World):
     """Two modules with relays between them.
 
     Args:
@@ -63,47 +65,18 @@ class Paths:
     """
 
     def __init__(self, seed: int, relays: int) -> None:
-        self.rng = random.Random(seed)
-        count = relays + 2
-        self.modules = [Module(n, self.rng, relays=1 < n < count) for n in range(1, count + 1)]
+        self._count = relays + 2
+        super().__init__(seed)
         self.cables = list(itertools.combinations(self.modules, 2))
         self.ends: dict[tuple[Module, Module], tuple[LinkEnd, LinkEnd]] = {}
-        self.speakers: dict[int, Speaker] = {}
-        self._noticing: set[asyncio.TimerHandle] = set()
 
-    async def __aenter__(self) -> Self:
-        stages.append(self)
-        for module in self.modules:
-            await module.bridge.start()
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        for module in self.modules:
-            await module.bridge.close()
-        stages.pop()
-
-    def speaker_at(self, uri: str) -> Speaker | None:
-        """Who has this address."""
-        return next((one for one in self.speakers.values() if one.uri == uri), None)
+    def make_sides(self, _rules: Iterable[ContractRule]) -> Sequence[Side]:
+        self.modules = [Module(n, self.rng, relays=1 < n < self._count) for n in range(1, self._count + 1)]
+        return self.modules
 
     def keeps(self, _speaker: int) -> bool:
         """No message may come again."""
         return False
-
-    def speak(self, topic: str, *, latching: bool = False) -> Speaker:
-        """A node of the first module publishes."""
-        side, number = self.modules[0], len(self.speakers) + 1
-        speaker = Speaker(side, number, topic, f"/n{number}", latching, f"http://speaker-{number}/")
-        self.speakers[number] = side.speakers[topic, speaker.node] = speaker
-        side.core.call("registerPublisher", speaker.node, topic, "a/B", speaker.uri)
-        return speaker
-
-    def listen(self, topic: str) -> Listener:
-        """A node of the last module listens."""
-        listener = Listener(self.modules[-1], topic)
-        self.modules[-1].listeners.append(listener)
-        listener.connect()
-        return listener
 
     # --- cables ---------------------------------------------------------------------------------------------
 
@@ -115,14 +88,7 @@ class Paths:
         """A new link stands; a side that has not noticed the end of the last one does so now."""
         for end in self.ends.get(cable, ()):
             end.end(silent=True)
-        a, b = cable
-        one, other = self.ends[cable] = LinkEnd(a, b), LinkEnd(b, a)
-        one.far, other.far = other, one
-        for end in (one, other):
-            for lane in ("express", "bulk"):
-                end.attach(lane)
-        for end in self.rng.sample((one, other), 2):
-            end.side.bridge.sessions.link_up(cast("PeerLink", end))
+        self.ends[cable] = self.connect(*cable)
 
     def pull(self, cable: tuple[Module, Module]) -> None:
         """Nothing arrives any more; each side notices it by its lease."""
@@ -132,7 +98,7 @@ class Paths:
             within = mesh_limits.EXPRESS_LEASE * self.rng.uniform(0.7, 1.1)
             asyncio.get_running_loop().call_later(within, partial(end.end, silent=True))
 
-    def leave(self, module: Module) -> None:
+    def say_bye(self, module: Module) -> None:
         """An agent says bye on all its links."""
         for cable in [cable for cable in self.cables if module in cable and self.plugged(cable)]:
             for end in self.rng.sample(self.ends[cable], 2):
@@ -150,7 +116,7 @@ class Paths:
         cable = self.rng.choice(self.cables)
         match self.rng.randrange(8):
             case 0:
-                self.leave(self.rng.choice(self.modules[1:-1]))
+                self.say_bye(self.rng.choice(self.modules[1:-1]))
             case 1:
                 self.move(self.rng.choice(self.modules))
             case _ if self.plugged(cable):
@@ -158,31 +124,26 @@ class Paths:
             case _:
                 self.plug(cable)
 
-    def carry(self) -> None:
+    def _carry_all(self) -> None:
         """What is under way arrives, on each wire a little or all."""
         ends = [end for pair in self.ends.values() for end in pair if not end.gone]
         for end in self.rng.sample(ends, len(ends)):
             for wire in end.wires.values():
                 wire.carry(self.rng.choice([100, 1000, 1 << 20]))
 
-    async def rest(self, seconds: float) -> None:
-        """Let time go on."""
-        for _ in range(round(seconds / PERIOD)):
-            self.carry()
-            await asyncio.sleep(PERIOD)
-
 
 async def _play(paths: Paths, seconds: float) -> None:
-    sure, chart = paths.speak("/sure"), paths.speak("/map", latching=True)
-    heard, charted = paths.listen("/sure"), paths.listen("/map")
+    here, there = paths.modules[0], paths.modules[-1]
+    sure, chart = paths.speak(here, "/sure", "/n1"), paths.speak(here, "/map", "/n2", latching=True)
+    heard, charted = paths.listen(there, "/sure"), paths.listen(there, "/map")
     chart.say(10)
     for cable in paths.cables:
         paths.plug(cable)
-    await paths.rest(1.0)
+    await paths.rest(1.0, step=PERIOD)
     until, pause = 0.0, 0.0
     while until < seconds:
         sure.say(10)
-        await paths.rest(PERIOD)
+        await paths.rest(PERIOD, step=PERIOD)
         until, pause = until + PERIOD, pause - PERIOD
         if pause <= 0:
             paths.disturb()
@@ -190,10 +151,10 @@ async def _play(paths: Paths, seconds: float) -> None:
     for cable in paths.cables:
         if not paths.plugged(cable):
             paths.plug(cable)
-    await paths.rest(5.0)
+    await paths.rest(5.0, step=PERIOD)
     for _ in range(10):
         sure.say(10)
-        await paths.rest(1.0)
+        await paths.rest(1.0, step=PERIOD)
     check(paths, sure, heard, chart, charted)
 
 

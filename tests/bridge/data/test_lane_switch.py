@@ -21,14 +21,6 @@ ROW = limits.EXPRESS_AGAIN_MESSAGES
 REST = limits.EXPRESS_AGAIN_AFTER
 
 
-def on_bulk() -> LaneSwitch:
-    """A switch that a large message at 0 s has brought to the bulk lane."""
-    switch = LaneSwitch(Contract())
-    assert switch.judge(LARGE, 0.0)
-    assert switch.fenced(switch.fence())
-    return switch
-
-
 @pytest.mark.parametrize(
     ("priority", "large", "target"),
     [
@@ -44,32 +36,6 @@ def test_a_route_begins_behind_the_word_that_opens_it(priority: Priority, large:
     switch = LaneSwitch(Contract(priority=priority), large=large)
     assert (switch.lane, switch.target, switch.fencing) == (EXPRESS, target, False)
     assert switch.judge(0, 0.0) is (target is BULK)
-
-
-@pytest.mark.parametrize("priority", [Priority.HIGH, Priority.LOW])
-def test_priority_outweighs_message_size(priority: Priority) -> None:
-    switch = LaneSwitch(Contract(priority=priority))
-    if priority is Priority.LOW:
-        assert switch.fenced(switch.fence())
-    for now in range(10 * ROW):
-        assert not switch.judge(LARGE if now == 3 else 0, float(now))
-    assert switch.lane is (EXPRESS if priority is Priority.HIGH else BULK)
-
-
-def test_bulk_loss_answers_only_a_bulk_fence() -> None:
-    there = LaneSwitch(Contract(), large=True)
-    assert not there.lane_lost()
-    number = there.fence()
-    assert not there.lane_lost(), "what is on the express lane still comes"
-    assert there.fencing
-    assert there.fenced(number)
-    assert not there.lane_lost(), "nothing was waited for"
-    back = on_bulk()
-    assert [back.judge(SMALL, REST) for _ in range(ROW)][-1]
-    number = back.fence()
-    assert back.lane_lost()
-    assert (back.lane, back.fencing) == (EXPRESS, False)
-    assert not back.fenced(number), "an answer that came too late"
 
 
 @settings(deadline=None)

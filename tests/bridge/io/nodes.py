@@ -11,7 +11,7 @@ import itertools
 from collections import defaultdict, deque
 from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Final, cast
 
 from rmpa.core import limits as core_limits
 from rmpa.core.outbox import QueuedMessage
@@ -19,45 +19,16 @@ from rmpa.ros import limits as ros_limits
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 
 if TYPE_CHECKING:
-    import random
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from rmpa.ros.core.liveness import Unreachable
     from rmpa.ros.node.publication import Publication
+    from tests.bridge.io.two_bridges import Side, World
 
 MD5: Final = "5a9ea5f83505693b71e785041e67a8bb"
 
 
-class Stage(Protocol):
-    """What the nodes know of the world that they are in."""
-
-    rng: random.Random
-
-    def speaker_at(self, uri: str) -> Speaker | None:
-        """Who has this address."""
-        ...
-
-    def keeps(self, speaker: int) -> bool:
-        """Whether messages of a speaker may come again over a new route."""
-        ...
-
-
-class Place(Protocol):
-    """What they know of their own side."""
-
-    name: str
-    listeners: list[Listener]
-
-    def named(self, topic: str) -> None:
-        """The master has named a topic's publishers."""
-        ...
-
-    def publications(self, topic: str) -> Iterable[Publication]:
-        """What local nodes can connect to."""
-        ...
-
-
-stages: Final[list[Stage]] = []
+stages: Final[list[World]] = []
 """The world that runs is the last one."""
 
 
@@ -81,7 +52,7 @@ class Core:
 
     node_host = node_address = "127.0.0.1"
 
-    def __init__(self, side: Place) -> None:
+    def __init__(self, side: Side) -> None:
         self.uri = f"http://core-{side.name}/"
         self._side = side
         self._topics: dict[str, dict[str, str]] = {}
@@ -191,7 +162,7 @@ class Speaker:
         greeting: How long that is.
     """
 
-    side: Place
+    side: Side
     number: int
     topic: str
     node: str
@@ -384,7 +355,7 @@ class Ear:
 class Listener:
     """A local node that subscribes to one topic; it connects to every publication that the master names."""
 
-    side: Place
+    side: Side
     topic: str
     ears: dict[Publication, Ear] = field(default_factory=dict)
     got: defaultdict[int, list[tuple[Ear, int]]] = field(default_factory=lambda: defaultdict(list))

@@ -19,7 +19,7 @@ from tests.bridge.io.links import LinkEnd
 from tests.bridge.io.nodes import Core, Listener, Node, PublisherConnection, Speaker, stages
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from rmpa.bridge.sessions import PeerSession
     from rmpa.core.contract import ContractRule
@@ -112,13 +112,32 @@ class World:
 
     def __init__(self, seed: int, rules: Iterable[ContractRule] = (), *, clocks: bool = False) -> None:
         self.rng = random.Random(seed)
-        self.sides = (Side("a", 1, rules, self.rng), Side("b", 2, rules, self.rng))
+        self.sides: Sequence[Side] = self.make_sides(rules)
         self.clocks = clocks
         self.speakers: dict[int, Speaker] = {}
         self.kept: set[str] = set()
         """Topics whose messages may come again, because some contract keeps them."""
         self._ends: tuple[LinkEnd, ...] = ()
         self._bulk_lost: set[LinkEnd] = set()
+
+    def make_sides(self, rules: Iterable[ContractRule]) -> Sequence[Side]:
+        """The modules."""
+        return Side("a", 1, rules, self.rng), Side("b", 2, rules, self.rng)
+
+    def connect(self, a: Side, b: Side, *, clocks: bool = False) -> tuple[LinkEnd, LinkEnd]:
+        """The ends of a new link, which both sides take."""
+        one, other = LinkEnd(a, b), LinkEnd(b, a)
+        one.far, other.far = other, one
+        for end in (one, other):
+            end.attach("express")
+            end.attach("bulk")
+            if clocks:
+                end.clock_offset, end.clock_error = 0.0, 0.001
+            end.side.link = end
+        for end in self.rng.sample((one, other), 2):
+            end.side.bridge.sessions.link_up(cast("PeerLink", end))
+            end.side.bridge.sessions.clock(cast("PeerLink", end))
+        return one, other
 
     async def __aenter__(self) -> Self:
         stages.append(self)
@@ -152,20 +171,8 @@ class World:
         for side in self.sides:
             if side.link is not None:
                 side.link.end(silent=True)
-        a, b = self.sides
-        one, other = LinkEnd(a, b), LinkEnd(b, a)
-        one.far, other.far = other, one
-        self._ends = (one, other)
         self._bulk_lost.clear()
-        for end in self._ends:
-            end.attach("express")
-            end.attach("bulk")
-            if self.clocks:
-                end.clock_offset, end.clock_error = 0.0, 0.001
-            end.side.link = end
-        for end in self.rng.sample(self._ends, 2):
-            end.side.bridge.sessions.link_up(cast("PeerLink", end))
-            end.side.bridge.sessions.clock(cast("PeerLink", end))
+        self._ends = self.connect(*self.sides, clocks=self.clocks)
 
     def cut(self) -> None:
         """The cable is out: nothing arrives any more; nobody has noticed yet."""

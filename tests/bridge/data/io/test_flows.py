@@ -19,7 +19,6 @@ from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.core.statistics import Counters
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import FrameKind
-from rmpa.mesh.reliable import ACK_DELAY
 from rmpa.ros import limits as ros_limits
 from rmpa.runtime import limits as runtime_limits
 from tests.bridge.io.doubles import Clock, Link, Outlet, add, running
@@ -361,36 +360,6 @@ def test_a_new_route_brings_nothing_again(kept: str, sent: str, new: str, contra
 
 
 # --- in: reliable ---------------------------------------------------------------------------------------------
-
-
-def test_acknowledged_are_many_at_once_or_a_few_soon(clock: Clock) -> None:
-    inlet = Inlet(RELIABLE)
-    inlet.begin(1, 1)
-    for sequence in range(1, mesh_limits.ACK_MESSAGES):
-        inlet.message(sequence)
-    assert inlet.acks == []
-    inlet.message(mesh_limits.ACK_MESSAGES)
-    assert inlet.acks == [mesh_limits.ACK_MESSAGES], "a full batch"
-    assert clock.due == []
-    inlet.message(mesh_limits.ACK_MESSAGES + 1)
-    clock.advance(ACK_DELAY / 2)
-    inlet.message(mesh_limits.ACK_MESSAGES + 2)
-    assert len(inlet.acks) == 1
-    clock.advance(ACK_DELAY / 2)
-    assert inlet.acks[1:] == [mesh_limits.ACK_MESSAGES + 2]
-    clock.advance(1.0)
-    assert len(inlet.acks) == 2, "once"
-
-
-def test_a_few_large_ones_are_acknowledged_at_once(clock: Clock) -> None:
-    inlet = Inlet(RELIABLE)
-    inlet.begin(1, 1)
-    size = mesh_limits.ACK_BYTES // 2
-    inlet.parts(1, bytes(size), 50)
-    assert inlet.acks == []
-    inlet.parts(2, bytes(size), 50)
-    assert inlet.acks == [2]
-    assert clock.due == []
 
 
 def test_overflow_is_the_exact_gap_on_a_new_link(clock: Clock) -> None:

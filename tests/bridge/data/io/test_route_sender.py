@@ -165,28 +165,6 @@ def test_what_was_sent_long_ago_is_not_kept() -> None:
 BIG = 300_000
 
 
-def test_parts_go_as_they_come_once_the_lane_is_right() -> None:
-    link, sender = fresh(best_effort)
-    assert not sender.begin(11, BIG), "the first one is what changes the lane: it is wanted whole"
-    sender.message(11, bytes(BIG))
-    assert not sender.begin(12, BIG), "and so is what comes before the fence is answered"
-    sender.message(12, bytes(BIG))
-    answer(link, sender)
-    opened = sender.begin(13, BIG)
-    assert opened is not None
-    lane, message = opened
-    link.drops.extend([1, 2])
-    assert lane.extend(message, memoryview(bytes(BIG - 1))) == 1
-    assert lane.extend(message, memoryview(b"z")) == 2
-    assert [(lane, number, len(payload)) for lane, number, payload in link.sent] == [
-        ("bulk", 1, BIG),
-        ("bulk", 2, BIG),
-        ("bulk", 3, BIG),
-    ]
-    assert link.stamps == [11, 12, 13]
-    assert link.sent[-1][2][-1:] == b"z"
-
-
 # --- down-sampling --------------------------------------------------------------------------------------------
 
 
