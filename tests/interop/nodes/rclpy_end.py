@@ -125,6 +125,7 @@ class End:
 
         def take(message: Any) -> None:
             data = getattr(message, "data", ())
+            data = data if hasattr(data, "__len__") else ()
             text = str(message) if len(data) < 1000 else ""
             say("heard", topic=topic, data=text, size=len(data), number=next(count))
             time.sleep(delay)

@@ -71,9 +71,9 @@ _RUN: Final = (
 )
 
 
-def shown_in_ros2(name: str, node: str) -> str:
+def shown_in_ros2(own: Ros2Endpoint) -> str:
     """What a problem of an endpoint in ROS 2 is kept under, apart from those of its source."""
-    return f"{name} of {node} in ROS 2"
+    return f"{own.name} of {own.node.name} in ROS 2 ({own.type})"
 
 
 def _without_hash(key: str) -> str:
@@ -220,6 +220,8 @@ class RclpySession:
         self._numbers = itertools.count(1)
         self._declared: dict[int, Ros2Endpoint] = {}
         self._keys: dict[int, str] = {}
+        # Those that the child could not make.
+        self._unmade: set[int] = set()
         # The subscriptions of ROS 2 by their keys without the hash.
         self._wanted: Counter[str] = Counter()
         self._by_gid: dict[bytes, int] = {}
@@ -276,6 +278,7 @@ class RclpySession:
             await self._kill()
             raise self._no_rclpy(f"no answer within {_START_MAX:g} s") from None
         self.problem = ""
+        self._unmade.clear()
         for number, endpoint in self._declared.items():
             self._create(number, endpoint)
 
@@ -373,11 +376,24 @@ class RclpySession:
             if self._ready is not None and not self._ready.done():
                 self._ready.set_exception(self._no_rclpy(str(told.get("text"))))
             return
-        what = shown_in_ros2(endpoint.name, endpoint.node.name)
+        what = shown_in_ros2(endpoint)
         if policy := told.get("policy"):
             self.say(what, f"its QoS does not fit {told['count']} endpoints of ROS 2: {policy}")
+            return
+        self._unmade.add(number)
+        made = (self._declared[each] for each in self._alike(endpoint) if each not in self._unmade)
+        other = next((each.type for each in made if each.type != endpoint.type), "")
+        if other:
+            text = (
+                f"{other} crosses, and {endpoint.type} does not: rclpy has one type of a topic at a time; rename one"
+            )
+            self.say(what, text)
         else:
             self.say(what, f"ROS 2 does not have it: {told.get('text')}")
+
+    def _alike(self, endpoint: Ros2Endpoint) -> list[int]:
+        """What is declared under the name of an endpoint."""
+        return [number for number, each in self._declared.items() if each.name == endpoint.name]
 
     def token(self, key: str) -> _Closer:
         """Have an endpoint made; a node is made with its first one."""
@@ -392,8 +408,13 @@ class RclpySession:
         def end() -> None:
             del self._declared[number], self._keys[number], self._by_gid[gid]
             self.outbox.discard(number)
-            self.say(shown_in_ros2(endpoint.name, endpoint.node.name), "")
+            self.say(shown_in_ros2(endpoint), "")
             self.write("-", number, b"")
+            self._unmade.discard(number)
+            for each in self._unmade.intersection(self._alike(endpoint)):  # the name may be free for its type now
+                self._unmade.discard(each)
+                self.say(shown_in_ros2(self._declared[each]), "")
+                self._create(each, self._declared[each])
 
         return _Closer(end)
 
@@ -531,6 +552,11 @@ class RclpySession:
     def _graph(self, change: dict[str, Any]) -> None:
         for gid in change["removed"]:
             self._remove(gid)
+        gone = change["removed"] and self._clients.keys() - {each.key() for each in self._foreign.values()}
+        for key in gone or ():
+            client = self._clients.pop(key)
+            del self._declared[client]
+            self.write("-", client, b"")
         rows = change["added"]
         prefixes = {row["node"]: row["gid"][:_PREFIX] for row in rows if row["kind"] != EntityKind.SERVICE}
         own = OWN_NAMESPACE + self._name

@@ -261,7 +261,9 @@ def _way(stages: tuple[Check, ...], name: str, node: str, peer: str, to: str) ->
 
 def _out_stages(export: ExportedTopic, dialect: Ros2Dialect, problems: Mapping[str, str]) -> Iterator[Check]:
     yield Check("rule", OK, dialect.why)
-    if problem := export.problem or problems.get(shown_in_ros2(export.source.here, export.source.proxy)):
+    if problem := export.problem or (
+        problems.get(shown_in_ros2(dialect.endpoint.endpoint)) if dialect.endpoint is not None else ""
+    ):
         yield Check("type", FAIL, problem)
     if dialect.endpoint is None:
         text = f"ROS 2 has no {export.source.type}; its publisher is being asked for the definition"
@@ -293,7 +295,9 @@ def _out_stages(export: ExportedTopic, dialect: Ros2Dialect, problems: Mapping[s
 def _in_stages(imported: Ros2Import, publisher: Ros2Publisher) -> Iterator[Check]:
     here, there = imported.decision.name, imported.first
     yield Check("rule", OK, imported.decision.why)
-    if problem := imported.problem or publisher.topic.problem:
+    own = imported.declared
+    in_ros2 = imported.part.context.problems.get(shown_in_ros2(own), "") if own is not None else ""
+    if problem := imported.problem or publisher.topic.problem or in_ros2:
         yield Check("type", FAIL, problem)
     kept = ", transient local" if publisher.latched else ""
     yield Check("type", OK, f"{there.type} of ROS 2 is {imported.ros1_type} here{kept}")

@@ -235,6 +235,11 @@ class Ros2Import:
         self._lingering: asyncio.TimerHandle | None = None
 
     @property
+    def declared(self) -> Ros2Endpoint | None:
+        """The gateway's subscription in ROS 2; ``None``: there is none."""
+        return self._subscribed[1].endpoint if self._subscribed is not None else None
+
+    @property
     def idle(self) -> bool:
         """Whether it has no publishers, and none came or went a moment ago: its publisher does not restart."""
         return not self.publishers and self._lingering is None
