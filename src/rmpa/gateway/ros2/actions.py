@@ -16,7 +16,7 @@ from rmpa.gateway.ros2.graph import SITE, valid_name
 from rmpa.gateway.ros2.pairs import derive_ros1
 from rmpa.gateway.ros2.services import SERVICE_NEEDS
 from rmpa.gateway.rules import ForeignSource, SourceKind
-from rmpa.gateway.zenoh.threads import ZenohQos, first_answer
+from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.ros.types.definitions import Specification, known_specifications
 from rmpa.ros.types.find import find_message_type
 from rmpa.ros.types.messages import MessageType
@@ -142,10 +142,6 @@ class JoinedAction(Goals):
                 self._context.say(f"{self.here} (messages)", str(error))
             self._timer.arm()
 
-    def _attachment(self, gid: bytes) -> bytes:
-        self._sequence += 1
-        return Ros2Attachment(self._sequence, self._clock.wall_ns(), gid).serialize()
-
 
 async def find_types(*names: str) -> list[MessageType]:
     """Find types of ROS 1; raises ``RmpaError`` if a definition is missing."""
@@ -183,7 +179,8 @@ class OfferedAction(JoinedAction, GoalsToRos1):
     def tell_ros2(self, topic: str, message: bytes) -> None:
         """Publish a message for ROS 2."""
         publisher, gid = self._publishers[topic]
-        publisher.put(message, self._attachment(gid))
+        self._sequence += 1
+        publisher.put(message, Ros2Attachment(self._sequence, self._clock.wall_ns(), gid).serialize())
 
     def answer(self, query: Query, response: bytes) -> None:
         """Answer a request; its attachment is repeated, as rmw_zenoh does."""
@@ -366,14 +363,8 @@ class ShownAction(JoinedAction, GoalsToRos2):
             self._callers[service] = self._declare(self._context.nodes.own_name, EntityKind.CLIENT, service)
         caller = self._callers[service]
         try:
-            answers = await self._context.session.get(
-                caller.endpoint.key(),
-                request,
-                self._attachment(caller.gid),
-                timeout=_ROS2_GOAL_TIMEOUT if service == "get_result" else limits.ROS2_CALL_TIMEOUT,
-                all_complete=True,
-            )
-            answer = first_answer(answers)
+            within = _ROS2_GOAL_TIMEOUT if service == "get_result" else limits.ROS2_CALL_TIMEOUT
+            answer = await self._context.nodes.call(caller.endpoint.key(), caller.gid, request, within)
             if answer is None or not answer.ok:
                 text = answer.text if answer is not None else "it is gone"
                 raise RemoteProtocolError(f"the action server of ROS 2 gave no answer to {service}: {text}")

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.link import Declared, Ros2Link
     from rmpa.gateway.ros2.types import Ros2Types
     from rmpa.gateway.zenoh.threads import ZenohReply
+    from rmpa.ros.wire.tcpros import Buffer
 
 # The name of ROS 2 among the sites, in rules and in the names of proxies; it is ``{module}`` too.
 SITE: Final = ROS2
@@ -262,6 +263,7 @@ class OwnRos2Nodes:
         self._domain = domain
         self._gid_bytes = gid_bytes
         self._numbers = itertools.count()
+        self._calls = itertools.count(1)
         self._nodes: dict[str, tuple[Ros2Node, Declared]] = {}
         self._uses: Counter[str] = Counter()
 
@@ -288,6 +290,11 @@ class OwnRos2Nodes:
         self.gids.add(gid)
         return OwnEndpoint(self, endpoint, gid)
 
+    async def call(self, key: str, gid: bytes, request: Buffer, within: float) -> ZenohReply | None:
+        """Call a service of ROS 2 as the client with a GID; ``None``: it gave no answer in ``within`` seconds."""
+        attachment = Ros2Attachment(next(self._calls), time.time_ns(), gid).serialize()
+        return first_answer(await self.session.get(key, request, attachment, timeout=within, all_complete=True))
+
     def release(self, node: Ros2Node) -> None:
         """One endpoint of a node was taken back; the node's token goes with the last."""
         self._uses[node.name] -= 1
@@ -310,19 +317,16 @@ class Ros2TypeAsker:
     """Asks for types; at most ``limits.ROS2_ASKS_MAX`` nodes at one time.
 
     Args:
-        session: The Zenoh session.
         nodes: Our nodes in ROS 2's graph.
         ros2: ROS 2's graph.
         types: The types of ROS 2's distribution.
     """
 
-    def __init__(self, session: Ros2Link, nodes: OwnRos2Nodes, ros2: Ros2Graph, types: Ros2Types) -> None:
-        self._session = session
+    def __init__(self, nodes: OwnRos2Nodes, ros2: Ros2Graph, types: Ros2Types) -> None:
         self._nodes = nodes
         self._ros2 = ros2
         self._types = types
         self._appeared = asyncio.Event()
-        self._asked = 0
         self._asking = 0
 
     def appeared(self) -> None:
@@ -372,13 +376,8 @@ class Ros2TypeAsker:
 
     async def call(self, server: Ros2Endpoint, request: bytes) -> ZenohReply | None:
         """Call one of the services that each node has; ``None``: it has not answered in time."""
-        self._asked += 1
         gid = gid_of(f"{self._nodes.own_name}/{SERVICE}")
-        attachment = Ros2Attachment(self._asked, time.time_ns(), gid).serialize()
-        wait = limits.ROS2_SERVICE_WAIT
-        return first_answer(
-            await self._session.get(server.key(), request, attachment, timeout=wait, all_complete=True)
-        )
+        return await self._nodes.call(server.key(), gid, request, limits.ROS2_SERVICE_WAIT)
 
     async def _wait(self, name: str, kind: EntityKind, node: Ros2Node) -> Ros2Endpoint | None:
         """An endpoint of a node, once it is there; ``None`` if it does not appear."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -336,12 +337,16 @@ def make_ros2_neighbour(graph: AgentGraph, session: Ros2Link, settings: Settings
 
 
 def pythons(chosen: str, environ: Mapping[str, str]) -> list[str]:
-    """The Pythons that may be ROS 2's: the chosen one alone, else each ``python3`` of PATH, then the system's."""
+    """The Pythons that may be ROS 2's: the chosen one alone, else each ``python3`` of PATH, then the system's.
+
+    A gateway in isolated mode has a Python of its own (the bundle), which is not ROS 2's even if it could import it.
+    """
     if chosen:
         return [chosen]
     folders = [*environ.get("PATH", "").split(os.pathsep), "/usr/bin"]
     found = dict.fromkeys(Path(folder).resolve() / "python3" for folder in folders if folder.startswith("/"))
-    return [str(each) for each in found if os.access(each, os.X_OK)]
+    own = Path(sys.executable).resolve() if sys.flags.isolated else None
+    return [str(each) for each in found if os.access(each, os.X_OK) and each.resolve() != own]
 
 
 async def open_rclpy_session(settings: Settings) -> RclpySession:

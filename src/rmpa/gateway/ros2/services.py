@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 import logging
 import time
 from functools import partial
@@ -20,7 +19,6 @@ from rmpa.gateway.ros2.graph import SITE, OwnRos2Nodes, Ros2Graph, Ros2TypeAsker
 from rmpa.gateway.ros2.pairs import TypeMapping, derive_service
 from rmpa.gateway.ros2.types import WITHOUT_HASH, Ros2Types, TypePair
 from rmpa.gateway.rules import CrossingRules, ForeignSource, SourceKind
-from rmpa.gateway.zenoh.threads import first_answer
 from rmpa.ros.types.definitions import known_types
 from rmpa.ros.types.find import find_service_type
 from rmpa.runtime.tasks import OwnedTasks
@@ -181,7 +179,7 @@ class Ros2Context(OwnedTasks):
         size = _GID_BYTES_BEFORE if ros2.distribution in WITHOUT_HASH else GID_BYTES
         self.nodes: Final = OwnRos2Nodes(session, ros2.domain, graph.name, size)
         self.ros2: Final = Ros2Graph(ros2.domain, session.zid)
-        self.asker: Final = Ros2TypeAsker(session, self.nodes, self.ros2, self.types)
+        self.asker: Final = Ros2TypeAsker(self.nodes, self.ros2, self.types)
         self.problems: dict[str, str] = {}
 
     def ros1_name(self, name: str) -> str:
@@ -356,7 +354,6 @@ class ShownRos2Service:
         self._pair: ServicePair | None = None
         self._service: ProxiedService | None = None
         self._client: OwnEndpoint | None = None
-        self._numbers = itertools.count(1)
         self._calls = 0
         self._closed = False
         context.start(self._show(), f"show {here}")
@@ -403,15 +400,11 @@ class ShownRos2Service:
         if self._client is None:  # it appears in ROS 2's graph with its first call
             terms = server.name, server.type, server.type_hash, Ros2Qos()
             self._client = nodes.declare(nodes.own_name, EntityKind.CLIENT, *terms)
-        attachment = Ros2Attachment(next(self._numbers), time.time_ns(), self._client.gid).serialize()
         self._calls += 1
         try:
-            answers = await self._context.session.get(
-                server.key(), asked, attachment, timeout=limits.ROS2_CALL_TIMEOUT, all_complete=True
-            )
+            answer = await nodes.call(server.key(), self._client.gid, asked, limits.ROS2_CALL_TIMEOUT)
         finally:
             self._calls -= 1
-        answer = first_answer(answers)
         if answer is None:
             raise UnreachableError("server of ROS 2", server.name, "it ended, or gave no response")
         if not answer.ok:
