@@ -106,18 +106,18 @@ def test_under_each_name_a_message_arrives_once_and_never_comes_back(
         return there_all and all(f"begin2 {name} 1" in texts(listeners[here]) for name in names)
 
     eventually(linked, LONG, what="messages both ways", every=0.3)
-    for number in range(20):
+    for number in range(8):  # rospy drops what is beyond its queue of ten
         for name in names:
             talkers[name].say(f"one {name} {number}")
     for name in names:
         sends[name].do("publish", topic=name, text=f"two {name}", count=20, rate=100)
     for name in names:
-        node.process.wait_event("heard", LONG, where=lambda e, n=name: e["data"] == f"one {n} 19")  # type: ignore[misc]
+        node.process.wait_event("heard", LONG, where=lambda e, n=name: e["data"] == f"one {n} 7")  # type: ignore[misc]
         listeners[here].wait_event("text", LONG, where=lambda e, n=name: e["data"] == f"two {n} 20")  # type: ignore[misc]
     for name in names:  # what would come back is on its way before these
         talkers[name].say(f"end {name}")
         node.process.wait_event("heard", LONG, where=lambda e, n=name: e["data"] == f"end {n}")  # type: ignore[misc]
-    from1 = {name: [f"one {name} {number}" for number in range(20)] for name in names}
+    from1 = {name: [f"one {name} {number}" for number in range(8)] for name in names}
     from2 = [f"two {name} {number}" for name in names for number in range(1, 21)]
     for name in names:
         heard = [text for text in texts(node.process, name) if text.startswith("one ")]

@@ -37,9 +37,7 @@ _SOURCES: Final = Needs(
 _WAYS: Final = Needs(
     (Access.SUBSCRIBE, Access.CALL), "the topic or service, by its name here; what leaves is the asking module's own"
 )
-_PARAMETERS: Final = Needs(
-    (Access.CALL,), "the services of parameters of a node of ROS 2, such as `/node/get_parameters`"
-)
+_PARAMETERS: Final = Needs((Access.CALL,), "a service of parameters of ROS 2, such as `/node/get_parameters`")
 # The questions about other sites.
 QUESTIONS: Final = (REPORT, SITE_INFO, WHY, PARAM)
 
