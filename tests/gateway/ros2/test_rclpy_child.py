@@ -6,6 +6,7 @@ import ast
 import asyncio
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -44,15 +45,22 @@ def main():
         size, operation, number = HEAD.unpack(sock.recv(9, socket.MSG_WAITALL))
         return chr(operation), number, sock.recv(size - 5, socket.MSG_WAITALL) if size > 5 else b""
     assert read()[0] == "H"
-    say("H", 0, json.dumps({"protocol": 1, "distribution": "jazzy", "rmw": "stand-in", "prefix": "0" * 24}).encode())
+    say("H", 0, json.dumps({"protocol": 1, "distribution": "jazzy", "rmw": "stand-in", "prefix": "0" * 24,
+                         "environment": dict(os.environ)}).encode())
     row = {"gid": "f" * 32, "kind": "MS", "node": "/there", "name": "/x", "type": "std_msgs/msg/String"}
     row |= {"hash": "", "qos": {}}
     say("G", 0, json.dumps({"nodes": ["/there"], "added": [row], "removed": []}).encode())
-    made = set()
+    made = {}
     while True:
         operation, number, body = read()
         if operation == "+":
-            made.add(number)
+            asked = json.loads(body)
+            if any(name == asked["name"] and kind != asked["type"] for name, kind in made.values()):
+                say("!", number, b'{"text": "invalid allocator"}')
+            else:
+                made[number] = asked["name"], asked["type"]
+        elif operation == "-":
+            made.pop(number, None)
         elif operation == "M" and number in made:  # what is published comes back as if another node had sent it
             if body == b"die":
                 os._exit(1)
@@ -97,12 +105,22 @@ def test_the_python_is_the_chosen_one_or_each_of_the_path(tmp_path: Path) -> Non
     assert pythons("/opt/python", {"PATH": path}) == ["/opt/python"]
 
 
+def test_the_python_of_a_bundle_is_not_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It runs isolated, and may have the release of Python that ROS 2 has, with PYTHONPATH set for that."""
+    (tmp_path / "python3").symlink_to(sys.executable)
+    own = str(tmp_path / "python3")
+    assert own in pythons("", {"PATH": str(tmp_path)})
+    bundle = SimpleNamespace(executable=sys.executable, flags=SimpleNamespace(isolated=1))
+    monkeypatch.setattr("rmpa.gateway.ros2.ros2.sys", bundle)
+    assert own not in pythons("", {"PATH": str(tmp_path)})
+
+
 @pytest.fixture
 async def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[RclpySession]:
     (tmp_path / "half").mkdir()
     (tmp_path / "half" / "child.py").write_text(STAND_IN)
     monkeypatch.setattr("rmpa.gateway.ros2.rclpy_session._HALF", tmp_path / "half")
-    session = RclpySession(sys.executable, 0, "gate", {})
+    session = RclpySession(sys.executable, 0, "gate", {"PYTHONPATH": "/ros/2", "LD_LIBRARY_PATH": "/ros/lib"})
     await session.start()
     yield session
     await session.close()
@@ -114,9 +132,32 @@ async def until(found: Callable[[], object]) -> None:
             await asyncio.sleep(0.01)
 
 
-def endpoint(session: RclpySession, kind: EntityKind, number: int) -> Ros2Endpoint:
+def endpoint(session: RclpySession, kind: EntityKind, number: int, base: str = "String") -> Ros2Endpoint:
     node = Ros2Node(0, session.zid, 1, "/rmpa/arm/node")
-    return Ros2Endpoint(node, number, kind, "/x", "std_msgs/msg/String", "RIHS01_1", Ros2Qos())
+    return Ros2Endpoint(node, number, kind, "/x", f"std_msgs/msg/{base}", "RIHS01_1", Ros2Qos())
+
+
+async def test_the_child_has_the_environment_that_was_sourced_and_nothing_of_the_gateway(
+    session: RclpySession,
+) -> None:
+    given = session.hello["environment"]
+    assert (given["PYTHONPATH"], given["LD_LIBRARY_PATH"]) == ("/ros/2", "/ros/lib")
+    assert given.keys() <= {"PYTHONPATH", "LD_LIBRARY_PATH", "LC_CTYPE"}
+
+
+async def test_a_second_type_of_a_topic_is_told_and_made_once_the_first_is_gone(session: RclpySession) -> None:
+    problems: dict[str, str] = {}
+    session.say = problems.__setitem__
+    first = session.token(endpoint(session, EntityKind.PUBLISHER, 2).token())
+    other = endpoint(session, EntityKind.SUBSCRIPTION, 3, "Int32").token()
+    session.token(other)
+    second = "/x of /rmpa/arm/node in ROS 2 (std_msgs/msg/Int32)"
+    await until(lambda: problems.get(second, "").startswith("std_msgs/msg/String crosses, and std_msgs/msg/Int32"))
+    first.close()
+    await until(lambda: problems[second] == "")
+    # What was asked before is done.
+    await session.get("", b"", Ros2Attachment(1, 0, gid_of(other)).serialize())
+    assert problems[second] == ""
 
 
 async def test_messages_calls_and_demand_and_all_of_it_again_after_a_death(session: RclpySession) -> None:

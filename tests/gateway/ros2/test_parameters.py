@@ -1,0 +1,123 @@
+"""Parameters of ROS 2's nodes: what is asked of a node, and what is made of its values."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from rmpa.core.errors import RmpaError
+from rmpa.gateway.ros2.format import EntityKind
+from rmpa.gateway.ros2.parameters import Ros2Parameters, _cast, _kind
+from rmpa.gateway.ros2.types import service_store
+from rmpa.gateway.rules import CrossingRules
+from rmpa.gateway.zenoh.threads import ZenohReply
+
+
+class Node:
+    """A node of ROS 2 with the parameters ``count`` and ``list``; it keeps what it was called with."""
+
+    def __init__(self, *services: str) -> None:
+        self.services = services
+        self.asked: list[Any] = []
+        self.nodes = {"/arm"}
+        self.reason = ""
+
+    def at(self, name: str, kind: EntityKind) -> Any:
+        return iter([name] if name.rpartition("/")[2] in self.services and kind is EntityKind.SERVICE else [])
+
+    async def call(self, server: str, request: bytes) -> ZenohReply:
+        store = service_store()
+        kind = "rcl_interfaces/srv/" + server.rpartition("/")[2].title().replace("_", "")
+        asked: Any = store.deserialize_cdr(request, f"{kind}_Request")
+        self.asked.append(asked)
+        types: Any = store.types
+        if "List" in kind:
+            made = types["rcl_interfaces/msg/ListParametersResult"](names=["list", "count"], prefixes=[])
+            answer = types[f"{kind}_Response"](result=made)
+        elif "Get" in kind:
+            answer = types[f"{kind}_Response"](values=[self.value(types, name) for name in asked.names])
+        else:
+            made = types["rcl_interfaces/msg/SetParametersResult"](successful=not self.reason, reason=self.reason)
+            answer = types[f"{kind}_Response"](result=made)
+        return ZenohReply("", bytes(store.serialize_cdr(answer, f"{kind}_Response")) + b"garbage", b"", ok=True)
+
+    @staticmethod
+    def value(types: Any, name: str) -> Any:
+        value, kind = {"count": (7, 2), "list": ([1.0, 2.0], 8)}.get(name, (None, 0))
+        every = ("bool", "integer", "double", "string", "byte_array", "bool_array", "integer_array", "double_array")
+        fields = {f"{each}_value": _cast([], at) if at > 4 else _cast(0, at) for at, each in enumerate(every, 1)}
+        fields["string_array_value"] = []
+        if kind:
+            fields[f"{every[kind - 1]}_value"] = _cast(value, kind)
+        return types["rcl_interfaces/msg/ParameterValue"](type=kind, **fields)
+
+
+ALL = ("list_parameters", "get_parameters", "set_parameters_atomically")
+
+
+def parameters(node: Node) -> Ros2Parameters:
+    return Ros2Parameters(cast("Any", SimpleNamespace(rules=CrossingRules(), ros2=node, asker=node)))
+
+
+async def ask(node: Node, why: str = "", **args: str) -> Any:
+    text = await parameters(node).answer({"node": "/arm", **args}, lambda _: why)
+    return json.loads(text) if text else None
+
+
+async def test_names_values_and_all_of_them_are_read_whatever_follows_a_response() -> None:
+    node = Node(*ALL)
+    assert await ask(node) == ["count", "list"]
+    assert await ask(node, key="list") == [1.0, 2.0]
+    assert await ask(node, key="") == {"count": 7, "list": [1.0, 2.0]}
+    with pytest.raises(RmpaError, match="no parameter nothing"):
+        await ask(node, key="nothing")
+
+
+async def test_a_value_is_set_by_the_type_of_the_parameter() -> None:
+    node = Node(*ALL)
+    await ask(node, key="", text='{"list": [3, 4], "made": {"here": true}}')
+    names = {each.name: (each.value.type, each.value.bool_value) for each in node.asked[-1].parameters}
+    assert names == {"list": (8, False), "made.here": (1, True)}
+    node.reason = "it is read only"
+    with pytest.raises(RmpaError, match="read only"):
+        await ask(node, key="count", text="8")
+
+
+@pytest.mark.parametrize("text", ["[1, true]", '[{"a": 1}]', "not JSON", "[" * 100_000, str(2**70)])
+async def test_what_is_no_value_is_refused(text: str) -> None:
+    with pytest.raises(RmpaError):
+        await ask(Node(*ALL), key="count", text=text)
+
+
+async def test_a_program_that_may_not_call_and_a_node_without_parameters_are_told() -> None:
+    node = Node(*ALL)
+    with pytest.raises(RmpaError, match="you may not"):
+        await ask(node, "you may not", key="count")
+    assert not node.asked
+    with pytest.raises(RmpaError, match="without services of parameters"):
+        await ask(Node())
+    node = Node()
+    node.nodes.clear()
+    with pytest.raises(RmpaError, match="no node of ROS 2"):
+        await ask(node)
+
+
+@pytest.mark.parametrize(
+    ("value", "present", "kind"),
+    [
+        (None, 4, 0),
+        (1, 3, 3),
+        (1, 2, 2),
+        (True, 3, 1),
+        ([], 0, 9),
+        ([], 7, 7),
+        ([1], 5, 5),
+        ([1, 2.5], 0, 8),
+        (["a"], 0, 9),
+    ],
+)
+def test_the_type_of_a_value(value: Any, present: int, kind: int) -> None:
+    assert _kind(value, present) == kind
