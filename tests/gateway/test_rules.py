@@ -96,6 +96,12 @@ def test_what_comes_in_is_renamed_and_a_name_that_is_none_is_told() -> None:
     assert (decision.allowed, "'cloud/scan'" in decision.why) == (False, True)
 
 
+def test_a_rate_holds_for_what_comes_from_ros2_and_another_site_limits_its_own() -> None:
+    rules = CrossingRules((CrossingRule(rate=5.0, size=1000),))
+    assert (into(rules, "/scan", "ros2", "").rate, into(rules, "/scan", "ros2", "").size) == (5.0, 1000)
+    assert into(rules, "/scan").rate is None
+
+
 def test_the_gateways_policy_stands_above_the_rules_that_of_bridge_for_topics_and_of_services_for_services() -> None:
     policy = PolicySettings(deny=("/secret/**",), deny_types=("std_msgs/Bool",))
     own = BridgeContext.of(Settings(policy=policy, services=ServiceSettings(deny=("/stop",))))
