@@ -156,16 +156,10 @@ class Ros2Qos:
     def serialize(self) -> str:
         """The text in a liveliness token."""
         usual = Ros2Qos()
-        pairs = (
-            (self.reliability, usual.reliability),
-            (self.durability, usual.durability),
-            (self.history, usual.history),
-            (self.liveliness, usual.liveliness),
-        )
-        kinds = ("" if value is default else str(int(value)) for value, default in pairs)
+        kinds = (str(int(at)) if (at := getattr(self, name)) != getattr(usual, name) else "" for name, _ in _WORDS)
         reliability, durability, history, liveliness = kinds
-        times = f"{_duration(self.deadline)}:{_duration(self.lifespan)}:{liveliness},{_duration(self.lease)}"
-        return f"{reliability}:{durability}:{history},{self.depth}:{times}"
+        deadline, lifespan, lease = (_duration(getattr(self, name)) for name in _TIMES)
+        return f"{reliability}:{durability}:{history},{self.depth}:{deadline}:{lifespan}:{liveliness},{lease}"
 
     @classmethod
     def parse(cls, text: str) -> Ros2Qos:
