@@ -63,6 +63,9 @@ def test_parameters_are_listed_read_and_set(hall: Hall) -> None:
         assert node.ask("value", "value", name=key)["value"] == made
     assert param(hall, "set", "asked2", "/gains", "{p: 3, i: 4}")[0] == 0
     assert value(hall, "asked2", "/gains") == {"p": 3.0, "i": 4.0}
+    code, text = param(hall, "dump", "asked2")
+    assert code == 0, text
+    assert "gains.p: 3.0" in text
 
 
 def test_what_cannot_be_read_or_set_is_told(hall: Hall) -> None:

@@ -11,8 +11,10 @@ import pytest
 
 from rmpa.gateway.ros2.conversion import Conversion, ConversionError, NoConversion
 from rmpa.gateway.ros2.pairs import TypeMapping
-from rmpa.gateway.ros2.types import Ros2Types
+from rmpa.gateway.ros2.services import ServicePair
+from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.definitions import known_types
+from rmpa.ros.types.find import find_service_type
 from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
@@ -274,3 +276,11 @@ def test_an_empty_string_without_its_null_is_read_and_a_string_without_end_is_no
     assert conversion.to_ros1(b"\0\1\0\0" + bytes(4)) == bytes(4)
     with pytest.raises(ConversionError, match="no end"):
         conversion.to_ros1(b"\0\1\0\0" + b"\2\0\0\0ab\0\0")
+
+
+def test_a_response_may_have_garbage_behind_it_as_that_of_rclpy_has() -> None:
+    """rclpy's serializer takes too much room for empty sequences of numbers of 8 bytes."""
+    kind = find_service_type("std_srvs/SetBool")
+    pair = ServicePair(kind, TypePair("std_srvs/srv/SetBool"), Ros2Types("jazzy"))
+    response = pair.response.to_ros1(pair.response.to_ros2(b"\1\1\0\0\0x") + bytes(range(20)))
+    assert response == b"\1\1\0\0\0x"

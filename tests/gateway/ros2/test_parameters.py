@@ -9,9 +9,10 @@ from typing import Any, cast
 import pytest
 
 from rmpa.core.errors import RmpaError
+from rmpa.gateway.ros2.conversion import Ros2Codec
 from rmpa.gateway.ros2.format import EntityKind
-from rmpa.gateway.ros2.parameters import Ros2Parameters, _cast, _kind
-from rmpa.gateway.ros2.types import service_store
+from rmpa.gateway.ros2.parameters import Ros2Parameters, _kind
+from rmpa.gateway.ros2.types import service_types
 from rmpa.gateway.rules import CrossingRules
 from rmpa.gateway.zenoh.threads import ZenohReply
 
@@ -29,32 +30,23 @@ class Node:
         return iter([name] if name.rpartition("/")[2] in self.services and kind is EntityKind.SERVICE else [])
 
     async def call(self, server: str, request: bytes) -> ZenohReply:
-        store = service_store()
         kind = "rcl_interfaces/srv/" + server.rpartition("/")[2].title().replace("_", "")
-        asked: Any = store.deserialize_cdr(request, f"{kind}_Request")
+        asked = Ros2Codec(service_types(), f"{kind}_Request").read(request)
         self.asked.append(asked)
-        types: Any = store.types
+        answer: dict[str, Any] = {"result": {"successful": not self.reason, "reason": self.reason}}
         if "List" in kind:
-            made = types["rcl_interfaces/msg/ListParametersResult"](names=["list", "count"], prefixes=[])
-            answer = types[f"{kind}_Response"](result=made)
+            answer = {"result": {"names": ["list", "bytes", "count"]}}
         elif "Get" in kind:
-            answer = types[f"{kind}_Response"](values=[self.value(types, name) for name in asked.names])
-        else:
-            made = types["rcl_interfaces/msg/SetParametersResult"](successful=not self.reason, reason=self.reason)
-            answer = types[f"{kind}_Response"](result=made)
-        return ZenohReply("", bytes(store.serialize_cdr(answer, f"{kind}_Response")) + b"garbage", b"", ok=True)
-
-    @staticmethod
-    def value(types: Any, name: str) -> Any:
-        value, kind = {"count": (7, 2), "list": ([1.0, 2.0], 8)}.get(name, (None, 0))
-        every = ("bool", "integer", "double", "string", "byte_array", "bool_array", "integer_array", "double_array")
-        fields = {f"{each}_value": _cast([], at) if at > 4 else _cast(0, at) for at, each in enumerate(every, 1)}
-        fields["string_array_value"] = []
-        if kind:
-            fields[f"{every[kind - 1]}_value"] = _cast(value, kind)
-        return types["rcl_interfaces/msg/ParameterValue"](type=kind, **fields)
+            answer = {"values": [VALUES.get(name, {}) for name in asked["names"]]}
+        made = Ros2Codec(service_types(), f"{kind}_Response").write(answer)
+        return ZenohReply("", made + b"garbage", b"", ok=True)
 
 
+VALUES = {
+    "count": {"type": 2, "integer_value": 7},
+    "list": {"type": 8, "double_array_value": [1.0, 2.0]},
+    "bytes": {"type": 5, "byte_array_value": [1, -1]},
+}
 ALL = ("list_parameters", "get_parameters", "set_parameters_atomically")
 
 
@@ -69,9 +61,9 @@ async def ask(node: Node, why: str = "", **args: str) -> Any:
 
 async def test_names_values_and_all_of_them_are_read_whatever_follows_a_response() -> None:
     node = Node(*ALL)
-    assert await ask(node) == ["count", "list"]
+    assert await ask(node) == ["bytes", "count", "list"]
     assert await ask(node, key="list") == [1.0, 2.0]
-    assert await ask(node, key="") == {"count": 7, "list": [1.0, 2.0]}
+    assert await ask(node, key="") == {"bytes": [1, 255], "count": 7, "list": [1.0, 2.0]}
     with pytest.raises(RmpaError, match="no parameter nothing"):
         await ask(node, key="nothing")
 
@@ -79,8 +71,11 @@ async def test_names_values_and_all_of_them_are_read_whatever_follows_a_response
 async def test_a_value_is_set_by_the_type_of_the_parameter() -> None:
     node = Node(*ALL)
     await ask(node, key="", text='{"list": [3, 4], "made": {"here": true}}')
-    names = {each.name: (each.value.type, each.value.bool_value) for each in node.asked[-1].parameters}
-    assert names == {"list": (8, False), "made.here": (1, True)}
+    made = {each["name"]: each["value"] for each in node.asked[-1]["parameters"]}
+    assert (made["list"]["type"], list(made["list"]["double_array_value"])) == (8, [3.0, 4.0])
+    assert (made["made.here"]["type"], made["made.here"]["bool_value"]) == (1, True)
+    await ask(node, key="bytes", text="[255]")
+    assert list(node.asked[-1]["parameters"][0]["value"]["byte_array_value"]) == [-1]
     node.reason = "it is read only"
     with pytest.raises(RmpaError, match="read only"):
         await ask(node, key="count", text="8")

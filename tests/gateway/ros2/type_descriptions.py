@@ -32,7 +32,7 @@ def respond(types: dict[str, list[tuple[str, int, int, int, str]]], *, ok: bool 
         ok: Whether the node says that it knows the type.
         why: Why it does not.
     """
-    store = type_description.service_store()
+    store = type_description.service_types().store
     made: Any = store.types
 
     def one(name: str) -> Any:

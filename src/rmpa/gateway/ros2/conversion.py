@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 _ONE_BYTE: Final = ("byte", "char", "int8", "uint8")
 _LITTLE_ENDIAN: Final = HEAD[:2]
 # What is raised for bytes that are not a message; rosbags does not check everything itself.
-_ERRORS: Final = (
+MALFORMED: Final = (
     SerdeError,
     RmpaError,
     struct.error,
@@ -61,6 +61,11 @@ class ConversionError(RmpaError):
     """A message does not fit the other side's type."""
 
     code = "no-conversion"
+
+
+def _is_call(ros2: str) -> bool:
+    """Whether a type is of a request, a response, or a part of an action."""
+    return ros2.split("/")[1] != "msg"
 
 
 class Ros2Codec:
@@ -85,7 +90,8 @@ class Ros2Codec:
                 known[each] = Specification(each, "", types.fields(each), ())
                 todo += known[each].depends()
         fields = known[name].fields
-        self._transcoder = Transcoder([part for field in fields for part in _parts_of(field, types.fields)])
+        parts = [part for field in fields for part in _parts_of(field, types.fields)]
+        self._transcoder = Transcoder(parts, padded=_is_call(name))
         self._codec = MessageCodec(name, known)
 
     def read(self, raw: Buffer) -> dict[str, Any]:
@@ -135,7 +141,7 @@ class Conversion:
             check_size(ros1.name, self._fields1)
             if fields is None:
                 parts = self._common_parts(ros1.name, ros2)
-                self.transcoder = Transcoder(parts) if parts is not None else None
+                self.transcoder = Transcoder(parts, padded=_is_call(ros2)) if parts is not None else None
             else:
                 self._mapped = [self._map(*paths) for paths in fields.items()]
             if self.transcoder is None:
@@ -156,7 +162,7 @@ class Conversion:
                 return self.transcoder.to_cdr(raw)
             codec1, codec2 = self._codecs
             return codec2.write(self._convert(codec1.views(memoryview(raw)), to_ros1=False))
-        except _ERRORS as error:
+        except MALFORMED as error:
             raise ConversionError(f"cannot convert a {self.ros1.name} to {self.ros2}: {error}") from error
 
     def to_ros1(self, raw: Buffer) -> bytes:
@@ -173,7 +179,7 @@ class Conversion:
                 return self.transcoder.to_ros1(raw)
             codec1, codec2 = self._codecs
             return codec1.write(self._convert(codec2.read(raw), to_ros1=True), 0).payload
-        except _ERRORS as error:
+        except MALFORMED as error:
             raise ConversionError(f"cannot convert a {self.ros2} to {self.ros1.name}: {error}") from error
 
     @functools.cached_property

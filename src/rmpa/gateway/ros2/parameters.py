@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import re
-import struct
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-from rosbags.serde import SerdeError
-
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.gateway import limits
+from rmpa.gateway.ros2.conversion import MALFORMED, Ros2Codec
 from rmpa.gateway.ros2.format import EntityKind
 from rmpa.gateway.ros2.graph import SITE
-from rmpa.gateway.ros2.types import read_response, service_store
+from rmpa.gateway.ros2.types import service_types
 from rmpa.gateway.rules import ForeignSource, SourceKind
 
 if TYPE_CHECKING:
@@ -21,25 +19,13 @@ if TYPE_CHECKING:
 
     from rmpa.gateway.ros2.services import Ros2Context
 
-_VALUE: Final = "rcl_interfaces/msg/ParameterValue"
-_PARAMETER: Final = "rcl_interfaces/msg/Parameter"
-# The fields of a value by the numbers of its types, from 1 on, each with what an empty one has; 0 is "not set".
-_FIELDS: Final[tuple[tuple[str, Any], ...]] = (
-    ("bool_value", False),
-    ("integer_value", 0),
-    ("double_value", 0.0),
-    ("string_value", ""),
-    ("byte_array_value", np.array([], np.uint8)),
-    ("bool_array_value", np.array([], np.bool_)),
-    ("integer_array_value", np.array([], np.int64)),
-    ("double_array_value", np.array([], np.float64)),
-    ("string_array_value", []),
-)
+_SCALARS: Final = ("bool", "integer", "double", "string")
+# The fields of rcl_interfaces/msg/ParameterValue by the numbers of its types; 0 is a parameter that is not set.
+_FIELDS: Final = ("", *(f"{each}_value" for each in (*_SCALARS, *(f"{each}_array" for each in ("byte", *_SCALARS)))))
 _KINDS: Final = (bool, int, float, str)
 _INTEGER, _DOUBLE, _BYTES, _STRINGS = 2, 3, 5, 9
 # What is added to a number for an array of it.
 _ARRAY: Final = 5
-_MALFORMED: Final = (SerdeError, ValueError, IndexError, AssertionError, OverflowError, RecursionError, struct.error)
 
 
 class Ros2Parameters:
@@ -68,39 +54,34 @@ class Ros2Parameters:
             if text is not None:
                 await self._set(node, dict(_leaves(str(key or ""), json.loads(str(text)))), denial)
                 return ""
-            listed = await self._call(node, "list_parameters", denial, prefixes=[], depth=0)
-            names = sorted(map(str, listed.result.names))
+            names = sorted((await self._call(node, "list_parameters", denial))["result"]["names"])
             return json.dumps(names if key is None else await self._get(node, str(key), names, denial))
-        except _MALFORMED as error:
+        except (*MALFORMED, RecursionError) as error:
+            if isinstance(error, PeerRefused | UnreachableError):
+                raise
             raise RmpaError(f"parameters of {node}: {error}", code="invalid-value") from error
 
     async def _get(self, node: str, key: str, names: list[str], denial: Callable[[str], str]) -> Any:
         within = [name for name in names if not key or name == key or name.startswith(f"{key}.")]
         if not within and key:
-            raise RmpaError(f"{node} has no parameter {key}; `rmpa param list` has them all", code="unknown-name")
+            raise PeerRefused(node, f"it has no parameter {key}", "`rmpa param list` has them all")
         answer = await self._call(node, "get_parameters", denial, names=within)
-        values = [_read(each) for each in answer.values]
+        values = [_read(each) for each in answer["values"]]
         begin = len(key) + 1 if key else 0
         return values[0] if within == [key] else {n[begin:]: v for n, v in zip(within, values, strict=True)}
 
     async def _set(self, node: str, wanted: dict[str, Any], denial: Callable[[str], str]) -> None:
         """Set all or none."""
-        present = await self._call(node, "get_parameters", denial, names=list(wanted))
+        present = (await self._call(node, "get_parameters", denial, names=list(wanted)))["values"]
         # A node answers with nothing at all if one of them is not declared.
-        numbers = [each.type for each in present.values] or [0] * len(wanted)
-        types, made = service_store().types, []
-        for (name, value), number in zip(wanted.items(), numbers, strict=True):
-            kind = _kind(value, number)
-            fields = {
-                field: _cast(value, kind) if at == kind else empty for at, (field, empty) in enumerate(_FIELDS, 1)
-            }
-            made.append(types[_PARAMETER](name=name, value=types[_VALUE](type=kind, **fields)))
-        answer = await self._call(node, "set_parameters_atomically", denial, parameters=made)
-        if not answer.result.successful:
-            raise PeerRefused(node, answer.result.reason or "it gives no reason")
+        numbers = [each["type"] for each in present] or [0] * len(wanted)
+        made = [{"name": name, "value": _write(wanted[name], at)} for name, at in zip(wanted, numbers, strict=True)]
+        result = (await self._call(node, "set_parameters_atomically", denial, parameters=made))["result"]
+        if not result["successful"]:
+            raise PeerRefused(node, result["reason"] or "it gives no reason")
 
-    async def _call(self, node: str, service: str, denial: Callable[[str], str], **fields: Any) -> Any:
-        name, context, store = f"{node}/{service}", self._context, service_store()
+    async def _call(self, node: str, service: str, denial: Callable[[str], str], **fields: Any) -> dict[str, Any]:
+        name, context = f"{node}/{service}", self._context
         decision = context.rules.incoming(ForeignSource(SourceKind.SERVICE, SITE, "", node, name, "*"))
         if why := denial(decision.name) if decision.allowed else decision.why:
             raise PeerRefused(SITE, why)
@@ -110,11 +91,13 @@ class Ros2Parameters:
         if server is None:
             raise UnreachableError("node of ROS 2", node, "`rmpa site info ros2` lists what is there")
         kind = f"rcl_interfaces/srv/{re.sub('(?:^|_)(.)', lambda found: found[1].upper(), service)}"
-        request = store.serialize_cdr(store.types[f"{kind}_Request"](**fields), f"{kind}_Request")
-        reply = await context.asker.call(server, bytes(request))
+        request = Ros2Codec(service_types(), f"{kind}_Request").write(fields)
+        reply = await context.asker.call(server, request)
         if reply is None or not reply.ok:
             raise UnreachableError("node of ROS 2", node, reply.text if reply is not None else "it gave no answer")
-        return read_response(reply.payload, f"{kind}_Response")
+        if len(reply.payload) > limits.ROS2_DESCRIPTION_MAX:
+            raise ValueError(f"the answer of {name} has {len(reply.payload)} bytes")
+        return Ros2Codec(service_types(), f"{kind}_Response").read(reply.payload)
 
 
 def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:
@@ -125,16 +108,26 @@ def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield from _leaves(f"{key}.{name}" if key else name, each)
 
 
-def _read(told: Any) -> Any:
+def _read(told: dict[str, Any]) -> Any:
     """A value of ROS 2 in JSON's types."""
-    if not 0 < told.type <= len(_FIELDS):
-        return None
-    value = getattr(told, _FIELDS[told.type - 1][0])
-    return value.tolist() if isinstance(value, np.ndarray) else value
+    kind = told["type"]
+    value = told[_FIELDS[kind]] if 0 < kind < len(_FIELDS) else None
+    if kind <= _BYTES - 1 or value is None:
+        return value
+    # A byte is signed in ROS 1.
+    return [each & 0xFF if kind == _BYTES else bool(each) if kind == _BYTES + 1 else each for each in value]
+
+
+def _write(value: Any, number: int) -> dict[str, Any]:
+    """A value by the type of the parameter, ``number``, where it fits it; ``None`` is no value."""
+    if not (kind := _kind(value, number)):
+        return {"type": 0}
+    signed = [each - 256 if each > 127 else each for each in value] if kind == _BYTES else value
+    return {"type": kind, _FIELDS[kind]: signed}
 
 
 def _kind(value: Any, number: int) -> int:
-    """The number of the type that a value is sent as: that of the parameter, ``number``, where the value fits it."""
+    """The number of the type that a value is sent as."""
     if value is None:
         return 0
     if not isinstance(value, list):
@@ -148,8 +141,3 @@ def _kind(value: Any, number: int) -> int:
         raise ValueError("a list has values of different types")
     fits = kind == _INTEGER and number in (_BYTES, _DOUBLE + _ARRAY)
     return number if fits else kind + _ARRAY
-
-
-def _cast(value: Any, kind: int) -> Any:
-    empty = _FIELDS[kind - 1][1]
-    return np.array(value, empty.dtype) if isinstance(empty, np.ndarray) else type(empty)(value)

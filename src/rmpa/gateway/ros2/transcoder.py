@@ -59,16 +59,18 @@ class Transcoder:
 
     Args:
         parts: What a message is made of, in order.
+        padded: Whether its CDR may have anything behind it. rclpy's serializer, by which requests and responses come,
+            leaves the room there that it took too much: some bytes for each empty sequence of numbers of 8 bytes.
 
     Raises:
         ValueError: Arrays of a fixed length make each message too much work.
     """
 
-    def __init__(self, parts: Sequence[LayoutPart]) -> None:
+    def __init__(self, parts: Sequence[LayoutPart], *, padded: bool = False) -> None:
         if max(_work(parts, to_cdr=False), _work(parts, to_cdr=True)) > limits.ROS2_WORK_MAX:
             raise ValueError("its arrays of a fixed length are too large")
         self._to_cdr = _compile(parts, to_cdr=True)
-        self._to_ros1 = _compile(parts, to_cdr=False)
+        self._to_ros1 = _compile(parts, to_cdr=False, padded=padded)
 
     def to_cdr(self, raw: Buffer) -> bytes:
         """Convert a message of ROS 1, without a length in front, to CDR with its head.
@@ -111,12 +113,12 @@ class FunctionText:
         self._names = 0
         self.texts: list[str] = []
 
-    def text(self, parts: Iterable[LayoutPart]) -> str:
-        """The function for a message of these parts."""
+    def text(self, parts: Iterable[LayoutPart], *, padded: bool = False) -> str:
+        """The function for a message of these parts; ``padded``: with anything behind them."""
         self.add("i = c = t = 0", f"out = [{'HEAD' if self._to_cdr else ''}]", "add = out.append")
         self._parts(parts)
         # Some serializers of CDR fill the end up to 4 bytes.
-        wrong = "i != end" if self._to_cdr else "not i <= end <= i + 3"
+        wrong = "i != end" if self._to_cdr else "i > end" if padded else "not i <= end <= i + 3"
         self.add(f"if {wrong}: raise ValueError(f'a message of {{end}} bytes has {{i}}')", "return b''.join(out)")
         return "\n".join(("def convert(s, end):", *self._lines))
 
@@ -311,9 +313,9 @@ def _work(parts: Iterable[LayoutPart], *, to_cdr: bool) -> int:
     return total
 
 
-def _compile(parts: Sequence[LayoutPart], *, to_cdr: bool) -> Callable[[Buffer, int], bytes]:
+def _compile(parts: Sequence[LayoutPart], *, to_cdr: bool, padded: bool = False) -> Callable[[Buffer, int], bytes]:
     writer = FunctionText(to_cdr=to_cdr)
-    text = writer.text(parts)
+    text = writer.text(parts, padded=padded)
     names: dict[str, Any] = {
         "HEAD": HEAD,
         "NULL": b"\0",

@@ -365,35 +365,19 @@ _ARRAY, _BOUNDED, _UNBOUNDED = 48, 96, 144
 
 
 @functools.cache
-def service_store() -> Typestore:
+def service_types() -> Ros2Types:
     """The types with requests and responses of the services that each node of ROS 2 has and the gateway calls."""
     types = Ros2Types("jazzy")
     for name, text in _PARTS.items():
         [fields] = get_types_from_msg(text.replace(";", "\n"), name).values()
         types.take({name: fields})
-    return types.store
-
-
-def read_response(raw: Buffer, name: str) -> Any:
-    """The response of a service that each node has; garbage behind it is let be, as rmw_fastrtps pads messages.
-
-    Raises:
-        RemoteProtocolError: It is malformed or too large.
-    """
-    if len(raw) > limits.ROS2_DESCRIPTION_MAX:
-        raise RemoteProtocolError(f"{name} has {len(raw)} bytes; at most {limits.ROS2_DESCRIPTION_MAX}")
-    kind = service_store().get_msgdef(name)
-    try:
-        read = kind.deserialize_cdr_le if raw[1] else kind.deserialize_cdr_be
-        return read(bytes(raw[4:]), 0, kind.cls, service_store())[0]
-    except (SerdeError, ValueError, IndexError, AssertionError, OverflowError, struct.error) as error:
-        raise RemoteProtocolError(f"{name} is malformed: {error}") from error
+    return types
 
 
 def type_request(name: str, type_hash: str) -> bytes:
     """The CDR of a request for the description of ``package/msg/Name`` with a hash."""
-    message = service_store().types[_REQUEST](type_name=name, type_hash=type_hash, include_type_sources=False)
-    return bytes(service_store().serialize_cdr(message, _REQUEST))
+    message = service_types().store.types[_REQUEST](type_name=name, type_hash=type_hash, include_type_sources=False)
+    return bytes(service_types().store.serialize_cdr(message, _REQUEST))
 
 
 def parse_type_response(raw: Buffer) -> dict[str, Any]:
@@ -403,7 +387,15 @@ def parse_type_response(raw: Buffer) -> dict[str, Any]:
         RemoteProtocolError: It is malformed, too large, or has a field that neither side's ROS has; or the node does
             not know the type, and the text says why.
     """
-    message = read_response(raw, _RESPONSE)
+    if len(raw) > limits.ROS2_DESCRIPTION_MAX:
+        raise RemoteProtocolError(f"a type's description has {len(raw)} bytes; at most {limits.ROS2_DESCRIPTION_MAX}")
+    store = service_types().store
+    kind = store.get_msgdef(_RESPONSE)
+    try:  # not by the store, which takes no garbage behind a message: rmw_fastrtps pads more than it does
+        read = kind.deserialize_cdr_le if raw[1] else kind.deserialize_cdr_be
+        message: Any = read(bytes(raw[4:]), 0, kind.cls, store)[0]
+    except (SerdeError, ValueError, IndexError, AssertionError, OverflowError, struct.error) as error:
+        raise RemoteProtocolError(f"a type's description is malformed: {error}") from error
     if not message.successful:
         raise RemoteProtocolError(f"the node does not describe the type: {message.failure_reason[:200]}")
     described = message.type_description
