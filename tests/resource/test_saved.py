@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 
 import msgspec
@@ -7,6 +8,7 @@ import pytest
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource import limits
+from rmpa.resource.adaptation import CoolDown
 from rmpa.resource.node import ResourceNode
 from rmpa.resource.quality import MEASURED
 from rmpa.resource.resource import Resource
@@ -202,6 +204,42 @@ async def started(core: RosCore, path: Path, one: Resource | None = None) -> Res
     member = ResourceNode(one or sonar(), core.uri, state=path)
     await member.start()
     return member
+
+
+def cooling(member: ResourceNode) -> list[CoolDown]:
+    return list(member.adapter.adaptation.cooling(asyncio.get_running_loop().time()).values())
+
+
+async def test_cool_down_survives_a_restart(core: RosCore, tmp_path: Path) -> None:
+    def broken() -> Resource:
+        one = Resource("sonar", role="sensing")
+        one.attribute("noise", better="min", unit="m")
+        one.profile(offers={"noise": 0.01}, name="fine")(fine)
+        one.profile(offers={"noise": 0.1}, cost=1, name="coarse")(lambda: None)
+        one.adaptation(window="100 ms", cool_down="60 s")
+        return one
+
+    def fine() -> None:
+        tried.append("fine")
+        raise OSError("no bus")
+
+    tried: list[str] = []
+    path = tmp_path / "sonar.json"
+    first = await started(core, path, broken())
+    await until(lambda: first.adapter.adaptation.profile == "coarse")
+    (before,) = cooling(first)
+    await first.close()
+    again = await started(core, path, broken())
+    await until(lambda: again.adapter.adaptation.profile == "coarse")
+    (after,) = cooling(again)
+    assert after.until == pytest.approx(before.until, abs=2)
+    assert (after.cool_down, after.why) == (60.0, "OSError: no bus")
+    assert tried == ["fine"]
+    # Somebody who has mended it need not wait.
+    again.adapter.pin("fine")
+    await until(lambda: len(tried) == 2)
+    await until(lambda: again.adapter.adaptation.profile == "coarse")
+    await again.close()
 
 
 async def test_a_damaged_file_is_set_aside(core: RosCore, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
