@@ -22,7 +22,6 @@ from rmpa.bridge.messages import (
     Source,
     TopicOffer,
 )
-from rmpa.bridge.peer_offers import DENIED
 from rmpa.bridge.policy import PermissionGate, Policy
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.topics.exports import LocalSource
@@ -31,6 +30,7 @@ from rmpa.config.peer_rules import Access, Effect, PeerRule, PermissionRule, Pol
 from rmpa.config.read import load_settings
 from rmpa.config.settings import ServiceSettings, TimeSettings, TrustSettings
 from rmpa.core.contract import Contract, Contracts
+from rmpa.core.facts import DENIED
 from rmpa.core.identity import NEVER_CROSSING
 from rmpa.core.statistics import Counters
 from rmpa.ros.wire.tcpros import ServiceDescription

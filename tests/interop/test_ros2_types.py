@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.bed.processes import eventually
 from lab.bed.gateways import python_of
+from lab.bed.processes import eventually
 from tests.interop.ros2_hall import LONG, Hall, OtherEnd, running_hall
 
 if TYPE_CHECKING:
