@@ -76,8 +76,11 @@ class SiteRequests:
         def answer(what: str, asker: PeerSession, args: Args) -> Awaitable[object]:
             return gateway.answer(what, args, asker.link.name)
 
-        for what, needs in ((REPORT, _SOURCES), (SITE_INFO, _SOURCES), (SITE_WHY, _WAYS), (PARAM, _PARAMETERS)):
-            self._bridge.rpc.on_request(what, partial(answer, what), needs)
+        rpc = self._bridge.rpc
+        rpc.on_request(REPORT, partial(answer, REPORT), _SOURCES)
+        rpc.on_request(SITE_INFO, partial(answer, SITE_INFO), _SOURCES)
+        rpc.on_request(SITE_WHY, partial(answer, SITE_WHY), _WAYS)
+        rpc.on_request(PARAM, partial(answer, PARAM), _PARAMETERS)
 
     async def answer(self, args: Args) -> Any:
         """The operation ``site``: ``what`` (one of ``QUESTIONS``) and its ``args``.
