@@ -35,6 +35,8 @@ from node import say
 
 STEP = 0.05
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# A subscription of depth 1 loses what one publisher keeps to what another one does (as tf2_ros, which has 100).
+LATE = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class End:
@@ -65,7 +67,7 @@ class End:
         def take(message: Any) -> None:
             say("heard", topic=topic, data=message.data)
 
-        qos = LATCHED if latched else QoSProfile(depth=1000)
+        qos = LATE if latched else QoSProfile(depth=1000)
         self.kept["subscribe " + topic] = self.node.create_subscription(String, topic, take, qos)
 
     def sensor(self, topic: str) -> None:
