@@ -16,6 +16,7 @@
 Events beside: ``up``; ``goal`` and ``cancel`` of the server; ``done`` after each line.
 """
 
+import contextlib
 import json
 import sys
 import threading
@@ -26,6 +27,7 @@ import rclpy
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
@@ -34,6 +36,7 @@ from test_msgs.action import Fibonacci
 from node import say
 
 STEP = 0.05
+InvalidHandle = rclpy_implementation.InvalidHandle
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # A subscription of depth 1 loses what one publisher keeps to what another one does (as tf2_ros, which has 100).
 LATE = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -177,7 +180,13 @@ def main() -> None:
     end = End(sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "/count")
     executor = MultiThreadedExecutor(4)
     executor.add_node(end.node)
-    threading.Thread(target=executor.spin, daemon=True).start()
+
+    def spin() -> None:
+        while rclpy.ok():
+            with contextlib.suppress(InvalidHandle):  # of what the other thread destroyed in this moment
+                executor.spin()
+
+    threading.Thread(target=spin, daemon=True).start()
     say("up")
     for line in sys.stdin:
         told = json.loads(line)
