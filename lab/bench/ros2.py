@@ -145,15 +145,11 @@ def _streams(hall: _Hall, plan: _Plan, console: Console, claims: list[Claim]) ->
         text = f"{size(each)} at {rate:.0f} Hz, there and back, p50, RMPA / a relay of rclpy"
         claims.append(Claim(text, _ratio(rmpa.median_of_rounds(50.0), plain.median_of_rounds(50.0)), wanted))
         claims.append(Claim(f"{size(each)}: lost by RMPA where rclpy loses {plain.lost}", rmpa.lost, plain.lost))
-    claims.append(_cpu_claim(scores["rmpa", 64], scores["rclpy", 64]))
+    # On the same way the half and the echo hear and publish the same messages.
+    used = scores["rmpa", 64].usage
+    text = "64 B, processor time, half / the echo beside it by rclpy's executor (each hears and publishes one a trip)"
+    claims.append(Claim(text, _ratio(used["half"].cpu, used["echo"].cpu), _CPU_FACTOR))
     return {f"{key} {each}": score.row(20_000.0) for (key, each), score in scores.items()}
-
-
-def _cpu_claim(rmpa: LatencyScore, plain: LatencyScore) -> Claim:
-    """The half hears and publishes one message each trip, and so does the echo."""
-    half = rmpa.usage["half"].cpu / rmpa.messages
-    text = "64 B, processor time, half / the echo by rclpy's executor (each hears and publishes one a trip)"
-    return Claim(text, _ratio(half, plain.usage["echo"].cpu / plain.messages), _CPU_FACTOR)
 
 
 def _ratio(value: float | None, base: float | None) -> float | None:

@@ -23,6 +23,7 @@
 Events beside: ``up``; ``goal`` and ``cancel`` of the server; ``done`` after each line.
 """
 
+import contextlib
 import importlib
 import itertools
 import json
@@ -37,6 +38,7 @@ from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalRespons
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock
 from rclpy.executors import MultiThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
 from std_msgs.msg import String
@@ -46,7 +48,10 @@ from test_msgs.action import Fibonacci
 from node import say
 
 STEP = 0.05
+InvalidHandle = rclpy_implementation.InvalidHandle
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# A subscription of depth 1 loses what one publisher keeps to what another one does (as tf2_ros, which has 100).
+LATE = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def load(name: str) -> Any:
@@ -91,7 +96,7 @@ class End:
         def take(message: Any) -> None:
             say("heard", topic=topic, data=message.data)
 
-        qos = LATCHED if latched else QoSProfile(depth=1000)
+        qos = LATE if latched else QoSProfile(depth=1000)
         self.kept["subscribe " + topic] = self.node.create_subscription(String, topic, take, qos)
 
     def sensor(self, topic: str) -> None:
@@ -251,7 +256,13 @@ def main() -> None:
     end = End(words[1], words[2] if len(words) > 2 else "/count")
     executor = MultiThreadedExecutor(4)
     executor.add_node(end.node)
-    threading.Thread(target=executor.spin, daemon=True).start()
+
+    def spin() -> None:
+        while rclpy.ok():
+            with contextlib.suppress(InvalidHandle):  # of what the other thread destroyed in this moment
+                executor.spin()
+
+    threading.Thread(target=spin, daemon=True).start()
     say("up")
     for line in sys.stdin:
         told = json.loads(line)
