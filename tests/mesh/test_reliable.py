@@ -132,7 +132,7 @@ def test_a_parked_sender_is_suspended_and_given_back() -> None:
     table: ResumeTable[str] = ResumeTable()
     machine, gone = parked(table, "a")
     assert gone == []
-    assert (len(table), table.pending_bytes, machine.in_flight) == (1, 8, 0)
+    assert (len(table), table.pending_bytes, machine.take()) == (1, 8, None)
     assert table.claim("b") is None
     assert table.claim("a") is machine
     assert table.claim("a") is None

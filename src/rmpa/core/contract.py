@@ -153,7 +153,7 @@ class Contract:
 
 # The names of a contract's fields, in order.
 KEYS: Final = tuple(item.name for item in fields(Contract))
-_DEFAULT: Final = Contract()
+DEFAULT_CONTRACT: Final = Contract()
 # Fields that only agents can keep where they differ from the default; the others are ``needs_agents``' own.
 _AGENTS_WORDS: Final = ("reliability", "durability", "history", "depth")
 # Which word of a field is the stronger one. Of the transports ``relay`` is the strongest, because it keeps the
@@ -184,7 +184,7 @@ def combine(offered: Contract, requested: Contract, type_name: str = "") -> Cont
     if depth is UNSET and type_name in VELOCITY_COMMANDS and not any(word in kept for word in stronger.values()):
         depth = 1
     return replace(
-        _DEFAULT,
+        DEFAULT_CONTRACT,
         **stronger,
         depth=depth,
         deadline=offered.deadline if requested.deadline is None else requested.deadline,
@@ -210,7 +210,11 @@ def needs_agents(contract: Contract) -> str:
         ("lifespan", contract.lifespan),
         ("liveliness lease", contract.liveliness_lease),
     )
-    terms = [f"{key} {value}" for key in _AGENTS_WORDS if (value := getattr(contract, key)) != getattr(_DEFAULT, key)]
+    terms = [
+        f"{key} {value}"
+        for key in _AGENTS_WORDS
+        if (value := getattr(contract, key)) != getattr(DEFAULT_CONTRACT, key)
+    ]
     terms += [f"{name} {value:g} s" for name, value in seconds if value is not None]
     if contract.priority is not Priority.NORMAL:
         terms.append(f"priority {contract.priority}")
@@ -269,7 +273,7 @@ class Contracts:
         self, rules: tuple[ContractRule, ...] = (), default_transport: Transport = DEFAULT_TRANSPORT
     ) -> None:
         self._rules = rules
-        self._default = replace(_DEFAULT, transport=default_transport)
+        self._default = replace(DEFAULT_CONTRACT, transport=default_transport)
         self._find = lru_cache(CONTRACTS_REMEMBERED)(self._combined)
 
     def of(self, topic: str, type_name: str) -> Contract:
@@ -283,6 +287,10 @@ class Contracts:
                 values |= rule.values
         return replace(self._default, **values)  # type: ignore[arg-type] # as ContractRule.values promises
 
+    def is_set(self, key: str, topic: str, type_name: str) -> bool:
+        """Whether a rule sets a key of this topic's contract."""
+        return any(key in rule.values for rule in self._rules if rule.fitting(topic, type_name) is not None)
+
     def explain(self, topic: str, type_name: str) -> dict[str, tuple[object, str]]:
         """Each key's value and where it comes from.
 
@@ -290,7 +298,10 @@ class Contracts:
             By key: the value, and ``rule 2: topics /cmd/**`` (counted from 1), ``[bridge] transport`` or ``default``.
         """
         found: dict[str, tuple[object, str]] = {key: (getattr(self._default, key), "default") for key in KEYS}
-        found |= {"depth": (_DEFAULT.queue_depth, "default"), "outage": (_DEFAULT.resume_window, "default")}
+        found |= {
+            "depth": (DEFAULT_CONTRACT.queue_depth, "default"),
+            "outage": (DEFAULT_CONTRACT.resume_window, "default"),
+        }
         if type_name in VELOCITY_COMMANDS:
             found["depth"] = (1, "default for velocity commands")
         if self._default.transport is not DEFAULT_TRANSPORT:

@@ -73,8 +73,7 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
         queued: Bytes in its send queues.
         dropped: Messages dropped because the link was too slow.
         heard_ago: Seconds since anything arrived.
-        rests: Whether the link is at rest: nothing depends on it, and keepalives come every 5 s, with more than 50
-            peers more rarely.
+        rests: Whether the link is at rest: nothing depends on it, and its keepalives come more rarely.
         lease: Seconds of silence after which the link counts as lost.
         lanes: Its lanes, ``express`` first; empty from an agent that does not report them.
     """
@@ -93,6 +92,11 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
     rests: bool = False
     lease: float = 1.0
     lanes: tuple[LaneInfo, ...] = ()
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether nothing has come for half the time after which the link counts as lost."""
+        return self.heard_ago is not None and self.heard_ago > self.lease / 2
 
 
 class BoundInfo(msgspec.Struct, kw_only=True, frozen=True):

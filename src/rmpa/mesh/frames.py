@@ -117,8 +117,8 @@ class Frame:
     Args:
         kind: Its kind.
         payload: Its bytes; what they mean depends on the kind.
-        route: Data only: the route's id, 32 bits.
-        sequence: Data only: counts the messages of the route, 32 bits.
+        route: Of data: the route's id, 32 bits; other kinds say what it is there.
+        sequence: Of data: counts the messages of the route, 32 bits; likewise.
         stamp_ns: The sender's wall clock, or for data the time of publication; 64 bits.
         flags: ``FIRST`` and ``LAST``; both on a whole message.
     """
@@ -394,7 +394,7 @@ def judge(
         ours: The identity of this agent.
         linked: The peer of the link that is up with the hello's address and port; ``None``: there is no such link.
         dialled: Whether this side dialled that link.
-        alive: Whether bytes were received on it within ``limits.GHOST_QUIET``; otherwise the peer may be dead.
+        alive: Whether bytes were received on it lately; otherwise the peer may be dead.
         full: Whether there is no place for one more peer.
     """
     if refuse := _judge_identity(hello, ours):

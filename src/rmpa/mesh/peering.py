@@ -159,7 +159,7 @@ class Peering:
     Args:
         ours: The identity of this agent.
         rng: Uniform numbers in [0, 1), for the jitter.
-        alive: Returns whether bytes arrived on a link, given by its id, in the last ``limits.GHOST_QUIET`` seconds.
+        alive: Returns whether bytes arrived on a link lately, given its id: within ``quiet_after`` of its keepalive.
 
     Attributes:
         left_out: Whether a mesh that is full has refused this module, and no link has come up since.

@@ -107,11 +107,6 @@ class ReliableSender:
         return len(self._sent) + len(self._unsent)
 
     @property
-    def in_flight(self) -> int:
-        """The number of messages that were sent over the present link and are not acknowledged."""
-        return len(self._dropped_in_flight) + len(self._sent) if self._linked else 0
-
-    @property
     def idle(self) -> bool:
         """Whether every offered message has arrived or is lost for good."""
         return not (self._unsent or self._sent or self._dropped_in_flight)

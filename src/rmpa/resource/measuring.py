@@ -95,7 +95,7 @@ class TopicQuality:
         self._clear()
 
     def window(self, now: float) -> dict[str, Value]:
-        """End the window and return its values by attribute (``attributes.MEASURED``)."""
+        """End the window and return its values by attribute (``quality.MEASURED``)."""
         span = max(now - self._began, 1e-9)
         silent = now - (self._last if self._last is not None else self._began)
         found: dict[str, Value] = {"bandwidth": self._bytes / span}

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
 
-from rmpa.core.contract import KEYS, Contract
+from rmpa.core.contract import DEFAULT_CONTRACT, KEYS
 from rmpa.core.errors import RmpaError
 from rmpa.resource import limits
 from rmpa.ros.types.descriptor import (
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _CLOSED: Final = "life cycle"
-_DEFAULT: Final = Contract()
 _Kind = TypeVar("_Kind", bound=msgspec.Struct)
 # ``profile`` or ``context`` in such a function and in the coroutines, tasks and ``asyncio.to_thread`` calls that it
 # begins; else empty.
@@ -384,5 +383,5 @@ def topic_of(name: str, node: str) -> str:
 
 def _topic(topic: DeclaredTopic, node: str, *, required: bool = True) -> TopicDescriptor:
     values = {key: getattr(topic.contract, key) for key in KEYS}
-    contract = {key: value for key, value in values.items() if value != getattr(_DEFAULT, key)}
+    contract = {key: value for key, value in values.items() if value != getattr(DEFAULT_CONTRACT, key)}
     return TopicDescriptor(topic.name, topic_of(topic.name, node), topic.type_name, contract, required)

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from rmpa.bridge.data.route import RouteBegin, kept_for
 from rmpa.bridge.data.route_sender import ReliableRouteSender, RouteSender
-from rmpa.core.contract import Contract, Durability, Reliability
+from rmpa.core.contract import DEFAULT_CONTRACT, Contract, Durability, Reliability
 from rmpa.core.identity import SERIAL_MASK, is_later, serial_add
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import HistoryCache
@@ -30,9 +30,6 @@ if TYPE_CHECKING:
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.node.subscription import TopicConnection
-
-
-_DEFAULT: Final = Contract()
 
 
 class FlowSender(Protocol):
@@ -67,8 +64,8 @@ class ExportRoute:
     session: PeerRun
     source: Source
     number: int = 0
-    contract: Contract = _DEFAULT
-    asked: Contract = _DEFAULT
+    contract: Contract = DEFAULT_CONTRACT
+    asked: Contract = DEFAULT_CONTRACT
     position: tuple[int, int] | None = None
     unknown: bool = False
     shared: bool = False

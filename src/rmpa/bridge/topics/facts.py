@@ -12,7 +12,7 @@ from rmpa.bridge.direct.paths import AGENTS
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import PolicyDecision
 from rmpa.config.rules import CLOCK
-from rmpa.core.contract import KEYS, Contract, Transport
+from rmpa.core.contract import DEFAULT_CONTRACT, KEYS, Contract, Transport
 from rmpa.core.facts import (
     CONFLICT,
     CROWDED,
@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
     from rmpa.bridge.topics.import_route import RemoteTopic
-
-_DEFAULT = Contract()
 
 
 class TopicFacts:
@@ -455,4 +453,4 @@ def _events(watch: QosWatch | None, now: float) -> dict[str, Any]:
 
 def _terms(contract: Contract) -> dict[str, str | float | None]:
     """The terms of a contract that differ from the default."""
-    return {key: getattr(contract, key) for key in KEYS if getattr(contract, key) != getattr(_DEFAULT, key)}
+    return {key: getattr(contract, key) for key in KEYS if getattr(contract, key) != getattr(DEFAULT_CONTRACT, key)}

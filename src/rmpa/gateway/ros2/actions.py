@@ -8,6 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
+from rmpa.core.identity import OWN_NODE, proxy_name
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.conversion import PART, ActionPair, action_name
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Durability, Ros2Qos, data_key
@@ -128,7 +129,7 @@ class JoinedAction(Goals):
 
     def _tap(self, source: MeshSource, part: str, changed: Callable[[object], None]) -> None:
         """Listen to a topic of ROS 1, as the node that publishes the others."""
-        listener = f"/rmpa/{SITE}{self._shown}"
+        listener = proxy_name(f"{OWN_NODE}/{SITE}", self._shown)
         self._taps[source] = self._context.graph.tap(
             source, partial(self._take, part), changed, changed, listener=listener
         )

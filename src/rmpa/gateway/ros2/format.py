@@ -255,7 +255,9 @@ def ros2_qos(contracts: Contracts, topic: str, type_name: str, *, latching: bool
         latching: Whether its publisher latches: then it is transient local with a depth of 1.
     """
     contract = contracts.of(topic, type_name)
-    best_effort = _best_effort(contracts, topic, type_name)
+    best_effort = contract.reliability is Reliability.BEST_EFFORT and contracts.is_set(
+        "reliability", topic, type_name
+    )
     kept = latching or contract.durability is Durability.TRANSIENT_LOCAL
     manual = contract.liveliness is Liveliness.MANUAL_BY_TOPIC
     return Ros2Qos(
@@ -285,11 +287,6 @@ def zenoh_qos(contract: Contract, qos: Ros2Qos) -> ZenohQos:
         messages=contract.queue_depth,
         cache=qos.depth if qos.latched else 0,
     )
-
-
-def _best_effort(contracts: Contracts, topic: str, type_name: str) -> bool:
-    value, origin = contracts.explain(topic, type_name)["reliability"]
-    return value is Reliability.BEST_EFFORT and origin != "default"
 
 
 def _nanoseconds(seconds: float | None) -> int:

@@ -16,6 +16,7 @@ from rmpa.agent.trust import trust_store
 from rmpa.config.peer_rules import Access
 from rmpa.core.contract import Contracts
 from rmpa.core.errors import StartError, UnreachableError
+from rmpa.core.identity import is_own
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.actions import Ros2Actions
 from rmpa.gateway.ros2.format import Ros2Endpoint, graph_key
@@ -185,7 +186,7 @@ class Ros2Neighbour:
                 ways.append(_way(stages, name, source.node, source.module, SITE))
         for what, why in self.topics.refused.items():
             topic, _, node = what.partition(" of ")
-            coming = not node.startswith("/rmpa/")
+            coming = not is_own(node)
             if topic == name and (coming or not site):
                 ends = (SITE, gateway) if coming else (gateway, SITE)
                 ways.append(_way((Check("rule", FAIL, why, _RULES),), name, node, *ends))
@@ -276,7 +277,7 @@ def _out_stages(export: ExportedTopic, dialect: Ros2Dialect, problems: Mapping[s
     deaf = [
         f"{node}: {text}"
         for (topic, _, node), text in ends
-        if topic == export.source.here and node.startswith("/") and not node.startswith("/rmpa/")
+        if topic == export.source.here and node.startswith("/") and not is_own(node)
     ]
     if deaf:
         yield Check("heard", WARN if export.wanted else FAIL, "; ".join(deaf))

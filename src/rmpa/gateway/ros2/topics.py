@@ -44,9 +44,9 @@ if TYPE_CHECKING:
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import Buffer
 
-# Seconds for the publisher's answer to that.
+# Seconds for a publisher's answer whether it is latched.
 _LATCH_LOOK_TIMEOUT: Final = 10.0
-# Publishers that are asked that at once: each opens a route in the mesh for a moment.
+# Publishers that are asked so at once: each opens a route in the mesh for a moment.
 _LATCH_LOOKS_AT_ONCE: Final = 2
 # Seconds for which a topic of ROS 2 that is wanted stays subscribed after a publisher came or went: messages of a
 # publisher that restarts are held until nodes have subscribed to it anew, which takes a module some 0.1 s.

@@ -174,8 +174,6 @@ def _peer(agent: str, peer: PeerInfo) -> Iterator[Check]:
 
 _LISTED: Final = 5
 _AGENTS_OWN: Final = ("/rmpa", "/rosout")
-
-
 _WEB: Final = "/rmpa_web"
 
 

@@ -21,7 +21,8 @@ from rmpa.config.rules import CLOCK
 from rmpa.config.values import did_you_mean
 from rmpa.core import limits as core_limits
 from rmpa.core.facts import CONFLICT, DENIED, Arrival, PublisherReport, RouteInfo
-from rmpa.core.identity import OUTSIDE_GUID, is_meant
+from rmpa.core.identity import OUTSIDE_GUID, OWN_NODE, is_meant, proxy_name
+from rmpa.discovery.limits import HEARTBEAT_LATE
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check, CheckLevel
 from rmpa.observe.why.diagnosis import (
@@ -156,15 +157,11 @@ def _conflict(peer: PeerInfo, level: CheckLevel) -> Check:
     return Check("peer", level, "; ".join(texts), remedy)
 
 
-# Seconds without a beacon after which a machine may be off.
-_SILENT: Final = 5.0
-
-
 def _link(peer: PeerInfo) -> Check:
     if (link := peer.link) is not None and peer.state == "linked":
         text = f"linked by {link.remote} for {link.up_ago:.0f} s"
         text += f", round trip {link.rtt * 1e3:.1f} ms" if link.rtt is not None else ""
-        if link.heard_ago is not None and link.heard_ago > link.lease / 2:
+        if link.is_silent:
             text += f"; silent for {link.heard_ago:.1f} s"
             return Check("link", WARN, text, "if it stays so, the cable or the radio is the place to look at")
         return Check("link", OK, text)
@@ -176,7 +173,7 @@ def _link(peer: PeerInfo) -> Check:
     if peer.state == "refused":
         return Check("link", FAIL, text, "do what the text says; both sides are asked again by themselves")
     remedy = ""
-    if peer.beacon_ago is None or peer.beacon_ago > _SILENT:
+    if peer.beacon_ago is None or peer.beacon_ago > HEARTBEAT_LATE:
         remedy = "its beacons have stopped too: is the machine on, and its cable or Wi-Fi connected? If so, "
     remedy += f"see that TCP to {peer.guid.partition('#')[0]} is open on both machines (a firewall? give it a fixed "
     remedy += "port with --port), and that the machines reach each other: `rmpa doctor`"
@@ -257,7 +254,7 @@ def _policy_there(way: Way) -> Check:
         return Check("policy there", UNKNOWN, f"{way.peer} did not tell")
     if way.told.crosses:
         return Check("policy there", OK, f"{way.peer} lets it cross: {way.told.rule}")
-    remedy = f"change [bridge] in the rmpa.toml of {way.peer}, and `rmpa reload` there"
+    remedy = f"change [bridge] or [[peer]] in the rmpa.toml of {way.peer}, and `rmpa reload` there"
     if way.told.rule.startswith("built in"):
         remedy = "no rule of yours can let it cross; republish it there under another name (topic_tools relay)"
     return Check("policy there", FAIL, f"{way.peer} does not let it cross: {way.told.rule}", remedy)
@@ -318,7 +315,7 @@ def _policy_here(way: Way) -> Check:
     if way.here.cause == DENIED:
         return permission_here(route.peer, Access.PUBLISH, topic, way.here.permission)
     if route.state == "hidden" and way.here.cause != CONFLICT:
-        remedy = "change [bridge] in this module's rmpa.toml, and `rmpa reload`"
+        remedy = "change [bridge] or [[peer]] in this module's rmpa.toml, and `rmpa reload`"
         return Check("policy here", FAIL, f"this module does not take it: {route.problem}", remedy)
     was = f" (its {route.wire})" if route.wire else ""
     return Check("policy here", OK, f"this module takes it as {topic}{was}")
@@ -336,7 +333,7 @@ def _type(way: Way) -> Check:
 
 
 def _graph(way: Way) -> Check:
-    proxy = way.here.proxy or f"/rmpa/{way.before.peer}{way.before.node}"
+    proxy = way.here.proxy or proxy_name(f"{OWN_NODE}/{way.before.peer}", way.before.node)
     if way.here.registered:
         return Check("graph", OK, f"its proxy {proxy} stands in the local graph")
     text = f"its proxy {proxy} is not in the local graph as a publisher of {way.ends.topic}"

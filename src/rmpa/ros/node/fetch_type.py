@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RmpaError
+from rmpa.core.identity import is_own
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.service_client import ask_publisher
@@ -28,8 +29,6 @@ _log = logging.getLogger(__name__)
 
 # Time-out for the header of one such publisher; a peer's publisher answers when its route is open.
 FETCH_TYPE_TIMEOUT: Final = 3.0
-# Prefix of the names of proxies for a peer's nodes. They are asked last, because asking one opens a route.
-_PROXIES: Final = "/rmpa/"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +67,7 @@ async def fetch_type(
     candidates = await _publishers(master_uri, caller_id, name)
     if not elsewhere:
         candidates = [each for each in candidates if each[0] == topic]
-    candidates.sort(key=lambda each: (each[0] != topic, each[1].startswith(_PROXIES), each))
+    candidates.sort(key=lambda each: (each[0] != topic, is_own(each[1]), each))
     for where, node in candidates[: limits.FETCH_TYPE_PUBLISHERS]:
         if node == caller_id:
             continue

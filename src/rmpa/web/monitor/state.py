@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import msgspec
 
+from rmpa.discovery.limits import HEARTBEAT_LATE
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import Tree, without_nulls
 from rmpa.web.monitor.resources import resource_detail, resource_entry, resource_flows
@@ -268,16 +269,13 @@ def _agent(agent: AgentInfo) -> Tree:
 def module_state(peer: PeerInfo) -> str:
     """The word for a peer: ``up``, ``silent``, ``linking``, ``refused``, ``relayed`` or ``away``."""
     if peer.state == "linked":
-        if peer.link is None or peer.link.heard_ago is None:
-            return "up"
-        after = peer.link.lease / 2 if peer.link.rests else 1.0  # keepalives come more often
-        return "silent" if peer.link.heard_ago > after else "up"
+        return "silent" if peer.link is not None and peer.link.is_silent else "up"
     if peer.state in ("refused", "conflict"):
         return "refused"
     if peer.state == "relayed":
         return "relayed"
-    # Heartbeats come every 5 s.
-    return "linking" if peer.beacon_ago is not None and peer.beacon_ago <= 7.0 else "away"
+    late = peer.beacon_ago is None or peer.beacon_ago > HEARTBEAT_LATE
+    return "away" if late else "linking"
 
 
 def _module(peer: PeerInfo, taken: float, rates: Sequence[float]) -> Tree:
