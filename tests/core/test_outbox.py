@@ -43,7 +43,7 @@ def test_out_of_turn_is_our_own_fault() -> None:
         box.consumed(1)
     box.push(b"x", 1)
     with pytest.raises(LocalProtocolError):
-        box.push_rest(b"y", 1)
+        box.push_rest(b"y")
     with pytest.raises(LocalProtocolError, match="9 bytes"):
         box.extend(QueuedMessage(2, 9), bytes(10))
 

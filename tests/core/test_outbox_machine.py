@@ -160,7 +160,7 @@ class AgainstModel(RuleBasedStateMachine):
         self.model.outside[entry.key, entry.number] = entry
         self.model.read(data[:sent], self.now)
         self.model.sent(len(data[:sent]))
-        self.box.push_rest(data[sent:], entry.key)
+        self.box.push_rest(data[sent:])
         self.model.look(self.now)
         self.model.outside.clear()
 

@@ -187,7 +187,7 @@ class Outbox:
             self._urgent.append(data)
             self.urgent_bytes += len(data)
 
-    def push_rest(self, data: bytes, key: int) -> None:  # noqa: ARG002 - the entry's key, for the caller's reader
+    def push_rest(self, data: bytes) -> None:
         """Queue the rest of an entry whose first bytes the driver has sent; it goes first and is never dropped.
 
         Raises:

@@ -231,7 +231,7 @@ class Stream:
         self._wait_for_room()
         if not sent and not part:
             return self._queue(b"".join(parts), key)
-        self.outbox.push_rest(b"".join(unsent(parts, sent)), key)
+        self.outbox.push_rest(b"".join(unsent(parts, sent)))
         return 0
 
     def _transmit(self, parts: Sequence[Buffer], size: int) -> int:
@@ -378,7 +378,7 @@ class Stream:
             if sent >= length:
                 sent -= length
             elif sent > 0:
-                self.outbox.push_rest(b"".join(unsent(parts, sent)), key)
+                self.outbox.push_rest(b"".join(unsent(parts, sent)))
                 sent = 0
             elif index <= last_part:
                 self.outbox.commit(b"".join(parts))

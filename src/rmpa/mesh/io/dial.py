@@ -5,12 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
-import fcntl
 import os
 import socket
 import struct
-import sys
-import termios
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.limits import KIB, MIB
@@ -105,16 +102,6 @@ def may_use_bbr() -> bool:
     """Whether this process may use BBR for the bulk lane."""
     with socket.socket() as sock:
         return _try(sock, socket.TCP_CONGESTION, _BBR)
-
-
-def unacknowledged(sock: socket.socket) -> int:
-    """Bytes written to a socket that the remote kernel has not acknowledged, unsent ones included; 0 if closed."""
-    if sock.fileno() < 0:
-        return 0
-    try:
-        return int.from_bytes(fcntl.ioctl(sock, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
-    except OSError:
-        return 0
 
 
 def _try(sock: socket.socket, name: int, value: int | bytes, level: int = socket.IPPROTO_TCP) -> bool:

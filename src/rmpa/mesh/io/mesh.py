@@ -15,7 +15,7 @@ from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FULL, Lane, Refusal, Refuse
-from rmpa.mesh.io.dial import Dialler, unacknowledged
+from rmpa.mesh.io.dial import Dialler
 from rmpa.mesh.io.link import Connection, LinkHandlers, PeerLink
 from rmpa.mesh.io.securing import Securing, SecuringError, prove, secure_dialled
 from rmpa.mesh.keepalive import Pace, rest_lease
@@ -363,7 +363,7 @@ class Mesh:
             endpoints = list(dict.fromkeys([link.remote_endpoint, *self._peering.endpoints(link.guid)]))
             try:
                 sock, endpoint = await self.dialler.dial(endpoints, briefly=True)
-                if not link.is_silent() or not unacknowledged(link.connection.sock):
+                if not link.is_silent() or not link.connection.stream.unacknowledged:
                     sock.close()  # it ended meanwhile, or is silent, but not for want of a way to it
                     return
                 secured = await self._secure(sock)
