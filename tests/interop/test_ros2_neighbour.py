@@ -42,7 +42,7 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
         yield hall
 
 
-@pytest.fixture(scope="module", params=[ZENOH, "jazzy", "kilted"])
+@pytest.fixture(scope="module", params=[ZENOH, "jazzy", pytest.param("kilted", marks=pytest.mark.long)])
 def ros2(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     """A ROS 2 node, and the hall that it is in: each way to ROS 2 has the same behaviour."""
     if request.param == ZENOH:

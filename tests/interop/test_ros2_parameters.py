@@ -22,7 +22,7 @@ crossing = "none"
 """
 
 
-@pytest.fixture(scope="module", params=["jazzy", "kilted"])
+@pytest.fixture(scope="module", params=["jazzy", pytest.param("kilted", marks=pytest.mark.long)])
 def hall(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
     if not python_of(request.param).exists():
         pytest.skip(f"ROS 2 {request.param} is not there: scripts/install-ros2")

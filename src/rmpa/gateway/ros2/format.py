@@ -243,7 +243,9 @@ def _kind(kind: type[_Kind], text: str, default: _Kind) -> _Kind:
 # The QoS of a topic that goes out to ROS 2. Its contract in ROS 2's words, and in Zenoh's.
 
 
-def ros2_qos(contracts: Contracts, topic: str, type_name: str, *, latching: bool) -> Ros2Qos:
+def ros2_qos(
+    contracts: Contracts, topic: str, type_name: str, *, latching: bool, depth: int = DEFAULT_DEPTH
+) -> Ros2Qos:
     """The QoS of a topic's publisher in ROS 2's graph.
 
     A topic whose contract no rule makes *best effort* is reliable, as TCPROS is and as ROS 2's default has it.
@@ -253,6 +255,7 @@ def ros2_qos(contracts: Contracts, topic: str, type_name: str, *, latching: bool
         topic: The topic.
         type_name: ``package/Name`` of ROS 1.
         latching: Whether its publisher latches: then it is transient local with a depth of 1.
+        depth: Of a volatile topic whose contract says none.
     """
     contract = contracts.of(topic, type_name)
     best_effort = contract.reliability is Reliability.BEST_EFFORT and contracts.is_set(
@@ -264,7 +267,7 @@ def ros2_qos(contracts: Contracts, topic: str, type_name: str, *, latching: bool
         Ros2Reliability.BEST_EFFORT if best_effort else Ros2Reliability.RELIABLE,
         Ros2Durability.TRANSIENT_LOCAL if kept else Ros2Durability.VOLATILE,
         Ros2History.KEEP_ALL if contract.history is History.KEEP_ALL else Ros2History.KEEP_LAST,
-        contract.kept if kept else DEFAULT_DEPTH if contract.depth is UNSET else contract.depth,
+        contract.kept if kept else depth if contract.depth is UNSET else contract.depth,
         _nanoseconds(contract.deadline),
         _nanoseconds(contract.lifespan),
         Ros2Liveliness.MANUAL_BY_TOPIC if manual else Ros2Liveliness.AUTOMATIC,

@@ -58,6 +58,8 @@ _ROS2_EARLY_BYTES: Final = 16 * 1024 * 1024
 
 # Messages that ROS 2 keeps for the gateway, but of images and the like: as many as a topic of ROS 1 may have waiting.
 _DEPTH: Final = 1000
+# Messages that wait for a slow node of ROS 2, but of images and the like: 0.2 s of a topic of 500 Hz.
+_OUT_DEPTH: Final = 100
 
 # Its publishers latch, in ROS 1 and ROS 2 (tf2_ros).
 _STATIC_TF: Final = "/tf_static"
@@ -121,7 +123,8 @@ class Ros2Dialect:
         if found is None:
             return None
         self._latching = self._latching or latched
-        qos = ros2_qos(context.contracts, source.name, source.type, latching=self._latching)
+        depth = DEFAULT_DEPTH if source.type in _STREAMS else _OUT_DEPTH
+        qos = ros2_qos(context.contracts, source.name, source.type, latching=self._latching, depth=depth)
         old = self.endpoint
         if old is None or (old.endpoint.type, old.endpoint.type_hash, old.endpoint.qos) != (*found, qos):
             self.endpoint = context.nodes.declare(source.proxy, EntityKind.PUBLISHER, source.here, *found, qos)
