@@ -218,12 +218,12 @@ def test_a_node_of_ros2_is_restarted_again_and_again(hall: Hall, times: int) -> 
 def test_nothing_is_lost_at_500_hz(hall: Hall, node: OtherEnd, seconds: int) -> None:
     """#429: reliable and keep all, both ways; of what ROS 2 publishes nothing that another node of rclpy hears."""
     count, on, back = 500 * seconds, f"/fast{seconds}", f"/fast_back{seconds}"
-    node.do("subscribe", topic=on)
+    node.do("follow", topic=on)
     with hall.robot.ros.rospy("talker", topic=on, type="String", rate=500, wait=1, count=count):
         node.process.wait_event("heard", seconds + FORGOTTEN, where=lambda e: e["data"] == f"message {count}")
     assert heard(node, on) == [f"message {number}" for number in range(1, count + 1)]
     beside = hall.node("beside2")
-    beside.do("subscribe", topic=back)
+    beside.do("follow", topic=back)
     with listener(hall.robot, back) as here:
         while not heard(beside, back):
             reaches(node, back, [here], f"turn {len(texts(here))}")

@@ -1,7 +1,7 @@
 """A ROS 2 node of rclpy. Runs with ROS 2's Python: ``rclpy_end.py NAME [ACTION]``. Reads lines of JSON.
 
 * ``{"do": "publish", "topic", "text", "count", "rate", "latched"}``: std_msgs/msg/String, each with its number;
-* ``{"do": "subscribe", "topic", "latched"}``: then ``heard`` with ``data``;
+* ``{"do": "subscribe", "topic", "latched"}``: then ``heard`` with ``data``; ``follow``: at a high rate;
 * ``{"do": "serve", "service", "delay"}``: std_srvs/srv/SetBool; then ``asked`` with ``data``;
 * ``{"do": "call", "service", "data"}``: likewise; then ``answered`` with ``success`` and ``message``, or ``error``;
 * ``{"do": "unpublish", "topic"}``, ``{"do": "unserve", "service"}``: take it back;
@@ -37,7 +37,7 @@ import rclpy
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock
-from rclpy.executors import MultiThreadedExecutor
+from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
@@ -98,6 +98,18 @@ class End:
 
         qos = LATE if latched else QoSProfile(depth=1000)
         self.kept["subscribe " + topic] = self.node.create_subscription(String, topic, take, qos)
+
+    def follow(self, topic: str) -> None:
+        """As ``subscribe``, by an executor of one thread: that of four takes 330 messages a second at the most."""
+        node = rclpy.create_node("fast_" + self.node.get_name())
+
+        def take(message: Any) -> None:
+            say("heard", topic=topic, data=message.data)
+
+        self.kept["follow " + topic] = node, node.create_subscription(String, topic, take, QoSProfile(depth=1000))
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        threading.Thread(target=executor.spin, daemon=True).start()
 
     def sensor(self, topic: str) -> None:
         qos = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
