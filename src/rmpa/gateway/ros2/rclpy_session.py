@@ -16,6 +16,7 @@ import random
 import socket
 import struct
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -37,6 +38,7 @@ from rmpa.gateway.ros2.format import (
     ros_type,
 )
 from rmpa.gateway.ros2.graph import OWN_NAMESPACE, gid_of
+from rmpa.gateway.ros2.rclpy_query import CALL, RclpyQuery
 from rmpa.gateway.zenoh.threads import ZenohReply, ZenohSample
 from rmpa.runtime.stream import Stream
 from rmpa.runtime.tasks import OwnedTasks
@@ -51,7 +53,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 _PROTOCOL: Final = 1
 _HEAD: Final = struct.Struct("<IBI")
-_CALL: Final = struct.Struct("<Q")
 _STAMPS: Final = struct.Struct("<qq")
 _MESSAGE: Final = ord("M")
 # Bytes of the head behind the length.
@@ -145,44 +146,6 @@ class RclpyPublisher:
     def close(self) -> None:
         """Publish no more."""
         self._session.publishers.discard(self)
-
-
-class RclpyQuery:
-    """A call of a ROS 2 client, to be answered once.
-
-    Args:
-        session: The session.
-        number: The server's.
-        call: The call's.
-        key: The service's.
-        request: As CDR.
-    """
-
-    def __init__(self, session: RclpySession, number: int, call: bytes, key: str, request: bytes) -> None:
-        self._session = session
-        self._number = number
-        self._call: bytes | None = call
-        self.key = key
-        self.parameters = ""
-        self.payload = request
-        self.attachment = Ros2Attachment(_CALL.unpack(call)[0], 0, bytes(16)).serialize()
-
-    def reply(self, _key: str, payload: Buffer, _attachment: bytes = b"") -> None:
-        """Give the answer."""
-        self._answer(b"\1", bytes(payload))
-
-    def reply_error(self, _text: str) -> None:
-        """Give up: ROS 2 has no response that says that a call has failed, and its client goes on waiting."""
-        self._answer(b"\0", b"")
-
-    def finish(self) -> None:
-        """No answer follows."""
-        self._answer(b"\0", b"")
-
-    def _answer(self, succeeded: bytes, payload: bytes) -> None:
-        call, self._call = self._call, None
-        if call is not None:
-            self._session.write("A", self._number, call + succeeded + payload)
 
 
 class RclpySession:
@@ -491,7 +454,7 @@ class RclpySession:
     ) -> list[ZenohReply]:
         """Call a service; no answer within ``timeout`` seconds is an empty list."""
         number = self.number_of(Ros2Attachment.parse(attachment).gid) or self._client(selector)
-        call = _CALL.pack(next(self._call_numbers))
+        call = CALL.pack(next(self._call_numbers))
         answer: asyncio.Future[list[ZenohReply]] = asyncio.get_running_loop().create_future()
         self._calls[call] = selector, answer
         try:
@@ -533,16 +496,16 @@ class RclpySession:
 
     def _query(self, number: int, body: bytes) -> None:
         key = self._keys.get(number, "")
-        query = RclpyQuery(self, number, body[: _CALL.size], key, body[_CALL.size :])
+        query = RclpyQuery(partial(self.write, "A", number), body[: CALL.size], key, body[CALL.size :])
         if (take := self._servers.get(key)) is not None:
             take(query)
         else:
             query.finish()
 
     def _answered(self, body: bytes) -> None:
-        key, answer = self._calls.get(body[: _CALL.size], ("", None))
+        key, answer = self._calls.get(body[: CALL.size], ("", None))
         if answer is not None and not answer.done():
-            ok, payload = bool(body[_CALL.size]), body[_CALL.size + 1 :]
+            ok, payload = bool(body[CALL.size]), body[CALL.size + 1 :]
             answer.set_result([ZenohReply(key, payload, b"", ok=ok)])
 
     def watch_tokens(self, key: str, on_token: Callable[[str, bool], None]) -> _Closer:
