@@ -55,7 +55,7 @@ class MeshScenario(Scenario):
         """Replace what the code would ask of the operating system."""
         slower = _SLOWER if self.count > _MANY else 1
         with (
-            mock.patch("rmpa.mesh.io.mesh.unacknowledged", lambda sock: sock.in_flight),
+            mock.patch("rmpa.runtime.stream.Stream.unacknowledged", property(lambda stream: stream._sock.in_flight)),
             mock.patch("rmpa.runtime.accept.Descriptors.has_room", return_value=True),
             mock.patch.multiple(
                 limits,
