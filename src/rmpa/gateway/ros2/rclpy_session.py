@@ -131,7 +131,7 @@ class RclpyPublisher:
                     self._used.add(number)
                     self._session.outbox.set_terms(number, self._qos.messages)
                 dropped += self._session.write("M", number, payload)
-                if self._session.is_latched(number):
+                if self._qos.cache:
                     self._session.kept[number] = payload
         self.dropped += dropped
         return dropped
@@ -405,10 +405,6 @@ class RclpySession:
     def number_of(self, gid: bytes) -> int | None:
         """The endpoint with this GID."""
         return self._by_gid.get(gid)
-
-    def is_latched(self, number: int) -> bool:
-        """Whether an endpoint keeps its last message for late ones."""
-        return self._declared[number].qos.latched
 
     def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> RclpyPublisher:
         """A publisher for the declared endpoints of a key; ``on_matching`` tells whether ROS 2 subscribes."""
