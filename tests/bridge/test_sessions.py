@@ -136,7 +136,7 @@ class Broken(Part):
 
 def test_a_run_at_another_address_goes_on_before_the_end_of_its_old_link_is_noticed() -> None:
     async def scene(made: Scene) -> None:
-        old = made.link()
+        old = made.link(silent=False)
         made.link(host="10.0.0.2")
         assert made.states() == [PeerState.LINKED]
         assert cast("Link", old).closed == "far has another address"
