@@ -178,6 +178,12 @@ def test_services_and_actions_go_by_a_relay_too(lab: Lab, agent: AgentFactory, s
         assert all(text in str(done["errors"]) for text in errors), done
     assert b.ros.tool("rosservice", "node", "/work").strip() == "/rmpa/a/worker"
     assert "/work" in r.ros.tool("rosservice", "list").split()
+    a.ros.rospy("listener", "__name:=motors", topic="/cmd_vel")
+    eventually(lambda: "/rmpa/a/motors" in b.ros.tool("rostopic", "info", "/cmd_vel"), what="a's subscriber at b")
+    r.agent.terminate()
+    b.wait_no_topic("/cmd_vel")
+    r.agent.restart()
+    b.wait_topic("/cmd_vel")
 
     if not lacks("actionlib"):
         server = a.ros.rospy("action_server", name="server")

@@ -102,6 +102,8 @@ def test_what_the_permissions_say_crosses_and_a_reload_closes_and_opens_it(
 
     # What no rule allows is not there, on either side.
     assert "/rmpa/joystick" not in publishers(base, "/spam")
+    assert "/rmpa/base/motors" in joystick.ros.tool("rostopic", "info", "/cmd_vel")
+    assert "/rmpa/base" not in joystick.ros.tool("rostopic", "info", "/spam")
     assert "/secret" not in joystick.topics()
     assert "/open_door" not in joystick.ros.tool("rosservice", "list").split()
     counters = base.agent.snapshot().counters
@@ -134,6 +136,7 @@ def test_what_the_permissions_say_crosses_and_a_reload_closes_and_opens_it(
     has_remote(base, "/cmd_vel", "joystick", there=False)
     has_remote(joystick, "/odom", "base", there=False)
     wait_services(joystick.ros, "/stop", there=False)
+    assert "/rmpa/base" not in joystick.ros.tool("rostopic", "info", "/cmd_vel")
     assert calls(caller, "echo 0 100 1 once")["ok"] == 0
     code, said = base.agent.rmpa("trust", "check", "joystick", "publish", "/cmd_vel", "--config", str(file))
     assert (code, said.strip()) == (1, "no: [[permission]] 2 denies publish of '/cmd_vel' to '*'")

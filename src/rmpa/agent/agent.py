@@ -23,6 +23,7 @@ from rmpa.bridge.nodes import Nodes
 from rmpa.bridge.params.follower import Params
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.services.part import Services
+from rmpa.bridge.subscriptions import Subscriptions
 from rmpa.bridge.twins import TwinWatch
 from rmpa.config.module_name import core_file
 from rmpa.core import limits
@@ -434,8 +435,9 @@ class Agent:
         )
         self.params, self.services = Params(self.bridge), Services(self.bridge)
         nodes = Nodes(self.bridge, self.bridge.topics, self.services)
-        twins = TwinWatch(self.bridge)
-        for part in (self.params, self.services, nodes, twins):
+        subscriptions = Subscriptions(self.bridge)
+        twins = TwinWatch(self.bridge, subscriptions)
+        for part in (self.params, self.services, nodes, subscriptions, twins):
             self.bridge.add(part)
         self.trust: AgentTrust | None = None
         if membership is not None:
@@ -446,7 +448,7 @@ class Agent:
         self.reloaded: Callable[[], None] = lambda: None
         self.other_notes: list[Callable[[], Iterable[str]]] = []
         counters = Counters()
-        self._facts = facts = BridgeFacts(self.bridge, self.services, twins)
+        self._facts = facts = BridgeFacts(self.bridge, self.services, subscriptions, twins)
         parts = AgentParts(
             core=self.core,
             facts=facts,

@@ -15,11 +15,14 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.messages import Origin
+    from rmpa.bridge.offers import OfferBook
+    from rmpa.bridge.peer_offers import ImportBook
     from rmpa.bridge.services.bodies import LocalService
     from rmpa.bridge.services.books import RemoteService
     from rmpa.bridge.services.calls import CallStats
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.subscriptions import Subscriptions
     from rmpa.bridge.twins import TwinWatch
 
 
@@ -133,6 +136,7 @@ class BridgeFacts:
     Args:
         bridge: The bridge.
         services: Its part for services.
+        subscriptions: Its part for the subscriptions of peers.
         twins: Its part for peers of this module's kind.
 
     Attributes:
@@ -140,11 +144,11 @@ class BridgeFacts:
         services: The facts of services.
     """
 
-    def __init__(self, bridge: Bridge, services: Services, twins: TwinWatch) -> None:
+    def __init__(self, bridge: Bridge, services: Services, subscriptions: Subscriptions, twins: TwinWatch) -> None:
         self.bridge = bridge
         self.topics = TopicFacts(bridge)
         self.services = ServiceFacts(services)
-        self._services, self._twins = services, twins
+        self._services, self._subscriptions, self._twins = services, subscriptions, twins
 
     def proxies(self) -> dict[str, Any]:
         """The fields of ``AgentInfo`` about the nodes that stand for those of peers."""
@@ -169,14 +173,18 @@ class BridgeFacts:
 
     def _beyond(self, session: PeerSession) -> Iterator[BoundInfo]:
         """What of a peer this module refuses because of its limits."""
-        topics, services = self.bridge.topics.imports, self._services.imports
+        books: dict[str, ImportBook[Any, Any, Any]] = {
+            "topics": self.bridge.topics.imports,
+            "services": self._services.imports,
+            "subscriptions": self._subscriptions.imports,
+        }
         most, peer, name = self.bridge.context.settings.limits, session.peer, session.link.name
-        nodes = {"topics": topics.refused_nodes(peer), "services": services.refused_nodes(peer)}
+        nodes = {kind: book.refused_nodes(peer) for kind, book in books.items()}
         further = [f"{count} {kind}" for kind, of in nodes.items() if (count := sum(map(len, of.values())))]
         for hidden, kind, limit in (
-            (len(nodes["topics"].keys() | nodes["services"].keys()), "nodes", most.nodes),
-            (topics.refused(peer), "topics", most.topics),
-            (services.refused(peer), "services", most.services),
+            (len(set().union(*nodes.values())), "nodes", most.nodes),
+            (books["topics"].refused(peer) + books["subscriptions"].refused(peer), "topics", most.topics),
+            (books["services"].refused(peer), "services", most.services),
         ):
             if hidden:
                 what = _count(hidden, kind) + (f" with {' and '.join(further)}" if kind == "nodes" else "")
@@ -200,9 +208,14 @@ class BridgeFacts:
 
     def notes(self) -> Iterator[str]:
         """What of this module no peer is offered because of its limits."""
-        for part, kind in ((self.bridge.topics, "topics"), (self._services, "services")):
-            if beyond := part.exports.beyond:
-                which = f"{_count(len(beyond), kind)} of this module are offered to no peer"
+        books: tuple[tuple[OfferBook[Any, Any, Any, Any], str, str], ...] = (
+            (self.bridge.topics.exports, "topics", ""),
+            (self._subscriptions.exports, "topics", " that nodes subscribe to"),
+            (self._services.exports, "services", ""),
+        )
+        for book, kind, of in books:
+            if beyond := book.beyond:
+                which = f"{_count(len(beyond), kind)} of this module{of} are offered to no peer"
                 limit = getattr(self.bridge.context.settings.limits, kind)
                 yield f"{which}: more than limits.{kind} = {limit}; {_raise_limit(kind)}"
 

@@ -58,16 +58,14 @@ class GraphPart(Part, ImportEffects):
     Attributes:
         exports: What is offered.
         imports: What peers offer.
-        direct_exports: Direct connections of peers' nodes to local ones.
-        direct_imports: Direct connections of local nodes to peers' ones.
+        direct: The direct connections of local nodes to peers' ones, and of peers' nodes to local ones.
         verb: What a peer does with its entries, for the log.
         refusals: Logs and counts warnings, and peers that break the protocol.
     """
 
     exports: OfferBook[Any, Any, Any, Any]
     imports: ImportBook[Any, Any, Any]
-    direct_exports: Grants
-    direct_imports: Paths[Any]
+    direct: tuple[Grants | Paths[Any], ...] = ()
     verb: ClassVar[str]
 
     def __init__(
@@ -147,21 +145,21 @@ class GraphPart(Part, ImportEffects):
         self.imports.ways.instance = self._bridge.relay.instance
         self.imports.link_up(session)
         self.exports.link_up(session)
-        self.direct_imports.link_up(session)
-        self.direct_exports.link_up(session)
+        for each in self.direct:
+            each.link_up(session)
         self.schedule()
 
     def link_down(self, session: PeerSession) -> None:
         """Drop the peer's advertisements that are not applied yet."""
-        self.direct_imports.link_down(session)
-        self.direct_exports.link_down(session)
+        for each in self.direct:
+            each.link_down(session)
         self._advertisements = deque(one for one in self._advertisements if one[0] is not session)
         self._unread_bytes = sum(len(waiting) for _, waiting in self._advertisements if isinstance(waiting, bytes))
 
     def gone(self, session: PeerSession) -> None:
         """Forget a peer."""
-        self.direct_imports.gone(session)
-        self.direct_exports.gone(session)
+        for each in self.direct:
+            each.gone(session)
 
     def depends(self, session: PeerSession) -> bool:
         """Whether an advertisement of a peer is not applied yet."""

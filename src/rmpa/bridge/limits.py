@@ -32,6 +32,8 @@ ADVERTISEMENT_MAX: Final = 1 * MIB
 # Bytes of received advertisements, of all peers, that may wait to be parsed: some 40,000 topics. Beyond it the oldest
 # are parsed at once.
 ADVERTISED_WAITING_BYTES: Final = 4 * MIB
+# Notifications of peers' subscriptions that may wait to be applied; beyond it the oldest are applied at once.
+SUBSCRIPTIONS_WAITING: Final = 64
 # Routes whose timers are due, and parameters of one request, that are handled in one turn of the event loop, which
 # takes some 100 microseconds; then data goes first.
 APPLIED_AT_ONCE: Final = 16

@@ -26,6 +26,7 @@ Name = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=r
 PeerName = Annotated[str, Meta(max_length=core_limits.PEER_NAME_MAX, pattern=rf"\A{BASE_NAME}\Z")]
 NameOrNone = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A({GLOBAL_NAME})?\Z")]
 TypeName = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A{TYPE_NAME}\Z")]
+AnyTypeName = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A(\*|{TYPE_NAME})\Z")]
 TypeNameOrNone = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A({TYPE_NAME})?\Z")]
 Md5 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{32}\Z")]
 InstanceId = Annotated[str, Meta(pattern=r"\A[0-9a-f]{32}\Z")]
@@ -141,6 +142,21 @@ class Advertise(msgspec.Struct, frozen=True, tag_field="op", tag="advertise"):
 
     added: Annotated[tuple[TopicOffer, ...], Meta(max_length=limits.ADVERTISED_MAX)] = ()
     removed: tuple[Source, ...] = ()
+    full: bool = False
+    more: bool = False
+
+
+class SubscriptionOffer(TopicOffer, frozen=True, omit_defaults=True):
+    """A subscription of a node, as ``TopicOffer``; ``type`` is ``*`` where the subscriber takes any."""
+
+    type: AnyTypeName
+
+
+class SubscriptionChanges(msgspec.Struct, frozen=True):
+    """The arguments of the notification of subscriptions; see ``Advertise``."""
+
+    added: Annotated[tuple[SubscriptionOffer, ...], Meta(max_length=limits.ADVERTISED_MAX)] = ()
+    removed: Annotated[tuple[Source, ...], Meta(max_length=limits.ADVERTISED_MAX)] = ()
     full: bool = False
     more: bool = False
 

@@ -102,6 +102,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
         owner: What provides an entry, for texts.
         message: ``(added, removed, full, more)``: the message to a peer with a portion of the entries.
         renews: Whether a changed entry is told again although its offer is the same.
+        reports: Whether a peer that may not know of an entry is reported: it may want to use it.
         seen: What the local graph has, whether it crosses or not.
         offered: What peers may have, within the limit; ``judge_for`` decides for each of them.
         beyond: What is offered to no peer because there is more than the limit, the first one first.
@@ -114,6 +115,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
     owner: ClassVar[str]
     message: ClassVar[Callable[..., Message]]
     renews: ClassVar[bool] = False
+    reports: ClassVar[bool] = True
 
     def __init__(self, out: Effects) -> None:
         self._out = out
@@ -163,7 +165,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
         decision, wire = self.judge_for(told, key, local)
         if decision.allowed:
             return self.offer_for(key, local, wire)
-        if isinstance(decision, PermissionDecision):
+        if isinstance(decision, PermissionDecision) and self.reports:
             self._out.context.gate.refused(self.access, told.session.name, self.name_of(key), decision)
         return None
 

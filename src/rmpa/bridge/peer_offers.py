@@ -16,7 +16,7 @@ from rmpa.bridge.policy import RelayPaths
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
-    from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin
+    from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, SubscriptionChanges
     from rmpa.bridge.peer import PeerRun
     from rmpa.bridge.policy import PolicyDecision
     from rmpa.config.peer_rules import Access
@@ -225,7 +225,9 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         self._ways_changed(self.ways.linked(peer, session.name, session.instance, session.rank))
         self._ready(peer)
 
-    def changes(self, peer: int, message: Advertise | AdvertiseServices) -> Iterator[tuple[KeyT, OfferT | None]]:
+    def changes(
+        self, peer: int, message: Advertise | AdvertiseServices | SubscriptionChanges
+    ) -> Iterator[tuple[KeyT, OfferT | None]]:
         """The changes of an advertisement, each with its name on the wire; removals, ``None``, go first.
 
         Entries that a complete catalogue does not contain are removed at its end.

@@ -8,13 +8,10 @@ several modules a name is offered by one module, and taken by others.
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
-from rmpa.bridge import limits
-from rmpa.bridge.policy import Needs
 from rmpa.bridge.sessions import Part
-from rmpa.config.peer_rules import Access
-from rmpa.core.identity import is_global_name, is_own, matches
+from rmpa.core.identity import is_own, matches
 from rmpa.core.log import RefusalLog
 from rmpa.runtime.loop import SystemClock, yield_to_data
 
@@ -24,6 +21,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.subscriptions import Subscriptions
     from rmpa.ros.master.parameters import GraphState
 
 _log = logging.getLogger(__name__)
@@ -62,7 +60,7 @@ def twin_names(
         offered: What this module's own nodes publish.
         taken: What they subscribe to.
         offered_there: What the peer's own nodes publish here.
-        taken_there: What they subscribe to, as far as the peer said.
+        taken_there: What they subscribe to.
     """
     both = offered & offered_there
     driven = taken & (taken_there | offered_there)
@@ -81,32 +79,23 @@ def twin_text(peer: str, names: tuple[str, ...]) -> str:
     )
 
 
-# The notification ``{"names": [...]}`` to a peer that offers what we do: the topics that nodes here subscribe to.
-TAKEN: Final = "names.taken"
-
-
 class TwinWatch(Part):
     """The part of the bridge that knows which peers are twins; it looks each ``limits.RECONCILE_INTERVAL``.
 
     Args:
-        bridge: The local graph, the sessions, topics and requests.
-
-    Attributes:
-        _said: By peer: the names that it was told last.
-        _taken_there: By peer: what its nodes take, by wire names, as it said last.
+        bridge: The local graph, the sessions and topics.
+        subscriptions: What the nodes of peers subscribe to.
     """
 
-    def __init__(self, bridge: Bridge) -> None:
+    def __init__(self, bridge: Bridge, subscriptions: Subscriptions) -> None:
         self._bridge = bridge
+        self._subscriptions = subscriptions
         self._clock = SystemClock()
         self._told = RefusalLog(_log, bridge.counters)
         self._state: GraphState | None = None
         self._offered: frozenset[str] = frozenset()
         self._taken: frozenset[str] = frozenset()
-        self._said: dict[int, tuple[str, ...]] = {}
-        self._taken_there: dict[int, tuple[str, ...]] = {}
         self._twins: dict[int, tuple[str, ...]] = {}
-        bridge.rpc.on_notification(TAKEN, self._told_by_peer, Needs((), "names of the peer's own graph"))
 
     def problem(self, session: PeerSession) -> str:
         """What the user is told of a peer, while it is a twin; else empty."""
@@ -123,29 +112,23 @@ class TwinWatch(Part):
             yield_to_data()
             self._judge(session)
 
-    def link_up(self, session: PeerSession) -> None:
-        """Forget what was said over an earlier link."""
-        self._said.pop(session.peer, None)
-
     def gone(self, session: PeerSession) -> None:
         """Forget a peer."""
-        for known in (self._said, self._taken_there, self._twins):
-            known.pop(session.peer, None)
+        self._twins.pop(session.peer, None)
 
     def _judge(self, session: PeerSession) -> None:
         peer, name = session.peer, session.link.name
         if not self._offered or not self._taken or self._is_decided(name):
             self._set(session, ())
             return
-        offers, rename = self._bridge.topics.imports.offered_by(peer), self._bridge.context.names.of(name).local_name
+        offers = self._bridge.topics.imports.offered_by(peer)
         offered_there = frozenset(
             topic
             for topic in (self._offered | self._taken).intersection(offers)
             if any(entry.shown and entry.origin is None for entry in offers[topic])
         )
-        if len(self._offered & offered_there) >= OFFERED_MIN:
-            self._say(session)
-        taken_there = frozenset(map(rename, self._taken_there.get(peer, ())))
+        both = len(self._offered & offered_there) >= OFFERED_MIN
+        taken_there = self._subscriptions.imports.topics(peer) if both else frozenset()
         self._set(session, twin_names(self._offered, self._taken, offered_there, taken_there))
 
     def _is_decided(self, name: str) -> bool:
@@ -162,24 +145,6 @@ class TwinWatch(Part):
             self._told.refuse(self._clock.now(), "peer.twin", name, f"{name}: {twin_text(name, names)}")
         elif before and not names:
             _log.info("= %s and this module share no commands any more", name)
-
-    def _say(self, session: PeerSession) -> None:
-        """Tell a peer what nodes here take of what it may publish here, if that has changed."""
-        name = session.link.name
-        wire, judge = self._bridge.context.names.of(name).wire_name, self._bridge.gate.judge
-        allowed = (each for each in sorted(self._taken) if judge(Access.PUBLISH, name, each).allowed)
-        names = tuple(map(wire, allowed))[: limits.TWIN_NAMES_MAX]
-        if session.linked and names != self._said.get(session.peer):
-            self._said[session.peer] = names
-            self._bridge.rpc.notify(session, TAKEN, {"names": names})
-
-    def _told_by_peer(self, session: PeerSession, args: dict[str, Any]) -> None:
-        names = args.get("names")
-        found = names[: limits.TWIN_NAMES_MAX] if isinstance(names, list) else ()
-        self._taken_there[session.peer] = tuple(
-            name for name in found if isinstance(name, str) and is_global_name(name)
-        )
-        self._judge(session)
 
 
 def _own(table: Mapping[str, Mapping[str, str]]) -> list[str]:

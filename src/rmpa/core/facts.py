@@ -269,6 +269,7 @@ class TopicInfo(msgspec.Struct, kw_only=True, frozen=True):
         md5: Of that type; empty before it is known.
         publishers: Local nodes that publish it, without proxies.
         subscribers: Local nodes that subscribe to it, without the agent's own.
+        remote_subscribers: Nodes of other modules that do, as ``module:/node``.
         routes: Its routes to and from peers.
         crosses: Whether policy lets it cross.
         policy: The rule that says so, ready to read.
@@ -281,6 +282,7 @@ class TopicInfo(msgspec.Struct, kw_only=True, frozen=True):
     md5: str = ""
     publishers: tuple[str, ...] = ()
     subscribers: tuple[str, ...] = ()
+    remote_subscribers: tuple[str, ...] = ()
     routes: tuple[RouteInfo, ...] = ()
     crosses: bool = True
     policy: str = ""

@@ -106,6 +106,7 @@ class Services(GraphPart):
         self.serving = Serving(bridge, self.exports, self._budgets)
         self.direct_exports = ServiceGrants(bridge, self.exports, self.warn)
         self.direct_imports = ServicePaths(bridge, self.warn, self._proxy_uri)
+        self.direct = self.direct_imports, self.direct_exports
         bridge.rpc.on_notification(_MISMATCH, self._told_of_mismatch, Needs((), "a text for the log"))
 
     def __iter__(self) -> Iterator[ShownService]:

@@ -24,7 +24,7 @@ from rmpa.core.facts import (
     SubscriberTransport,
     TopicInfo,
 )
-from rmpa.core.identity import is_own
+from rmpa.core.identity import is_own, proxied_node
 from rmpa.ros.wire.tcpros import LENGTH, printable
 from rmpa.runtime.loop import SystemClock, sorted_yielding, yield_to_data, yielding_to_data
 
@@ -100,6 +100,9 @@ class TopicFacts:
                 md5=next((route.md5 for route in crossing if route.md5), ""),
                 publishers=own,
                 subscribers=tuple(node for node in state.subscribers.get(name, ()) if not is_own(node)),
+                remote_subscribers=tuple(
+                    ":".join(whose) for node in state.subscribers.get(name, ()) if (whose := proxied_node(node))
+                ),
                 routes=crossing,
                 crosses=decision.allowed,
                 policy=decision.rule,
@@ -119,7 +122,9 @@ class TopicFacts:
         """
         state, topics = self._core.state(), self._bridge.topics
         idle: set[str] = set()
-        first, problems = set(state.subscribers), set()
+        first, problems = set[str](), set[str]()
+        for name, nodes in yielding_to_data(list(state.subscribers.items())):
+            (idle if all(map(is_own, nodes)) else first).add(name)
         for entry in yielding_to_data(list(topics.imports)):
             if entry.state != "idle" or entry.direct:
                 first.add(entry.name)

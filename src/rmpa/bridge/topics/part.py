@@ -82,6 +82,7 @@ class Topics(GraphPart):
         self.joins = Joins(bridge, self)
         self.direct_exports = TopicGrants(bridge, self.exports)
         self.direct_imports = TopicPaths(bridge, self.warn, self.imports)
+        self.direct = self.direct_imports, self.direct_exports
         self._nodes: dict[str, tuple[str, ...]] = {}
         self._ticker: asyncio.TimerHandle | None = None
 

@@ -155,7 +155,7 @@ class Core(Protocol):
         return self.registrations.at(RegistrationKind.SUBSCRIBER, topic)
 
     def type_of(self, topic: str, node: str = "") -> str:
-        """The type with which a node publishes a topic, else the one registered last; ``*`` for none."""
+        """The type of a node's topic, else the one that was registered last by any; ``*`` for none."""
         return self.registrations.type_of(topic, node)
 
     def on_change(self, callback: Callable[[GraphChange], None]) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Final
 
 import msgspec
 
-from rmpa.core.identity import is_type_name
+from rmpa.core.identity import is_type_name, proxied_node
 from rmpa.ros.master.parameters import GraphChange, GraphState, RegistrationKind, SlaveCall
 
 # Characters of a name that is read from a state file: rosmaster has no limit, and the longest seen have 200.
@@ -97,12 +97,15 @@ class Registrations:
         return self._types
 
     def type_of(self, topic: str, node: str = "") -> str:
-        """The type with which a node publishes a topic, else the one registered last by any node; ``*`` for none.
+        """The type with which a node publishes or subscribes to a topic, else the one registered last by any node.
+
+        ``*`` for none.
 
         The master keeps one type for each topic; publishers may have several.
         """
-        own = self._entries.get(node, _NO_ENTRIES).get((RegistrationKind.PUBLISHER, topic), "")
-        return own if is_type_name(own) else self._types.get(topic, ANY_TYPE)
+        entries = self._entries.get(node, _NO_ENTRIES)
+        registered = (entries.get((kind, topic), "") for kind in _OTHER_SIDE)
+        return next(filter(is_type_name, registered), self._types.get(topic, ANY_TYPE))
 
     def record(self, node: str) -> NodeRecord | None:
         """Everything that a node registered; ``None`` for an unknown node."""
@@ -214,10 +217,11 @@ class Registrations:
         return True
 
     def notify_subscribers(self, topic: str) -> None:
-        """Send the subscribers of a topic the list of its publishers."""
+        """Send the subscribers of a topic the list of its publishers; a proxy connects to none, and needs no list."""
         publishers = list(self.at(RegistrationKind.PUBLISHER, topic).values())
         # Nodelets of one process share a slave API, which is notified once.
-        apis = dict.fromkeys(self.at(RegistrationKind.SUBSCRIBER, topic).values())
+        subscribers = self.at(RegistrationKind.SUBSCRIBER, topic)
+        apis = dict.fromkeys(api for node, api in subscribers.items() if proxied_node(node) is None)
         self.calls += [(api, "publisherUpdate", topic, publishers) for api in apis]
 
     def take(self) -> tuple[list[SlaveCall], list[GraphChange]]:

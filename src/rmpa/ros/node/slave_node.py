@@ -13,7 +13,7 @@ import asyncio
 import itertools
 import logging
 import os
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.statistics import Counters
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rmpa.ros.node.listeners import SharedListener
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.service_server import ServiceCall
-    from rmpa.ros.node.subscription import Subscription, TopicConnection
+    from rmpa.ros.node.subscription import TopicConnection
     from rmpa.ros.wire.slave_api import BusConnection
     from rmpa.ros.wire.tcpros import Buffer
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
@@ -45,6 +45,27 @@ def _ignore(*_: object) -> None:
 
 def _not_followed(_key: str, _value: XmlRpcValue) -> bool:
     return False
+
+
+class SubscribedTopic(Protocol):
+    """A topic that a node subscribes to, or is shown to.
+
+    Attributes:
+        topic: The topic's global name.
+        type_name: Its type; ``*`` for any.
+    """
+
+    topic: str
+    type_name: str
+
+    def connections(self) -> list[BusConnection]:
+        """The connections to its publishers."""
+
+    def update(self, uris: Iterable[str]) -> None:
+        """Take the master's list of publishers, by their slave APIs."""
+
+    def close(self) -> None:
+        """Disconnect from all."""
 
 
 class SlaveNode:
@@ -95,7 +116,7 @@ class SlaveNode:
         self._listener = listener
         self._advertised = advertised_host or host
         self._publications: dict[str, Publication] = {}
-        self._subscriptions: list[Subscription] = []
+        self._subscriptions: list[SubscribedTopic] = []
         self._services: dict[str, ServiceEndpoint] = {}
         self._numbers = itertools.count(1)
         self._on_shutdown = on_shutdown
@@ -168,11 +189,11 @@ class SlaveNode:
         if publication is not None:
             publication.withdraw()
 
-    def add_subscription(self, subscription: Subscription) -> None:
+    def add_subscription(self, subscription: SubscribedTopic) -> None:
         """Pass ``publisherUpdate`` of its topic on to a subscription."""
         self._subscriptions.append(subscription)
 
-    def remove_subscription(self, subscription: Subscription) -> None:
+    def remove_subscription(self, subscription: SubscribedTopic) -> None:
         """Disconnect from its topic's publishers."""
         if subscription in self._subscriptions:
             self._subscriptions.remove(subscription)
