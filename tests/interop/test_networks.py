@@ -179,7 +179,8 @@ def test_services_and_actions_go_by_a_relay_too(lab: Lab, agent: AgentFactory, s
     assert b.ros.tool("rosservice", "node", "/work").strip() == "/rmpa/a/worker"
     assert "/work" in r.ros.tool("rosservice", "list").split()
     a.ros.rospy("listener", "__name:=motors", topic="/cmd_vel")
-    eventually(lambda: "/rmpa/a/motors" in b.ros.tool("rostopic", "info", "/cmd_vel"), what="a's subscriber at b")
+    b.wait_topic("/cmd_vel")
+    assert "/rmpa/a/motors" in b.ros.tool("rostopic", "info", "/cmd_vel")
     r.agent.terminate()
     b.wait_no_topic("/cmd_vel")
     r.agent.restart()

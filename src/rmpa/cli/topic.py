@@ -251,7 +251,8 @@ def _described(graph: Graph, wanted: GraphName, crossing: TopicInfo | None) -> I
         yield from (f" * {origin_text(node)}" for node in meant)
     if crossing is None:
         return
-    yield from ("", "Mesh:" + ("" if crossing.routes else " nothing of it crosses"))
+    nothing = " nothing of it crosses" + (" until a node here publishes it" if crossing.remote_subscribers else "")
+    yield from ("", "Mesh:" + ("" if crossing.routes else nothing))
     if crossing.policy:
         yield f" * {'may cross' if crossing.crosses else 'does not cross'}: {crossing.policy}"
     for route in crossing.routes:

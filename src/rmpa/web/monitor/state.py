@@ -223,7 +223,8 @@ class StateBuilder:
 
     def _topic(self, topic: TopicInfo) -> Tree:
         sources = {self.own} if topic.publishers else set()
-        targets = {self.own} if topic.subscribers else set()
+        targets = {node.partition(":")[0] for node in topic.remote_subscribers}
+        targets |= {self.own} if topic.subscribers else set()
         rate = bandwidth = latency = 0.0
         lost = dropped = 0
         problem = next(iter((*topic.mismatches, *topic.unreachable)), "")
@@ -324,15 +325,16 @@ def node_key(module: str, node: str) -> str:
 def node_entries(snapshot: Snapshot) -> dict[str, Tree]:
     """The nodes of all modules by ``node_key``: how many topics each publishes and subscribes to, what it serves.
 
-    Of a peer those that publish or serve something here.
+    Of a peer those of which something is shown here.
     """
     publishes: dict[tuple[str, str], int] = defaultdict(int)
     subscribes, serves = publishes.copy(), publishes.copy()
     for topic in snapshot.topics:
         for node in topic.publishers:
             publishes["", node] += 1
-        for node in topic.subscribers:
-            subscribes["", node] += 1
+        for node in (*topic.subscribers, *topic.remote_subscribers):
+            module, _, name = node.rpartition(":")
+            subscribes[module, name] += 1
         for route in topic.routes:
             if route.direction == "in":
                 publishes[route.peer, route.node] += 1
@@ -362,7 +364,7 @@ def node_detail(snapshot: Snapshot, key: str) -> Tree | None:
         if (not module and node in topic.publishers)
         or (module and any((each.direction, each.peer, each.node) == ("in", module, node) for each in topic.routes))
     ]
-    subscribes = [topic.name for topic in snapshot.topics if not module and node in topic.subscribers]
+    subscribes = [topic.name for topic in snapshot.topics if key in (*topic.subscribers, *topic.remote_subscribers)]
     services = [service_key(each) for each in snapshot.services if (each.peer, each.node) == (module, node)]
     if not publishes and not subscribes and not services:
         return None
