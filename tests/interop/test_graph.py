@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import re
+from functools import partial
+from typing import Final
 
 import pytest
 
-from lab.bed.processes import eventually
-from tests.interop.conftest import ModuleFactory
+from lab.bed.processes import CommandFailed, eventually
+from tests.interop.conftest import ModuleFactory, ShellFactory
 from tests.interop.modules import Module, flows, whole
+from tests.interop.ros import PYTHON, Ros, free_port
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
 
@@ -19,18 +23,53 @@ prefix = "/{peer}"
 deny = ["/**/private"]
 """
 
+# What rqt_graph does to draw its nodes and topics: ROS's own code, of rosgraph.
+DRAW: Final = """
+import json, rosgraph.impl.graph
+graph = rosgraph.impl.graph.Graph()
+graph.set_master_stale(5.0)
+graph.set_node_stale(5.0)
+graph.update()
+print(json.dumps([[edge.start.strip(), edge.end.strip()] for edge in graph.nt_edges]))
+"""
+
+
+def drawn(ros: Ros) -> set[tuple[str, str]]:
+    """The edges that rqt_graph draws between nodes and topics of the tests, without the names of proxies' modules."""
+    edges = json.loads(ros.tool(PYTHON, "-c", DRAW).splitlines()[-1])
+    named = {tuple(re.sub("^/rmpa/[^/]+/", "/", end) for end in edge) for edge in edges}
+    return {(start, end) for start, end in named if "/test/" in start + end and "/rmpa" not in (start, end)}
+
+
+def is_drawn(ros: Ros, edges: set[tuple[str, str]]) -> bool:
+    found = drawn(ros)
+    print(sorted(found ^ edges))  # shown where the wait is in vain
+    return found == edges
+
+
+def start_all(*shells: Ros) -> None:
+    """Start nodes that publish and subscribe to each other's topics, on one module or on three."""
+    base, arm, pc = shells
+    base.roscpp("listener", "__name:=motors", topic="/test/cmd_vel")
+    base.rospy("talker", "__name:=wheels", topic="/test/odom", rate=10)
+    arm.rospy("listener", "__name:=planner", topic="/test/odom")
+    arm.rospy("listener", "__name:=waiting", topic="/test/goal")
+    pc.roscpp("talker", "__name:=driver", topic="/test/cmd_vel", rate=10)
+    pc.rospy("listener", "__name:=screen", topic="/test/odom")
+
 
 def subscribers(module: Module, topic: str) -> set[str]:
     """What the stock ``rostopic info`` says of a topic's subscribers; empty for an unknown topic."""
-    said = module.ros.tool("rostopic", "info", topic).partition("Subscribers:")[2]
-    return set(re.findall(r"\* (\S+) \(http", said))
+    try:
+        said = module.ros.tool("rostopic", "info", topic)
+    except CommandFailed:
+        return set()
+    return set(re.findall(r"\* (\S+) \(http", said.partition("Subscribers:")[2]))
 
 
 def wait_subscribers(module: Module, topic: str, *nodes: str) -> None:
-    eventually(
-        lambda: subscribers(module, topic) == set(nodes) if topic in module.topics() else not nodes,
-        what=f"{nodes} as the subscribers of {topic} at {module.name}",
-    )
+    what = f"{nodes} as the subscribers of {topic} at {module.name}"
+    eventually(lambda: subscribers(module, topic) == set(nodes), what=what)
 
 
 @pytest.mark.parametrize("client", ["rospy", "roscpp"])
@@ -85,3 +124,38 @@ def test_a_subscription_follows_the_rules_and_names_of_its_module(modules: Modul
     wait_subscribers(pc, "/base/cmd_vel")
     base.host.restore()
     wait_subscribers(pc, "/base/cmd_vel", "/rmpa/base/motors")
+
+
+def test_rqt_graph_draws_in_each_module_what_it_draws_of_one_roscore(
+    modules: ModuleFactory, shell: ShellFactory
+) -> None:
+    """By the calls of rqt_graph, which Debian does not have."""
+    alone = shell(port=free_port())
+    alone.roscore()
+    start_all(alone, alone, alone)
+    expected = {
+        ("/driver", "/test/cmd_vel"), ("/test/cmd_vel", "/motors"), ("/wheels", "/test/odom"),
+        ("/test/odom", "/planner"), ("/test/odom", "/screen"),
+    }  # fmt: skip
+    # It draws connections; a topic without a publisher has none.
+    eventually(lambda: is_drawn(alone, expected), what="the graph of one roscore")
+    made = modules("a", "b", "c")
+    start_all(*(module.ros for module in made))
+    for module in made:
+        eventually(partial(is_drawn, module.ros, expected), what=f"the whole graph at {module.name}")
+
+
+def test_a_lazy_relay_is_still_lazy(modules: ModuleFactory) -> None:
+    """topic_tools' relay subscribes while its own topic has a subscriber; a shown one elsewhere is none."""
+    pc, base, other = modules("a", "b", "c")
+    pc.ros.roscpp("talker", "__name:=camera", topic="/test/image", rate=20)
+    pc.wait_topic("/test/image")
+    relay = ("/usr/lib/topic_tools/relay", "/test/image", "/test/small", "__name:=lazy", "_lazy:=true")
+    pc.ros.start(*relay, name="relay")
+    pc.wait_topic("/test/small")
+    heard = base.ros.rospy("listener", "__name:=eyes", topic="/test/small")
+    flows(heard)
+    wait_subscribers(other, "/test/small", f"/rmpa/{base.name}/eyes")
+    assert "/lazy" in subscribers(pc, "/test/image")
+    heard.end()
+    eventually(lambda: "/lazy" not in subscribers(pc, "/test/image"), what="the relay lazy again")

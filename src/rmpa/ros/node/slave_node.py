@@ -234,7 +234,7 @@ class SlaveNode:
 
     def connections(self) -> list[BusConnection]:
         """All topic connections."""
-        found = [c for publication in self._publications.values() for c in publication.connections()]
+        found = [c for each in self._publications.values() for c in (*each.connections(), *each.events.elsewhere())]
         found += [c for subscription in self._subscriptions for c in subscription.connections()]
         return found + [tap.connection() for tap in self._taps()]
 
