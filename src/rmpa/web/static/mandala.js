@@ -329,6 +329,27 @@ export function Ring({ state, current }) {
   </div>`;
 }
 
+// What nodes say on /diagnostics: each error, and a line for all warnings.
+function diagnosed({ errors, more, warnings = [], stale = [], problems = [] }, own) {
+  const to = href("diagnostics");
+  const some = (names) => `${names.slice(0, 3).join(", ")}${names.length > 3 ? " …" : ""}`;
+  const found = Object.entries(errors || {}).map(([key, one]) => ({
+    id: `d${key}`,
+    level: one.level,
+    who: [one.module || own, one.hardware !== one.module && one.hardware].filter(Boolean).join(" "),
+    text: `${one.name}: ${one.message}${one.level === "STALE" ? " (nothing since)" : ""}`,
+    to: href("diagnostics", key),
+    since: one.since,
+  }));
+  const line = (level, who, text) => found.push({ id: `d${who}`, level, who, text, to });
+  if (more) line("ERROR", `${more} more`, "errors on /diagnostics");
+  if (warnings.length) line("WARN", count(warnings.length, "warning"), `of nodes: ${some(warnings)}`);
+  if (stale.length) line("STALE", count(stale.length, "stale status", "stale statuses"), `of nodes: ${some(stale)}`);
+  for (const text of problems) line("WARN", "/diagnostics", text);
+  return found;
+}
+const count = (number, one, several = `${one}s`) => `${number} ${number > 1 ? several : one}`;
+
 function concerns(state) {
   const found = [];
   for (const [id, alarm] of entries(state, "alarms"))
@@ -353,6 +374,7 @@ function concerns(state) {
     else if (module.error)
       found.push({ id: `m${name}`, level: "WARN", text: module.error, who: name, to: href("module", name) });
   }
+  found.push(...diagnosed(section(state, "diagnostics"), section(state, "agent").name));
   const troubled = new Map(); // many topics have one trouble when a module is lost: that is one line
   for (const [name, topic] of entries(state, "topics"))
     if (topic.problem) troubled.set(topic.problem, [...(troubled.get(topic.problem) || []), name]);

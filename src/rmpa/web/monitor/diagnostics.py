@@ -1,0 +1,164 @@
+"""What nodes of all modules say on ``/diagnostics``, for the pages: followed while a page is open."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import Counter, deque
+from typing import TYPE_CHECKING, Any, Final
+
+from rmpa.core.errors import RmpaError
+from rmpa.observe.diagnostics import ERROR, OK, STALE, WARN, Status, StatusKey, StatusTable, history
+from rmpa.observe.health import TOPIC
+from rmpa.ros.types.definitions import ARRAY_TYPE
+from rmpa.web.monitor import limits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.web.hub.hub import Hub
+    from rmpa.web.hub.topics import ClientSubscription, ReceivedMessage
+    from rmpa.web.monitor.messages import Tree
+    from rmpa.web.monitor.resources import MessageValues
+
+# Between the parts of a status' key; a name that has it is mistaken only for another one of its own module.
+_BETWEEN: Final = "\x1f"
+# Seconds between two looks for what is stale, and between two changes that pages are told.
+_LOOK: Final = 0.5
+
+
+class DiagnosticsFeed:
+    """Subscribes to ``/diagnostics`` while a page is open, and keeps what was said.
+
+    Args:
+        hub: Subscribes.
+        values: Decodes.
+        changed: Called when pages are to be shown something new.
+        clock: Seconds since the epoch.
+    """
+
+    def __init__(
+        self, hub: Hub, values: MessageValues, changed: Callable[[], None], clock: Callable[[], float] = time.time
+    ) -> None:
+        self._hub = hub
+        self._values = values
+        self._changed = changed
+        self._clock = clock
+        self._table = StatusTable(limits.DIAGNOSTIC_HISTORY)
+        self._subscription: ClientSubscription | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._refused = ""
+        self._dirty = True
+        self._worst: deque[tuple[float, str]] = deque(maxlen=limits.DIAGNOSTIC_WORST)
+        self._entries: dict[str, Tree] = {}
+        self._summary: Tree = {}
+
+    def follow(self, *, wanted: bool) -> None:
+        """Whether a page is open."""
+        if wanted and self._subscription is None and self._timer is None:
+            self._refused = ""
+            try:
+                self._subscription = self._hub.topics.subscribe(TOPIC, ARRAY_TYPE, self._take, self._fail)
+            except RmpaError as error:
+                self._fail(error)
+            self._look()
+        elif not wanted:
+            self.close()
+
+    def close(self) -> None:
+        """End; what was said is kept, and becomes stale."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if self._subscription is not None:
+            self._subscription.close()
+            self._subscription = None
+
+    @property
+    def summary(self) -> Tree:
+        """What each page is shown: the statuses counted by level, and those that are wrong, without the agent's own."""
+        return self._summary
+
+    def all(self) -> Tree:
+        """All statuses by key; those that did not change are the same objects as before."""
+        return {"statuses": dict(self._entries), "worst": [[at, level] for at, level in self._worst]}
+
+    def one(self, key: str) -> Tree | None:
+        """One status with its values."""
+        status = self._find(key)
+        if status is None:
+            return None
+        return {"heard": round(status.heard, 1), "source": status.source, "values": dict(status.values)}
+
+    def past(self, key: str) -> dict[str, Any]:
+        """The numbers of a status as far back as they are kept: by value, and their moments under an empty name."""
+        status = self._find(key)
+        return dict(history(status)) if status is not None else {}
+
+    def _find(self, key: str) -> Status | None:
+        parts = key.split(_BETWEEN, 2)
+        return self._table.statuses.get(StatusKey(*parts)) if len(parts) == 3 else None
+
+    def _fail(self, error: RmpaError) -> None:
+        self._refused = str(error)
+        self._subscription = None
+        self._dirty = True
+
+    def _take(self, message: ReceivedMessage) -> None:
+        now = self._clock()
+        if not self._table.admits(message.source, len(message.payload), now):
+            return
+        try:
+            statuses = self._values.of(message)["status"]
+        except RmpaError:
+            return  # not an array of statuses; its subscriber says so in the log
+        self._table.take(message.source, statuses, now)
+        self._dirty = True
+
+    def _look(self) -> None:
+        self._timer = asyncio.get_running_loop().call_later(_LOOK, self._look)
+        now = self._clock()
+        if self._table.judge(now):
+            self._dirty = True
+        if not self._dirty:
+            return
+        self._dirty = False
+        before, self._entries = self._entries, {}
+        for key, status in self._table.statuses.items():
+            text = _BETWEEN.join(key)
+            entry, known = _entry(status), before.get(text)
+            self._entries[text] = known if known == entry else entry
+        worst = self._table.worst()
+        if not self._worst or self._worst[-1][1] != worst:
+            self._worst.append((round(now, 1), worst))
+        self._summary = self._count()
+        self._changed()
+
+    def _count(self) -> Tree:
+        mine = [(key, entry) for key, entry in self._entries.items() if "agent" not in entry]
+        wrong = [(key, entry) for key, entry in mine if entry["level"] == ERROR or entry.get("last") == ERROR]
+        found: Tree = {
+            "levels": dict(Counter(str(entry["level"]) for entry in self._entries.values())),
+            "errors": dict(wrong[: limits.DIAGNOSTIC_ERRORS]),
+            "more": max(0, len(wrong) - limits.DIAGNOSTIC_ERRORS),
+        }
+        for name, level in (("warnings", WARN), ("stale", STALE)):
+            found[name] = sorted(str(e["name"]) for _, e in mine if e["level"] == level and e.get("last") != ERROR)[:100]
+        problems = [f"{source}: {text}" for source, text in self._table.problems.items()][:10]
+        return {**found, "problems": [*([self._refused] if self._refused else []), *problems]}
+
+
+def _entry(status: Status) -> Tree:
+    """A status without its values, as a page lists it."""
+    entry: Tree = {
+        "name": status.key.name,
+        "level": status.level,
+        "message": status.message,
+        "since": round(status.since, 1),
+        "levels": [[round(at, 1), level] for at, level in status.levels],
+    }
+    more = {"module": status.key.module, "hardware": status.key.hardware, "node": status.node}
+    entry |= {name: value for name, value in more.items() if value}
+    if status.last != status.level and status.last != OK:
+        entry["last"] = status.last
+    return entry | ({"agent": True} if status.is_agents else {})
