@@ -84,6 +84,8 @@ LOG_LINES: Final = 500
 # [Pages] Characters of one of them
 # At it: the rest is cut
 LOG_CHARACTERS: Final = 1024
+# Topics of a lost link that are named; further ones are counted.
+LOST_TOPICS: Final = 20
 # Time after the start of this module's agent in which peers that it has not found yet do not count as lost: beacons
 # come every 5 s at the latest, and links take seconds where names or addresses are resolved.
 AGENT_SETTLES: Final = 10.0

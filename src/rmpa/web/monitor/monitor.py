@@ -269,9 +269,9 @@ class Monitor:
         self.answers = Answers(
             hub,
             self.resources,
-            self.diagnostics.past,
             os.environ if environ is None else environ,
             lambda: agent or self.mesh.agent,
+            self.diagnostics.past,
         )
 
     def start(self) -> None:

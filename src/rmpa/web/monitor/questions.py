@@ -67,18 +67,18 @@ class Answers:
     Args:
         hub: Calls services, and has this module's parameters.
         resources: Knows the Smart Resources.
-        past: The past of the values of a status of ``/diagnostics``, by its key.
         environ: Says where the agents' sockets are.
         agent: Returns the agent's name; empty for the only one.
+        past: The past of the values of a status of ``/diagnostics``, by its key.
     """
 
     def __init__(
         self,
         hub: Hub,
         resources: ResourceWatch,
-        past: Callable[[str], Any],
         environ: Mapping[str, str],
         agent: Callable[[], str],
+        past: Callable[[str], Any] = lambda _: {},
     ) -> None:
         self._hub = hub
         self._past_of = past

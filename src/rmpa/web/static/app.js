@@ -4,7 +4,7 @@ import { html, render, Component } from "./markup.js";
 import { Connection } from "./connection.js";
 import { sentence } from "./format.js";
 import { section } from "./state.js";
-import { Mark, Since } from "./parts.js";
+import { Mark, Since, keyOfNode } from "./parts.js";
 import { Mandala } from "./mandala.js";
 import { Search, Shortcuts } from "./search.js";
 import { applyTheme, nextTheme, theme } from "./theme.js";
@@ -48,7 +48,8 @@ const LAZY = {
 function address() {
   const [page = "", name] = location.hash.replace(/^#\/?/, "").split("/");
   try {
-    return { page, name: name === undefined ? undefined : decodeURIComponent(name) };
+    const known = name === undefined ? undefined : decodeURIComponent(name);
+    return { page, name: page === "node" && known ? keyOfNode(known) : known };
   } catch {
     return { page, name };
   }

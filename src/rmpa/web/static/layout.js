@@ -6,7 +6,7 @@
 
 const GAP = { column: 70, row: 12, lane: 18, title: 24 };
 const COLUMNS = 17; // more are not read at one look
-const SHAPE = 3; // rows to a column: boxes are wide, and so are screens
+const SHAPE = 8; // rows to a column: boxes are wide, and so are screens
 const SWEEPS = 8;
 const ALIGNS = 6;
 
@@ -98,7 +98,7 @@ function nearest(ids, edges) {
 // A column with many vertices of one lane becomes several, so that the whole is as wide as it is high.
 function split(ids, rank, known) {
   const lanes = new Set(ids.map((id) => known.get(id).lane)).size;
-  const most = Math.max(3, Math.ceil(Math.sqrt(SHAPE * ids.length) / lanes));
+  const most = Math.max(5, Math.ceil(Math.sqrt(SHAPE * ids.length) / lanes));
   const counts = new Map(),
     parts = new Map(),
     widest = [];

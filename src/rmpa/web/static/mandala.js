@@ -129,7 +129,7 @@ const Module = memo(({ name, module, at, geo, resources, alarms, compact }) => {
   const short = name.length > limit ? `${name.slice(0, limit - 1)}…` : name;
   const word = small
     ? ""
-    : profile && module.state !== "away" && module.state !== "linking"
+    : profile && !["away", "linking", "lost"].includes(module.state)
       ? profile.slice(0, limit)
       : compact && module.state === "here"
         ? "here"
@@ -329,6 +329,17 @@ export function Ring({ state, current }) {
   </div>`;
 }
 
+// What was lost with a link, until it is back: the topics that stopped, and messages.
+export function costs(lost) {
+  if (!lost) return "";
+  const topics = Object.entries(lost.topics || {}).map(([name, rate]) => (rate ? `${name} (${hertz(rate)})` : name));
+  const stopped = topics.length ? `. Stopped: ${topics.slice(0, 5).join(", ")}` : ". No topic was in use";
+  const left = Math.max(0, topics.length - 5) + (lost.more || 0);
+  const rest = left ? ` and ${left} more` : "";
+  const kept = lost.kept ? `; ${count(lost.kept, "message")} wait for it` : "";
+  return `${stopped}${rest}${kept}${lost.dropped ? `; ${count(lost.dropped, "message")} dropped` : ""}`;
+}
+
 // What nodes say on /diagnostics: each error, and a line for all warnings.
 function diagnosed({ errors, more, warnings = [], stale = [], problems = [] }, own) {
   const to = href("diagnostics");
@@ -365,8 +376,8 @@ function concerns(state) {
     if (module.state !== "up" && module.state !== "here" && module.state !== "relayed")
       found.push({
         id: `m${name}`,
-        level: { refused: "ERROR", away: "STALE" }[module.state] || "WARN",
-        text: `${known(module.state).word}${module.error ? `: ${module.error}` : ""}`,
+        level: { refused: "ERROR", lost: "ERROR", away: "STALE" }[module.state] || "WARN",
+        text: `${known(module.state).word}${module.error ? `: ${module.error}` : ""}${costs(module.lost)}`,
         who: name,
         to: href("module", name),
         since: module.since,
@@ -479,8 +490,8 @@ export function Mandala({ state, connection }) {
   const up = modules.filter(([, one]) => one.state === "up" || one.state === "here").length;
   const domain = section(state, "agent").domain ?? "–";
   const total = modules.length + (section(state, "hidden").modules || 0);
-  const marks = ["up", "relayed", "silent", "linking", "refused", "away"].filter(
-    (each) => each !== "relayed" || modules.some(([, one]) => one.state === each),
+  const marks = ["up", "relayed", "silent", "linking", "refused", "away", "lost"].filter(
+    (each) => !["relayed", "lost"].includes(each) || modules.some(([, one]) => one.state === each),
   );
   const { places } = arranged(state);
   const ordered = modules.sort(([a], [b]) => (places[a] ?? 1e9) - (places[b] ?? 1e9));
