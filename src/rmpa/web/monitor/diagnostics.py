@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import Counter, deque
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RmpaError
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.topics import ClientSubscription, ReceivedMessage
-    from rmpa.web.monitor.messages import Tree
+    from rmpa.web.monitor.messages import Tree, Value
     from rmpa.web.monitor.resources import MessageValues
 
 # Between the parts of a status' key; a name that has it is mistaken only for another one of its own module.
@@ -143,9 +144,11 @@ class DiagnosticsFeed:
             "more": max(0, len(wrong) - limits.DIAGNOSTIC_ERRORS),
         }
         for name, level in (("warnings", WARN), ("stale", STALE)):
-            found[name] = sorted(str(e["name"]) for _, e in mine if e["level"] == level and e.get("last") != ERROR)[:100]
-        problems = [f"{source}: {text}" for source, text in self._table.problems.items()][:10]
-        return {**found, "problems": [*([self._refused] if self._refused else []), *problems]}
+            those = (entry for _, entry in mine if entry["level"] == level and entry.get("last") != ERROR)
+            found[name] = [[e.get("module", ""), e["name"]] for e in islice(those, 100)]
+        problems: list[Value] = [f"{source}: {text}" for source, text in islice(self._table.problems.items(), 10)]
+        refused: list[Value] = [self._refused] if self._refused else []
+        return {**found, "problems": refused + problems}
 
 
 def _entry(status: Status) -> Tree:

@@ -186,7 +186,7 @@ class StateBuilder:
             else:
                 before = self._entries.get("modules", {}).get(name, (None, {}))[1]
                 since = before.get("since") if before.get("state") in _LOST else None
-                entry: Tree = {"state": "away", "since": since or self._seen[name], "error": _GONE}
+                entry = {"state": "away", "since": since or self._seen[name], "error": _GONE}
                 yield name, self._as_lost(entry, name, snapshot) if name in self._lost else entry
 
     def _note_lost(self, snapshot: Snapshot) -> None:
@@ -213,7 +213,7 @@ class StateBuilder:
         topics = self._lost[name]
         away = [r for t in snapshot.topics for r in t.routes if (r.peer, r.direction, r.state) == (name, "out", "away")]
         busiest = sorted(topics, key=lambda topic: (-topics[topic], topic))
-        told = {
+        told: Tree = {
             "topics": {topic: float(f"{topics[topic]:.3g}") for topic in busiest[: limits.LOST_TOPICS]},
             "more": max(0, len(topics) - limits.LOST_TOPICS),
             "kept": sum(route.kept for route in away),

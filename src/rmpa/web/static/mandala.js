@@ -341,10 +341,15 @@ export function costs(lost) {
 }
 
 // What nodes say on /diagnostics: each error, and a line for all warnings.
-function diagnosed({ errors, more, warnings = [], stale = [], problems = [] }, own) {
+function diagnosed({ errors, more, warnings = [], stale = [], problems = [] }, own, modules) {
   const to = href("diagnostics");
   const some = (names) => `${names.slice(0, 3).join(", ")}${names.length > 3 ? " …" : ""}`;
-  const found = Object.entries(errors || {}).map(([key, one]) => ({
+  // What a module said whose link is lost is old, which the line of the module says already.
+  const here = (module) => !module || !["lost", "away"].includes(modules[module]?.state);
+  const those = (list) => list.filter(([module]) => here(module)).map(([, name]) => name);
+  [warnings, stale] = [those(warnings), those(stale)];
+  const current = Object.entries(errors || {}).filter(([, one]) => here(one.module));
+  const found = current.map(([key, one]) => ({
     id: `d${key}`,
     level: one.level,
     who: [one.module || own, one.hardware !== one.module && one.hardware].filter(Boolean).join(" "),
@@ -385,7 +390,7 @@ function concerns(state) {
     else if (module.error)
       found.push({ id: `m${name}`, level: "WARN", text: module.error, who: name, to: href("module", name) });
   }
-  found.push(...diagnosed(section(state, "diagnostics"), section(state, "agent").name));
+  found.push(...diagnosed(section(state, "diagnostics"), section(state, "agent").name, section(state, "modules")));
   const troubled = new Map(); // many topics have one trouble when a module is lost: that is one line
   for (const [name, topic] of entries(state, "topics"))
     if (topic.problem) troubled.set(topic.problem, [...(troubled.get(topic.problem) || []), name]);
