@@ -97,6 +97,7 @@ class StatusTable:
         self._history = history
         self._buckets: dict[str, TokenBucket] = {}
         self._counts = Counter[str]()
+        self._resumed = -math.inf
 
     @property
     def problems(self) -> dict[str, str]:
@@ -156,13 +157,17 @@ class StatusTable:
                 changed.append(status)
         return changed
 
+    def resume(self, now: float) -> None:
+        """Listen again after a pause, in which silence meant nothing."""
+        self._resumed = now
+
     def judge(self, now: float) -> list[Status]:
         """Mark what is stale, and forget what is gone; returns those that have become stale."""
         changed = []
         recent = now - limits.DIAGNOSTIC_PROBLEM
         self._problems = {source: one for source, one in self._problems.items() if one[0] >= recent}
         for status in [*self.statuses.values()]:
-            silent = now - status.heard
+            silent = now - max(status.heard, self._resumed)
             if silent > limits.DIAGNOSTIC_FORGET:
                 self._forget(status)
             elif silent > limits.DIAGNOSTIC_STALE and status.become(STALE, now):

@@ -24,13 +24,15 @@ PAGES = {
     "topic/%2Fodom": "bridge.allow has",
     "services": "/base/set_parameters",
     "nodes": "Of peers, the nodes",
-    "node/base%3A%2Fbase": "Node of base",
+    "node/base%3A%2Fbase": "/rmpa/base/base",
     "service/base%3A%2Fbase%2Fset_parameters": "std_srvs/SetBool",
     "params": "rosdistro",
     "resources": "a simulated Turtlebot",
     "resource/velocity%3A%2Fvelocity": "For a robot that carries a full glass",
     "alarms": "All that is wrong",
     "log": "turn",
+    "diagnostics": "No node has said anything yet",
+    "graph": "/velocity_order",
     "drive": "The robot may move",
 }
 
@@ -68,7 +70,7 @@ async def test_a_page_shows_its_thing_and_is_accessible_in_both_colours_and_on_a
     assert (site.server.reports, page.errors) == ([], [])
 
 
-@pytest.mark.parametrize("scene", ["sick", "mute", "large", "knock"])
+@pytest.mark.parametrize("scene", ["sick", "mute", "large", "knock", "ill", "killed"])
 async def test_the_first_page_is_accessible_whatever_is_wrong(site: Site, scene: str) -> None:
     page = await site.open("", scene)
     assert await violations(page) == []
@@ -495,7 +497,7 @@ async def test_characters_that_turn_or_hide_a_name_are_seen(site: Site) -> None:
 
 async def test_the_gravest_stands_first_and_a_lost_module_above_what_follows_from_it(site: Site) -> None:
     page = await site.open("", "killed")
-    await page.wait("document.querySelector('.module.away')")
+    await page.wait("document.querySelector('.module.lost')")
     problem = {"type": "a/B", "problem": "its peer is away"}
     alarm = {"level": "ERROR", "text": "hot", "resource": "velocity:/velocity", "module": "velocity", "at": 1.0}
     await receive(page, {"topics": {"/a": problem, "/b": problem}, "alarms": {"x": alarm}})

@@ -58,6 +58,7 @@ class DiagnosticsFeed:
         """Whether a page is open."""
         if wanted and self._subscription is None and self._timer is None:
             self._refused = ""
+            self._table.resume(self._clock())
             try:
                 self._subscription = self._hub.topics.subscribe(TOPIC, ARRAY_TYPE, self._take, self._fail)
             except RmpaError as error:
@@ -67,7 +68,7 @@ class DiagnosticsFeed:
             self.close()
 
     def close(self) -> None:
-        """End; what was said is kept, and becomes stale."""
+        """End; what was said is kept for the next page."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

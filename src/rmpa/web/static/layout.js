@@ -198,8 +198,12 @@ export function layout(vertices, edges, lanes, before) {
   acyclic(ids, links);
   let rank = ranks(ids, links);
   if (Math.max(0, ...rank.values()) >= COLUMNS) rank = nearest(ids, links);
-  const column = (id) => before?.at.get(id)?.x ?? Infinity;
-  rank = split([...ids].sort((a, b) => (column(a) < column(b) ? -1 : column(a) > column(b) ? 1 : 0)), rank, known);
+  const left = (id) => before?.at.get(id)?.x ?? Infinity;
+  rank = split(
+    [...ids].sort((a, b) => (left(a) < left(b) ? -1 : left(a) > left(b) ? 1 : 0)),
+    rank,
+    known,
+  );
   const boxes = new Map(known);
   const inputs = new Map(),
     outputs = new Map();

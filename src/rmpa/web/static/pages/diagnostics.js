@@ -156,11 +156,12 @@ export function Diagnostics({ name, state, connection }) {
   const shown = all.filter(fits);
   const levels = section(section(state, "diagnostics"), "levels");
   const { problems = [] } = section(state, "diagnostics");
-  const said = [...LEVELS].reverse().filter((level) => levels[level]);
+  const present = [...LEVELS].reverse().filter((level) => levels[level]);
+  const said = present.map((level) => `${levels[level]} ${known(level).word}`).join(", ");
   return html`<${Page}
     title="Diagnostics"
     kind=${all.length
-      ? `${count(all.length)} statuses of all modules: ${said.map((each) => `${levels[each]} ${known(each).word}`).join(", ")}`
+      ? `${count(all.length)} statuses of all modules: ${said}`
       : "What nodes of all modules say on /diagnostics"}
     aside=${html`<${Choice} label="Least level" value=${least} onChoose=${choose} options=${WHICH} />`}
   >

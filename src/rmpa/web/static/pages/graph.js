@@ -1,6 +1,6 @@
 // The graph of nodes and topics as rqt_graph draws it: nodes in a lane for each module, topics between them.
 
-import { html, useEffect, useRef, useState } from "../markup.js";
+import { html, useEffect, useLayoutEffect, useRef, useState } from "../markup.js";
 import { count, hertz } from "../format.js";
 import { section } from "../state.js";
 import { curve, layout } from "../layout.js";
@@ -70,7 +70,7 @@ export function choose(topics, { text, module, namespace, debug, leaves, only, o
   return { nodes, topics: shown };
 }
 
-// The boxes and edges of the drawing: topics of the same nodes are one box, or with `merged` only edges from node to node.
+// The boxes and edges: topics of the same nodes are one box, or with `merged` only edges from node to node.
 export function shapes({ nodes, topics }, own, merged) {
   const vertices = [...nodes.values()].map((one) => ({
     id: one.name,
@@ -255,7 +255,7 @@ export function GraphPage({ name, state, connection }) {
               >`}
         </div>`
       : html`<p class="empty">Nothing is like that: choose less, or show debug topics.</p>`)}
-    ${chosen && html`<${AsTable} chosen=${chosen} own=${own} state=${state} />`}<//
+    ${chosen && html`<${AsTable} chosen=${chosen} state=${state} />`}<//
   >`;
 }
 
@@ -267,8 +267,10 @@ const NEXT = { ArrowRight: [1, 0], ArrowLeft: [-1, 0], ArrowDown: [0, 1], ArrowU
 function useView(box, drawn) {
   const [moved, set] = useState(null);
   const [{ w, h }, measure] = useState({ w: 800, h: 500 });
-  useEffect(() => {
-    const observer = new ResizeObserver(() => measure({ w: box.current.clientWidth, h: box.current.clientHeight }));
+  useLayoutEffect(() => {
+    const look = () => measure({ w: box.current.clientWidth, h: box.current.clientHeight });
+    const observer = new ResizeObserver(look);
+    look();
     observer.observe(box.current);
     return () => observer.disconnect();
   }, []);
@@ -339,6 +341,7 @@ function Drawing({ drawn, vertices, edges, name, state, own }) {
   const view = useView(box, drawn);
   const pointers = usePointers(box, view);
   const topics = section(state, "topics");
+  useEffect(() => drawn.at.has(name) && view.show(drawn.at.get(name)), [name, drawn]);
   const lit = new Set([name]);
   const selected = (edge) => edge.from === name || edge.to === name;
   for (const edge of edges) if (selected(edge)) lit.add(edge.from).add(edge.to);
@@ -548,7 +551,7 @@ function About({ name, chosen, vertices, own, state, children }) {
   >`;
 }
 
-const AsTable = ({ chosen, own, state }) =>
+const AsTable = ({ chosen, state }) =>
   html`<${Panel} title="As a table"
     ><${Table}
       caption="Topics of the graph"

@@ -24,12 +24,14 @@ import { json } from "../typed.js";
 
 const STATES = { home: "stays in its module", hidden: "hidden here", idle: "not in use", open: "in use" };
 
-// The types that a service's server alone knows: all are asked when a page shows services, and again when there are more.
+const ASKING = html`<span class="muted">asking …</span>`,
+  UNTOLD = html`<span class="muted">not told by its server</span>`;
+// The types that a service's server alone knows: all are asked when a page shows services, and when there are more.
 export function useTypes(connection, state) {
   const unknown = entries(state, "services").filter(([, one]) => !one.type && one.state !== "hidden");
   const { value, failure } = useAnswer(connection, "types", {}, 0, String(unknown.length));
-  const missing = html`<span class="muted">${value || failure ? "not told by its server" : "asking …"}</span>`;
-  return (one) => one.type || (one.state !== "hidden" && value?.[one.name]) || (one.state === "hidden" ? "" : missing);
+  const missing = value || failure ? UNTOLD : ASKING;
+  return (one) => one.type || (one.state === "hidden" ? "" : value?.[one.name] || missing);
 }
 
 const Row = memo(
@@ -53,7 +55,9 @@ export function Services({ state, connection }) {
   const filter = useFilter("name or type");
   const all = entries(state, "services");
   const hidden = section(state, "hidden").services;
-  const shown = all.filter(([name, one]) => filter.matches(`${name} ${typeOf(one)}`));
+  const shown = all.filter(([name, one]) =>
+    filter.matches(`${name} ${[typeOf(one)].filter((each) => typeof each === "string")}`),
+  );
   return html`<${Page} title="Services" kind=${`${all.length} in all modules`}>
     ${filter.field}
     <${Panel}
