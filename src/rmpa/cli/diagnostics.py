@@ -195,12 +195,15 @@ class _Watch:
 
     def text(self, found: list[Status], *, values: bool) -> Iterator[Text]:
         """Statuses for people."""
+        if not found:
+            yield "there is no such status"
+            return
         yield summary(len(found), "statuses", (one.level for one in found))
         if values:
             for one in found:
                 yield self._line(one, dated=False)
                 yield from self._values(one)
-        elif found:
+        else:
             rows = [
                 (one.key.name, one.level, one.key.module or self._own or "-", one.key.hardware or "-", one.message)
                 for one in found
