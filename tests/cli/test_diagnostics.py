@@ -66,7 +66,12 @@ def test_it_shows_the_worst_first_whose_it_is_and_exits_1_at_an_error(
     assert rmpa("--name", "laser*", "--level", "warn")[:2] == (0, "there is no such status\n")
     (shown,) = json.loads(rmpa("joystick", "--json")[1])
     assert shown["values"] == {"volts": "24.1 V", "\x1b[31m": "nan"}
-    assert (shown["module"], shown["hardware"], shown["node"], shown["level"]) == ("joystick", "SN 1", "/arm", "ERROR")
+    assert (shown["module"], shown["hardware"], shown["node"], shown["level"]) == (
+        "joystick",
+        "SN 1",
+        "/arm",
+        "ERROR",
+    )
     assert "    \\x1b[31m: nan\n" in rmpa("joystick", "-v")[1]
     code, _, err = rmpa("nono")
     assert code == 1

@@ -1,4 +1,4 @@
-"""Statuses of ``/diagnostics``: whose they are, when they are stale, their past, and what a hostile publisher costs."""
+"""Statuses of ``/diagnostics``: whose they are, when they are stale, their past; a hostile publisher."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_too_many_and_too_long_messages_are_left_out_and_it_is_said_for_a_while(
 def test_texts_and_values_are_bounded() -> None:
     table = StatusTable()
     many = {f"k{number}": "x" * 5000 for number in range(limits.DIAGNOSTIC_VALUES + 50)}
-    (found,) = table.take("/arm", [status("n" * 5000, **many)], 1.0)
+    (found,) = table.take("/arm", [status("n" * 5000, 0, **many)], 1.0)
     assert (len(found.key.name), len(found.values)) == (257, limits.DIAGNOSTIC_VALUES)
     assert max(map(len, found.values.values())) == 513
 
@@ -103,7 +103,10 @@ def test_the_past_of_numbers_is_kept_within_a_share_for_each_status() -> None:
 @pytest.mark.parametrize(
     ("text", "number"),
     [("12.5 V", 12.5), ("-3", -3.0), ("1e3Hz", 1000.0), (" 7 % ", 7.0), (".5", 0.5)]
-    + [(text, math.nan) for text in ("nan", "inf", "1e999", "10.0.0.1", "12:30", "1-2", "True", "", "v 3", "2026-11-29")],
+    + [
+        (text, math.nan)
+        for text in ("nan", "inf", "1e999", "10.0.0.1", "12:30", "1-2", "True", "", "v 3", "2026-11-29")
+    ],
 )
 def test_a_value_is_a_number_with_or_without_its_unit(text: str, number: float) -> None:
     assert number_of(text) == pytest.approx(number, nan_ok=True)

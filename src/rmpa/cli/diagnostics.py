@@ -47,9 +47,7 @@ _TICK: Final = 0.1
     flag("-v", "--values", help="With the values."),
     flag("-f", "--follow", help="Go on: print each change of a level, until Ctrl-C."),
 )
-def diagnostics(
-    modules: tuple[str, ...], level: str, name: str, values: bool, follow: bool, options: Options
-) -> int:
+def diagnostics(modules: tuple[str, ...], level: str, name: str, values: bool, follow: bool, options: Options) -> int:
     """Show what the nodes of all modules, or of each MODULE, say on /diagnostics: the worst first.
 
     Exits 1 if a status that is shown is at ERROR.
@@ -109,9 +107,9 @@ class _Watch:
     def wanted(self, statuses: Iterable[Status]) -> Iterator[Status]:
         """Those of some statuses that are shown."""
         for one in statuses:
-            if self._is_of(one.key.module) and fnmatchcase(one.key.name, self._name):
-                if LEVELS.index(one.level) >= self._least:
-                    yield one
+            bad = LEVELS.index(one.level) >= self._least
+            if bad and self._is_of(one.key.module) and fnmatchcase(one.key.name, self._name):
+                yield one
 
     def _is_of(self, module: str) -> bool:
         return not self._modules or module in self._modules
@@ -119,9 +117,7 @@ class _Watch:
     async def listen(self) -> None:
         """Hear each publisher once, if it speaks in time."""
         graph = await read_graph(self._master)
-        publishers = {
-            node for node in graph.publishers.get(TOPIC, ()) if self._is_of(proxied_peer(node) or "")
-        }
+        publishers = {node for node in graph.publishers.get(TOPIC, ()) if self._is_of(proxied_peer(node) or "")}
         if not publishers:
             where = ", ".join(each or self._own for each in sorted(self._modules)) or "any module"
             warn(f"no node of {where} publishes {TOPIC}", "no-publisher")

@@ -18,7 +18,9 @@ async def test_an_error_of_a_node_is_what_is_wrong_and_leads_to_its_status_with_
     assert second.startswith("1 warning")  # the agent's own are said elsewhere on that page
     await page.run("document.querySelector('.concerns a').click()")
     await page.wait(f"{CHOSEN}?.innerText.includes('Voltage')")
-    await page.run(f"[...{CHOSEN}.querySelectorAll('button')].find((each) => each.ariaLabel === 'Plot Voltage').click()")
+    await page.run(
+        f"[...{CHOSEN}.querySelectorAll('button')].find((each) => each.ariaLabel === 'Plot Voltage').click()"
+    )
     await page.wait(SAMPLES)
     assert "Voltage 2" in await page.run(SAMPLES)
     plots = f"[...{CHOSEN}.querySelectorAll('button')].map((each) => each.ariaLabel)"
@@ -34,7 +36,7 @@ async def test_the_tree_is_of_module_hardware_and_name_and_keeps_filter_and_grou
     page = await site.open("diagnostics", "ill")
     await page.wait("document.querySelectorAll('.status').length === 5")
     groups = "[...document.querySelectorAll('.diagnostics summary strong')].map((each) => each.textContent)"
-    assert await page.run(groups) == ["base", "SN 4711 › arm_driver › Battery", "pc"]
+    assert await page.run(groups) == ["base", "SN 4711 / arm_driver / Battery", "pc"]
     await page.click("Warnings and worse")
     await page.wait("document.querySelectorAll('.status').length === 3")
     await page.run("document.querySelector('.status').click()")
@@ -48,7 +50,9 @@ async def test_what_nodes_report_no_more_is_stale(site: Site) -> None:
     page = await site.open("diagnostics", "ill")
     await page.wait_text("too hot")
     site.server.reports_of_nodes.silent = True
-    await page.wait("[...document.querySelectorAll('.status')].some((each) => each.innerText.startsWith('stale (error)'))")
+    await page.wait(
+        "[...document.querySelectorAll('.status')].some((each) => each.innerText.startsWith('stale (error)'))"
+    )
     await page.run("location.hash = '#/'")
     await page.wait_text("too hot (nothing since)")
 

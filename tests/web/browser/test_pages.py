@@ -289,7 +289,7 @@ async def test_topics_that_carry_data_come_first_and_the_filter_looks_among_all(
     page = await site.open("topics")
     await page.wait_text("are left out")
     rows = "[...document.querySelectorAll('tbody th')].map((each) => each.innerText.trim())"
-    assert await page.run(rows) == ["/command_information", "/odom", "/velocity_order"]
+    assert await page.run(rows) == ["/command_information", "/diagnostics", "/odom", "/velocity_order"]
     await page.run("(() => { const field = document.querySelector('main input'); field.value = 'base/qual';"
                    " field.dispatchEvent(new Event('input', {bubbles: true})); })()")  # fmt: skip
     await page.wait(f"{rows}.join() === '/base/quality'")
@@ -480,7 +480,7 @@ async def test_long_lists_are_drawn_in_parts(site: Site) -> None:
     rows = "[...document.querySelectorAll('tbody th')].filter((each) => each.textContent.startsWith('/many/')).length"
     await page.wait(f"{rows} > 100")
     assert await page.run(rows) <= 200
-    await page.click("Show 200 more of 1,753")
+    await page.click("Show 200 more of 1,754")
     await page.wait(f"{rows} > 390")
 
 
@@ -497,7 +497,7 @@ async def test_characters_that_turn_or_hide_a_name_are_seen(site: Site) -> None:
 
 async def test_the_gravest_stands_first_and_a_lost_module_above_what_follows_from_it(site: Site) -> None:
     page = await site.open("", "killed")
-    await page.wait("document.querySelector('.module.lost')")
+    await page.wait("document.querySelector('.module.away')")
     problem = {"type": "a/B", "problem": "its peer is away"}
     alarm = {"level": "ERROR", "text": "hot", "resource": "velocity:/velocity", "module": "velocity", "at": 1.0}
     await receive(page, {"topics": {"/a": problem, "/b": problem}, "alarms": {"x": alarm}})

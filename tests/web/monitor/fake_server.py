@@ -255,8 +255,9 @@ class FakeServer:
         self._odometry = json.loads((FIXTURES / "odometry.json").read_text())
         self._answers = json.loads((FIXTURES / "answers.json").read_text())
         self._mute_since = 0.0
-        self.reports_of_nodes: Any = Reports()
-        self._diagnostics = DiagnosticsFeed(self.reports_of_nodes, self.reports_of_nodes, lambda: None)
+        self.reports_of_nodes = Reports()
+        reports: Any = self.reports_of_nodes
+        self._diagnostics = DiagnosticsFeed(reports, reports, lambda: None)
         self._reported = 0.0
 
     def app(self) -> web.Application:
@@ -399,11 +400,10 @@ class FakeServer:
         return {"/base/set_parameters": "dynamic_reconfigure/Reconfigure"}
 
     def _answer_graph(self, args: dict[str, Any]) -> Any:
-        nodes = {
-            each.name: [each.type, [*each.publishers, *(proxy(r) for r in each.routes if r.direction == "in")]]
-            + [[*each.subscribers]]
-            for each in self._snapshot.topics
-        }
+        nodes: dict[str, Any] = {}
+        for each in self._snapshot.topics:
+            publishers = [*each.publishers, *(proxy(one) for one in each.routes if one.direction == "in")]
+            nodes[each.name] = [each.type, publishers, each.subscribers]
         digest = str(hash(str(nodes)))
         return {"digest": digest} | ({"topics": nodes, "hidden": 0} if args.get("has") != digest else {})
 

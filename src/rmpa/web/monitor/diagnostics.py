@@ -78,7 +78,7 @@ class DiagnosticsFeed:
 
     @property
     def summary(self) -> Tree:
-        """What each page is shown: the statuses counted by level, and those that are wrong, without the agent's own."""
+        """What each page is shown: statuses counted by level, and those that are wrong, without the agent's own."""
         return self._summary
 
     def all(self) -> Tree:
@@ -163,6 +163,6 @@ def _entry(status: Status) -> Tree:
     }
     more = {"module": status.key.module, "hardware": status.key.hardware, "node": status.node}
     entry |= {name: value for name, value in more.items() if value}
-    if status.last != status.level and status.last != OK:
+    if status.last not in {status.level, OK}:
         entry["last"] = status.last
     return entry | ({"agent": True} if status.is_agents else {})

@@ -211,7 +211,9 @@ class StateBuilder:
     def _as_lost(self, entry: Tree, name: str, snapshot: Snapshot) -> Tree:
         """The entry of a module whose link was lost, with the topics that stopped and the messages that it costs."""
         topics = self._lost[name]
-        away = [r for t in snapshot.topics for r in t.routes if (r.peer, r.direction, r.state) == (name, "out", "away")]
+        away = [
+            r for t in snapshot.topics for r in t.routes if (r.peer, r.direction, r.state) == (name, "out", "away")
+        ]
         busiest = sorted(topics, key=lambda topic: (-topics[topic], topic))
         told: Tree = {
             "topics": {topic: float(f"{topics[topic]:.3g}") for topic in busiest[: limits.LOST_TOPICS]},

@@ -79,7 +79,7 @@ export function grow(statuses, own) {
   const flat = (label, node) => {
     while (node.children.size === 1 && !node.leaves.length) {
       const [[step, child]] = node.children;
-      [label, node] = [`${label} › ${step}`, child];
+      [label, node] = [`${label} / ${step}`, child];
     }
     const children = [...node.children].map(([step, child]) => flat(step, child));
     if (!children.length && node.leaves.length === 1)
