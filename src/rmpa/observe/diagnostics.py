@@ -157,6 +157,12 @@ class StatusTable:
                 changed.append(status)
         return changed
 
+    def touch(self, source: str, now: float) -> None:
+        """A publisher has sent a message that is not read: its statuses are as they were."""
+        for status in self.statuses.values():
+            if status.source == source:
+                status.heard = now
+
     def resume(self, now: float) -> None:
         """Listen again after a pause, in which silence meant nothing."""
         self._resumed = now

@@ -94,6 +94,9 @@ class Reports:
     def __init__(self) -> None:
         self.take: Callable[[Any], None] = lambda _: None
         self.topics = self
+        self.graph = SimpleNamespace(
+            topics={"/diagnostics": SimpleNamespace(publishers=[node for node, *_ in REPORTS])}
+        )
         self.silent = False
 
     def subscribe(self, _topic: str, _type: str, take: Callable[[Any], None], _failed: object) -> Any:

@@ -1,14 +1,20 @@
-"""What nodes of all modules say on ``/diagnostics``, for the pages: followed while a page is open."""
+"""What nodes of all modules say on ``/diagnostics``, for the pages: followed while a page is open.
+
+What the agent says of itself there costs it the more the more topics there are, and all pages show it in other ways.
+So it is followed only while a page shows the diagnostics themselves, or while other nodes say something, too.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections import Counter, deque
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RmpaError
+from rmpa.core.identity import OWN_NODE
 from rmpa.observe.diagnostics import ERROR, OK, STALE, WARN, Status, StatusKey, StatusTable, history
 from rmpa.observe.health import TOPIC
 from rmpa.ros.types.definitions import ARRAY_TYPE
@@ -48,6 +54,7 @@ class DiagnosticsFeed:
         self._table = StatusTable(limits.DIAGNOSTIC_HISTORY)
         self._subscription: ClientSubscription | None = None
         self._timer: asyncio.TimerHandle | None = None
+        self._looked = -math.inf
         self._refused = ""
         self._dirty = True
         self._worst: deque[tuple[float, str]] = deque(maxlen=limits.DIAGNOSTIC_WORST)
@@ -56,13 +63,7 @@ class DiagnosticsFeed:
 
     def follow(self, *, wanted: bool) -> None:
         """Whether a page is open."""
-        if wanted and self._subscription is None and self._timer is None:
-            self._refused = ""
-            self._table.resume(self._clock())
-            try:
-                self._subscription = self._hub.topics.subscribe(TOPIC, ARRAY_TYPE, self._take, self._fail)
-            except RmpaError as error:
-                self._fail(error)
+        if wanted and self._timer is None:
             self._look()
         elif not wanted:
             self.close()
@@ -72,9 +73,29 @@ class DiagnosticsFeed:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
+        self._unsubscribe()
+
+    def _subscribe(self, now: float) -> None:
+        self._refused = ""
+        self._table.resume(now)
+        try:
+            self._subscription = self._hub.topics.subscribe(TOPIC, ARRAY_TYPE, self._take, self._fail)
+        except RmpaError as error:
+            self._fail(error)
+
+    def _unsubscribe(self) -> None:
         if self._subscription is not None:
             self._subscription.close()
             self._subscription = None
+
+    def _is_shown(self, now: float) -> bool:
+        """Whether a page shows the diagnostics themselves."""
+        return now - self._looked < limits.LOOK_KEPT
+
+    def _is_of_use(self, now: float) -> bool:
+        topic = self._hub.graph.topics.get(TOPIC)
+        others = topic is not None and any(node != OWN_NODE for node in topic.publishers)
+        return others or self._is_shown(now)
 
     @property
     def summary(self) -> Tree:
@@ -83,6 +104,7 @@ class DiagnosticsFeed:
 
     def all(self) -> Tree:
         """All statuses by key; those that did not change are the same objects as before."""
+        self._looked = self._clock()
         return {"statuses": dict(self._entries), "worst": [[at, level] for at, level in self._worst]}
 
     def one(self, key: str) -> Tree | None:
@@ -108,6 +130,9 @@ class DiagnosticsFeed:
 
     def _take(self, message: ReceivedMessage) -> None:
         now = self._clock()
+        if message.source == OWN_NODE and not self._is_shown(now):
+            self._table.touch(OWN_NODE, now)
+            return
         if not self._table.admits(message.source, len(message.payload), now):
             return
         try:
@@ -120,6 +145,11 @@ class DiagnosticsFeed:
     def _look(self) -> None:
         self._timer = asyncio.get_running_loop().call_later(_LOOK, self._look)
         now = self._clock()
+        if not self._is_of_use(now):
+            self._unsubscribe()
+            self._table.resume(now)
+        elif self._subscription is None and not self._refused:
+            self._subscribe(now)
         if self._table.judge(now):
             self._dirty = True
         if not self._dirty:
