@@ -279,12 +279,7 @@ function drawn({ ordered, lanes, boxes, inputs, outputs, links, known }) {
   }
   const at = new Map();
   ordered.forEach((column, index) => column.forEach((id) => at.set(id, { x: x[index], y: y.get(id) })));
-  const paths = links.map((edge) => ({
-    from: edge.from,
-    to: edge.to,
-    turned: edge.turned,
-    points: points(edge, at, boxes),
-  }));
+  const paths = links.map((edge) => ({ ...edge, points: points(edge, at, boxes) }));
   for (const id of [...at.keys()]) if (!known.has(id)) at.delete(id);
   const width = Math.max(right - GAP.column + 16, 120);
   return {

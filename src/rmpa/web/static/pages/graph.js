@@ -4,7 +4,7 @@ import { html, useEffect, useLayoutEffect, useRef, useState } from "../markup.js
 import { count, hertz } from "../format.js";
 import { section } from "../state.js";
 import { curve, layout } from "../layout.js";
-import { Choice, Failure, Link, Mark, NodeLink, Page, Panel, Table, href, useFilter } from "../parts.js";
+import { Choice, Failure, Link, Mark, NodeLink, Page, Panel, Table, href, memo, useFilter } from "../parts.js";
 import { isData } from "./topics.js";
 
 const PERIOD = 2000; // milliseconds between two questions for a graph that may have changed
@@ -83,7 +83,7 @@ export function shapes({ nodes, topics }, own, merged) {
   const edges = new Map();
   const join = (from, to, name) => {
     const key = `${from}\n${to}`;
-    if (!edges.has(key)) edges.set(key, { from, to, topics: [] });
+    if (!edges.has(key)) edges.set(key, { from, to, topics: [], named: merged });
     edges.get(key).topics.push(name);
   };
   const stacks = new Map();
@@ -124,7 +124,7 @@ export function shapes({ nodes, topics }, own, merged) {
 function flow(names, topics) {
   const told = names.map((name) => topics[name] || {});
   const rate = Math.max(0, ...told.map((one) => one.rate || 0));
-  return { tone: told.some((one) => one.problem) ? "bad" : rate ? "flows" : "", rate };
+  return { tone: told.some((one) => one.problem) ? "bad" : rate ? "flows" : "", rate: rate ? hertz(rate) : "" };
 }
 
 function useGraph(connection) {
@@ -274,7 +274,11 @@ function useView(box, drawn) {
     observer.observe(box.current);
     return () => observer.disconnect();
   }, []);
-  const scale = Math.min(Math.max(0.6, drawn.width / w, drawn.height / h), LEGIBLE); // what is larger is panned
+  const wide = Math.min(Math.max(0.6, drawn.width / w), LEGIBLE);
+  const scale = Math.min(Math.max(wide, drawn.height / h), LEGIBLE); // what is larger is panned
+  useLayoutEffect(() => {
+    box.current.style.height = `min(72vh, ${Math.max(240, Math.ceil(drawn.height / wide))}px)`; // no higher than it is
+  }, [drawn.height, wide]);
   const whole = { scale, x: (drawn.width - w * scale) / 2, y: Math.min(0, (drawn.height - h * scale) / 2) };
   const now = moved || { ...whole, x: Math.min(0, whole.x) };
   const change = (next) => set((before) => next(before || now));
@@ -294,10 +298,8 @@ function useView(box, drawn) {
 }
 
 // One pointer pans, two zoom; the wheel zooms where it points.
-function usePointers(box, view) {
+function usePointers(box, latest) {
   const pointers = useRef(new Map());
-  const latest = useRef(view);
-  latest.current = view;
   useEffect(() => {
     const wheel = (event) => {
       event.preventDefault();
@@ -336,20 +338,23 @@ function usePointers(box, view) {
   };
 }
 
+const MARKER = { viewBox: "0 0 8 8", refX: 7, refY: 4, markerWidth: 9, markerHeight: 9 };
+
 function Drawing({ drawn, vertices, edges, name, state, own }) {
   const box = useRef();
   const view = useView(box, drawn);
-  const pointers = usePointers(box, view);
+  const latest = useRef(view);
+  latest.current = view;
+  const pointers = usePointers(box, latest);
   const topics = section(state, "topics");
   useEffect(() => drawn.at.has(name) && view.show(drawn.at.get(name)), [name, drawn]);
-  const lit = new Set([name]);
   const selected = (edge) => edge.from === name || edge.to === name;
-  for (const edge of edges) if (selected(edge)) lit.add(edge.from).add(edge.to);
-  const dims = name && vertices.some((each) => each.id === name);
+  const lit = new Set([name, ...edges.filter(selected).flatMap((edge) => [edge.from, edge.to])]);
   const key = (event) => {
     const here = event.target.closest("[data-id]")?.dataset.id;
     const step = NEXT[event.key];
-    const act = { "+": () => view.zoom(1 / FACTOR), "-": () => view.zoom(FACTOR), 0: view.fit }[event.key];
+    const larger = () => view.zoom(1 / FACTOR);
+    const act = { "+": larger, "=": larger, "-": () => view.zoom(FACTOR), 0: view.fit }[event.key];
     if (act) act();
     else if (step && here) neighbour(drawn, vertices, here, step, box.current);
     else if (step) view.pan(-60 * step[0], -60 * step[1]);
@@ -361,17 +366,17 @@ function Drawing({ drawn, vertices, edges, name, state, own }) {
       <button type="button" onClick=${() => view.zoom(FACTOR)} aria-label="Smaller (−)">−</button>
       <button type="button" onClick=${view.fit}>Whole</button>
       <button type="button" onClick=${() => save(box.current, drawn)}>Save as SVG</button>
-      <span class="mark legend-edge flows"
-        ><svg viewBox="0 0 26 16"><path d="M1 8h24" /></svg>flows</span
-      >
-      <span class="mark legend-edge bad"
-        ><svg viewBox="0 0 26 16"><path d="M1 8h24" /></svg>a problem</span
-      >
+      ${["flows", "bad"].map(
+        (tone) =>
+          html`<span key=${tone} class="mark legend-edge ${tone}"
+            ><svg viewBox="0 0 26 16"><path d="M1 8h24" /></svg>${tone === "bad" ? "a problem" : "flows"}</span
+          >`,
+      )}
       <span class="muted">Drag or arrows move, wheel, pinch or + − zoom, 0 shows all.</span>
     </div>
     <svg
       ref=${box}
-      class=${dims ? "graph dims" : "graph"}
+      class=${drawn.at.has(name) ? "graph dims" : "graph"}
       viewBox=${view.viewBox}
       tabindex="0"
       role="group"
@@ -380,16 +385,7 @@ function Drawing({ drawn, vertices, edges, name, state, own }) {
       ...${pointers}
     >
       <defs>
-        <marker
-          id="tip"
-          viewBox="0 0 8 8"
-          refX="7"
-          refY="4"
-          markerWidth="9"
-          markerHeight="9"
-          markerUnits="userSpaceOnUse"
-          orient="auto"
-        >
+        <marker id="tip" markerUnits="userSpaceOnUse" orient="auto" ...${MARKER}>
           <path class="tip" d="M0 .5 8 4 0 7.5Z" />
         </marker>
       </defs>
@@ -400,20 +396,15 @@ function Drawing({ drawn, vertices, edges, name, state, own }) {
             <text class="lane-name" x="12" y=${lane.y + 17}>${lane.name}</text>
           </g>`,
       )}
-      ${drawn.paths.map((path, at) => {
-        const edge = edges.find((each) => each.from === path.from && each.to === path.to);
-        const { tone, rate } = flow(edge.topics, topics);
-        const middle = path.points[Math.floor(path.points.length / 2)],
-          before = path.points[Math.floor((path.points.length - 1) / 2)];
-        const label = edge.topics.length > 1 ? `${edge.topics.length} topics` : short(edge.topics[0], 22);
-        return html`<g key=${`${path.from} ${path.to} ${at}`} class=${`edge ${tone} ${selected(edge) ? "lit" : ""}`}>
-          <title>${edge.topics.join(", ")}${rate ? `: ${hertz(rate)}` : ""}</title>
-          <path d=${curve(path.points)} marker-end="url(#tip)" />
-          ${!path.from.startsWith("topic ") &&
-          !path.to.startsWith("topic ") &&
-          html`<text x=${(middle.x + before.x) / 2} y=${(middle.y + before.y) / 2 - 5}>${label}</text>`}
-        </g>`;
-      })}
+      ${drawn.paths.map(
+        (path) =>
+          html`<${Edge}
+            key=${`${path.from} ${path.to}`}
+            path=${path}
+            ...${flow(path.topics, topics)}
+            lit=${selected(path)}
+          />`,
+      )}
       ${vertices.map(
         (one) =>
           html`<${Vertex}
@@ -423,28 +414,38 @@ function Drawing({ drawn, vertices, edges, name, state, own }) {
             lit=${lit.has(one.id)}
             chosen=${one.id === name}
             own=${own}
-            topics=${topics}
-            show=${view.show}
+            ...${flow(one.topics || [], topics)}
+            view=${latest}
           />`,
       )}
     </svg>`;
 }
 
-function Vertex({ one, at, lit, chosen, own, topics, show }) {
+const Edge = memo(({ path, tone, rate, lit }) => {
+  const { topics, points } = path;
+  const middle = points[Math.floor(points.length / 2)],
+    before = points[Math.floor((points.length - 1) / 2)];
+  const label = topics.length > 1 ? `${topics.length} topics` : short(topics[0], 22);
+  return html`<g class="edge ${tone} ${lit ? "lit" : ""}">
+    <title>${topics.join(", ")}${rate && `: ${rate}`}</title>
+    <path d=${curve(points)} marker-end="url(#tip)" />
+    ${path.named && html`<text x=${(middle.x + before.x) / 2} y=${(middle.y + before.y) / 2 - 5}>${label}</text>`}
+  </g>`;
+});
+
+const Vertex = memo(({ one, at, lit, chosen, own, tone, rate, view }) => {
   const { x, y } = at;
   const node = one.kind === "node";
-  const { tone, rate } = node ? {} : flow(one.topics, topics);
-  const said = node
-    ? `Node ${one.id}${one.lane === own ? "" : `, of ${one.lane}`}`
-    : `Topic ${one.topics.join(", ")}${rate ? `, ${hertz(rate)}` : ""}`;
+  const whose = one.lane === own ? "" : `, of ${one.lane}`;
+  const said = node ? `Node ${one.id}${whose}` : `Topic ${one.topics.join(", ")}${rate && `, ${rate}`}`;
   return html`<a
-    class=${`vertex ${one.kind} ${tone || ""} ${lit ? "lit" : ""} ${chosen ? "chosen" : ""}`}
+    class="vertex ${one.kind} ${tone} ${lit ? "lit" : ""} ${chosen ? "chosen" : ""}"
     href=${href("graph", one.id)}
     data-id=${one.id}
     aria-label=${said}
     aria-current=${chosen ? "true" : undefined}
     draggable="false"
-    onFocus=${(event) => event.currentTarget.matches(":focus-visible") && show(at)}
+    onFocus=${(event) => event.currentTarget.matches(":focus-visible") && view.current.show(at)}
   >
     <title>${said}</title>
     <rect x=${x - one.w / 2} y=${y - one.h / 2} width=${one.w} height=${one.h} rx=${node ? one.h / 2 : 4} />
@@ -453,7 +454,7 @@ function Vertex({ one, at, lit, chosen, own, topics, show }) {
         html`<text key=${index} x=${x} y=${y + 5 + (index - (one.lines.length - 1) / 2) * LINE}>${line}</text>`,
     )}
   </a>`;
-}
+});
 
 // The nearest vertex in the direction of an arrow key has the focus.
 function neighbour(drawn, vertices, from, [dx, dy], svg) {
@@ -468,35 +469,25 @@ function neighbour(drawn, vertices, from, [dx, dy], svg) {
   [...svg.querySelectorAll("[data-id]")].find((each) => each.dataset.id === next.id)?.focus();
 }
 
+const LOOKS = "fill stroke stroke-width stroke-dasharray opacity font-size font-family font-weight text-anchor".split(
+  " ",
+);
+
 // A file of the whole drawing with the colours that it has now.
 function save(svg, drawn) {
   const copy = svg.cloneNode(true);
-  const from = svg.querySelectorAll("rect, path, text"),
-    to = copy.querySelectorAll("rect, path, text");
-  from.forEach((each, at) => {
+  const all = (root) => root.querySelectorAll("rect, path, text");
+  const to = all(copy);
+  const give = (one, values) => Object.entries(values).forEach(([key, value]) => one.setAttribute(key, value));
+  all(svg).forEach((each, at) => {
     const style = getComputedStyle(each);
-    for (const one of [
-      "fill",
-      "stroke",
-      "stroke-width",
-      "stroke-dasharray",
-      "stroke-opacity",
-      "opacity",
-      "font-size",
-      "font-family",
-      "font-weight",
-      "text-anchor",
-    ])
-      to[at].setAttribute(one, style.getPropertyValue(one));
+    give(to[at], Object.fromEntries(LOOKS.map((look) => [look, style.getPropertyValue(look)])));
   });
-  copy.setAttribute("xmlns", "http://www.w3.org/2000/svg");
-  copy.setAttribute("viewBox", `-10 -10 ${drawn.width + 20} ${drawn.height + 20}`);
-  copy.setAttribute("width", drawn.width + 20);
-  copy.setAttribute("height", drawn.height + 20);
+  const [width, height] = [drawn.width + 20, drawn.height + 20];
+  give(copy, { xmlns: "http://www.w3.org/2000/svg", viewBox: `-10 -10 ${width} ${height}`, width, height });
   for (const each of copy.querySelectorAll("a")) each.removeAttribute("href");
   const ground = document.createElementNS("http://www.w3.org/2000/svg", "rect");
-  const size = { x: -10, y: -10, width: "100%", height: "100%", fill: getComputedStyle(svg).backgroundColor };
-  for (const [key, value] of Object.entries(size)) ground.setAttribute(key, value);
+  give(ground, { x: -10, y: -10, width, height, fill: getComputedStyle(svg).backgroundColor });
   copy.prepend(ground);
   const link = document.createElement("a");
   link.href = URL.createObjectURL(new Blob([new XMLSerializer().serializeToString(copy)], { type: "image/svg+xml" }));
@@ -507,18 +498,20 @@ function save(svg, drawn) {
 
 const Names = ({ names, page }) =>
   names.map(
-    (each, at) =>
-      html`${at > 0 && ", "}${page
-        ? html`<${Link} key=${each} page=${page} name=${each} />`
-        : html`<${NodeLink} key=${each} name=${each} />`}`,
+    (name, at) =>
+      html`${at > 0 && ", "}${page ? html`<${Link} page=${page} name=${name} />` : html`<${NodeLink} name=${name} />`}`,
   );
+const Part = ({ title, ...names }) =>
+  html`<h3>${title}</h3>
+    <p><${Names} ...${names} /></p>`;
 
 function About({ name, chosen, vertices, own, state, children }) {
   const topics = section(state, "topics");
-  const vertex = vertices.find((each) => each.id === name);
   const node = chosen.nodes.get(name);
-  const stack = vertex?.topics || (chosen.topics.has(name.slice(6)) ? [name.slice(6)] : []);
-  const all = [...chosen.topics.values()];
+  const stack = vertices.find((each) => each.id === name)?.topics || [];
+  const first = chosen.topics.get(stack[0]);
+  const of = (end) => [...chosen.topics.values()].filter((one) => one[end].includes(name)).map((one) => one.name);
+  if (!node && !first) return html`<${Panel} title="It is not drawn at present"><p class="row">${children}</p><//>`;
   return html`<${Panel}
     title=${node ? "Node" : stack.length > 1 ? `${stack.length} topics of the same nodes` : "Topic"}
   >
@@ -527,26 +520,16 @@ function About({ name, chosen, vertices, own, state, children }) {
             <${NodeLink} name=${name} />${node.module !== own &&
             html` <span class="muted">${node.node} of ${node.module}</span>`}
           </p>
-          <h3>Publishes</h3>
-          <p><${Names} page="topic" names=${all.filter((one) => one.from.includes(name)).map((one) => one.name)} /></p>
-          <h3>Subscribes</h3>
-          <p><${Names} page="topic" names=${all.filter((one) => one.to.includes(name)).map((one) => one.name)} /></p>`
-      : stack.map((each) => {
-          const one = chosen.topics.get(each);
-          return html`<div key=${each}>
-            <p>
-              <${Link} page="topic" name=${each} /> <span class="muted">${one?.type} ${hertz(topics[each]?.rate)}</span>
-            </p>
-            ${topics[each]?.problem && html`<p><${Mark} state="WARN" word="" /> ${topics[each].problem}</p>`}
-          </div>`;
-        })}
-    ${!node &&
-    chosen.topics.has(stack[0]) &&
-    html`<h3>Publishers</h3>
-      <p><${Names} names=${chosen.topics.get(stack[0]).from} /></p>
-      <h3>Subscribers</h3>
-      <p><${Names} names=${chosen.topics.get(stack[0]).to} /></p>`}
-    ${!node && !stack.length && html`<p class="empty">It is not drawn at present.</p>`}
+          <${Part} title="Publishes" page="topic" names=${of("from")} />
+          <${Part} title="Subscribes" page="topic" names=${of("to")} />`
+      : html`${stack.map(
+            (each) =>
+              html`<p key=${each}>
+                <${Link} page="topic" name=${each} />${" "}
+                <span class="muted">${chosen.topics.get(each)?.type} ${hertz(topics[each]?.rate)}</span>
+                ${topics[each]?.problem && html`<${Mark} state="WARN" word=${topics[each].problem} />`}
+              </p>`,
+          )} <${Part} title="Publishers" names=${first.from} /><${Part} title="Subscribers" names=${first.to} />`}
     <p class="row">${children}</p><//
   >`;
 }
