@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rmpa.core.identity import is_own, proxied_node
+from rmpa.core.limits import MIB
 from rmpa.core.timers import TokenBucket
 from rmpa.observe import limits
 from rmpa.ros.types.definitions import DiagnosticLevel
@@ -119,10 +120,13 @@ class StatusTable:
         if source not in self._buckets:
             if len(self._buckets) >= limits.DIAGNOSTICS_MAX:
                 del self._buckets[next(iter(self._buckets))]
-            self._buckets[source] = TokenBucket(limits.DIAGNOSTIC_RATE, 3 * limits.DIAGNOSTIC_RATE)
-        if self._buckets[source].take(now):
+            self._buckets[source] = TokenBucket(limits.DIAGNOSTIC_FLOW, 3 * limits.DIAGNOSTIC_FLOW)
+        bucket, cost = self._buckets[source], max(length, limits.DIAGNOSTIC_FLOW / limits.DIAGNOSTIC_RATE)
+        if bucket.has(now, cost):
+            bucket.spend(cost)
             return True
-        text = f"it sends more than {limits.DIAGNOSTIC_RATE:g} messages a second, some are left out"
+        most = f"{limits.DIAGNOSTIC_RATE:g} messages and {limits.DIAGNOSTIC_FLOW // MIB} MiB a second are read"
+        text = f"it sends too much, at most {most}"
         self._problems[source] = now, text
         return False
 

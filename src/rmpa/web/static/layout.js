@@ -190,7 +190,7 @@ function settle(wanted, sizes, low, high) {
 
 // `vertices`: { id, lane, w, h }; `lanes`: names from top to bottom; `edges`: { from, to }; `before`: the layout of a
 // moment ago. Returns the centre of each vertex, the points of each edge, the box of each lane, and the whole size.
-export function layout(vertices, edges, lanes, before) {
+export function layout(vertices, edges, lanes, before, gap = GAP.column) {
   const past = (id) => before?.at.get(id)?.y ?? Infinity;
   const ids = vertices.map((each) => each.id).sort((a, b) => past(a) - past(b) || (a < b ? -1 : 1));
   const known = new Map(vertices.map((each) => [each.id, each]));
@@ -231,10 +231,10 @@ export function layout(vertices, edges, lanes, before) {
   const lane = (id) => lanes.indexOf(boxes.get(id).lane);
   for (const column of columns) column.sort((a, b) => lane(a) - lane(b));
   const ordered = order(columns, inputs, outputs, lane);
-  return drawn({ ordered, lanes, boxes, inputs, outputs, links, known });
+  return drawn({ ordered, lanes, boxes, inputs, outputs, links, known, gap });
 }
 
-function drawn({ ordered, lanes, boxes, inputs, outputs, links, known }) {
+function drawn({ ordered, lanes, boxes, inputs, outputs, links, known, gap }) {
   const height = (list) => list.reduce((sum, id) => sum + boxes.get(id).h + GAP.row, -GAP.row);
   const bands = [];
   let top = 0;
@@ -275,13 +275,13 @@ function drawn({ ordered, lanes, boxes, inputs, outputs, links, known }) {
   for (const column of ordered) {
     const wide = Math.max(...column.map((id) => boxes.get(id).w), 0);
     x.push(right + wide / 2);
-    right += wide + GAP.column;
+    right += wide + gap;
   }
   const at = new Map();
   ordered.forEach((column, index) => column.forEach((id) => at.set(id, { x: x[index], y: y.get(id) })));
   const paths = links.map((edge) => ({ ...edge, points: points(edge, at, boxes) }));
   for (const id of [...at.keys()]) if (!known.has(id)) at.delete(id);
-  const width = Math.max(right - GAP.column + 16, 120);
+  const width = Math.max(right - gap + 16, 120);
   return {
     at,
     paths,

@@ -9,6 +9,7 @@ import { isData } from "./topics.js";
 
 const PERIOD = 2000; // milliseconds between two questions for a graph that may have changed
 const LETTERS = 26;
+const NAMED = 170; // between columns, where edges have names
 const STACK = 4; // topics of the same nodes that are named in one box; the others are counted
 const LINE = 17;
 const DEBUG = new RegExp(
@@ -209,7 +210,13 @@ export function GraphPage({ name, state, connection }) {
     const chosen = choose(topics, { text: filter.typed, module, namespace, debug, leaves, only, own, state });
     const { vertices, edges } = shapes(chosen, own, view === "nodes");
     const lanes = [...new Set([own, ...vertices.map((each) => each.lane).sort()])];
-    memory.current = { key, chosen, vertices, edges, drawn: layout(vertices, edges, lanes, memory.current.drawn) };
+    memory.current = {
+      key,
+      chosen,
+      vertices,
+      edges,
+      drawn: layout(vertices, edges, lanes, memory.current.drawn, view === "nodes" ? NAMED : undefined),
+    };
   }
   const { chosen, vertices = [], edges = [], drawn } = memory.current;
   const modules = [...new Set(Object.values(topics).flatMap(([, from, to]) => [...from, ...to]))]
@@ -291,7 +298,7 @@ function useView(box, drawn) {
   const show = ({ x, y }) =>
     change((at) => {
       const inside = (spot, low, length) =>
-        Math.min(Math.max(low, spot + (110 - length) * at.scale), spot - 110 * at.scale);
+        Math.min(Math.max(low, spot + (60 - length) * at.scale), spot - 60 * at.scale);
       return { ...at, x: inside(x, at.x, w), y: inside(y, at.y, h) };
     });
   return { viewBox: `${now.x} ${now.y} ${w * now.scale} ${h * now.scale}`, zoom, pan, fit: () => set(null), show };
