@@ -74,9 +74,9 @@ class DiagnosticsFeed:
             self._timer.cancel()
             self._timer = None
         self._unsubscribe()
+        self._refused = ""
 
     def _subscribe(self, now: float) -> None:
-        self._refused = ""
         self._table.resume(now)
         try:
             self._subscription = self._hub.topics.subscribe(TOPIC, ARRAY_TYPE, self._take, self._fail)
@@ -169,10 +169,16 @@ class DiagnosticsFeed:
     def _count(self) -> Tree:
         mine = [(key, entry) for key, entry in self._entries.items() if "agent" not in entry]
         wrong = [(key, entry) for key, entry in mine if entry["level"] == ERROR or entry.get("last") == ERROR]
+        shown, of_node = [], Counter[object]()
+        for key, entry in wrong:  # one node hides no other
+            of_node[entry.get("module"), entry["node"]] += 1
+            if of_node[entry.get("module"), entry["node"]] <= limits.DIAGNOSTIC_ERRORS_NODE:
+                shown.append((key, entry))
+        shown = shown[: limits.DIAGNOSTIC_ERRORS]
         found: Tree = {
             "levels": dict(Counter(str(entry["level"]) for entry in self._entries.values())),
-            "errors": dict(wrong[: limits.DIAGNOSTIC_ERRORS]),
-            "more": max(0, len(wrong) - limits.DIAGNOSTIC_ERRORS),
+            "errors": dict(shown),
+            "more": len(wrong) - len(shown),
         }
         for name, level in (("warnings", WARN), ("stale", STALE)):
             those = (entry for _, entry in mine if entry["level"] == level and entry.get("last") != ERROR)

@@ -122,6 +122,8 @@ DIAGNOSTIC_WORST: Final = 200
 # At it: further ones are counted
 # Told in: the page of the mesh
 DIAGNOSTIC_ERRORS: Final = 20
+# Of these, errors of one node.
+DIAGNOSTIC_ERRORS_NODE: Final = 5
 # Time between two signs of life to a page, which takes its connection for lost after three without any.
 TICK_PERIOD: Final = 2.0
 # Pause before it is looked again whether a page has taken what was sent.
