@@ -301,7 +301,14 @@ function useView(box, drawn) {
         Math.min(Math.max(low, spot + (60 - length) * at.scale), spot - 60 * at.scale);
       return { ...at, x: inside(x, at.x, w), y: inside(y, at.y, h) };
     });
-  return { viewBox: `${now.x} ${now.y} ${w * now.scale} ${h * now.scale}`, zoom, pan, fit: () => set(null), show };
+  return {
+    viewBox: `${now.x} ${now.y} ${w * now.scale} ${h * now.scale}`,
+    left: now.x,
+    zoom,
+    pan,
+    fit: () => set(null),
+    show,
+  };
 }
 
 // One pointer pans, two zoom; the wheel zooms where it points.
@@ -400,7 +407,7 @@ function Drawing({ drawn, vertices, edges, name, state, own }) {
         (lane) =>
           html`<g key=${lane.name}>
             <rect class="lane" x="0" y=${lane.y} width=${drawn.width} height=${lane.h} rx="10" />
-            <text class="lane-name" x="12" y=${lane.y + 17}>${lane.name}</text>
+            <text class="lane-name" x=${12 + Math.max(0, view.left)} y=${lane.y + 17}>${lane.name}</text>
           </g>`,
       )}
       ${drawn.paths.map(
