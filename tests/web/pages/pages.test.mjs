@@ -154,6 +154,20 @@ test("a layout stays as it is, and few boxes move when a node comes", () => {
   assert.ok(moved(layout(more, link, lanes, drawn)) < 0.2);
 });
 
+test("edges that need not cross do not", () => {
+  const names = [..."abcdef"];
+  const box = (id) => ({ id, lane: "pc", w: 40, h: 20 });
+  const ends = Object.fromEntries(names.map((each, at) => [each, `z${names.length - at}`])); // the order of names crosses all
+  const edges = names.map((from) => ({ from, to: ends[from] }));
+  const { at } = layout([...names, ...Object.values(ends)].map(box), edges, ["pc"]);
+  const height = (id) => at.get(id).y;
+  const sorted = [...names].sort((a, b) => height(a) - height(b));
+  assert.deepEqual(
+    Object.values(ends).sort((a, b) => height(a) - height(b)),
+    sorted.map((each) => ends[each]),
+  );
+});
+
 test("a chain, a cycle and a loop have their columns", () => {
   const box = (id) => ({ id, lane: "pc", w: 40, h: 20 });
   const link = (text) => text.split(" ").map((each) => ({ from: each[0], to: each[1] }));
