@@ -157,7 +157,7 @@ test("a layout stays as it is, and few boxes move when a node comes", () => {
 test("edges that need not cross do not", () => {
   const names = [..."abcdef"];
   const box = (id) => ({ id, lane: "pc", w: 40, h: 20 });
-  const ends = Object.fromEntries(names.map((each, at) => [each, `z${names.length - at}`])); // the order of names crosses all
+  const ends = Object.fromEntries(names.map((each, at) => [each, `z${names.length - at}`])); // each crosses each
   const edges = names.map((from) => ({ from, to: ends[from] }));
   const { at } = layout([...names, ...Object.values(ends)].map(box), edges, ["pc"]);
   const height = (id) => at.get(id).y;
