@@ -234,7 +234,7 @@ def history(status: Status) -> Iterator[tuple[str, list[float | None]]]:
     yield "", [round(at, 2) for at, _ in status.samples]
     for place, name in enumerate(status.values):
         column = [None if math.isnan(numbers[place]) else numbers[place] for _, numbers in status.samples]
-        if any(number is not None for number in column):
+        if name and any(number is not None for number in column):
             yield name, column
 
 

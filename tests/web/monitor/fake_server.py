@@ -79,7 +79,7 @@ REPORTS = [
 
 def reported(source: str, voltage: float) -> list[dict[str, Any]]:
     """The statuses of one message of a node, with a number, a text and NaN."""
-    figures = {"Voltage": f"{voltage:.2f} V", "Address": "10.0.0.1", "Current": "nan"}
+    figures = {"Voltage": f"{voltage:.2f} V", "Address": "10.0.0.1", "Current": "nan", "__proto__": "1"}
     values = [{"key": key, "value": value} for key, value in figures.items()]
     return [
         {"name": name, "hardware_id": hardware, "level": level, "message": message, "values": values}

@@ -184,8 +184,7 @@ class DiagnosticsFeed:
             those = (entry for _, entry in mine if entry["level"] == level and entry.get("last") != ERROR)
             found[name] = [[e.get("module", ""), e["name"]] for e in islice(those, 100)]
         problems: list[Value] = [f"{source}: {text}" for source, text in islice(self._table.problems.items(), 10)]
-        refused: list[Value] = [self._refused] if self._refused else []
-        return {**found, "problems": refused + problems}
+        return {**found, "problems": problems} | ({"refused": self._refused} if self._refused else {})
 
 
 def _entry(status: Status) -> Tree:

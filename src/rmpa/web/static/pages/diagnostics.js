@@ -2,7 +2,7 @@
 
 import { html, useEffect, useRef, useState } from "../markup.js";
 import { count, plain } from "../format.js";
-import { entries, section } from "../state.js";
+import { adopt, entries, section } from "../state.js";
 import {
   Choice,
   Facts,
@@ -28,8 +28,12 @@ const SPAN = 600; // seconds of a strip
 const WIDTH = 120;
 const HEIGHTS = { OK: 3, STALE: 6, WARN: 9, ERROR: 14 }; // by its height a level is seen without its colour
 const LINES = 8; // of a plot
+const KEPT = 600; // moments of it
 const NUMBER = /^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?:[^\d\s.:/-][^\d:/]*)?$/; // with a unit or without
-const numberOf = (text) => (NUMBER.test(text ?? "") ? Number(NUMBER.exec(text)[1]) : null);
+const numberOf = (text) => {
+  const number = Number(NUMBER.exec(text ?? "")?.[1] ?? NaN);
+  return Number.isFinite(number) ? number : null;
+};
 
 // The levels of the last ten minutes, from left to right.
 function Strip({ levels, label }) {
@@ -155,7 +159,7 @@ export function Diagnostics({ name, state, connection }) {
     filter.matches(`${one.name} ${one.module || own} ${one.hardware || ""} ${one.message}`);
   const shown = all.filter(fits);
   const levels = section(section(state, "diagnostics"), "levels");
-  const { problems = [] } = section(state, "diagnostics");
+  const { problems = [], refused } = section(state, "diagnostics");
   const present = [...LEVELS].reverse().filter((level) => levels[level]);
   const said = present.map((level) => `${levels[level]} ${known(level).word}`).join(", ");
   return html`<${Page}
@@ -165,7 +169,7 @@ export function Diagnostics({ name, state, connection }) {
       : "What nodes of all modules say on /diagnostics"}
     aside=${html`<${Choice} label="Least level" value=${least} onChoose=${choose} options=${WHICH} />`}
   >
-    ${problems.map((text) => html`<p class="failure" key=${text}>${text}</p>`)}
+    ${[...problems, ...(refused ? [refused] : [])].map((text) => html`<p class="failure" key=${text}>${text}</p>`)}
     <div class=${name ? "beside-status chosen" : "beside-status"}>
       <div>
         ${filter.field}
@@ -199,26 +203,24 @@ function Chosen({ name, one, own, state, connection }) {
   const detail = section(section(state, "detail"), `diagnostic:${name}`);
   const values = Object.entries(detail.values || {});
   const [fields, setFields] = useState([]);
-  const past = useRef({});
+  const past = useRef(Object.create(null)); // columns by value, and the moments under an empty name
   const [version, next] = useState(0);
   useEffect(() => {
-    connection.ask("past", { status: name }).then(
-      (found) => {
-        past.current = found;
-        next((n) => n + 1);
-      },
-      () => {},
-    );
+    const take = (found) => {
+      past.current = adopt(found);
+      next((n) => n + 1);
+    };
+    connection.ask("past", { status: name }).then(take, () => {});
   }, []);
   useEffect(() => {
-    if (!detail.heard || past.current[""]?.at(-1) >= detail.heard) return;
-    const before = past.current[""]?.length || 0;
-    for (const [key, text] of values) {
-      const number = numberOf(text);
-      if (number === null && !past.current[key]) continue;
-      (past.current[key] ||= new Array(before).fill(null)).push(Number.isFinite(number) ? number : null);
+    const columns = past.current;
+    const moments = (columns[""] ||= []);
+    if (!detail.heard || moments.at(-1) >= detail.heard) return;
+    for (const [key, text] of values) if (key && numberOf(text) !== null) columns[key] ||= moments.map(() => null);
+    for (const [key, column] of Object.entries(columns)) {
+      column.push(key ? numberOf(detail.values[key]) : detail.heard);
+      if (column.length > KEPT) column.shift();
     }
-    (past.current[""] ||= []).push(detail.heard);
     next((n) => n + 1);
   }, [detail.heard]);
   if (!one) return html`<${Panel} title="Status"><p class="empty">There is no such status at present.</p><//>`;
@@ -226,8 +228,7 @@ function Chosen({ name, one, own, state, connection }) {
   const toggle = (key) =>
     setFields(fields.includes(key) ? fields.filter((each) => each !== key) : [...fields, key].slice(-LINES));
   const plotted = fields.filter((key) => past.current[key]);
-  const moments = past.current[""] || [];
-  const data = [moments, ...plotted.map((key) => pad(past.current[key], moments.length))];
+  const data = ["", ...plotted].map((key) => past.current[key] || []);
   return html`<${Panel} title=${one.name}>
     <p>
       <${Mark} state=${one.level} /> for <${Since} moment=${one.since} /> <strong>${one.message}</strong>
@@ -272,6 +273,3 @@ function Chosen({ name, one, own, state, connection }) {
     <p class="row"><a class="button" href="#/diagnostics">Close</a></p><//
   >`;
 }
-
-const pad = (column, length) =>
-  [...new Array(Math.max(0, length - column.length)).fill(null), ...column].slice(-length);
