@@ -161,7 +161,8 @@ export function Diagnostics({ name, state, connection }) {
   const levels = section(section(state, "diagnostics"), "levels");
   const { problems = [], refused } = section(state, "diagnostics");
   const present = [...LEVELS].reverse().filter((level) => levels[level]);
-  const said = present.map((level) => `${levels[level]} ${known(level).word}`).join(", ");
+  const plural = (level) => (levels[level] > 1 && /ERROR|WARN/.test(level) ? "s" : "");
+  const said = present.map((level) => `${levels[level]} ${known(level).word}${plural(level)}`).join(", ");
   return html`<${Page}
     title="Diagnostics"
     kind=${all.length
