@@ -89,6 +89,7 @@ _DECLARED: Final = {
     "alarm": ("main", "See the alarms of resources."),
     "alarm list": ("resource", "List the resources that have a problem."),
     "alarm echo": ("resource", "Print alarms as they are raised and cleared, until Ctrl-C."),
+    "diagnostics": ("diagnostics", "Show what the nodes of all modules say on /diagnostics."),
     "site": ("main", "See other sites that gateways join."),
     "site list": ("peer", "List this site and the others, with their state."),
     "site info": ("peer", "Show the modules of a site and what they offer."),

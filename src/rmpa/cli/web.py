@@ -5,15 +5,19 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import shutil
 import sys
 from dataclasses import replace
+from importlib.util import find_spec
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import urlsplit
 
 import click
 
 from rmpa.cli.module import agent_settings, check_web, find_module
 from rmpa.cli.options import Options, agent_verb, config_option, flag
-from rmpa.cli.output import begin_log
+from rmpa.cli.output import Painted, begin_log
 from rmpa.config.read import INSECURE
 from rmpa.config.settings import WebSettings
 from rmpa.config.values import HOST, BadValue
@@ -69,7 +73,7 @@ def web(config: str | None, insecure: bool, check: bool, options: Options, **giv
 
     Examples:
       rmpa web                        for this machine: http://127.0.0.1:8480/, https:// in a secured mesh
-      rmpa web --listen 0.0.0.0       for the network; prints the URL with its token once
+      rmpa web --listen 0.0.0.0       for the network; prints the URL with its token once, and as a QR code
       rmpa up --web                   the agent starts it, and again if it ends
       curl -s localhost:8480/api/v1/peers | jq '.[].name'
     """
@@ -93,14 +97,17 @@ def web(config: str | None, insecure: bool, check: bool, options: Options, **giv
         return 0
     said = [f"--insecure: {INSECURE['trust.insecure']}"] if insecure else []
     begin_log(setup.settings, (*module.loaded.notes, *said), _log, sys.stderr)
+    from rmpa.web.server.access import is_loopback
     from rmpa.web.server.process import serve
 
     def announce(url: str, access: TokenAccess) -> None:
-        lines = [url]
+        lines: list[str] = [url]
         if access.is_new:
             lines.append(f"the token is kept in {access.file}; it is not printed again")
         elif access.file:
             lines.append(f"clients need the token of {access.file}")
+        if not (options.as_json or is_loopback(urlsplit(url).hostname or "")):
+            lines += _qr_code(url)
         options.show({"url": url, "token_file": str(access.file or "")}, lines)
         sys.stdout.flush()
 
@@ -111,6 +118,23 @@ def web(config: str | None, insecure: bool, check: bool, options: Options, **giv
         if not asyncio.run(serve(setup, pinned, announce, load=lambda: make()[1])):
             return 0
         module, setup = make()
+
+
+def _qr_code(url: str) -> list[Painted]:
+    """A URL for the camera of a phone, on a terminal that can show it: two rows of the code in one line."""
+    plain = os.environ.get("TERM") == "dumb" or "utf" not in (sys.stdout.encoding or "").lower()
+    if not sys.stdout.isatty() or plain or find_spec("segno") is None:
+        return []
+    import segno
+
+    rows = [[bool(dark) for dark in row] for row in segno.make(url, error="l", micro=False).matrix_iter(border=2)]
+    if len(rows[0]) > shutil.get_terminal_size().columns:
+        return []
+    pairs = zip_longest(rows[::2], rows[1::2], fillvalue=[False] * len(rows[0]))
+    blocks = {(False, False): " ", (True, False): "▀", (False, True): "▄", (True, True): "█"}
+    lines = ("".join(blocks[both] for both in zip(upper, lower, strict=True)) for upper, lower in pairs)
+    # Dark on light, whatever the terminal's colours are: cameras want it so.
+    return [Painted(f"\x1b[30;107m{line}\x1b[0m") for line in lines]
 
 
 def _setup(module: Module, settings: Settings) -> WebSetup:

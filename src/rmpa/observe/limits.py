@@ -52,6 +52,32 @@ DIAGNOSTICS_STALE: Final = 60.0
 # Why: Each second it would take 0.03 ms for each of them, two thirds of a core with 20,000.
 DIAGNOSTICS_TOPICS: Final = 2000
 
+# [Agent] Statuses of `/diagnostics` that `rmpa diagnostics` and the page keep
+# At it: of the publisher with the most, the oldest is forgotten
+# Told in: both
+DIAGNOSTICS_MAX: Final = 2000
+# [Agent] Time without news after which a status is stale
+# At it: it is shown as stale, with its last level
+# Told in: `rmpa diagnostics`, the page of diagnostics
+# Why: As rqt_robot_monitor has it; diagnostic_updater sends once a second.
+DIAGNOSTIC_STALE: Final = 3.0
+# How long a status without news is shown.
+DIAGNOSTIC_FORGET: Final = 600.0
+# [Agent] Messages of one publisher of `/diagnostics` a second, in the long run
+# At it: further ones are left out
+# Told in: `rmpa diagnostics`, the page of diagnostics
+DIAGNOSTIC_RATE: Final = 20.0
+# Their bytes a second, likewise: reading them takes a tenth of a core.
+DIAGNOSTIC_FLOW: Final = MIB
+# How long it is said that a publisher of ``/diagnostics`` is heard in part.
+DIAGNOSTIC_PROBLEM: Final = 30.0
+# Bytes of a message on ``/diagnostics`` that is decoded: 2,000 statuses of an agent are some 1.5 MB.
+DIAGNOSTIC_BYTES: Final = 4 * MIB
+# Values of a status; further ones are left out.
+DIAGNOSTIC_VALUES: Final = 256
+# Changes of a status' level that are remembered.
+DIAGNOSTIC_LEVELS: Final = 32
+
 # Time-out for a multicast packet to return to its sender; where that works, it takes less than a millisecond.
 DOCTOR_HEAR: Final = 1.0
 # Time-out of a program of the system (nft, iptables).

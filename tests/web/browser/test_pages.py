@@ -24,13 +24,15 @@ PAGES = {
     "topic/%2Fodom": "bridge.allow has",
     "services": "/base/set_parameters",
     "nodes": "Of peers, the nodes",
-    "node/base%3A%2Fbase": "Node of base",
+    "node/base%3A%2Fbase": "/rmpa/base/base",
     "service/base%3A%2Fbase%2Fset_parameters": "std_srvs/SetBool",
     "params": "rosdistro",
     "resources": "a simulated Turtlebot",
     "resource/velocity%3A%2Fvelocity": "For a robot that carries a full glass",
     "alarms": "All that is wrong",
     "log": "turn",
+    "diagnostics": "No node has said anything yet",
+    "graph": "/velocity_order",
     "drive": "The robot may move",
 }
 
@@ -68,7 +70,7 @@ async def test_a_page_shows_its_thing_and_is_accessible_in_both_colours_and_on_a
     assert (site.server.reports, page.errors) == ([], [])
 
 
-@pytest.mark.parametrize("scene", ["sick", "mute", "large", "knock"])
+@pytest.mark.parametrize("scene", ["sick", "mute", "large", "knock", "ill", "killed"])
 async def test_the_first_page_is_accessible_whatever_is_wrong(site: Site, scene: str) -> None:
     page = await site.open("", scene)
     assert await violations(page) == []
@@ -287,7 +289,7 @@ async def test_topics_that_carry_data_come_first_and_the_filter_looks_among_all(
     page = await site.open("topics")
     await page.wait_text("are left out")
     rows = "[...document.querySelectorAll('tbody th')].map((each) => each.innerText.trim())"
-    assert await page.run(rows) == ["/command_information", "/odom", "/velocity_order"]
+    assert await page.run(rows) == ["/command_information", "/diagnostics", "/odom", "/velocity_order"]
     await page.run("(() => { const field = document.querySelector('main input'); field.value = 'base/qual';"
                    " field.dispatchEvent(new Event('input', {bubbles: true})); })()")  # fmt: skip
     await page.wait(f"{rows}.join() === '/base/quality'")
@@ -478,7 +480,7 @@ async def test_long_lists_are_drawn_in_parts(site: Site) -> None:
     rows = "[...document.querySelectorAll('tbody th')].filter((each) => each.textContent.startsWith('/many/')).length"
     await page.wait(f"{rows} > 100")
     assert await page.run(rows) <= 200
-    await page.click("Show 200 more of 1,753")
+    await page.click("Show 200 more of 1,754")
     await page.wait(f"{rows} > 390")
 
 

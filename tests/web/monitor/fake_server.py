@@ -5,7 +5,8 @@
 It has the real pages and the real ``MonitorSession``; the agent, the hub and all answers are made up here.
 Scenes: ``demo`` (all is well), ``killed`` (the module base was killed), ``sick`` (one of each state, and alarms),
 ``large`` (16 modules, 300 topics), ``mute`` (the agent does not answer), ``sensors`` (a laser and a camera),
-``cut`` (18,000 topics are left out), ``knock`` (modules that are not of this mesh, at its authority).
+``cut`` (18,000 topics are left out), ``knock`` (modules that are not of this mesh, at its authority), ``ill`` (nodes
+report errors on /diagnostics).
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from rmpa.trust.permissions import TrustReason, TrustStatus
 from rmpa.web.clients.frame_writer import Opcode
 from rmpa.web.hub.node_link import FULL
 from rmpa.web.hub.topics import ReceivedMessage
+from rmpa.web.monitor.diagnostics import DiagnosticsFeed
 from rmpa.web.monitor.messages import SUBPROTOCOL, Tree
 from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.session import MonitorSession
@@ -63,6 +65,51 @@ def snapshots() -> list[Snapshot]:
 def resources() -> list[ResourceFacts]:
     """The demo's Smart Resources."""
     return msgspec.convert(json.loads((FIXTURES / "resources.json").read_text())["resources"], list[ResourceFacts])
+
+
+# What nodes report in the scene ``ill``: node, hardware, name, level, message.
+REPORTS = [
+    ("/rmpa/base/arm_driver", "SN 4711", "arm_driver: Battery/Cell 1", 2, "too hot"),
+    ("/rmpa/base/arm_driver", "SN 4711", "arm_driver: Battery/Cell 2", 0, "fine"),
+    ("/rmpa/base/laser", "", "laser: Frequency Status", 0, "Desired frequency met"),
+    ("/camera", "cam-7", f"camera: {'a_status_whose_name_has_about_sixty_letters_' * 2}", 1, "<b>late</b>"),
+    ("/rmpa", "pc", "rmpa: this module", 2, "the agent's own"),
+]
+
+
+def reported(source: str, voltage: float) -> list[dict[str, Any]]:
+    """The statuses of one message of a node, with a number, a text and NaN."""
+    figures = {"Voltage": f"{voltage:.2f} V", "Address": "10.0.0.1", "Current": "nan", "__proto__": "1"}
+    values = [{"key": key, "value": value} for key, value in figures.items()]
+    return [
+        {"name": name, "hardware_id": hardware, "level": level, "message": message, "values": values}
+        for node, hardware, name, level, message in REPORTS
+        if node == source
+    ]
+
+
+class Reports:
+    """The hub and the values of the diagnostics: each node reports when it is asked to."""
+
+    def __init__(self) -> None:
+        self.take: Callable[[Any], None] = lambda _: None
+        self.topics = self
+        self.graph = SimpleNamespace(
+            topics={"/diagnostics": SimpleNamespace(publishers=[node for node, *_ in REPORTS])}
+        )
+        self.silent = False
+
+    def subscribe(self, _topic: str, _type: str, take: Callable[[Any], None], _failed: object) -> Any:
+        self.take = take
+        return SimpleNamespace(close=lambda: None)
+
+    def of(self, message: Any) -> Any:
+        return message.values
+
+    def report(self) -> None:
+        for source in () if self.silent else dict.fromkeys(node for node, *_ in REPORTS):
+            status = reported(source, 24 + math.sin(time.time()))
+            self.take(SimpleNamespace(source=source, payload=b"", values={"status": status}))
 
 
 def outside(name: str, trust: TrustStatus) -> PeerInfo:
@@ -211,6 +258,10 @@ class FakeServer:
         self._odometry = json.loads((FIXTURES / "odometry.json").read_text())
         self._answers = json.loads((FIXTURES / "answers.json").read_text())
         self._mute_since = 0.0
+        self.reports_of_nodes = Reports()
+        reports: Any = self.reports_of_nodes
+        self._diagnostics = DiagnosticsFeed(reports, reports, lambda: None)
+        self._reported = 0.0
 
     def app(self) -> web.Application:
         """The application."""
@@ -244,11 +295,18 @@ class FakeServer:
         if self.params != self._params_told:
             self._params_told = dict(self.params)
             self._param_changes += 1
-        return self._builder.build(
+        self._diagnostics.follow(wanted=True)
+        if self.agent.scene == "ill" and time.time() - self._reported > 0.5:
+            self._reported = time.time()
+            self.reports_of_nodes.report()
+        state = self._builder.build(
             self._snapshot, self.agent.facts(), self.agent.alarms(), parameters=self._param_changes
         )
+        return state | {"diagnostics": self._diagnostics.summary}
 
     def _details(self, kind: str, name: str) -> Tree | None:
+        if kind.startswith("diagnostic"):
+            return self._diagnostics.all() if kind == "diagnostics" else self._diagnostics.one(name)
         return details(self._snapshot, {one.key: one for one in self.agent.facts()}, kind, name)
 
     async def _socket(self, request: web.Request) -> web.WebSocketResponse:
@@ -338,6 +396,20 @@ class FakeServer:
             "connections": [{"topic": each, **other} for each in publishes],
         }
 
+    def _answer_past(self, args: dict[str, Any]) -> Any:
+        return self._diagnostics.past(args["status"])
+
+    def _answer_types(self, _args: dict[str, Any]) -> Any:
+        return {"/base/set_parameters": "dynamic_reconfigure/Reconfigure"}
+
+    def _answer_graph(self, args: dict[str, Any]) -> Any:
+        nodes: dict[str, Any] = {}
+        for each in self._snapshot.topics:
+            publishers = [*each.publishers, *(proxy(one) for one in each.routes if one.direction == "in")]
+            nodes[each.name] = [each.type, publishers, each.subscribers]
+        digest = str(hash(str(nodes)))
+        return {"digest": digest} | ({"topics": nodes, "hidden": 0} if args.get("has") != digest else {})
+
     def _answer_call(self, args: dict[str, Any]) -> Any:
         return {"response": {"success": True, "message": f"as asked: {args['request']}"}, "seconds": 0.0031}
 
@@ -346,6 +418,11 @@ class FakeServer:
 
     def _answer_configure(self, args: dict[str, Any]) -> Any:
         return {"value": args["value"], "text": f"{args['name']} is {args['value']} now"}
+
+
+def proxy(route: RouteInfo) -> str:
+    """The node that stands for a peer's."""
+    return f"/rmpa/{route.peer}{route.node}"
 
 
 class _Client(Recorded):

@@ -23,7 +23,7 @@ from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.state import StateBuilder, details, module_state
 from tests.web.monitor.fake_server import resources, snapshots
 from tests.web.monitor.patches import apply
-from tests.web.snapshots import AGENT, FULL, LINK, peer
+from tests.web.snapshots import AGENT, FULL, LINK, peer, route
 
 RECORDED = snapshots()
 RESOURCES = resources()
@@ -63,10 +63,27 @@ def test_the_state_says_who_is_there_and_what_flows() -> None:
 def test_a_killed_module_shows_in_the_next_state_and_comes_back() -> None:
     builder = StateBuilder("pc")
     states: list[Any] = [builder.build(snapshot) for snapshot in RECORDED]
-    assert [state["modules"]["base"]["state"] for state in states] == ["up", "up", "linking", "away", "up", "up"]
+    assert [state["modules"]["base"]["state"] for state in states] == ["up", "up", "lost", "lost", "up", "up"]
     assert "refused" in states[2]["modules"]["base"]["error"]
     assert "base>pc" not in states[2]["flows"]
     assert states[2]["modules"]["base"]["since"] == states[3]["modules"]["base"]["since"]
+    lost = states[3]["modules"]["base"]["lost"]
+    assert lost["topics"]["/odom"] == pytest.approx(50, rel=0.05)
+    assert "lost" not in states[4]["modules"]["base"]
+
+
+def test_a_lost_link_stays_until_it_is_back_and_says_what_waits_and_is_dropped() -> None:
+    builder = StateBuilder(FULL.agent.name)
+    builder.build(FULL)
+    away = replace(route(direction="out"), state="away", kept=7, lost=2, dropped=1)
+    waits = TopicInfo(name="/image", type="sensor_msgs/Image", routes=(away,))
+    cut = replace(FULL, peers=(peer(state="linking", link=None),), topics=(waits,))
+    builder.build(cut)
+    later: Any = builder.build(replace(cut, taken=FULL.taken + limits.FORGET_AFTER + 9, peers=()))
+    arm = later["modules"]["arm"]
+    assert (arm["state"], arm["lost"]["kept"], arm["lost"]["dropped"]) == ("lost", 7, 3)
+    back: Any = builder.build(FULL)
+    assert back["modules"]["arm"]["state"] == "up"
 
 
 def test_what_a_lost_module_said_last_is_no_news() -> None:

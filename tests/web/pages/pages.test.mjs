@@ -3,6 +3,7 @@ import assert from "node:assert/strict";
 import test from "node:test";
 
 import { bandwidth, bytes, duration, hertz, plain, seconds, sentence } from "./static/format.js";
+import { curve, layout } from "./static/layout.js";
 import { SIZE, arrange, chord, emptyRing, geometry, outside, place } from "./static/ring.js";
 import { adopt, applyPatch } from "./static/state.js";
 
@@ -104,4 +105,79 @@ test("a patch changes what it names alone, and removes with null (RFC 7396)", ()
   assert.equal(applyPatch(state, { notes: ["y"] }).topics, state.topics, "what is not touched is the same object");
   assert.equal(applyPatch(state, { ["__proto__"]: { polluted: 1 } }).polluted, undefined);
   assert.equal(adopt(JSON.parse('{"__proto__": {"toString": 1}}')).toString, undefined);
+});
+
+// A robot of some nodes and topics in lanes, always the same one, with cycles.
+function robot(nodes, topics) {
+  let seed = 7;
+  const next = (most) => ((seed = (seed * 1103515245 + 12345) % 2147483648), seed % most);
+  const lanes = ["pc", "base", "arm", "camera"];
+  const vertices = [],
+    edges = [];
+  for (let at = 0; at < nodes; at++) vertices.push({ id: `/n${at}`, lane: lanes[at % 4], w: 120, h: 36 });
+  for (let at = 0; at < topics; at++) {
+    const from = next(nodes);
+    vertices.push({ id: `topic /t${at}`, lane: lanes[from % 4], w: 140, h: 27 });
+    edges.push({ from: `/n${from}`, to: `topic /t${at}` });
+    for (let to = next(3); to > 0; to--) edges.push({ from: `topic /t${at}`, to: `/n${next(nodes)}` });
+  }
+  return { vertices, edges, lanes };
+}
+
+test("a graph of 50 nodes and 100 topics is laid out without boxes over each other, each within its lane", () => {
+  const { vertices, edges, lanes } = robot(50, 100);
+  const drawn = layout(vertices, edges, lanes);
+  for (const one of vertices) {
+    const { x, y } = drawn.at.get(one.id);
+    const lane = drawn.lanes.find((each) => each.name === one.lane);
+    assert.ok(y - one.h / 2 >= lane.y && y + one.h / 2 <= lane.y + lane.h, one.id);
+    assert.ok(x - one.w / 2 >= 0 && x + one.w / 2 <= drawn.width, one.id);
+    for (const other of vertices.slice(0, vertices.indexOf(one))) {
+      const there = drawn.at.get(other.id);
+      const apart = Math.abs(there.x - x) * 2 >= one.w + other.w || Math.abs(there.y - y) * 2 >= one.h + other.h;
+      assert.ok(apart, `${one.id} ${other.id}`);
+    }
+  }
+  assert.equal(drawn.paths.length, edges.length);
+  assert.ok(drawn.paths.every(({ points }) => /^M[\d. ]+(C[-\d. ]+)+$/.test(curve(points))));
+});
+
+test("a layout stays as it is, and few boxes move when a node comes", () => {
+  const { vertices, edges, lanes } = robot(20, 40);
+  let drawn = layout(vertices, edges, lanes);
+  for (let turn = 0; turn < 3; turn++) drawn = layout(vertices, edges, lanes, drawn);
+  const moved = (now) =>
+    vertices.filter(({ id }) => far(now.at.get(id), drawn.at.get(id)) > 60).length / vertices.length;
+  assert.equal(moved(layout(vertices, edges, lanes, drawn)), 0);
+  const more = [...vertices, { id: "/new", lane: "arm", w: 120, h: 36 }];
+  const link = [...edges, { from: "topic /t0", to: "/new" }];
+  assert.ok(moved(layout(more, link, lanes, drawn)) < 0.2);
+});
+
+test("edges that need not cross do not", () => {
+  const names = [..."abcdef"];
+  const box = (id) => ({ id, lane: "pc", w: 40, h: 20 });
+  const ends = Object.fromEntries(names.map((each, at) => [each, `z${names.length - at}`])); // each crosses each
+  const edges = names.map((from) => ({ from, to: ends[from] }));
+  const { at } = layout([...names, ...Object.values(ends)].map(box), edges, ["pc"]);
+  const height = (id) => at.get(id).y;
+  const sorted = [...names].sort((a, b) => height(a) - height(b));
+  assert.deepEqual(
+    Object.values(ends).sort((a, b) => height(a) - height(b)),
+    sorted.map((each) => ends[each]),
+  );
+});
+
+test("a chain, a cycle and a loop have their columns", () => {
+  const box = (id) => ({ id, lane: "pc", w: 40, h: 20 });
+  const link = (text) => text.split(" ").map((each) => ({ from: each[0], to: each[1] }));
+  const columns = (names, edges) => {
+    const { at } = layout([...names].map(box), link(edges), ["pc"]);
+    const order = [...new Set([...at.values()].map(({ x }) => x))].sort((a, b) => a - b);
+    return [...names].map((name) => order.indexOf(at.get(name).x)).join("");
+  };
+  assert.equal(columns("abcd", "ab bc ad dc"), "0121");
+  assert.equal(columns("abc", "ab bc ca"), "012");
+  assert.equal(columns("ab", "aa ab"), "01");
+  assert.equal(columns("abcd", "ab bc dc"), "0121"); // what only sends stands before what it sends to
 });

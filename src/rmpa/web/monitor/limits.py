@@ -84,6 +84,8 @@ LOG_LINES: Final = 500
 # [Pages] Characters of one of them
 # At it: the rest is cut
 LOG_CHARACTERS: Final = 1024
+# Topics of a lost link that are named; further ones are counted.
+LOST_TOPICS: Final = 20
 # Time after the start of this module's agent in which peers that it has not found yet do not count as lost: beacons
 # come every 5 s at the latest, and links take seconds where names or addresses are resolved.
 AGENT_SETTLES: Final = 10.0
@@ -112,6 +114,16 @@ DRIVE_TURN: Final = 4.0
 RESOURCES_MAX: Final = 256
 # Time for which the details of a Smart Resource are followed after a page has shown it.
 LOOK_KEPT: Final = 10.0
+# Numbers of values of ``/diagnostics`` whose past is kept, all statuses together: some 4 MB.
+DIAGNOSTIC_HISTORY: Final = 500_000
+# Changes of the worst level of all statuses that are remembered.
+DIAGNOSTIC_WORST: Final = 200
+# [Pages] Statuses at ERROR under *What is wrong*
+# At it: further ones are counted
+# Told in: the page of the mesh
+DIAGNOSTIC_ERRORS: Final = 20
+# Of these, errors of one node.
+DIAGNOSTIC_ERRORS_NODE: Final = 5
 # Time between two signs of life to a page, which takes its connection for lost after three without any.
 TICK_PERIOD: Final = 2.0
 # Pause before it is looked again whether a page has taken what was sent.

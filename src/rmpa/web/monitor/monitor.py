@@ -17,6 +17,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.runtime.tasks import end_tasks, keep_task
 from rmpa.web import limits as web_limits
 from rmpa.web.monitor import limits
+from rmpa.web.monitor.diagnostics import DiagnosticsFeed
 from rmpa.web.monitor.messages import LOG_TOPIC
 from rmpa.web.monitor.questions import Answers
 from rmpa.web.monitor.resources import MessageValues, ResourceWatch
@@ -54,6 +55,8 @@ class MeshFeed:
         clock: Callable[[], float] = time.time,
     ) -> None:
         self._parameters = parameters
+        # What nodes say on ``/diagnostics``.
+        self.diagnostics: DiagnosticsFeed | None = None
         self._watch = watch
         self._resources = resources
         self._clock = clock
@@ -85,8 +88,10 @@ class MeshFeed:
         """Give a page each new state, beginning with the last one."""
         self._pages[page] = show
         self._resources.show_all(wanted=True)
+        if self.diagnostics is not None:
+            self.diagnostics.follow(wanted=True)
         if self._state is not None:
-            show(self._state)
+            show(self._whole(self._state))
         self._wake.set()
 
     def unfollow(self, page: object) -> None:
@@ -94,6 +99,18 @@ class MeshFeed:
         self._pages.pop(page, None)
         if not self._pages:
             self._resources.show_all(wanted=False)
+            if self.diagnostics is not None:
+                self.diagnostics.follow(wanted=False)
+
+    def show(self) -> None:
+        """Show all pages the state once more: the diagnostics have changed."""
+        if self._state is not None:
+            state = self._whole(self._state)
+            for show in [*self._pages.values()]:
+                show(state)
+
+    def _whole(self, state: Tree) -> Tree:
+        return state | {"diagnostics": self.diagnostics.summary} if self.diagnostics is not None else state
 
     async def close(self) -> None:
         """End."""
@@ -106,6 +123,8 @@ class MeshFeed:
             return None
         if kind == "resource":
             self._resources.look(name)
+        if kind.startswith("diagnostic") and self.diagnostics is not None:
+            return self.diagnostics.all() if kind == "diagnostics" else self.diagnostics.one(name)
         return details(self._snapshot, self._resources.facts, kind, name)
 
     async def _run(self) -> None:
@@ -139,8 +158,7 @@ class MeshFeed:
             facts = tuple(self._resources.facts.values())
             standing = self._resources.alarms()
             self._state = self._builder.build(reading.snapshot, facts, standing, self._parameters())
-        for show in [*self._pages.values()]:
-            show(self._state)
+        self.show()
 
 
 _TYPE: Final = "rosgraph_msgs/Log"
@@ -246,12 +264,14 @@ class Monitor:
         self.resources = ResourceWatch(hub, self.values)
         self.log = LogFeed(hub, self.values)
         self.mesh = MeshFeed(watch, self.resources, lambda: hub.params.changes)
+        self.mesh.diagnostics = self.diagnostics = DiagnosticsFeed(hub, self.values, self.mesh.show)
         self.sticks = Sticks(hub, lambda: self.mesh.agent)
         self.answers = Answers(
             hub,
             self.resources,
             os.environ if environ is None else environ,
             lambda: agent or self.mesh.agent,
+            self.diagnostics.past,
         )
 
     def start(self) -> None:
@@ -265,5 +285,6 @@ class Monitor:
         """End, before the hub ends."""
         await self.mesh.close()
         self.answers.close()
+        self.diagnostics.close()
         self.log.close()
         self.resources.close()

@@ -48,7 +48,7 @@ def shown_node(own: str) -> str:
 Args: TypeAlias = dict[str, Any]  # the edge: each question has its own
 # All questions, each with the right (``Rights``) that a page needs for it; the method ``_QUESTION`` answers it.
 QUESTIONS: Final = {
-    **dict.fromkeys(("why", "agent", "contract", "node", "describe"), ""),
+    **dict.fromkeys(("why", "agent", "contract", "node", "describe", "past", "graph", "types"), ""),
     **dict.fromkeys(("params", "param_names"), "view"),
     **dict.fromkeys(("set_param", "delete_param", "invite", "call", "profile", "context", "configure"), "control"),
 }
@@ -69,12 +69,19 @@ class Answers:
         resources: Knows the Smart Resources.
         environ: Says where the agents' sockets are.
         agent: Returns the agent's name; empty for the only one.
+        past: The past of the values of a status of ``/diagnostics``, by its key.
     """
 
     def __init__(
-        self, hub: Hub, resources: ResourceWatch, environ: Mapping[str, str], agent: Callable[[], str]
+        self,
+        hub: Hub,
+        resources: ResourceWatch,
+        environ: Mapping[str, str],
+        agent: Callable[[], str],
+        past: Callable[[str], Any] = lambda _: {},
     ) -> None:
         self._hub = hub
+        self._past_of = past
         self._resources = resources
         self._environ = environ
         self._agent_name = agent
@@ -107,6 +114,31 @@ class Answers:
 
     async def _contract(self, args: Args) -> Any:
         return await self._control_call("contract", topic=_name(args, "topic"), type_name=_text(args, "type"))
+
+    async def _past(self, args: Args) -> Any:
+        return self._past_of(_text(args, "status"))
+
+    async def _graph(self, args: Args) -> Any:
+        """The graph of this module's core: each topic with its type and its nodes, proxies included, and services.
+
+        Nothing but its revision where the page ``has`` that one.
+        """
+        graph = self._hub.graph
+        await _in_time(graph.loaded.wait())
+        shown = [*islice(graph.topics.values(), limits.TOPICS_SHOWN)]
+        topics = {each.name: [" ".join(each.types), each.publishers, each.subscribers] for each in shown}
+        digest = hashlib.sha256(msgspec.json.encode(topics)).hexdigest()[:16]
+        if args.get("has") == digest:
+            return {"digest": digest}
+        return {"digest": digest, "topics": topics, "hidden": len(graph.topics) - len(shown)}
+
+    async def _types(self, _args: Args) -> Any:
+        """The types of the services of this module's graph, as far as their servers tell them in time, by name."""
+        graph = self._hub.graph
+        await _in_time(graph.loaded.wait())
+        await graph.find_all()
+        found = islice((each for each in graph.services.values() if each.type), limits.SERVICES_SHOWN)
+        return {each.name: each.type for each in found}
 
     async def _node(self, args: Args) -> Any:
         """The facts about a node, with names of nodes as pages have them."""

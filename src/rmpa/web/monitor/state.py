@@ -49,7 +49,7 @@ _STEADY: Final[Mapping[str, tuple[float, float]]] = {
 _MOMENT: Final = "since"
 _GONE: Final = "has left the roster: no beacon and no link"
 # States of a module of which nothing comes any more.
-_LOST: Final = frozenset({"linking", "refused", "away"})
+_LOST: Final = frozenset({"linking", "refused", "away", "lost"})
 
 
 def steady_entry(before: Mapping[str, Any] | None, entry: Tree) -> Tree:
@@ -80,6 +80,9 @@ class StateBuilder:
         self._seen: dict[str, float] = {}
         # The last counts of each link, and its bytes a second in and out.
         self._links: dict[str, tuple[tuple[float, int, int], list[float]]] = {}
+        # What each linked module's link carries: topics with their messages a second; and what a lost link carried.
+        self._carried: dict[str, dict[str, float]] = {}
+        self._lost: dict[str, dict[str, float]] = {}
         # By section and key, the entries that are shown, with what they were made of.
         self._entries: dict[str, dict[str, tuple[object, Tree]]] = {}
         self._state: Tree = {"agent": {"name": own}, "modules": {}, "topics": {}}
@@ -161,13 +164,18 @@ class StateBuilder:
         # Modules that have left the roster are kept for a while, as many as can be shown.
         seen = self._seen | {peer.name: taken for peer in peers}
         newest = sorted(seen, key=seen.__getitem__, reverse=True)[: limits.MODULES_SHOWN]
-        self._seen = {name: seen[name] for name in newest if taken - seen[name] <= limits.FORGET_AFTER}
+        stays = self._lost.keys()
+        self._seen = {
+            name: seen[name] for name in newest if name in stays or taken - seen[name] <= limits.FORGET_AFTER
+        }
+        self._note_lost(snapshot)
         started = round(snapshot.agent.started, 1)
         yield self.own, {"state": "here", "since": started}
         links, self._links = self._links, {}
         for peer in peers:
             rates = self._rates(peer.name, taken, peer.link, links) if peer.link is not None else []
-            yield peer.name, _module(peer, taken, rates)
+            entry = _module(peer, taken, rates)
+            yield peer.name, self._as_lost(entry, peer.name, snapshot) if peer.name in self._lost else entry
         present = {peer.name for peer in snapshot.peers}
         if snapshot.trust is None:  # where a secured mesh is not this one's, its members are outside, and not away
             present |= {one.name for one in snapshot.strangers}
@@ -178,7 +186,42 @@ class StateBuilder:
             else:
                 before = self._entries.get("modules", {}).get(name, (None, {}))[1]
                 since = before.get("since") if before.get("state") in _LOST else None
-                yield name, {"state": "away", "since": since or self._seen[name], "error": _GONE}
+                entry = {"state": "away", "since": since or self._seen[name], "error": _GONE}
+                yield name, self._as_lost(entry, name, snapshot) if name in self._lost else entry
+
+    def _note_lost(self, snapshot: Snapshot) -> None:
+        """Note which links were lost without a farewell, and what they carried, until they are back.
+
+        A module that ends says so, and leaves the roster at once; of one whose cable is out the entry stays.
+        """
+        carried: dict[str, dict[str, float]] = {}
+        for topic in snapshot.topics:
+            for route in topic.routes:
+                if route.state == "open" or route.transport in ("direct", "both"):
+                    topics = carried.setdefault(route.peer, {})
+                    topics[topic.name] = max(topics.get(topic.name, 0.0), route.rate or 0.0)
+        before, self._carried = self._carried, {}
+        for peer in snapshot.peers:
+            if peer.state in ("linked", "relayed"):
+                self._lost.pop(peer.name, None)
+                self._carried[peer.name] = carried.get(peer.name, {})
+            elif peer.name in before:
+                self._lost[peer.name] = before[peer.name]
+
+    def _as_lost(self, entry: Tree, name: str, snapshot: Snapshot) -> Tree:
+        """The entry of a module whose link was lost, with the topics that stopped and the messages that it costs."""
+        topics = self._lost[name]
+        away = [
+            r for t in snapshot.topics for r in t.routes if (r.peer, r.direction, r.state) == (name, "out", "away")
+        ]
+        busiest = sorted(topics, key=lambda topic: (-topics[topic], topic))
+        told: Tree = {
+            "topics": {topic: float(f"{topics[topic]:.3g}") for topic in busiest[: limits.LOST_TOPICS]},
+            "more": max(0, len(topics) - limits.LOST_TOPICS),
+            "kept": sum(route.kept for route in away),
+            "dropped": sum(route.lost + route.dropped for route in away),
+        }
+        return {**entry, "state": "lost", "lost": told}
 
     def _outside(self, snapshot: Snapshot) -> Iterable[tuple[str, Tree]]:
         """The modules that are not of this mesh; for one that a page can invite here with ``here``."""

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from rmpa.config.module_name import module_dir, state_dir
 from rmpa.core.contract import Priority
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
+from rmpa.discovery.network import choose, list_interfaces, pick_address
 from rmpa.ros.node.node import Node
 from rmpa.runtime.plugins import WEB_PROTOCOLS, load_plugins, plugin_error
 from rmpa.runtime.systemd import feed_watchdog, notify_service_manager
@@ -294,9 +295,24 @@ def access_of(web: WebSettings, module: str, environ: Mapping[str, str], state: 
     return TokenAccess(token, file, is_new)
 
 
-def url_of(web: WebSettings, access: TokenAccess, port: int, *, is_https: bool = False) -> str:
-    """The URL of a server's first page; with the token if that was made now."""
-    host = socket.gethostname() if web.listen == "0.0.0.0" else web.listen  # noqa: S104 - compared
+def url_of(
+    web: WebSettings, access: TokenAccess, port: int, *, is_https: bool = False, interfaces: tuple[str, ...] = ()
+) -> str:
+    """The URL of a server's first page, as another computer can open it; with the token if that was made now.
+
+    Where the server listens at all addresses: the name that ``--host`` gives, else the address at which other modules
+    find this one. The name of this machine is often known to itself alone.
+
+    Args:
+        web: The settings.
+        access: The token.
+        port: Where it listens.
+        is_https: Whether it has a certificate.
+        interfaces: The names of those that ``[discovery]`` allows; none: all.
+    """
+    host = web.listen
+    if host == "0.0.0.0":  # noqa: S104 - compared
+        host = next(iter(web.hosts), "") or str(pick_address(choose(list_interfaces(), interfaces)))
     query = f"?{TOKEN_PARAMETER}={access.token}" if access.is_new else ""
     return f"{'https' if is_https else 'http'}://{host}:{port}/{query}"
 
@@ -342,7 +358,9 @@ async def serve(
             certificate.start()
             monitor.start()
             follower.start(hub.graph)
-            announce(url_of(web, setup.access, server.port, is_https=certificate.context is not None), setup.access)
+            is_https, interfaces = certificate.context is not None, setup.settings.interfaces
+            url = url_of(web, setup.access, server.port, is_https=is_https, interfaces=interfaces)
+            announce(url, setup.access)
             notify_service_manager("READY=1")
             feed_watchdog(loop)
             await _first_of(stop.wait(), follower.misfit.wait(), _changed(setup, load, reload))

@@ -4,7 +4,7 @@ import { html, render, Component } from "./markup.js";
 import { Connection } from "./connection.js";
 import { sentence } from "./format.js";
 import { section } from "./state.js";
-import { Mark, Since } from "./parts.js";
+import { Mark, Since, keyOfNode } from "./parts.js";
 import { Mandala } from "./mandala.js";
 import { Search, Shortcuts } from "./search.js";
 import { applyTheme, nextTheme, theme } from "./theme.js";
@@ -15,13 +15,17 @@ const PAGES = [
   ["topics", "Topics", "t"],
   ["services", "Services", "s"],
   ["nodes", "Nodes", "n"],
+  ["graph", "Graph", "g"],
   ["params", "Parameters", "p"],
   ["resources", "Resources", "r"],
   ["alarms", "Alarms", "a"],
+  ["diagnostics", "Diagnostics", "i"],
   ["log", "Log", "l"],
   ["drive", "Drive", "d"],
 ];
 const DETAILED = ["module", "topic", "service", "node", "resource"];
+// Pages on which a name chooses a part: what was filtered and opened there stays.
+const KEPT = ["diagnostics", "graph"];
 // All pages but the first one are loaded when they are first opened.
 const LAZY = {
   module: ["module.js", "ModulePage"],
@@ -35,6 +39,8 @@ const LAZY = {
   resources: ["resources.js", "Resources"],
   resource: ["resources.js", "ResourcePage"],
   alarms: ["alarms.js", "Alarms"],
+  diagnostics: ["diagnostics.js", "Diagnostics"],
+  graph: ["graph.js", "GraphPage"],
   log: ["log.js", "Log"],
   drive: ["drive.js", "DrivePage"],
 };
@@ -42,7 +48,8 @@ const LAZY = {
 function address() {
   const [page = "", name] = location.hash.replace(/^#\/?/, "").split("/");
   try {
-    return { page, name: name === undefined ? undefined : decodeURIComponent(name) };
+    const known = name === undefined ? undefined : decodeURIComponent(name);
+    return { page, name: page === "node" && known ? keyOfNode(known) : known };
   } catch {
     return { page, name };
   }
@@ -59,7 +66,7 @@ class App extends Component {
 
   componentDidMount() {
     addEventListener("hashchange", () => {
-      this.arrives = true;
+      this.arrives = !KEPT.includes(address().page) || address().page !== this.state.page;
       this.setState({ ...address(), overlay: "" }, () => this.look());
     });
     addEventListener("keydown", (event) => this.key(event));
@@ -94,7 +101,9 @@ class App extends Component {
 
   look() {
     const { page, name } = address();
-    this.connection.look(DETAILED.includes(page) && name !== undefined ? [[page, name]] : []);
+    const about = page === "diagnostics" ? "diagnostic" : DETAILED.includes(page) && page;
+    const all = page === "diagnostics" ? [["diagnostics", ""]] : [];
+    this.connection.look(about && name !== undefined ? [...all, [about, name]] : all);
   }
 
   key(event) {
@@ -148,7 +157,7 @@ class App extends Component {
       </p>`;
     }
     return html`<${loaded[lazy[1]]}
-      key=${`${page} ${name}`}
+      key=${KEPT.includes(page) ? page : `${page} ${name}`}
       name=${name}
       state=${connection.state}
       connection=${connection}

@@ -129,7 +129,7 @@ const Module = memo(({ name, module, at, geo, resources, alarms, compact }) => {
   const short = name.length > limit ? `${name.slice(0, limit - 1)}…` : name;
   const word = small
     ? ""
-    : profile && module.state !== "away" && module.state !== "linking"
+    : profile && !["away", "linking", "lost"].includes(module.state)
       ? profile.slice(0, limit)
       : compact && module.state === "here"
         ? "here"
@@ -329,6 +329,43 @@ export function Ring({ state, current }) {
   </div>`;
 }
 
+// What was lost with a link, until it is back: the topics that stopped, and messages.
+export function costs(lost) {
+  if (!lost) return "";
+  const topics = Object.entries(lost.topics || {}).map(([name, rate]) => (rate ? `${name} (${hertz(rate)})` : name));
+  const stopped = topics.length ? `. Stopped: ${topics.slice(0, 5).join(", ")}` : ". No topic was in use";
+  const left = Math.max(0, topics.length - 5) + (lost.more || 0);
+  const rest = left ? ` and ${left} more` : "";
+  const kept = lost.kept ? `; ${count(lost.kept, "message")} wait for it` : "";
+  return `${stopped}${rest}${kept}${lost.dropped ? `; ${count(lost.dropped, "message")} dropped` : ""}`;
+}
+
+// What nodes say on /diagnostics: each error, and a line for all warnings.
+function diagnosed({ errors, more, warnings = [], stale = [], problems = [] }, own, modules) {
+  const to = href("diagnostics");
+  const some = (names) => `${names.slice(0, 3).join(", ")}${names.length > 3 ? " …" : ""}`;
+  // What a module said whose link is lost is old, which the line of the module says already.
+  const here = (module) => !module || !["lost", "away"].includes(modules[module]?.state);
+  const those = (list) => list.filter(([module]) => here(module)).map(([, name]) => name);
+  [warnings, stale] = [those(warnings), those(stale)];
+  const current = Object.entries(errors || {}).filter(([, one]) => here(one.module));
+  const found = current.map(([key, one]) => ({
+    id: `d${key}`,
+    level: one.level,
+    who: [one.module || own, one.hardware !== one.module && one.hardware].filter(Boolean).join(" "),
+    text: `${one.name}: ${one.message}${one.level === "STALE" ? " (nothing since)" : ""}`,
+    to: href("diagnostics", key),
+    since: one.since,
+  }));
+  const line = (level, who, text) => found.push({ id: `d${who}`, level, who, text, to });
+  if (more) line("ERROR", `${more} more`, "errors on /diagnostics");
+  if (warnings.length) line("WARN", count(warnings.length, "warning"), `of nodes: ${some(warnings)}`);
+  if (stale.length) line("STALE", count(stale.length, "stale status", "stale statuses"), `of nodes: ${some(stale)}`);
+  for (const text of problems) line("WARN", "/diagnostics", text);
+  return found;
+}
+const count = (number, one, several = `${one}s`) => `${number} ${number > 1 ? several : one}`;
+
 function concerns(state) {
   const found = [];
   for (const [id, alarm] of entries(state, "alarms"))
@@ -344,8 +381,8 @@ function concerns(state) {
     if (module.state !== "up" && module.state !== "here" && module.state !== "relayed")
       found.push({
         id: `m${name}`,
-        level: { refused: "ERROR", away: "STALE" }[module.state] || "WARN",
-        text: `${known(module.state).word}${module.error ? `: ${module.error}` : ""}`,
+        level: { refused: "ERROR", lost: "ERROR", away: "STALE" }[module.state] || "WARN",
+        text: `${known(module.state).word}${module.error ? `: ${module.error}` : ""}${costs(module.lost)}`,
         who: name,
         to: href("module", name),
         since: module.since,
@@ -353,6 +390,7 @@ function concerns(state) {
     else if (module.error)
       found.push({ id: `m${name}`, level: "WARN", text: module.error, who: name, to: href("module", name) });
   }
+  found.push(...diagnosed(section(state, "diagnostics"), section(state, "agent").name, section(state, "modules")));
   const troubled = new Map(); // many topics have one trouble when a module is lost: that is one line
   for (const [name, topic] of entries(state, "topics"))
     if (topic.problem) troubled.set(topic.problem, [...(troubled.get(topic.problem) || []), name]);
@@ -457,8 +495,8 @@ export function Mandala({ state, connection }) {
   const up = modules.filter(([, one]) => one.state === "up" || one.state === "here").length;
   const domain = section(state, "agent").domain ?? "–";
   const total = modules.length + (section(state, "hidden").modules || 0);
-  const marks = ["up", "relayed", "silent", "linking", "refused", "away"].filter(
-    (each) => each !== "relayed" || modules.some(([, one]) => one.state === each),
+  const marks = ["up", "relayed", "silent", "linking", "refused", "away", "lost"].filter(
+    (each) => !["relayed", "lost"].includes(each) || modules.some(([, one]) => one.state === each),
   );
   const { places } = arranged(state);
   const ordered = modules.sort(([a], [b]) => (places[a] ?? 1e9) - (places[b] ?? 1e9));

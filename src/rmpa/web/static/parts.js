@@ -12,6 +12,7 @@ export const STATES = {
   refused: { word: "refused", tone: "bad" },
   relayed: { word: "relayed", tone: "good" },
   away: { word: "away", tone: "idle" },
+  lost: { word: "link lost", tone: "bad" },
   pending: { word: "pending", tone: "warn" },
   revoked: { word: "revoked", tone: "bad" },
   foreign: { word: "foreign", tone: "idle" },
@@ -30,6 +31,7 @@ const SHAPES = {
   refused: html`<path class="stroke heavy" d="M3 3l10 10M13 3 3 13" />`,
   relayed: html`<circle class="stroke" cx="8" cy="8" r="6" /><circle class="fill" cx="8" cy="8" r="3" />`,
   away: html`<path class="stroke" d="M8 2 14 8 8 14 2 8Z" />`,
+  lost: html`<path class="stroke heavy" d="M1.5 8H6M10 8h4.5M6 4.5v7M10 4.5v7" />`,
   pending: html`<circle class="stroke" cx="8" cy="8" r="6" stroke-dasharray="2.4 2.3" /><path
       class="stroke"
       d="M8 5v6M5 8h6"
@@ -304,10 +306,13 @@ export function useAnswer(connection, what, args, period = 0, key = "") {
   return state;
 }
 
-// A node as it is named in the state: `MODULE:/name` for a peer's.
+// A node as it is named in the state: `MODULE:/name` for a peer's. People read the name that the graph of this module
+// has, as in rosnode, rosbridge and Foxglove: its proxy's, `/rmpa/MODULE/name`.
 export const nodeKey = (module, node) => (module ? `${module}:${node}` : node);
+export const nodeName = (key) => key.replace(/^([^/:]+):(?=\/)/, "/rmpa/$1");
+export const keyOfNode = (name) => name.replace(/^\/rmpa\/([^/]+)(?=\/)/, "$1:");
 export const NodeLink = ({ name, children }) =>
-  html`<a class="mono" href=${href("node", name)}>${children?.length ? children : name}</a>`;
+  html`<a class="mono" href=${href("node", keyOfNode(name))}>${children?.length ? children : nodeName(name)}</a>`;
 export const NodeLinks = ({ names }) =>
   names.map((name, at) => html`${at > 0 && ", "}<${NodeLink} key=${name} name=${name} />`);
 export const ModuleLink = ({ name }) => html`<a class="whole" href=${href("module", name)}>${name}</a>`;

@@ -2,7 +2,7 @@
 
 import { html, useEffect, useLayoutEffect, useRef, useState } from "./markup.js";
 import { entries } from "./state.js";
-import { href } from "./parts.js";
+import { href, nodeName } from "./parts.js";
 
 const MOST = 40;
 const KINDS = [
@@ -19,7 +19,8 @@ export function find(state, text, parameters = []) {
   for (const [part, kind, page] of KINDS)
     for (const [name, value] of entries(state, part)) {
       const called = kind === "resource" ? "smart resource" : kind;
-      const parts = [called, name, value.type, value.module, value.description];
+      const shown = kind === "node" ? nodeName(name) : name;
+      const parts = [called, name, shown, value.type, value.module, value.description];
       const about = parts.filter(Boolean).join(" ").toLowerCase();
       if (!words.every((word) => about.includes(word))) continue;
       const last = words[words.length - 1] || "";
@@ -34,7 +35,7 @@ export function find(state, text, parameters = []) {
             : 2;
       found.push({
         kind,
-        name,
+        name: shown,
         to: href(page, name),
         about: value.type || value.description || value.state || (kind === "node" && value.module) || "",
         rank,

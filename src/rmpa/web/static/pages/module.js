@@ -6,6 +6,7 @@ import { entries, section } from "../state.js";
 import { Facts, Gone, Link, Mark, Page, Panel, Since, Table, Uptime, Why, useAnswer } from "../parts.js";
 import { NODE_COLUMNS, NodeRow } from "./nodes.js";
 import { TOPIC_COLUMNS, TopicRow, isData } from "./topics.js";
+import { costs } from "../mandala.js";
 import { Lines } from "../plot.js";
 
 const DIRECTIONS = [
@@ -39,6 +40,7 @@ export function ModulePage({ name, state, connection }) {
       ${(module.error || (module.hidden || []).length > 0) &&
       html`<${Panel} title="What is wrong">
         ${module.error && html`<p class="failure">${module.error}</p>`}
+        ${module.lost && html`<p class="failure">${costs(module.lost).slice(2)}</p>`}
         ${(module.hidden || []).map((text) => html`<p class="failure" key=${text}>${text}</p>`)}<//
       >`}
       ${!own &&

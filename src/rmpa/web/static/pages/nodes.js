@@ -11,6 +11,7 @@ import {
   Mark,
   ModuleLink,
   NodeLink,
+  nodeName,
   Page,
   Panel,
   Table,
@@ -19,6 +20,7 @@ import {
   useFilter,
 } from "../parts.js";
 import { Lines, useLog } from "../loglines.js";
+import { useTypes } from "./services.js";
 
 const NODE_PERIOD = 5; // seconds after which the node that is shown is asked again
 
@@ -26,7 +28,7 @@ export const NodeRow = memo(
   ({ name, node, own }) =>
     html`<tr>
       <th scope="row">
-        <${NodeLink} name=${name}>${node.name}<//>${node.problem &&
+        <${NodeLink} name=${name} />${node.problem &&
         html`<div class="muted"><${Mark} state="WARN" word="" />${node.problem}</div>`}
       </th>
       ${own && html`<td><${ModuleLink} name=${node.module || own} /></td>`}
@@ -42,7 +44,7 @@ export function Nodes({ state }) {
   const filter = useFilter("name or module");
   const own = section(state, "agent").name;
   const all = entries(state, "nodes");
-  const shown = all.filter(([name, one]) => filter.matches(`${name} ${one.module || own}`));
+  const shown = all.filter(([name, one]) => filter.matches(`${nodeName(name)} ${name} ${one.module || own}`));
   const hidden = section(state, "hidden").nodes;
   return html`<${Page} title="Nodes" kind=${`${all.length} in all modules`}>
     ${filter.field}
@@ -71,6 +73,7 @@ export function NodePage({ name, state, connection }) {
   const known = section(state, "nodes")[name];
   const detail = section(section(state, "detail"), `node:${name}`);
   const { value: facts, failure } = useAnswer(connection, "node", { name: node, peer }, NODE_PERIOD);
+  const typeOf = useTypes(connection, state);
   const topics = section(state, "topics");
   // What its own module knows is more: a node of a peer has topics that do not cross.
   const list = (kind, told) => [...new Set([...(detail[kind] || []), ...(told || [])])].sort();
@@ -78,13 +81,13 @@ export function NodePage({ name, state, connection }) {
     subscribes = list("subscribes", facts && Object.keys(facts.subscriptions));
   const services = list("services", facts && facts.services.map((each) => (peer ? `${peer}:${each}` : each)));
   if (!known && !facts)
-    return html`<${Page} title=${node} kind=${`Node of ${peer || own}`}
+    return html`<${Page} title=${nodeName(name)} kind=${`Node of ${peer || own}`}
       >${failure ? html`<${Failure} failure=${failure} />` : html`<${Gone} kind="node" name=${name} />`}<//
     >`;
   const problem = detail.problem || facts?.problem;
   return html`<${Page}
-    title=${node}
-    kind=${html`Node of <${ModuleLink} name=${peer || own} />`}
+    title=${nodeName(name)}
+    kind=${html`Node ${peer && html`<code>${node}</code> `}of <${ModuleLink} name=${peer || own} />`}
     aside=${facts &&
     html`<${Mark} state=${facts.problem ? "ERROR" : "OK"} word=${facts.problem ? "does not answer" : "answers"} />`}
     ><div class="grid">
@@ -112,7 +115,7 @@ export function NodePage({ name, state, connection }) {
                   ? html`<${Link} page="service" name=${each}>${service.name}<//>`
                   : html`<span class="mono">${each.slice(each.indexOf(":") + 1)}</span>`}
               </th>
-              <td class="muted">${service ? service.type || "not asked yet" : "not known here"}</td>
+              <td class="muted">${service ? typeOf(service) : "not known here"}</td>
             </tr>`;
           }}<//
         ><//

@@ -17,33 +17,47 @@ import {
   Why,
   memo,
   nodeKey,
+  useAnswer,
   useFilter,
 } from "../parts.js";
 import { json } from "../typed.js";
 
 const STATES = { home: "stays in its module", hidden: "hidden here", idle: "not in use", open: "in use" };
 
+const ASKING = html`<span class="muted">asking …</span>`,
+  UNTOLD = html`<span class="muted">not told by its server</span>`;
+// The types that a service's server alone knows: all are asked when a page shows services, and when there are more.
+export function useTypes(connection, state) {
+  const unknown = entries(state, "services").filter(([, one]) => !one.type && one.state !== "hidden");
+  const { value, failure } = useAnswer(connection, "types", {}, 0, String(unknown.length));
+  const missing = value || failure ? UNTOLD : ASKING;
+  return (one) => one.type || (one.state === "hidden" ? "" : value?.[one.name] || missing);
+}
+
 const Row = memo(
-  ({ name, service, own }) =>
+  ({ name, service, own, type }) =>
     html`<tr>
       <th scope="row">
         <${Link} page="service" name=${name}>${service.name}<//>${service.problem &&
         html`<div class="muted">${service.problem}</div>`}
       </th>
       <td><${ModuleLink} name=${service.module || own} /></td>
-      <td><${NodeLink} name=${nodeKey(service.module, service.node)}>${service.node}<//></td>
-      <td>${service.type || html`<span class="muted">not asked yet</span>`}</td>
+      <td><${NodeLink} name=${nodeKey(service.module, service.node)} /></td>
+      <td>${type}</td>
       <td>${STATES[service.state] || service.state}</td>
       <td class="number">${count(service.calls || 0)}</td>
       <td class="number">${count(service.failed || 0)}</td>
     </tr>`,
 );
 
-export function Services({ state }) {
+export function Services({ state, connection }) {
+  const typeOf = useTypes(connection, state);
   const filter = useFilter("name or type");
   const all = entries(state, "services");
   const hidden = section(state, "hidden").services;
-  const shown = all.filter(([name, one]) => filter.matches(`${name} ${one.type || ""}`));
+  const shown = all.filter(([name, one]) =>
+    filter.matches(`${name} ${[typeOf(one)].filter((each) => typeof each === "string")}`),
+  );
   return html`<${Page} title="Services" kind=${`${all.length} in all modules`}>
     ${filter.field}
     <${Panel}
@@ -53,7 +67,14 @@ export function Services({ state }) {
         empty="No service matches."
         list=${shown}
       >
-        ${([key, one]) => html`<${Row} key=${key} name=${key} service=${one} own=${section(state, "agent").name} />`}<//
+        ${([key, one]) =>
+          html`<${Row}
+            key=${key}
+            name=${key}
+            service=${one}
+            own=${section(state, "agent").name}
+            type=${typeOf(one)}
+          />`}<//
       >
       ${hidden &&
       html`<p class="empty">

@@ -54,7 +54,7 @@ const ABOUT = new RegExp(
     "requirements|responses|set_context|state)$",
 );
 export function isData(name, state) {
-  if (name === "/rosout" || name === "/rosout_agg" || name === "/diagnostics") return false;
+  if (name === "/rosout" || name === "/rosout_agg") return false;
   const owner = name.replace(ABOUT, "");
   return owner === name || !Object.values(section(state, "resources")).some((one) => one.name === owner);
 }
