@@ -17,6 +17,9 @@ const PAGES = [
   ["nodes", "Nodes", "n"],
   ["params", "Parameters", "p"],
   ["resources", "Resources", "r"],
+  ["map", "Map", "o"],
+  ["tf", "Frames", "f"],
+  ["panels", "Panels", "b"],
   ["alarms", "Alarms", "a"],
   ["log", "Log", "l"],
   ["drive", "Drive", "d"],
@@ -34,6 +37,9 @@ const LAZY = {
   node: ["nodes.js", "NodePage"],
   resources: ["resources.js", "Resources"],
   resource: ["resources.js", "ResourcePage"],
+  map: ["map.js", "MapPage"],
+  tf: ["tf.js", "FramesPage"],
+  panels: ["panels.js", "Panels"],
   alarms: ["alarms.js", "Alarms"],
   log: ["log.js", "Log"],
   drive: ["drive.js", "DrivePage"],
@@ -152,6 +158,7 @@ class App extends Component {
       name=${name}
       state=${connection.state}
       connection=${connection}
+      pages=${LAZY}
     />`;
   }
 

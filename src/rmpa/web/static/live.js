@@ -4,6 +4,7 @@ import { html, useEffect, useRef, useState } from "./markup.js";
 import { bytes, clock } from "./format.js";
 import { Choice, Failure, Panel } from "./parts.js";
 import { Plot, append } from "./plot.js";
+import { MessageTree } from "./tree.js";
 
 const IMAGES = ["sensor_msgs/Image", "sensor_msgs/CompressedImage"];
 const POSES = {
@@ -47,14 +48,15 @@ export function Live({ connection, topic, type }) {
           Nothing is subscribed to. Switched on, <code>rmpa web</code> subscribes to it as a node of this module, once
           for all its clients.
         </p>`
-      : html`<div class="grid">
-          ${view === "image" && html`<${Image} connection=${connection} topic=${topic} />`}${view === "scan" &&
-          html`<${Scan} connection=${connection} topic=${topic} />`}
-          ${view === "pose" && html`<${Pose} connection=${connection} topic=${topic} path=${POSES[type]} />`}
-          ${fields.length > 0 &&
-          html`<${Fields} key=${fields.join()} connection=${connection} topic=${topic} fields=${fields} />`}
-          ${view !== "image" &&
-          html`<${Value} connection=${connection} topic=${topic} chosen=${fields} onChoose=${toggle} />`}
+      : html`<div class=${view || fields.length ? "live two" : "live"}>
+          <div class="views">
+            ${view === "image" && html`<${Image} connection=${connection} topic=${topic} />`}${view === "scan" &&
+            html`<${Scan} connection=${connection} topic=${topic} />`}
+            ${view === "pose" && html`<${Pose} connection=${connection} topic=${topic} path=${POSES[type]} />`}
+            ${fields.length > 0 &&
+            html`<${Fields} key=${fields.join()} connection=${connection} topic=${topic} fields=${fields} />`}
+          </div>
+          <${Value} connection=${connection} topic=${topic} chosen=${fields} onChoose=${toggle} />
         </div>`}<//
   >`;
 }
@@ -72,7 +74,7 @@ function useWatch(connection, wanted, take) {
   return failure;
 }
 
-function Value({ connection, topic, chosen, onChoose }) {
+export function Value({ connection, topic, chosen, onChoose }) {
   const [message, set] = useState(null);
   const failure = useWatch(connection, { topic, how: "value", rate: 5 }, set);
   return html`<div>
@@ -80,51 +82,12 @@ function Value({ connection, topic, chosen, onChoose }) {
       ? html`<p class="muted">
             ${clock(message.stamp)} · ${bytes(message.size)} · ${message.type}. Numbers can be chosen to be plotted.
           </p>
-          <div class="tree"><${Tree} value=${message.value} path="" chosen=${chosen} onChoose=${onChoose} /></div>`
+          <${MessageTree} value=${message.value} chosen=${chosen} onChoose=${onChoose} />`
       : !failure && html`<p class="empty">Waiting for a message …</p>`}
   </div>`;
 }
 
-function Tree({ value, path, chosen, onChoose }) {
-  if (typeof value === "number" || typeof value === "boolean")
-    return html`<button
-      type="button"
-      class="field"
-      aria-pressed=${String(chosen.includes(path))}
-      title=${`Plot ${path}`}
-      onClick=${() => onChoose(path)}
-    >
-      ${chosen.includes(path) ? "● " : ""}${typeof value === "number" && !Number.isInteger(value)
-        ? value.toPrecision(6)
-        : String(value)}
-    </button>`;
-  if (value === null || typeof value !== "object")
-    return html`<span>${typeof value === "string" ? JSON.stringify(value) : String(value)}</span>`;
-  const rows = Object.entries(value);
-  if (Array.isArray(value) && value.length > 12)
-    return html`<details>
-      <summary>${value.length} elements</summary>
-      <${Rows} rows=${rows} path=${path} chosen=${chosen} onChoose=${onChoose} />
-    </details>`;
-  return html`<${Rows} rows=${rows} path=${path} chosen=${chosen} onChoose=${onChoose} />`;
-}
-
-const Rows = ({ rows, path, chosen, onChoose }) =>
-  html`<ul>
-    ${rows.map(
-      ([key, inner]) =>
-        html`<li key=${key}>
-          <span class="key">${key}:</span>${" "}<${Tree}
-            value=${inner}
-            path=${path ? `${path}.${key}` : key}
-            chosen=${chosen}
-            onChoose=${onChoose}
-          />
-        </li>`,
-    )}
-  </ul>`;
-
-function Fields({ connection, topic, fields }) {
+export function Fields({ connection, topic, fields }) {
   const data = useRef([[], ...fields.map(() => [])]);
   const [version, grow] = useState(0);
   const failure = useWatch(connection, { topic, how: "plot", fields, rate: 10 }, (message) => {
@@ -151,7 +114,7 @@ function Canvas({ draw, label, version }) {
   return html`<canvas class="view" ref=${canvas} width="960" height="600" role="img" aria-label=${label}></canvas>`;
 }
 
-function Image({ connection, topic }) {
+export function Image({ connection, topic }) {
   const canvas = useRef();
   const [about, set] = useState("");
   const busy = useRef(false);
