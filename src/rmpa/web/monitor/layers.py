@@ -33,8 +33,8 @@ LAYER: Final = 2
 Made = tuple[dict[str, Any], bytes]
 
 
-def layer_frame(watch: int, message: ReceivedMessage, values: Any) -> bytes:
-    """The binary frame of a message.
+def layer_frame(watch: int, message: ReceivedMessage, values: Any, number: int = 1) -> bytes:
+    """The binary frame of a message, which is the ``number``-th of its node.
 
     Raises:
         RemoteProtocolError: It cannot be drawn; the text says why.
@@ -51,6 +51,7 @@ def layer_frame(watch: int, message: ReceivedMessage, values: Any) -> bytes:
             "at": message.stamp_ns / 1e9,
             "stamp": _seconds(header["stamp"]),
             "source": source_key(message),
+            "n": number,
             **about,
         }
     except (KeyError, TypeError, ValueError, IndexError, struct.error):
@@ -249,13 +250,13 @@ class LayerWatch(WatchState):
     def __init__(self, id_: int, rate: float, decode: Decode) -> None:
         super().__init__(id_, "map", (), rate, decode)
         self._waiting: dict[str, ReceivedMessage] = {}
-        # The nodes that were heard.
-        self._sources: dict[str, None] = {}
+        # Messages of each node that was heard.
+        self._sources: dict[str, int] = {}
 
     def receive(self, message: ReceivedMessage) -> None:
         """Keep a message, in place of an earlier one of its node."""
         if message.source in self._sources or len(self._sources) < limits.LAYER_SOURCES:
-            self._sources[message.source] = None
+            self._sources[message.source] = self._sources.get(message.source, 0) + 1
             self._waiting[message.source] = message
 
     def due(self, now: float) -> float | None:
@@ -272,7 +273,8 @@ class LayerWatch(WatchState):
         """
         self._sent = now
         message = self._waiting.pop(next(iter(self._waiting)))
-        make = functools.partial(layer_frame, self._id, message, self._decode(message))
+        number = self._sources[message.source]
+        make = functools.partial(layer_frame, self._id, message, self._decode(message), number)
         return make() if len(message.payload) <= limits.LAYER_AT_ONCE else make
 
 

@@ -75,8 +75,10 @@ export class Layer {
 
   // `heard` is the page's time (seconds); returns a promise where a picture is decoded.
   take(head, body, heard) {
-    const gap = heard - this.heard;
-    if (this.count) this.period = this.period ? this.period * 0.8 + gap * 0.2 : gap;
+    // `n` counts what came to the server, also what a page is not sent.
+    const since = this.head && heard - this.since[0] > 2 && [heard, head.n];
+    if (since) this.rate = (head.n - this.since[1]) / (heard - this.since[0]);
+    if (since || !this.head || head.n < this.head.n) this.since = [heard, head.n];
     Object.assign(this, { head, heard, kind: head.kind, frame: head.frame, count: this.count + 1 });
     if (head.kind === "scan") this.points = polar(head);
     else if (head.kind === "pose") this.follow(head.pose);
@@ -106,7 +108,7 @@ export class Layer {
   // What came once, as a latched map, is old when its publisher has gone; else after a few of its own periods.
   isOld(now, isThere) {
     if (!isThere) return true;
-    return this.count > 1 && now - this.heard > Math.max(OLD, 3 * this.period);
+    return this.rate > 0 && now - this.heard > Math.max(OLD, 3 / this.rate);
   }
 
   // The picture of a grid in the colour of the text: its pixels have an opacity alone.
@@ -291,7 +293,7 @@ export function drawLayer(context, view, layer, pose, { colours, colour, old, ra
 
 // Each frame: its x axis long, its y axis short. Names that would cover each other are counted.
 export function drawFrames(context, view, placed, colours) {
-  const named = new Map();
+  const named = [];
   context.font = "12px system-ui";
   for (const { name, pose, colour, old } of placed) {
     const { a, b, c, d, tx, ty } = planar(pose);
@@ -309,11 +311,17 @@ export function drawFrames(context, view, placed, colours) {
       context.lineTo(x + dx * size, y - dy * size);
       context.stroke();
     }
-    const key = `${Math.round(x / 60)} ${Math.round(y / 14)}`;
-    named.set(key, [...(named.get(key) ?? []), { name, x, y }]);
+    const near = named.find((one) => Math.abs(one.x - x) < 90 && Math.abs(one.y - y) < 14);
+    if (near) near.others += 1;
+    else named.push({ name, x, y, others: 0 });
   }
   context.globalAlpha = 1;
   context.fillStyle = colours.muted;
-  for (const [first, ...others] of named.values())
-    context.fillText(others.length ? `${first.name} +${others.length}` : first.name, first.x + 6, first.y + 16);
+  context.strokeStyle = colours.panel;
+  context.lineWidth = 4;
+  for (const { name, x, y, others } of named) {
+    const text = others ? `${name} +${others}` : name;
+    context.strokeText(text, x + 6, y + 16);
+    context.fillText(text, x + 6, y + 16);
+  }
 }

@@ -174,17 +174,17 @@ function About({ layer, own, live, map, isThere }) {
     age = now() - layer.heard;
   const thinned = head.every > 1 && `1 of ${count(head.kind === "grid" ? head.every ** 2 : head.every)} drawn`;
   const size = head.cells ? `${count(head.cells[0])} × ${count(head.cells[1])}` : head.count && count(head.count);
-  const rate = layer.period && !old && hertz(1 / layer.period);
+  const rate = !old && layer.rate && hertz(layer.rate);
   const said = [layer.frame, size, thinned, rate].filter(Boolean).join(" · ");
   return html`<p class="about">
     <svg viewBox="0 0 10 10" aria-hidden="true"><rect width="10" height="10" rx="2" fill=${map.colour(layer)} /></svg>
-    <span class="whole">${layer.module || own}</span> <span class="muted">${said}</span>
+    <span class="whole">${layer.module || own}</span><span class="muted"> · ${said}</span>
     ${old
       ? html` <${Mark}
           state="STALE"
           word=${live && !isThere(layer) ? `its publisher has gone, ${duration(age)}` : duration(age)}
         />`
-      : layer.count === 1 && age > OLD && html` <span class="muted">${duration(age)} old</span>`}
+      : layer.count === 1 && age > OLD && html`<span class="muted"> · ${duration(age)} old</span>`}
     ${layer.problem && html`<br /><${Mark} state="WARN" word="" />${" "}${layer.problem}`}
   </p>`;
 }
@@ -365,7 +365,9 @@ class MapCanvas {
     const context = canvas.getContext("2d");
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, width, height);
-    const colours = Object.fromEntries(["line", "text", "muted", "idle"].map((name) => [name, ink(`--${name}`)]));
+    const colours = Object.fromEntries(
+      ["line", "text", "muted", "idle", "panel"].map((name) => [name, ink(`--${name}`)]),
+    );
     drawGround(context, view, colours);
     for (const { layer, pose, old } of this.placed())
       drawLayer(context, view, layer, pose, { colours, colour: this.colour(layer), old, ratio });

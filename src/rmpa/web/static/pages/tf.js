@@ -8,6 +8,8 @@ import { Frames, SILENT, angles } from "../frames.js";
 
 const TYPES = ["tf2_msgs/TFMessage", "tf/tfMessage"];
 const MOST = 4; // topics: a page may watch 16
+const BEHIND = 1; // seconds between stamp and receipt
+const SIMULATED = 1e8; // stamps below it are of a simulated clock
 const STALE = 2; // seconds; a transform that moves is sent more often
 
 export const now = () => performance.now() / 1000;
@@ -114,7 +116,7 @@ function age(edge) {
   if (edge.fixed) return html`<span class="muted">–</span>`;
   const old = ageOf(edge);
   if (old > STALE) return html`<${Mark} state="STALE" word=${duration(old)} />`;
-  return `< ${STALE} s`;
+  return `${ageOf(edge).toFixed(1)} s`;
 }
 
 export function FramesPage({ state, connection }) {
@@ -128,6 +130,13 @@ export function FramesPage({ state, connection }) {
     const edge = frames.edge(name);
     if (!edge.fixed && ageOf(edge) > SILENT)
       problems.push({ frame: name, level: "STALE", text: `was last sent ${duration(ageOf(edge))} ago` });
+    const behind = edge.at - edge.stamp;
+    if (!edge.fixed && edge.stamp > SIMULATED && Math.abs(behind) > BEHIND)
+      problems.push({
+        frame: name,
+        level: "WARN",
+        text: `has stamps ${duration(Math.abs(behind))} ${behind > 0 ? "behind" : "ahead of"} this machine's clock, sent by ${edge.source}`,
+      });
   }
   const rows = rowsOf(frames).filter(({ name }) =>
     filter.matches([name, ...(frames.edges.get(name)?.keys() ?? [])].join(" ")),
