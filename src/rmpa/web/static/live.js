@@ -6,7 +6,7 @@ import { Choice, Failure, Panel } from "./parts.js";
 import { Plot, append } from "./plot.js";
 import { MessageTree } from "./tree.js";
 
-const IMAGES = ["sensor_msgs/Image", "sensor_msgs/CompressedImage"];
+export const IMAGES = ["sensor_msgs/Image", "sensor_msgs/CompressedImage"];
 const POSES = {
   "nav_msgs/Odometry": "pose.pose",
   "geometry_msgs/PoseStamped": "pose",

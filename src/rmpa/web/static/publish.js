@@ -16,17 +16,18 @@ const DEFAULTS = { string: "", time: "now", bool: "false" };
 function blank(types, [, type, size]) {
   const one = PRIMITIVE.test(type) ? (DEFAULTS[type] ?? "0") : null;
   if (size === null) return one ?? draft(types, type);
-  if (one !== null)
-    return size > 0
-      ? Array(size)
-          .fill(one || "0")
-          .join(", ")
-      : "";
+  if (one !== null) {
+    const all = Array.from({ length: Math.max(0, size) }, () => one);
+    return type === "string" ? JSON.stringify(all) : all.join(", ");
+  }
   return Array.from({ length: Math.max(0, size) }, () => draft(types, type));
 }
-const fieldsOf = (types, type) => types[type].filter(([name]) => type !== HEADER || name !== "seq"); // counted by itself
-const draft = (types, type) =>
-  Object.fromEntries(fieldsOf(types, type).map((field) => [field[0], blank(types, field)]));
+// The seq of a header is counted by the server.
+const fieldsOf = (types, type) => types[type].filter(([name]) => type !== HEADER || name !== "seq");
+const draft = (types, type) => {
+  const made = Object.fromEntries(fieldsOf(types, type).map((field) => [field[0], blank(types, field)]));
+  return type === "geometry_msgs/Quaternion" ? { ...made, w: "1" } : made; // one that turns nothing
+};
 
 // The message that is meant; what is wrong goes into `errors` by path.
 function meant(types, type, size, text, path, errors) {

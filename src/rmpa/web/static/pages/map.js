@@ -1,9 +1,9 @@
 // Scans, grids, paths, poses, clouds and frames of all robots in one map from above, in a frame that is chosen.
 
-import { html, useEffect, useRef, useState } from "../markup.js";
+import { html, useContext, useEffect, useRef, useState } from "../markup.js";
 import { count, duration, hertz } from "../format.js";
 import { entries, section } from "../state.js";
-import { Failure, Mark, Page, Panel } from "../parts.js";
+import { AsPanel, Failure, Mark, Page, Panel } from "../parts.js";
 import { Frames } from "../frames.js";
 import {
   LAYERS,
@@ -40,6 +40,7 @@ function restored() {
   }
 }
 
+// As a panel it is given what is kept of it.
 export function MapPage(props) {
   const [kept, set] = useState(restored);
   const keep = (news) => {
@@ -69,60 +70,63 @@ function MapView({ state, connection, kept, keep }) {
   const isThere = (layer) => live && (section(state, "topics")[layer.topic]?.from || []).length > 0;
   map.current.show({ frames, fixed, own, shown, isThere, live, follow: kept.follow, axes: kept.frames !== false });
   const toggle = (name, value) => keep({ on: { ...kept.on, [name]: value } });
+  const list = html`<div class="form">
+    <${Failure} failure=${failure} />
+    <div class="row">
+      <${Choose} label="Fixed frame" value=${fixed} names=${names} choose=${(name) => keep({ fixed: name })} />
+      <${Choose}
+        label="Keep in the middle"
+        value=${kept.follow ?? ""}
+        names=${["", ...names]}
+        choose=${(name) => keep({ follow: name })}
+      />
+    </div>
+    <ul class="layers">
+      ${topics.map(
+        ([name, one]) =>
+          html`<${Row}
+            key=${name}
+            ...${{
+              name,
+              connection,
+              own,
+              live,
+              map: map.current,
+              type: one.type,
+              isThere,
+              off: !shown.includes(name),
+            }}
+            checked=${wanted.includes(name)}
+            toggle=${(value) => toggle(name, value)}
+          />`,
+      )}
+      <li>
+        <label class="check"
+          ><input
+            type="checkbox"
+            checked=${kept.frames !== false}
+            onChange=${(event) => keep({ frames: event.target.checked })}
+          /><span
+            >Frames of tf <span class="muted">${transformTopics(state).join(", ") || "no topic has them"}</span></span
+          ></label
+        >
+      </li>
+    </ul>
+    ${!topics.length &&
+    html`<p class="empty">No topic has a type that is drawn: ${Object.keys(LAYERS).join(", ")}.</p>`}
+    ${wanted.length > MOST &&
+    html`<p class="empty">${MOST} layers are drawn at one time: switch one off to see another.</p>`}
+  </div>`;
   return html`<div class="mapping">
     <div class="map">
       <${Surface} map=${map.current} fixed=${fixed} layers=${shown.length} />
     </div>
-    <${Panel}
-      ><div class="form">
-        <${Failure} failure=${failure} />
-        <div class="row">
-          <${Choose} label="Fixed frame" value=${fixed} names=${names} choose=${(name) => keep({ fixed: name })} />
-          <${Choose}
-            label="Keep in the middle"
-            value=${kept.follow ?? ""}
-            names=${["", ...names]}
-            choose=${(name) => keep({ follow: name })}
-          />
-        </div>
-        <ul class="layers">
-          ${topics.map(
-            ([name, one]) =>
-              html`<${Row}
-                key=${name}
-                ...${{
-                  name,
-                  connection,
-                  own,
-                  live,
-                  map: map.current,
-                  type: one.type,
-                  isThere,
-                  off: !shown.includes(name),
-                }}
-                checked=${wanted.includes(name)}
-                toggle=${(value) => toggle(name, value)}
-              />`,
-          )}
-          <li>
-            <label class="check"
-              ><input
-                type="checkbox"
-                checked=${kept.frames !== false}
-                onChange=${(event) => keep({ frames: event.target.checked })}
-              /><span
-                >Frames of tf
-                <span class="muted">${transformTopics(state).join(", ") || "no topic has them"}</span></span
-              ></label
-            >
-          </li>
-        </ul>
-        ${!topics.length &&
-        html`<p class="empty">No topic has a type that is drawn: ${Object.keys(LAYERS).join(", ")}.</p>`}
-        ${wanted.length > MOST &&
-        html`<p class="empty">${MOST} layers are drawn at one time: switch one off to see another.</p>`}
-      </div><//
-    >
+    ${useContext(AsPanel)
+      ? html`<details>
+          <summary>Layers and frames</summary>
+          ${list}
+        </details>`
+      : html`<${Panel}>${list}<//>`}
   </div>`;
 }
 

@@ -135,7 +135,9 @@ export function FramesPage({ state, connection }) {
       problems.push({
         frame: name,
         level: "WARN",
-        text: `has stamps ${duration(Math.abs(behind))} ${behind > 0 ? "behind" : "ahead of"} this machine's clock, sent by ${edge.source}`,
+        text:
+          `has stamps ${duration(Math.abs(behind))} ${behind > 0 ? "behind" : "ahead of"} the clock here, ` +
+          `sent by ${edge.source}`,
       });
   }
   const rows = rowsOf(frames).filter(({ name }) =>
