@@ -134,6 +134,26 @@ class App extends Component {
     this.setState({});
   }
 
+  // Once at a time: where it fails, again after a while.
+  load(file) {
+    this.loading ??= new Set();
+    if (this.loading.has(file)) return;
+    this.loading.add(file);
+    import(`./pages/${file}`).then(
+      (module) => {
+        this.loaded = { ...this.loaded, [file]: module };
+        this.setState({ broken: false });
+      },
+      () => {
+        this.setState({ broken: true });
+        setTimeout(() => {
+          this.loading.delete(file);
+          this.setState({});
+        }, 3000);
+      },
+    );
+  }
+
   page() {
     const { page, name } = this.state;
     const { connection } = this;
@@ -142,13 +162,7 @@ class App extends Component {
     if (!lazy) return html`<p class="empty">There is no page <code>${page}</code>. <a href="#/">The mesh</a></p>`;
     const loaded = this.loaded?.[lazy[0]];
     if (!loaded) {
-      import(`./pages/${lazy[0]}`).then(
-        (module) => {
-          this.loaded = { ...this.loaded, [lazy[0]]: module };
-          this.setState({});
-        },
-        () => this.setState({ broken: true }),
-      );
+      this.load(lazy[0]);
       return html`<p class="empty">
         ${this.state.broken ? "This page cannot be loaded: rmpa web does not answer." : "Loading …"}
       </p>`;
