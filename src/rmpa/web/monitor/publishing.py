@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from rmpa.ros.types.codec import MessageCodec
     from rmpa.ros.types.messages import MessageType
+    from rmpa.web.clients.connection import Session
     from rmpa.web.hub.topics import ClientPublication
-    from rmpa.web.monitor.session import MonitorSession
 
 _WORDS: Final = ("nan", "inf", "+inf", "-inf")
 
@@ -92,7 +92,7 @@ class PagePublications:
 
     def __init__(
         self,
-        session: MonitorSession,
+        session: Session,
         send: Callable[[dict[str, Any]], None],
         failed: Callable[[int, RmpaError], None],
         clock: Callable[[], float],

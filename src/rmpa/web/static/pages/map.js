@@ -22,7 +22,7 @@ import { now, transformTopics, useFrames, useTick } from "./tf.js";
 const MOST = 12; // layers: a page may watch 16 topics, of which some are tf's
 const KEPT = "rmpa.map"; // in the browser: { fixed, follow, frames, on: { topic: true or false } }
 const PREFERRED = ["map", "world", "odom"];
-const GATHER = 50; // milliseconds in which messages are drawn together
+const GATHER = 100; // milliseconds in which messages are drawn together
 const OLD = 2; // seconds after which a transform on the way to a layer is old
 const STEP = 40; // pixels of an arrow key
 const WORDS = { grid: "grid", cloud: "cloud", poses: "poses", path: "path", scan: "scan", pose: "pose" };
