@@ -24,6 +24,8 @@ const KEPT = "rmpa.map"; // in the browser: { fixed, follow, frames, on: { topic
 const PREFERRED = ["map", "world", "odom"];
 const GATHER = 100; // milliseconds in which messages are drawn together
 const OLD = 2; // seconds after which a transform on the way to a layer is old
+const SETTLED = 1; // seconds in which transforms come that belong to a message
+const LASTING = ["grid", "path"];
 const STEP = 40; // pixels of an arrow key
 const WORDS = { grid: "grid", cloud: "cloud", poses: "poses", path: "path", scan: "scan", pose: "pose" };
 const HELP = "Drag or arrow keys move it, the wheel, two fingers or + and − zoom, 0 shows all.";
@@ -255,6 +257,7 @@ class MapCanvas {
 
   attach(canvas, place) {
     Object.assign(this, { canvas, place });
+    canvas.view = this.view; // for the console and for tests
     const on = (name, what, more) => canvas.addEventListener(name, what, more);
     on("wheel", (event) => this.wheel(event), { passive: false });
     on("keydown", (event) => this.key(event));
@@ -320,13 +323,25 @@ class MapCanvas {
     this.touched();
   }
 
+  // A measurement stays where its frame was at its stamp, as soon as the transforms around it have come. A grid or
+  // a path is of its frame as it is now.
+  poseOf(layer, frames, fixed) {
+    const { head, kept } = layer,
+      lasts = LASTING.includes(layer.kind);
+    if (kept?.head === head && kept.fixed === fixed && kept.pose && now() - layer.heard > SETTLED && !lasts)
+      return kept;
+    const stamp = lasts ? 0 : head.stamp;
+    layer.kept = { head, fixed, ...frames.lookup(fixed, layer.frame, stamp, layer.module) };
+    return layer.kept;
+  }
+
   // What is shown now, each layer with its pose in the fixed frame, or why there is none.
   placed() {
     const { frames, fixed, isThere } = this.shown,
       found = [];
     for (const layer of this.all) {
       if (!layer.head) continue;
-      const { pose, problem, edges } = frames.lookup(fixed, layer.frame, layer.head.stamp, layer.module);
+      const { pose, problem, edges } = this.poseOf(layer, frames, fixed);
       const late = (edges || []).find((edge) => !edge.fixed && now() - edge.heard > OLD);
       layer.problem = problem ?? (late && `the transform of ${late.child} is ${duration(now() - late.heard)} old`);
       if (pose) found.push({ layer, pose, old: Boolean(late) || layer.isOld(now(), isThere(layer)) });

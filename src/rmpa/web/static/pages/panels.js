@@ -83,6 +83,7 @@ export function Panels({ state, connection, pages }) {
   const replace = (at, news) => change(panels.map((one, each) => (each === at ? { ...one, ...news } : one)));
   const add = (panel) => {
     const next = checked([...panels, { tall: 1, wide: 1, ...panel }]);
+    arrange(open); // it stays as it is, also after the first one
     return next.error ? fail({ error: `Not added: ${next.error}.` }) : change(next.panels);
   };
   // A number that is chosen in a message is a line of the topic's plot.

@@ -50,10 +50,10 @@ export function useTick(seconds) {
   }, [seconds]);
 }
 
-// Whether a node is in the graph; true of all while none is known.
+// Whether a node is in the graph; true of all where not all are known.
 export function presence(state) {
   const nodes = section(state, "nodes");
-  const known = Object.keys(nodes).length > 0;
+  const known = Object.keys(nodes).length > 0 && !section(state, "hidden").nodes;
   return (name) => !known || name in nodes;
 }
 
