@@ -106,9 +106,9 @@ def transform(child: str, parent: str, x: float = 0.0, y: float = 0.0, yaw: floa
 
 
 def scan(frame: str) -> dict[str, Any]:
-    """One range of 3 m straight ahead, and one to the left that was not measured."""
+    """One range of 3.3 m straight ahead, and one to the left that was not measured."""
     about = {"angle_min": 0.0, "angle_increment": math.pi / 2, "range_min": 0.1, "range_max": 10.0}
-    return {"header": header(frame), **about, "ranges": [3.0, 99.0]}
+    return {"header": header(frame), **about, "ranges": [3.3, 99.0]}
 
 
 # How opaque a pixel of the map is at a place in metres, and its colour.
@@ -119,11 +119,11 @@ SCALE = "document.querySelector('.ground').view.scale"
 
 
 async def open_map(real: RealSite) -> Chromium:
-    """With a scan whose point is at (2, 3) of the map, and a grid with a wall at (-4, -4)."""
+    """With a scan whose point is at (2.3, 3.3) of the map, and a grid with a wall at (-4, -4)."""
     await real.publish(
         "/tf_static", {"transforms": [transform("base", "odom", 1.0), transform("laser", "base", 1.0)]}
     )
-    await real.publish("/tf", {"transforms": [transform("odom", "map", 2.0, -2.0, math.pi / 2)]})
+    await real.publish("/tf", {"transforms": [transform("odom", "map", 2.3, -2.0, math.pi / 2)]})
     await real.publish("/scan", scan("laser"))
     cells = [0] * 400
     cells[0] = 100
@@ -142,14 +142,14 @@ async def open_map(real: RealSite) -> Chromium:
 
 async def test_scan_and_grid_stand_where_tf_says(real: RealSite) -> None:
     page = await open_map(real)
-    # Forward of the laser is y of the map: 2 m of transforms and a range of 3 m, from y = -2.
-    await page.wait(f"{PIXEL % (2, 3)} !== {PIXEL % (2, 4)} && {PIXEL % (2, 3)} !== {PIXEL % (3, 3)}")
+    # Forward of the laser is y of the map: 2 m of transforms and a range of 3.3 m, from y = -2.
+    await page.wait(f"{PIXEL % (2.3, 3.3)} !== {PIXEL % (2.3, 3.7)} && {PIXEL % (2.3, 3.3)} !== {PIXEL % (2.7, 3.3)}")
     await page.wait(f"{PIXEL % (-4.75, -4.75)} !== {PIXEL % (-4.25, -4.25)}")
     assert await violations(page) == []
-    await real.publish("/tf", {"transforms": [transform("odom", "map", 0.0, -2.0, math.pi / 2)]})
-    await page.wait(f"{PIXEL % (2, 3)} !== {PIXEL % (2, 4)}")  # that scan was before
+    await real.publish("/tf", {"transforms": [transform("odom", "map", 0.3, -2.0, math.pi / 2)]})
+    await page.wait(f"{PIXEL % (2.3, 3.3)} !== {PIXEL % (2.3, 3.7)}")  # that scan was before
     await real.publish("/scan", scan("laser"))
-    await page.wait(f"{PIXEL % (0, 3)} !== {PIXEL % (0, 4)} && {PIXEL % (2, 3)} === {PIXEL % (3, 3)}")
+    await page.wait(f"{PIXEL % (0.3, 3.3)} !== {PIXEL % (0.3, 3.7)} && {PIXEL % (2.3, 3.3)} === {PIXEL % (2.7, 3.3)}")
     assert page.errors == []
 
 
@@ -163,13 +163,13 @@ async def test_a_missing_transform_is_said_at_its_layer_and_ends_when_it_comes(r
 
 async def test_what_is_old_is_grey_and_says_so(real: RealSite) -> None:
     page = await open_map(real)
-    await page.wait(f"{PIXEL % (2, 3)} !== {PIXEL % (2, 4)}")
-    colour = await page.run(PIXEL % (2, 3))
+    await page.wait(f"{PIXEL % (2.3, 3.3)} !== {PIXEL % (2.3, 3.7)}")
+    colour = await page.run(PIXEL % (2.3, 3.3))
     real.show(scan=())
     await page.wait_text("its publisher has gone")
-    await page.wait(f"{PIXEL % (2, 3)} !== {json.dumps(colour)} && {PIXEL % (2, 3)} !== {PIXEL % (2, 4)}")
+    await page.wait(f"{PIXEL % (2.3, 3.3)} !== {json.dumps(colour)} && {PIXEL % (2.3, 3.3)} !== {PIXEL % (2.3, 3.7)}")
     real.show()
-    await page.wait(f"{PIXEL % (2, 3)} === {json.dumps(colour)}")
+    await page.wait(f"{PIXEL % (2.3, 3.3)} === {json.dumps(colour)}")
 
 
 async def test_keys_wheel_and_fingers_move_and_zoom_the_map(real: RealSite) -> None:
@@ -204,7 +204,9 @@ async def test_layers_are_switched_and_the_frame_is_chosen_and_both_are_kept(rea
     await page.run(
         "[...document.querySelectorAll('.layers label')].find((e) => e.innerText.includes('/scan')).click()"
     )
-    await page.wait(f"!document.body.innerText.includes('base · laser') && {PIXEL % (2, 3)} === {PIXEL % (2, 4)}")
+    await page.wait(
+        f"!document.body.innerText.includes('base · laser') && {PIXEL % (2.3, 3.3)} === {PIXEL % (2.3, 3.7)}"
+    )
     await page.run("(() => { const frame = document.querySelector('select'); frame.value = 'odom';"
                    " frame.dispatchEvent(new Event('change', {bubbles: true})); })()")  # fmt: skip
     await page.wait("document.querySelector('.ground').ariaLabel.includes('in the frame odom')")

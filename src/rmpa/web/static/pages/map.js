@@ -376,10 +376,10 @@ class MapCanvas {
     Object.assign(view, { width, height });
     const { frames, fixed, follow } = this.shown;
     const middle = follow && frames.lookup(fixed, follow).pose;
-    if (!this.moved && this.drawn !== this.all.length) {
-      this.fit(false);
-      this.drawn = this.all.length;
-    }
+    const placed = this.placed(),
+      drawn = `${placed.length} ${fixed}`;
+    if (!this.moved && this.drawn !== drawn) this.fit(false);
+    this.drawn = drawn;
     if (middle) [view.x, view.y] = middle;
     const context = canvas.getContext("2d");
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
@@ -388,7 +388,7 @@ class MapCanvas {
       ["line", "text", "muted", "idle", "panel"].map((name) => [name, ink(`--${name}`)]),
     );
     drawGround(context, view, colours);
-    for (const { layer, pose, old } of this.placed())
+    for (const { layer, pose, old } of placed)
       drawLayer(context, view, layer, pose, { colours, colour: this.colour(layer), old, ratio });
     if (this.shown.axes) drawFrames(context, view, this.axes(), colours);
     drawScale(context, view, colours);
