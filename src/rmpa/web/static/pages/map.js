@@ -178,7 +178,7 @@ function About({ layer, own, live, map, isThere }) {
   const { head } = layer;
   const old = layer.isOld(now(), isThere(layer)),
     age = now() - layer.heard;
-  const thinned = head.every > 1 && `1 of ${count(head.kind === "grid" ? head.every ** 2 : head.every)} drawn`;
+  const thinned = head.every > 1 && (head.cells ? `${head.every} × ${head.every} as one` : `1 of ${head.every} drawn`);
   const size = head.cells ? `${count(head.cells[0])} × ${count(head.cells[1])}` : head.count && count(head.count);
   const rate = !old && layer.rate && hertz(layer.rate);
   const said = [layer.frame, size, thinned, rate].filter(Boolean).join(" · ");
