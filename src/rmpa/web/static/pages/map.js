@@ -153,9 +153,10 @@ function Row({ name, type, connection, own, live, map, checked, off, toggle, isT
     setFailure(null);
     if (off) return undefined;
     const rate = kind === "cloud" ? 4 : kind === "scan" ? 10 : 5;
-    const end = connection.watch({ topic: name, how: "map", rate }, (message) =>
-      message.op === "failed" ? setFailure(message) : map.take(name, message),
-    );
+    const end = connection.watch({ topic: name, how: "map", rate }, (message) => {
+      if (message.op === "failed") setFailure(message);
+      else if (message.op === "layer") map.take(name, message);
+    });
     return () => {
       end();
       map.forget(name);

@@ -1,7 +1,7 @@
 // Several things beside each other: messages, plots, pictures, a map, the log and more, in a grid that is kept by name.
 
 import { html, useEffect, useRef, useState } from "../markup.js";
-import { entries } from "../state.js";
+import { entries, section } from "../state.js";
 import { AsPanel, Failure, Page, Panel } from "../parts.js";
 import { Fields, IMAGES, Image, Value } from "../live.js";
 
@@ -146,7 +146,8 @@ function Content({ one, state, connection, pages, plot, plotted, keep }) {
     return html`<${Value} ...${{ connection, topic }} chosen=${plotted} onChoose=${(path) => plot(topic, path)} />`;
   if (kind === "plot")
     return html`<${Fields} key=${one.fields.join()} ...${{ connection, topic, fields: one.fields }} />`;
-  if (kind === "picture") return html`<${Image} ...${{ connection, topic }} />`;
+  if (kind === "picture")
+    return html`<${Image} ...${{ connection, topic, state }} type=${section(state, "topics")[topic]?.type} />`;
   const more = kind === "map" ? { kept: one.map ?? {}, keep: (news) => keep({ ...one.map, ...news }) } : {};
   return html`<${AsPanel.Provider} value=${true}
     ><${Loaded} ...${{ page: pages[kind], state, connection, pages, ...more }}

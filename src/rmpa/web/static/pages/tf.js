@@ -31,7 +31,8 @@ export function useFrames(connection, state, changed) {
     setFailure(null);
     const ends = topics.map((topic) =>
       connection.watch({ topic, how: "tf", rate: 10 }, (message) => {
-        if (message.op === "failed") return setFailure(message);
+        if (message.op === "failed") setFailure(message);
+        if (message.op !== "tf") return;
         frames.current.take(message, now());
         tell.current();
       }),
