@@ -249,6 +249,7 @@ class LayerWatch(WatchState):
 
     def __init__(self, id_: int, rate: float, decode: Decode) -> None:
         super().__init__(id_, "map", (), rate, decode)
+        self._last = -1e9
         self._waiting: dict[str, ReceivedMessage] = {}
         # Messages of each node that was heard.
         self._sources: dict[str, int] = {}
@@ -263,7 +264,7 @@ class LayerWatch(WatchState):
         """When the next frame may be sent; ``None`` while there is nothing to send."""
         if self.busy or not self._waiting:
             return None
-        return max(now, self._sent + 1 / (self._rate * len(self._sources)))
+        return max(now, self._last + 1 / (self._rate * len(self._sources)))
 
     def frame(self, now: float) -> bytes | dict[str, Any] | Callable[[], bytes]:
         """The frame that is due; of a large message the function that makes it, to be called in a thread.
@@ -271,7 +272,7 @@ class LayerWatch(WatchState):
         Raises:
             RmpaError: The message cannot be drawn.
         """
-        self._sent = now
+        self._last = now
         message = self._waiting.pop(next(iter(self._waiting)))
         number = self._sources[message.source]
         make = functools.partial(layer_frame, self._id, message, self._decode(message), number)
@@ -283,6 +284,7 @@ class FramesWatch(WatchState):
 
     def __init__(self, id_: int, rate: float, decode: Decode) -> None:
         super().__init__(id_, "tf", (), rate, decode)
+        self._last = -1e9
         self._counts: dict[tuple[str, str], int] = {}
         self._changed: dict[tuple[str, str], list[Any]] = {}
         self._left_out = 0
@@ -316,11 +318,11 @@ class FramesWatch(WatchState):
 
     def due(self, now: float) -> float | None:
         """When the next frame may be sent; ``None`` while there is nothing to send."""
-        return max(now, self._sent + 1 / self._rate) if self._changed else None
+        return max(now, self._last + 1 / self._rate) if self._changed else None
 
     def frame(self, now: float) -> dict[str, Any]:
         """What changed: lists of child, parent, sender, static, stamp, receipt, count of messages, pose or null."""
-        self._sent = now
+        self._last = now
         changed, self._changed = self._changed, {}
         return {"op": "tf", "id": self._id, "frames": [*changed.values()], "left_out": self._left_out}
 
