@@ -220,7 +220,7 @@ async def test_live_values_poses_and_chosen_fields_are_drawn(site: Site) -> None
     page = await site.open("topic/%2Fodom")
     await page.click("On")
     await page.wait_text("base_link")
-    await page.wait("/x -?\\d+\\.\\d\\d m, y/.test(document.querySelector('figcaption').textContent)")
+    await page.wait("/x -?\\d+\\.\\d\\d m, y/.test(document.querySelector('.about').textContent)")
     await page.wait("document.querySelector('[title=\"Plot twist.twist.linear.x\"]')")
     await page.run("document.querySelector('[title=\"Plot twist.twist.linear.x\"]').click()")
     await page.wait(
@@ -235,7 +235,7 @@ async def test_scans_and_pictures_are_drawn(site: Site, address: str) -> None:
     page = await site.open(address, "sensors")
     await page.click("On")
     colours = (
-        "(() => { const view = document.querySelector('canvas.view');"
+        "(() => { const view = document.querySelector('canvas.view, canvas.ground');"
         " const data = view.getContext('2d').getImageData(0, 0, view.width, view.height).data;"
         " return new Set(new Uint32Array(data.buffer)).size; })()"
     )

@@ -24,7 +24,8 @@ UNKNOWN, FREE, WALL = 0, 26, 255
 
 
 def message(kind: str, values: dict[str, Any], source: str = SOURCE, topic: str = "/x") -> ReceivedMessage:
-    payload = codec_for(MessageType(kind)).write({"header": HEADER, **values}, 0).payload
+    fields = {key: value for key, value in {"header": HEADER, **values}.items() if value is not None}
+    payload = codec_for(MessageType(kind)).write(fields, 0).payload
     return ReceivedMessage(topic, kind, memoryview(payload), 7_000_000_000, source)
 
 
@@ -81,6 +82,11 @@ def test_a_layer_says_its_frame_its_times_and_who_sends_it() -> None:
         "pose": [1.0, 2.0, 0.5, 0.0, 0.0, 0.0, 1.0],
     }  # fmt: skip
     assert body == b""
+
+
+def test_a_pose_without_a_header_has_no_frame() -> None:
+    head, _ = layer("geometry_msgs/Pose", header=None, **pose(1, 2))
+    assert (head["frame"], head["stamp"], head["pose"][:2]) == ("", 0.0, [1.0, 2.0])
 
 
 def test_odometry_has_its_spread_from_above() -> None:

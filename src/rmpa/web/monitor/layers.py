@@ -44,12 +44,12 @@ def layer_frame(watch: int, message: ReceivedMessage, values: Any, number: int =
     kind, make = _LAYERS[message.type]
     try:
         about, body = make(values)
-        header = values["header"]
+        header = values.get("header")  # a geometry_msgs/Pose has none
         head = {
             "kind": kind,
-            "frame": str(header["frame_id"]).lstrip("/"),
+            "frame": str(header["frame_id"]).lstrip("/") if header else "",
             "at": message.stamp_ns / 1e9,
-            "stamp": _seconds(header["stamp"]),
+            "stamp": _seconds(header["stamp"]) if header else 0.0,
             "source": source_key(message),
             "n": number,
             **about,
@@ -237,6 +237,7 @@ _LAYERS: Final[dict[str, tuple[str, Callable[[Any], Made]]]] = {
     "nav_msgs/OccupancyGrid": ("grid", _grid),
     "nav_msgs/Path": ("path", _path),
     "nav_msgs/Odometry": ("pose", _one_pose(("pose",))),
+    "geometry_msgs/Pose": ("pose", _one_pose(())),
     "geometry_msgs/PoseStamped": ("pose", _one_pose(("pose",))),
     "geometry_msgs/PoseWithCovarianceStamped": ("pose", _one_pose(("pose",))),
     "geometry_msgs/PoseArray": ("poses", _poses),

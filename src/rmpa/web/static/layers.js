@@ -1,6 +1,7 @@
 // What a map from above is drawn of: the view, and the layers that messages become.
 
-import { SAME, composed, turned } from "./frames.js";
+import { count } from "./format.js";
+import { SAME, angles, composed, turned } from "./frames.js";
 
 export const LAYERS = {
   "nav_msgs/OccupancyGrid": "grid",
@@ -121,6 +122,19 @@ export class Layer {
       this.tint = colour;
     }
     return this.canvas;
+  }
+
+  // What is to be said of it beside its picture.
+  get said() {
+    const { head } = this;
+    if (head.cells) return `${count(head.cells[0])} × ${count(head.cells[1])}`;
+    if (head.kind === "pose") {
+      const [x, y] = head.pose;
+      return `x ${x.toFixed(2)} m, y ${y.toFixed(2)} m, ${((angles(head.pose)[2] * 180) / Math.PI).toFixed(0)}°`;
+    }
+    if (head.kind !== "scan") return count(head.count);
+    const seen = head.ranges.filter((each) => each !== null);
+    return `${seen.length} of ${head.ranges.length} ranges${seen.length ? `, nearest ${Math.min(...seen).toFixed(2)} m` : ""}`;
   }
 
   // Corners and points in its own frame, to fit the view to.

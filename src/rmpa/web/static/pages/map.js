@@ -1,7 +1,7 @@
 // Scans, grids, paths, poses, clouds and frames of all robots in one map from above, in a frame that is chosen.
 
 import { html, useContext, useEffect, useRef, useState } from "../markup.js";
-import { count, duration, hertz } from "../format.js";
+import { duration, hertz } from "../format.js";
 import { entries, section } from "../state.js";
 import { AsPanel, Failure, Mark, Page, Panel } from "../parts.js";
 import { Frames } from "../frames.js";
@@ -28,6 +28,7 @@ const SETTLED = 1; // seconds in which transforms come that belong to a message
 const LASTING = ["grid", "path"];
 const STEP = 40; // pixels of an arrow key
 const WORDS = { grid: "grid", cloud: "cloud", poses: "poses", path: "path", scan: "scan", pose: "pose" };
+const NO_FRAMES = new Frames();
 const HELP = "Drag or arrow keys move it, the wheel, two fingers or + and − zoom, 0 shows all.";
 
 // What is shown at first: what is small, and the map itself.
@@ -132,6 +133,24 @@ function MapView({ state, connection, kept, keep }) {
   </div>`;
 }
 
+// One topic by itself, in its own frame: tf is not asked.
+export function TopicMap({ state, connection, topic, type }) {
+  const map = useRef();
+  map.current ||= new MapCanvas();
+  useTick(0.5);
+  const own = section(state, "agent").name,
+    live = connection.phase === "open";
+  const isThere = () => live && (section(state, "topics")[topic]?.from || []).length > 0;
+  const fixed = map.current.all[0]?.frame ?? "";
+  map.current.show({ frames: NO_FRAMES, fixed, own, isThere, live, axes: false });
+  return html`<div>
+    <div class="map"><${Surface} map=${map.current} fixed=${fixed} layers=${1} /></div>
+    <ul class="layers">
+      <${Row} ...${{ name: topic, type, connection, own, live, map: map.current, isThere }} />
+    </ul>
+  </div>`;
+}
+
 function chosen(frames, names, inUse) {
   const known = PREFERRED.find((name) => names.includes(name));
   return known ?? frames.roots[0] ?? [...inUse][0] ?? "";
@@ -164,11 +183,12 @@ function Row({ name, type, connection, own, live, map, checked, off, toggle, isT
   }, [name, off]);
   const layers = map.of(name);
   return html`<li>
-    <label class="check"
+    ${toggle &&
+    html`<label class="check"
       ><input type="checkbox" checked=${checked} onChange=${(event) => toggle(event.target.checked)} /><span
         ><span class="mono">${name}</span> <span class="muted">${WORDS[kind]}</span></span
       ></label
-    >
+    >`}
     ${!off && !layers.length && !failure && html`<p class="muted about">Waiting for a message …</p>`}
     ${layers.map((layer) => html`<${About} key=${layer.source} ...${{ layer, own, live, map, isThere }} />`)}
     <${Failure} failure=${failure} />
@@ -180,9 +200,8 @@ function About({ layer, own, live, map, isThere }) {
   const old = layer.isOld(now(), isThere(layer)),
     age = now() - layer.heard;
   const thinned = head.every > 1 && (head.cells ? `${head.every} × ${head.every} as one` : `1 of ${head.every} drawn`);
-  const size = head.cells ? `${count(head.cells[0])} × ${count(head.cells[1])}` : head.count && count(head.count);
   const rate = !old && layer.rate && hertz(layer.rate);
-  const said = [layer.frame, size, thinned, rate].filter(Boolean).join(" · ");
+  const said = [layer.frame, layer.said, thinned, rate].filter(Boolean).join(" · ");
   return html`<p class="about">
     <svg viewBox="0 0 10 10" aria-hidden="true"><rect width="10" height="10" rx="2" fill=${map.colour(layer)} /></svg>
     <span class="whole">${layer.module || own}</span><span class="muted"> · ${said}</span>

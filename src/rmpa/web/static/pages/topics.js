@@ -153,7 +153,7 @@ export function TopicPage({ name, state, connection }) {
           ]}
       /><//>
       <${Panel} title="Way of a message"><${Why} connection=${connection} kind="topic" name=${name} /><//>
-      <${Live} connection=${connection} topic=${name} type=${topic.type} />
+      <${Live} connection=${connection} topic=${name} type=${topic.type} state=${state} />
       <${PublishPanel} connection=${connection} state=${state} topic=${name} type=${topic.type} />
       ${flowing.length > 0 &&
       html`<${Panel}
