@@ -134,7 +134,8 @@ export class Layer {
     }
     if (head.kind !== "scan") return count(head.count);
     const seen = head.ranges.filter((each) => each !== null);
-    return `${seen.length} of ${head.ranges.length} ranges${seen.length ? `, nearest ${Math.min(...seen).toFixed(2)} m` : ""}`;
+    const nearest = seen.length ? `, nearest ${Math.min(...seen).toFixed(2)} m` : "";
+    return `${seen.length} of ${head.ranges.length} ranges${nearest}`;
   }
 
   // Corners and points in its own frame, to fit the view to.
@@ -263,11 +264,11 @@ function dots(context, view, points, { a, b, c, d, e, f, tx, ty }, step, size) {
   }
 }
 
-function line(context, view, place, count, of) {
+function line(context, view, place, points, of) {
   context.lineWidth = 2.5;
   context.lineJoin = "round";
   context.beginPath();
-  for (let at = 0; at < count; at += 1) context[at ? "lineTo" : "moveTo"](...view.to(...apply(place, ...of(at))));
+  for (let at = 0; at < points; at += 1) context[at ? "lineTo" : "moveTo"](...view.to(...apply(place, ...of(at))));
   context.stroke();
 }
 
