@@ -29,6 +29,9 @@ PAGES = {
     "params": "rosdistro",
     "resources": "a simulated Turtlebot",
     "resource/velocity%3A%2Fvelocity": "For a robot that carries a full glass",
+    "map": "Fixed frame",
+    "tf": "No topic has the type tf2_msgs/TFMessage",
+    "panels": "Add what is to be shown",
     "alarms": "All that is wrong",
     "log": "turn",
     "diagnostics": "No node has said anything yet",
@@ -219,7 +222,7 @@ async def test_live_values_poses_and_chosen_fields_are_drawn(site: Site) -> None
     page = await site.open("topic/%2Fodom")
     await page.click("On")
     await page.wait_text("base_link")
-    await page.wait("/x -?\\d+\\.\\d\\d m, y/.test(document.querySelector('figcaption').textContent)")
+    await page.wait("/x -?\\d+\\.\\d\\d m, y/.test(document.querySelector('.about').textContent)")
     await page.wait("document.querySelector('[title=\"Plot twist.twist.linear.x\"]')")
     await page.run("document.querySelector('[title=\"Plot twist.twist.linear.x\"]').click()")
     await page.wait(
@@ -234,7 +237,7 @@ async def test_scans_and_pictures_are_drawn(site: Site, address: str) -> None:
     page = await site.open(address, "sensors")
     await page.click("On")
     colours = (
-        "(() => { const view = document.querySelector('canvas.view');"
+        "(() => { const view = document.querySelector('canvas.view, canvas.ground');"
         " const data = view.getContext('2d').getImageData(0, 0, view.width, view.height).data;"
         " return new Set(new Uint32Array(data.buffer)).size; })()"
     )

@@ -7,6 +7,7 @@ import contextlib
 import json
 import ssl
 from collections.abc import AsyncIterator, Callable
+from pathlib import Path
 from typing import Any
 
 import aiohttp
@@ -75,10 +76,12 @@ async def running_server(
     port: int = 0,
     watch: AgentWatch | None = None,
     tls: tuple[ssl.SSLContext, ssl.SSLContext] | None = None,
+    static: Path | None = None,
 ) -> AsyncIterator[Server]:
     """The sockets; with ``watch``, which asks an agent, also the monitor; with ``tls`` by WSS.
 
     Args:
+        static: The folder of the pages, which are at ``/pages``.
         tls: The contexts of the server and of its clients.
     """
     async with running_hub(core) as hub:
@@ -89,6 +92,13 @@ async def running_server(
         app = web.Application()
         for path in ("/", MONITOR_PATH):
             app.router.add_get(path, sockets.handle)
+        if static is not None:
+
+            async def index(_: web.Request) -> web.FileResponse:
+                return web.FileResponse(static / "index.html")
+
+            app.router.add_get("/pages", index)
+            app.router.add_static("/static", static)
         runner = web.AppRunner(app, shutdown_timeout=1)
         await runner.setup()
         site = web.TCPSite(runner, "127.0.0.1", port, ssl_context=tls[0] if tls else None)

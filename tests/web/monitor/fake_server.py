@@ -333,7 +333,12 @@ class FakeServer:
         pose = {"position": {"x": x, "y": y, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": z, "w": w}}
         twist = {"linear": {"x": forward, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": turn}}
         header = {"seq": int(at), "stamp": {"secs": int(time.time()), "nsecs": 0}, "frame_id": "odom"}
-        return {"header": header, "child_frame_id": "base_link", "pose": {"pose": pose}, "twist": {"twist": twist}}
+        return {
+            "header": header,
+            "child_frame_id": "base_link",
+            "pose": {"pose": pose, "covariance": [0.0] * 36},
+            "twist": {"twist": twist},
+        }
 
     async def answer(self, what: str, args: dict[str, Any]) -> Any:
         """The answer to a question of a page.

@@ -30,13 +30,13 @@ from tests.web.monitor.patches import apply
 
 def test_a_value_is_cut_and_says_so() -> None:
     long = {"text": "x" * 1000, "ranges": [0.5] * 1000, "data": memoryview(bytes(700)), "nan": float("nan")}
-    more = 1000 - limits.VALUE_ITEMS
     assert cut(long) == {
         "text": "x" * limits.VALUE_CHARACTERS + f"… {1000 - limits.VALUE_CHARACTERS} more",
-        "ranges": [0.5] * limits.VALUE_ITEMS + [f"… {more} more"],
+        "ranges": {"…": 1000, "first": [0.5] * limits.VALUE_ITEMS},
         "data": "700 bytes",
         "nan": "nan",
     }
+    assert cut(memoryview(bytes(4 * 10**6)).cast("f"))["…"] == 10**6
     assert cut({"id": 2**53 + 1, "small": 2**53}) == {"id": str(2**53 + 1), "small": 2**53}  # browsers would round it
     wide: Any = [[[list(range(60)) for _ in range(60)] for _ in range(60)] for _ in range(3)]
     assert len(json.dumps(cut(wide))) < 40 * limits.VALUE_NODES

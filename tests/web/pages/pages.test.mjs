@@ -2,10 +2,12 @@
 import assert from "node:assert/strict";
 import test from "node:test";
 
+import { Frames, angles, composed, inverted } from "./static/frames.js";
 import { bandwidth, bytes, duration, hertz, plain, seconds, sentence } from "./static/format.js";
 import { curve, layout } from "./static/layout.js";
 import { SIZE, arrange, chord, emptyRing, geometry, outside, place } from "./static/ring.js";
 import { adopt, applyPatch } from "./static/state.js";
+import { primitive } from "./static/typed.js";
 
 const THIN = "\u2009";
 const far = (a, b) => Math.hypot(a.x - b.x, a.y - b.y);
@@ -180,4 +182,119 @@ test("a chain, a cycle and a loop have their columns", () => {
   assert.equal(columns("abc", "ab bc ca"), "012");
   assert.equal(columns("ab", "aa ab"), "01");
   assert.equal(columns("abcd", "ab bc dc"), "0121"); // what only sends stands before what it sends to
+});
+
+const near = (a, b) => a.forEach((each, at) => assert.ok(Math.abs(each - b[at]) < 1e-9, `${a} is not ${b}`));
+const QUARTER = [0, 0, Math.SQRT1_2, Math.SQRT1_2]; // to the left
+const NONE = [0, 0, 0, 1];
+let received = 0;
+const row = (child, parent, pose, { by = "/a", stamp = 1, fixed = false } = {}) => [
+  child,
+  parent,
+  by,
+  fixed,
+  stamp,
+  stamp,
+  (received += 1),
+  pose,
+];
+function framesOf(...rows) {
+  const made = new Frames();
+  for (const each of rows) made.take({ frames: [each], left_out: 0 }, each[4]);
+  return made;
+}
+
+test("what one frame is in another goes up one branch of the tree and down another", () => {
+  const frames = framesOf(
+    row("odom", "map", [1, 2, 0, ...QUARTER]),
+    row("base", "odom", [3, 0, 0, ...NONE]),
+    row("laser", "base", [0, 1, 0.5, ...NONE], { fixed: true }),
+    row("other", "map", [5, 0, 0, ...NONE]),
+  );
+  near(frames.lookup("map", "laser").pose, [0, 5, 0.5, ...QUARTER]);
+  near(frames.lookup("other", "laser").pose, [-5, 5, 0.5, ...QUARTER]);
+  near(composed(frames.lookup("laser", "other").pose, frames.lookup("other", "laser").pose), [0, 0, 0, ...NONE]);
+  near(angles(inverted([0, 0, 0, ...QUARTER])), [0, 0, -Math.PI / 2]);
+  assert.deepEqual(frames.roots, ["map"]);
+});
+
+test("a transform between two stamps is between them, and outside of all the nearest one", () => {
+  const at = (stamp, x, turn) => row("base", "odom", [x, 0, 0, ...turn], { stamp });
+  const frames = framesOf(at(10, 0, NONE), at(11, 4, QUARTER));
+  const pose = frames.lookup("odom", "base", 10.25).pose;
+  near(pose.slice(0, 3), [1, 0, 0]);
+  assert.ok(Math.abs(angles(pose)[2] - Math.PI / 8) < 0.02);
+  const nearest = { 9: 0, 99: 4, 0: 4 };
+  for (const [stamp, x] of Object.entries(nearest))
+    near(frames.lookup("odom", "base", Number(stamp)).pose.slice(0, 1), [x]);
+});
+
+test("what cannot be looked up says why, also in a loop", () => {
+  const frames = framesOf(
+    row("a", "map", [0, 0, 0, ...NONE]),
+    row("b", "c", [0, 0, 0, ...NONE]),
+    row("c", "b", [0, 0, 0, ...NONE]),
+    row("d", "map", null),
+    row("f", "g", [0, 0, 0, ...NONE]),
+  );
+  for (const [frame, said] of [
+    ["x", "no node sends x"],
+    ["b", "a loop"],
+    ["d", "NaN"],
+    ["f", "two trees"],
+    ["", "a frame without a name"],
+  ])
+    assert.ok(frames.lookup("map", frame).problem.includes(said), frame);
+  assert.deepEqual(
+    frames.problems(1).map(({ frame }) => frame),
+    ["b", "d", "g"],
+  );
+});
+
+test("two parents and two senders are pointed out, and a layer has the frames of its own module", () => {
+  const frames = framesOf(
+    row("base", "odom", [1, 0, 0, ...NONE], { by: "one:/a", stamp: 1 }),
+    row("base", "odom", [2, 0, 0, ...NONE], { by: "two:/a", stamp: 2 }),
+  );
+  near(frames.lookup("odom", "base", 0, "one").pose, [1, 0, 0, ...NONE]);
+  near(frames.lookup("odom", "base", 0, "").pose, [2, 0, 0, ...NONE]);
+  assert.match(frames.problems(2)[0].text, /is sent by 2 nodes: one:\/a and two:\/a/);
+  assert.deepEqual(
+    frames.problems(2, (node) => node !== "one:/a"),
+    [],
+  );
+  assert.deepEqual(frames.problems(99), []); // silent by then
+  frames.take({ frames: [row("base", "map", [0, 0, 0, ...NONE], { by: "two:/a", stamp: 3 })], left_out: 0 }, 3);
+  assert.match(frames.problems(3)[0].text, /has 2 parents: odom and map/);
+});
+
+test("a value of a message is of its type, or says what would be", () => {
+  for (const [type, typed, value] of [
+    ["int8", "-128", -128],
+    ["uint64", "18446744073709551615", "18446744073709551615"],
+    ["int64", "-9223372036854775808", "-9223372036854775808"],
+    ["float64", " -Inf ", "-inf"],
+    ["float32", "NaN", "nan"],
+    ["float64", "1e300", 1e300],
+    ["bool", "True", true],
+    ["time", "now", "now"],
+    ["duration", "-1.5", { secs: -2, nsecs: 500000000 }],
+    ["string", " x ", " x "],
+  ])
+    assert.deepEqual(primitive(type, typed), { value }, typed);
+  for (const [type, typed, said] of [
+    ["uint8", "256", "not within 0 … 255"],
+    ["int8", "128", "not within -128 … 127"],
+    ["uint64", "18446744073709551616", "not within"],
+    ["int64", "1e3", "all its digits"],
+    ["int32", "1.5", "whole"],
+    ["int32", "nan", "not a number"],
+    ["float32", "1e39", "does not fit"],
+    ["float64", "1,5", "write it as 1.5"],
+    ["float64", "", "Type a number"],
+    ["time", "-1", "do not fit"],
+    ["time", "soon", "Type now"],
+    ["bool", "2", "neither true nor false"],
+  ])
+    assert.ok(primitive(type, typed).error.includes(said), `${type} ${typed}`);
 });

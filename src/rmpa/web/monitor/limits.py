@@ -59,6 +59,44 @@ VALUE_NODES: Final = 2000
 # At it: of neighbours the nearest is shown
 # Why: Two a degree.
 SCAN_POINTS: Final = 720
+# [Pages] Points of a cloud on a map
+# At it: every n-th is drawn
+# Told in: the list of layers
+CLOUD_POINTS: Final = 8000
+# [Pages] Poses of a path, or of an array of poses, on a map
+# At it: every n-th is drawn
+# Told in: the list of layers
+PATH_POINTS: Final = 2000
+# [Pages] Cells of a grid on a map
+# At it: of neighbours the most occupied is drawn
+# Told in: the list of layers
+# Why: A browser keeps 4 bytes of each.
+GRID_CELLS: Final = 2048 * 2048
+# Bytes of a message whose layer is made on the event loop; a longer one's is made in a thread.
+LAYER_AT_ONCE: Final = 32 * KIB
+# Nodes that publish one topic, of which each is a layer of its own.
+LAYER_SOURCES: Final = 32
+# [Pages] Frames of tf, each sender of it counted
+# At it: further ones are left out
+# Told in: the page of frames
+FRAMES_MAX: Final = 1000
+# Characters of a frame's name; the rest is cut.
+FRAME_CHARACTERS: Final = 128
+# [Pages] Topics that one page publishes at a rate
+# At it: a further one is refused
+# Told in: the form
+PUBLISHED_MAX: Final = 8
+# [Pages] Messages of one of them a second
+# At it: a higher rate is refused
+# Told in: the form
+PUBLISHED_RATE: Final = 50.0
+# Bytes of a message that a page publishes: what a form of ``REQUEST_MAX`` makes.
+PUBLISHED_BYTES: Final = 256 * KIB
+# [Pages] Time after which a topic that a page publishes at a rate ends
+# At it: nothing more is published
+# Told in: the form
+# Why: The page says each second that it is there; a browser stops this in a hidden page.
+PUBLISH_RENEW: Final = 3.0
 # [Pages] Pixels of a raw image
 # At it: every n-th row and column is shown
 # Told in: the size below the image

@@ -86,7 +86,10 @@ _INDEX: Final = re.compile(r"\[(\d+)\]")
 
 
 def cut(value: Any) -> Any:
-    """A message's values, bounded: long strings and arrays are cut, and ``"… 512 more"`` says so."""
+    """A message's values, bounded: a long string ends with ``"… 512 more"``.
+
+    A long array is an object of its first elements and its length: ``{"…": 1000000, "first": [0, 1]}``.
+    """
     return _cut(value, [limits.VALUE_NODES])
 
 
@@ -99,7 +102,7 @@ def _cut(value: Any, left: list[int]) -> Any:
     if isinstance(value, str):
         most = limits.VALUE_CHARACTERS
         return value if len(value) <= most else f"{value[:most]}… {len(value) - most} more"
-    if isinstance(value, bytes | bytearray | memoryview):
+    if isinstance(value, bytes | bytearray) or (isinstance(value, memoryview) and value.format == "B"):
         return f"{len(value)} bytes"
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)
@@ -110,9 +113,7 @@ def _cut(value: Any, left: list[int]) -> Any:
     if not hasattr(value, "__len__"):
         return str(value)
     shown = [_cut(inner, left) for inner in value[: limits.VALUE_ITEMS]]
-    if len(value) > limits.VALUE_ITEMS:
-        shown.append(f"… {len(value) - limits.VALUE_ITEMS} more")
-    return shown
+    return {"…": len(value), "first": shown} if len(value) > limits.VALUE_ITEMS else shown
 
 
 def field_path(text: str) -> tuple[str, ...]:
@@ -316,6 +317,8 @@ class WatchState:
         self._paths = tuple(field_path(field) for field in fields)
         self._samples = SampleBuffer(len(self._paths))
         self._sent = -1e9
+        # Whether a frame is being made in a thread.
+        self.busy = False
 
     def receive(self, message: ReceivedMessage) -> None:
         """Keep a message; a plot takes its numbers at once, all others decode only what is sent.
@@ -333,7 +336,7 @@ class WatchState:
         waiting = len(self._samples) > 0 if self._paths else self._newest is not None
         return max(now, self._sent + 1 / self._rate) if waiting else None
 
-    def frame(self, now: float) -> bytes | dict[str, Any]:
+    def frame(self, now: float) -> bytes | dict[str, Any] | Callable[[], bytes]:
         """The picture or message that is due.
 
         Raises:

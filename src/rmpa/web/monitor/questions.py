@@ -48,7 +48,7 @@ def shown_node(own: str) -> str:
 Args: TypeAlias = dict[str, Any]  # the edge: each question has its own
 # All questions, each with the right (``Rights``) that a page needs for it; the method ``_QUESTION`` answers it.
 QUESTIONS: Final = {
-    **dict.fromkeys(("why", "agent", "contract", "node", "describe", "past", "graph", "types"), ""),
+    **dict.fromkeys(("why", "agent", "contract", "node", "describe", "message", "past", "graph", "types"), ""),
     **dict.fromkeys(("params", "param_names"), "view"),
     **dict.fromkeys(("set_param", "delete_param", "invite", "call", "profile", "context", "configure"), "control"),
 }
@@ -175,6 +175,17 @@ class Answers:
             "text": f"{kind.request.definition.strip()}\n---\n{kind.response.definition.strip()}".strip(),
             "request": msgspec.json.decode(empty.json(memoryview(example))),
         }
+
+    async def _message(self, args: Args) -> Any:
+        """The fields of a message type, and of all that it embeds, for a form; -1: an array of any length."""
+        kind = await self._hub.types.find_message(_text(args, "type"))
+        sizes = {name: one.fields for name, one in codec_for(kind).known.items()}
+        types = {
+            name: [[each.name, each.type, (-1 if each.size is None else each.size) if each.array else None]
+                   for each in fields]
+            for name, fields in sizes.items()
+        }  # fmt: skip
+        return {"type": kind.name, "text": kind.definition.strip(), "types": types}
 
     async def _params(self, args: Args) -> Any:
         """All parameters that the rules let a page see, with their digest; none to a page that ``has`` that one.

@@ -163,7 +163,7 @@ class MessageValues:
         known = last.pop(key, None)
         if known is None or known[0] is not message.payload:  # an object's id is used again once it has gone
             codec = codec_for(self._hub.types.version(message.type, message.md5sum))
-            known = message.payload, codec.json_values(message.payload)
+            known = message.payload, codec.views(message.payload)  # a map of 16 million cells is no list
         last[key] = known
         while sum(len(payload) + _OVERHEAD for payload, _ in last.values()) > _KEPT:
             del last[next(iter(last))]

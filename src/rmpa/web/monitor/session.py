@@ -20,7 +20,9 @@ from rmpa.core.timers import TokenBucket
 from rmpa.web.clients.connection import Session, decoder_of, ops_of
 from rmpa.web.clients.frame_writer import Opcode
 from rmpa.web.monitor import limits
+from rmpa.web.monitor.layers import watch_of
 from rmpa.web.monitor.messages import VERSION, Tree, WatchState, difference
+from rmpa.web.monitor.publishing import FieldError, PagePublications
 from rmpa.web.monitor.questions import QUESTIONS
 
 if TYPE_CHECKING:
@@ -35,7 +37,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 Id: TypeAlias = Annotated[int, Meta(gt=0, lt=2**32)]
 Kind: TypeAlias = Literal["module", "topic", "service", "node", "resource", "counters", "diagnostics", "diagnostic"]
-How: TypeAlias = Literal["value", "plot", "image", "scan"]
+How: TypeAlias = Literal["value", "plot", "image", "scan", "map", "tf"]
 # Of a joystick: a share of the fastest that is allowed.
 Tilt: TypeAlias = Annotated[float, Meta(ge=-1, le=1)]
 # What a page may have, as ``hello`` lists it.
@@ -186,8 +188,8 @@ class MonitorSession(Session):
         monitor: Monitor,
         clock: Callable[[], float] | None = None,
     ) -> None:
-        # The joystick publishes by the hub, whatever else the page may publish: nothing.
-        super().__init__(hub, dataclasses.replace(rights, control=rights.drive), priority, address)
+        # The joystick publishes by the hub; each op checks the page's own right.
+        super().__init__(hub, dataclasses.replace(rights, control=rights.control or rights.drive), priority, address)
         self._may = rights
         self._monitor = monitor
         self._clock = clock or asyncio.get_running_loop().time
@@ -201,6 +203,7 @@ class MonitorSession(Session):
         self._driven: ClientPublication | None = None
         self._stick: Stick | None = None
         self._has_stick = False
+        self._publications = PagePublications(self, self._send, self._failed, self._clock)
 
     def opened(self) -> None:
         """Greet the page, and show it the state."""
@@ -216,6 +219,7 @@ class MonitorSession(Session):
         self._monitor.log.unfollow(self)
         self._stop()
         self._show_stick("")
+        self._publications.close()
         self._questions.clear()
 
     def received_frame(self, data: str | bytes, now: float) -> None:
@@ -246,7 +250,7 @@ class MonitorSession(Session):
 
     def next_timer(self) -> float | None:
         """When something is due that the page waits for, or the robot must be stopped."""
-        dues: list[float | None] = [self._tick, self._joystick.due, self._patches.due]
+        dues: list[float | None] = [self._tick, self._joystick.due, self._patches.due, self._publications.due]
         if self._stick is not None and (wait := self._stick.due(self)) is not None:
             dues.append(self._clock() + wait)
         if self.connection.unsent == 0:
@@ -263,6 +267,7 @@ class MonitorSession(Session):
         with self._turn():
             if self._stick is not None:
                 self._stick.handle_timer(self)
+            self._publications.handle_timer(now)
             if (news := self._patches.take(now, self._monitor.mesh.details)) is not None:
                 self._send(news)
             self._flush(now)
@@ -289,7 +294,8 @@ class MonitorSession(Session):
         """What the page ordered cannot be done: a watch, a question, or (0) neither."""
         remedy = str(getattr(error, "remedy", ""))
         text = str(error).removesuffix(f"; {remedy}") if remedy else str(error)
-        self._refuse(id_, text, remedy, error.code)
+        field = {"field": error.field} if isinstance(error, FieldError) else {}
+        self._refuse(id_, text, remedy, error.code, **field)
 
     def _refuse(self, id_: int, error: str, remedy: str = "", code: str = "refused", **more: Any) -> None:
         self._send({"op": "failed", "id": id_, "error": error, "remedy": remedy, "code": code, **more})
@@ -327,7 +333,7 @@ class MonitorSession(Session):
             raise RemoteProtocolError(f"watch {id} is in use")
         if len(self._watches) >= limits.WATCHES_MAX:
             raise RemoteProtocolError(f"{limits.WATCHES_MAX} topics are watched already; close one first")
-        watch = WatchState(id, how, fields, rate, self._monitor.values.of)
+        watch = watch_of(id, how, fields, rate, self._monitor.values.of)
         self._watches[id] = watch, None
 
         def receive(message: ReceivedMessage) -> None:
@@ -370,7 +376,24 @@ class MonitorSession(Session):
             except RmpaError as error:
                 self._end_watch(id_, error)
             else:
-                self.connection.push((Opcode.BINARY, (frame,))) if isinstance(frame, bytes) else self._send(frame)
+                if isinstance(frame, bytes):
+                    self.connection.push((Opcode.BINARY, (frame,)))
+                elif isinstance(frame, dict):
+                    self._send(frame)
+                else:
+                    self._make(id_, watch, frame)
+
+    def _make(self, id_: int, watch: WatchState, make: Callable[[], bytes]) -> None:
+        """Make a frame in a thread, and send it unless the watch has ended by then."""
+        watch.busy = True
+
+        def done(frame: bytes) -> None:
+            watch.busy = False
+            if self._watches.get(id_, (None,))[0] is watch:
+                with self._turn():
+                    self.connection.push((Opcode.BINARY, (frame,)))
+
+        self.run(asyncio.to_thread(make), done, functools.partial(self._end_watch, id_))
 
     def op_ask(self, now: float, *, id: Id, what: str, args: dict[str, Any] = {}, at: float = 0.0) -> None:  # noqa: A002, B006 - copied by msgspec
         """A question or an order that has one answer; ``at`` is as of ``drive``."""
@@ -379,11 +402,8 @@ class MonitorSession(Session):
         needed = QUESTIONS[what]
         if needed and not getattr(self._may, needed):
             self._refuse(id, *(_NO_TOKEN if needed == "view" else _NO_CONTROL))
-        elif needed == "control" and now - at > limits.ORDER_AGE:
-            # One that TCP kept over a cut must not act long after the page has given it up.
-            late = min(now - at, now - self._opened)
-            text = f"the order may have come {late:.0f} s late, and is not carried out"
-            self._refuse(id, text, "look at what is, and repeat it")
+        elif needed == "control" and self._is_late(id, now, at):
+            pass
         elif id in self._questions or len(self._questions) >= limits.ASKS_MAX:
             self._refuse(id, f"{len(self._questions)} questions wait for an answer already")
         else:
@@ -394,6 +414,15 @@ class MonitorSession(Session):
                 functools.partial(self._unanswered, id),
             )
 
+    def _is_late(self, id_: int, now: float, at: float) -> bool:
+        """Refuse an order that TCP kept over a cut: it must not act long after the page has given it up."""
+        if now - at <= limits.ORDER_AGE:
+            return False
+        late = min(now - at, now - self._opened)
+        text = f"the order may have come {late:.0f} s late, and is not carried out"
+        self._refuse(id_, text, "look at what is, and repeat it")
+        return True
+
     def _answered(self, id_: int, value: Any) -> None:
         if id_ in self._questions:
             self._questions.discard(id_)
@@ -403,6 +432,32 @@ class MonitorSession(Session):
         if id_ in self._questions:
             self._questions.discard(id_)
             self._failed(id_, error)
+
+    def op_publish(
+        self,
+        now: float,
+        *,
+        id: Id,  # noqa: A002
+        topic: str,
+        type: str,  # noqa: A002
+        values: dict[str, Any],
+        rate: Annotated[float, Meta(ge=0)] = 0.0,
+        at: float = 0.0,
+    ) -> None:
+        """Publish a message of a form: once where ``rate`` is 0, else until ``unpublish``; ``at`` as of ``ask``."""
+        if not self._may.control:
+            self._refuse(id, *_NO_CONTROL)
+        elif not self._is_late(id, now, at):
+            _check_topic(topic)
+            self._publications.begin(id, topic, type, values, rate)
+
+    def op_publishing(self, now: float, *, id: Id) -> None:  # noqa: A002
+        """The page is there, and what it publishes goes on; repeated each second."""
+        self._publications.renew(id, now)
+
+    def op_unpublish(self, _: float, *, id: Id) -> None:  # noqa: A002
+        """Publish it no more."""
+        self._publications.end(id)
 
     def op_log(self, _: float, *, on: bool) -> None:
         """Whether lines of the log are wanted, oldest first; those that are kept come at once."""

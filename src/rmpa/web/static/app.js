@@ -18,6 +18,9 @@ const PAGES = [
   ["graph", "Graph", "g"],
   ["params", "Parameters", "p"],
   ["resources", "Resources", "r"],
+  ["map", "Map", "o"],
+  ["tf", "Frames", "f"],
+  ["panels", "Panels", "b"],
   ["alarms", "Alarms", "a"],
   ["diagnostics", "Diagnostics", "i"],
   ["log", "Log", "l"],
@@ -38,6 +41,9 @@ const LAZY = {
   node: ["nodes.js", "NodePage"],
   resources: ["resources.js", "Resources"],
   resource: ["resources.js", "ResourcePage"],
+  map: ["map.js", "MapPage"],
+  tf: ["tf.js", "FramesPage"],
+  panels: ["panels.js", "Panels"],
   alarms: ["alarms.js", "Alarms"],
   diagnostics: ["diagnostics.js", "Diagnostics"],
   graph: ["graph.js", "GraphPage"],
@@ -137,6 +143,26 @@ class App extends Component {
     this.setState({});
   }
 
+  // Once at a time: where it fails, again after a while.
+  load(file) {
+    this.loading ??= new Set();
+    if (this.loading.has(file)) return;
+    this.loading.add(file);
+    import(`./pages/${file}`).then(
+      (module) => {
+        this.loaded = { ...this.loaded, [file]: module };
+        this.setState({ broken: false });
+      },
+      () => {
+        this.setState({ broken: true });
+        setTimeout(() => {
+          this.loading.delete(file);
+          this.setState({});
+        }, 3000);
+      },
+    );
+  }
+
   page() {
     const { page, name } = this.state;
     const { connection } = this;
@@ -145,13 +171,7 @@ class App extends Component {
     if (!lazy) return html`<p class="empty">There is no page <code>${page}</code>. <a href="#/">The mesh</a></p>`;
     const loaded = this.loaded?.[lazy[0]];
     if (!loaded) {
-      import(`./pages/${lazy[0]}`).then(
-        (module) => {
-          this.loaded = { ...this.loaded, [lazy[0]]: module };
-          this.setState({});
-        },
-        () => this.setState({ broken: true }),
-      );
+      this.load(lazy[0]);
       return html`<p class="empty">
         ${this.state.broken ? "This page cannot be loaded: rmpa web does not answer." : "Loading …"}
       </p>`;
@@ -161,6 +181,7 @@ class App extends Component {
       name=${name}
       state=${connection.state}
       connection=${connection}
+      pages=${LAZY}
     />`;
   }
 

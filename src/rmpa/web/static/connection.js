@@ -19,6 +19,7 @@ export class Connection {
     this.looks = [];
     this.watches = new Map();
     this.questions = new Map();
+    this.publishing = new Map(); // what tells the form of each publication
     this.logSinks = new Set();
     this.notice = null;
     this.driven = ""; // the topic whose joystick is shown
@@ -82,6 +83,9 @@ export class Connection {
       question.reject(failure);
     }
     this.questions.clear();
+    const ended = { op: "failed", error: "the connection was lost: nothing more is published", remedy: "" };
+    for (const sink of this.publishing.values()) sink(ended);
+    this.publishing.clear();
     this.timer = setTimeout(() => this.open(), this.wait * (0.75 + Math.random() / 2));
     this.wait = Math.min(LAST_WAIT, this.wait * 2);
     this.changed();
@@ -138,7 +142,11 @@ export class Connection {
       case "value":
       case "points":
       case "scan":
+      case "tf":
         this.watches.get(message.id)?.sink(message);
+        break;
+      case "published":
+        this.publishing.get(message.id)?.(message);
         break;
       case "answer":
         this.settle(message.id)?.resolve(message.value);
@@ -173,6 +181,7 @@ export class Connection {
 
   receiveBinary(buffer) {
     const view = new DataView(buffer);
+    if (buffer.byteLength > 12 && view.getUint8(0) === 2) return this.receiveLayer(view, buffer);
     if (buffer.byteLength < 20 || view.getUint8(0) !== 1) return;
     const format = ["", "jpeg", "png", "rgb8", "mono8"][view.getUint8(1)];
     const width = view.getUint16(2, true),
@@ -187,10 +196,21 @@ export class Connection {
     });
   }
 
+  // The picture or the points of a map's layer, behind what is said of them.
+  receiveLayer(view, buffer) {
+    const from = 12 + view.getUint32(8, true);
+    const head = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 12, from - 12)));
+    this.watches.get(view.getUint32(4, true))?.sink({ op: "layer", head, body: new Uint8Array(buffer, from) });
+  }
+
   failed(message) {
     const question = this.settle(message.id);
     if (question) question.reject(message);
-    else if (this.watches.has(message.id)) this.watches.get(message.id).sink(message);
+    else if (this.publishing.has(message.id)) {
+      const sink = this.publishing.get(message.id);
+      this.publishing.delete(message.id);
+      sink(message);
+    } else if (this.watches.has(message.id)) this.watches.get(message.id).sink(message);
     else {
       this.notice = message;
       this.changed();
@@ -218,6 +238,19 @@ export class Connection {
     return () => {
       this.watches.delete(id);
       this.send({ op: "unwatch", id });
+    };
+  }
+
+  // Publishes once, or at a rate until the function that it returns is called; `sink` gets `published` and `failed`.
+  publish(wanted, sink) {
+    const id = ++this.counter;
+    this.publishing.set(id, sink);
+    this.send({ op: "publish", id, at: this.serverTime(), ...wanted });
+    const renew = setInterval(() => this.publishing.has(id) && this.send({ op: "publishing", id }), 1000);
+    return () => {
+      clearInterval(renew);
+      this.publishing.delete(id);
+      if (wanted.rate) this.send({ op: "unpublish", id });
     };
   }
 

@@ -4,7 +4,16 @@
 import { html as template } from "./vendor/htm-preact.js";
 import { plain } from "./format.js";
 
-export { Component, render, useEffect, useLayoutEffect, useRef, useState } from "./vendor/htm-preact.js";
+export {
+  Component,
+  createContext,
+  render,
+  useContext,
+  useEffect,
+  useLayoutEffect,
+  useRef,
+  useState,
+} from "./vendor/htm-preact.js";
 
 const TEXTS = ["aria-label", "title", "placeholder"];
 const done = new WeakSet(); // a part of a template is often a template of its own

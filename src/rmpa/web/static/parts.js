@@ -1,6 +1,6 @@
 // Small parts that all pages are made of.
 
-import { Component, html, useEffect, useLayoutEffect, useRef, useState } from "./markup.js";
+import { Component, createContext, html, useContext, useEffect, useLayoutEffect, useRef, useState } from "./markup.js";
 import { ago, count, plain } from "./format.js";
 
 // Each state and level has a word, a colour (by its class) and a shape: none of them is needed to tell them apart.
@@ -156,11 +156,16 @@ export const Panel = ({ title, children, aside, wide }) =>
     </header>`}${children}
   </section>`;
 
+// Set where a page is shown as a panel beside others.
+export const AsPanel = createContext(false);
+
 export const Page = ({ title, kind, aside, children }) => {
-  const heading = useRef();
+  const heading = useRef(),
+    panel = useContext(AsPanel);
   useEffect(() => {
-    document.title = `${plain(title)} · RMPA`;
+    if (!panel) document.title = `${plain(title)} · RMPA`;
   }, [title]);
+  if (panel) return html`<div>${aside && html`<div class="actions">${aside}</div>`}${children}</div>`;
   return html`<div class="page">
     <header class="title">
       <div>

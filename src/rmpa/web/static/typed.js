@@ -68,5 +68,56 @@ export function fresh(text) {
   return typed.error?.startsWith("That is not JSON") ? { value: text } : typed;
 }
 
+const BITS = {
+  int8: 8,
+  byte: 8,
+  uint8: 8,
+  char: 8,
+  int16: 16,
+  uint16: 16,
+  int32: 32,
+  uint32: 32,
+  int64: 64,
+  uint64: 64,
+};
+const BEYOND = /^[+-]?(nan|inf(inity)?)$/i;
+const NANO = 1e9;
+
+// A primitive of a ROS message, as JSON has it: what JSON has no number for goes as text.
+export function primitive(type, text) {
+  const typed = text.trim();
+  if (type === "string") return { value: text };
+  if (type === "bool") return truth(text);
+  if (type === "time" && typed === "now") return { value: "now" };
+  if (type === "time" || type === "duration") {
+    const { value, error } = number(typed);
+    if (error) return { error: type === "time" ? "Type now, or seconds since 1970." : "Type seconds." };
+    const secs = Math.floor(value);
+    if (type === "time" ? secs < 0 || secs >= 2 ** 32 : Math.abs(value) >= 2 ** 31)
+      return { error: `${typed} s do not fit a ${type}.` };
+    return { value: { secs, nsecs: Math.min(NANO - 1, Math.round((value - secs) * NANO)) } };
+  }
+  if (type.startsWith("float")) {
+    if (BEYOND.test(typed))
+      return {
+        value: typed
+          .toLowerCase()
+          .replace("infinity", "inf")
+          .replace(/^[+-]nan$/, "nan"),
+      };
+    if (!NUMBER.test(typed)) return number(typed);
+    if (Math.abs(Number(typed)) > (type === "float32" ? 3.4028235677973366e38 : Number.MAX_VALUE))
+      return { error: `${typed} does not fit ${type}.` };
+    return { value: Number(typed) };
+  }
+  if (!/^[+-]?\d{1,20}$/.test(typed))
+    return number(typed, true).error ? number(typed, true) : { error: "Write all its digits." };
+  const value = BigInt(typed),
+    size = 2n ** BigInt(BITS[type] - (/^u|char/.test(type) ? 0 : 1));
+  const low = /^u|char/.test(type) ? 0n : -size;
+  if (value < low || value >= size) return { error: `${typed} is not within ${low} … ${size - 1n} (${type}).` };
+  return { value: BITS[type] === 64 ? String(value) : Number(value) };
+}
+
 export const kind = (value) =>
   Array.isArray(value) ? "list" : { string: "text", object: "namespace" }[typeof value] || typeof value;

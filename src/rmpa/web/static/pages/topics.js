@@ -23,6 +23,7 @@ import {
 } from "../parts.js";
 import { Lines } from "../plot.js";
 import { Live } from "../live.js";
+import { PublishPanel } from "../publish.js";
 
 export const TOPIC_COLUMNS = ["Topic", "Type", "#Rate", "#Bytes", "#Latency", "#Lost", "From → to"];
 
@@ -124,7 +125,8 @@ export function TopicPage({ name, state, connection }) {
     return html`<${Page} title=${name} kind="Topic"
       ><${Gone} kind="topic" name=${name} /><${Panel} title="Why?"
         ><${Why} connection=${connection} kind="topic" name=${name} /><//
-    ><//>`;
+      ><${PublishPanel} connection=${connection} state=${state} topic=${name}
+    /><//>`;
   const routes = entries(detail, "routes");
   const own = section(state, "agent").name;
   const format = FIGURES.find(([key]) => key === figure)[2];
@@ -152,7 +154,8 @@ export function TopicPage({ name, state, connection }) {
           ]}
       /><//>
       <${Panel} title="Way of a message"><${Why} connection=${connection} kind="topic" name=${name} /><//>
-      <${Live} connection=${connection} topic=${name} type=${topic.type} />
+      <${Live} connection=${connection} topic=${name} type=${topic.type} state=${state} />
+      <${PublishPanel} connection=${connection} state=${state} topic=${name} type=${topic.type} />
       ${flowing.length > 0 &&
       html`<${Panel}
         wide
