@@ -184,3 +184,5 @@ WEB_TOKEN_LENGTH_MIN: Final = 16
 WEB_TOKEN_FILE_MAX: Final = 4096
 # Seconds between two looks at the files of the certificate: a renewed one is served long before the old one ends.
 CERTIFICATE_LOOK_PERIOD: Final = 5.0
+# Frames of the tree of transforms that clients ask about; a humanoid has some 100.
+FRAMES_MAX: Final = 5000

@@ -22,6 +22,7 @@ from rmpa.web.hub.graph import GraphService, GraphTopic
 from rmpa.web.hub.params import MISSING
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.protocol import OpError, graph_name, type_name
+from rmpa.web.rosbridge.tf import SERVICE, SERVICE_TYPE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable
@@ -198,7 +199,7 @@ class Rosapi:
                 return {"type": await self._graph.find(name)}
             return {"type": ""}
 
-        known = SERVICES.get(name) or self._service(name).type
+        known = SERVICES.get(name) or self._service(name).type or (SERVICE_TYPE if name == SERVICE else "")
         return find() if not known and name in self._graph.services else {"type": known}
 
     def _answer_service_node(self, service: str) -> Values:

@@ -182,15 +182,15 @@ function Chain({ stick, topic, type, nodes, takers, own }) {
     modules.set(module, [...(modules.get(module) || []), node]);
   }
   return html`<ol class="chain">
-    <li class=${holder ? "held" : ""} role="status">
+    <li class=${holder ? "held" : ""}>
       <span class="kind">Driver</span>
       ${holder
-        ? html`<strong>${mine ? "This page" : `The page of ${holder.by}`}</strong>
+        ? html`<strong role="status">${mine ? "This page" : `The page of ${holder.by}`}</strong>
             <span
               >${mine && `${holder.by} `}at <${ModuleLink} name=${holder.module} />, for${" "}
               <${Since} moment=${holder.since}
             /></span>`
-        : html`<strong>The stick is free</strong>`}
+        : html`<strong role="status">The stick is free</strong>`}
     </li>
     <li>
       <span class="kind">Topic</span><strong class="mono"><${Link} page="topic" name=${topic} /></strong
