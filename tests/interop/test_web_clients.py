@@ -10,6 +10,7 @@ import contextlib
 import importlib.metadata
 import importlib.util
 import io
+import itertools
 import json
 import os
 import random
@@ -94,6 +95,28 @@ def test_roslibjs_works_unmodified(package: str, served: Web) -> None:
     with Process(["node", npm.CLIENTS / "roslib.mjs", home, url(served)], name=package) as client:
         assert client.wait(RUN) == 0, client.output
         assert client.lines[-1] == "ok"
+
+
+@pytest.mark.parametrize("package", ["roslib1", "roslib2"])
+async def test_roslibs_tf_clients_follow_a_robot_of_another_module(package: str, served: Web, arm: Node) -> None:
+    tf = await arm.advertise("/tf", "tf2_msgs/TFMessage")
+    fixed = await arm.advertise("/tf_static", "tf2_msgs/TFMessage", latch=True)
+    fixed.publish(fixed.make({"transforms": [placed("base", "laser", 0.5)]}))
+    with Process(["node", npm.CLIENTS / "tf.mjs", npm.packages() / package, url(served)], name=package) as client:
+        for number in itertools.count():
+            if client.returncode is not None or "ok" in client.output:
+                break
+            tf.publish(tf.make({"transforms": [placed("odom", "base", number * 0.1)]}))
+            await asyncio.sleep(0.05)
+        assert await client.ended() == 0, client.output
+        assert client.lines[-1] == "ok"
+
+
+def placed(parent: str, child: str, x: float) -> dict[str, Any]:
+    """A geometry_msgs/TransformStamped."""
+    rotation = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+    place = {"translation": {"x": x, "y": 0.0, "z": 0.0}, "rotation": rotation}
+    return {"header": {"frame_id": parent}, "child_frame_id": child, "transform": place}
 
 
 def test_foxglove_ws_protocols_client_works_unmodified(served: Web) -> None:
@@ -239,8 +262,6 @@ async def test_the_parameter_example_follows_and_sets_parameters(
 
 # --- roslibpy -------------------------------------------------------------------------------------------------------
 
-# tf2_web_republisher has to run, which is a node in C++ of its own repository.
-NEEDS_A_NODE_OF_ITS_OWN: Final = "tests/ros1/test_tf.py::test_tf_test"
 # Where roslibpy's tests connect, without a token.
 ROSBRIDGE_PORT: Final = 9090
 
@@ -288,7 +309,7 @@ async def test_roslibpys_own_tests_pass(lab: Lab, agent: AgentFactory, web: WebF
         pytest.skip("roslibpy is not installed (extra web-peers)")
     source = await asyncio.to_thread(roslibpy_source, tmp_path)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", "/dev/null"]
-    command += ["--rootdir", str(source), str(source / "tests" / "ros1"), "--deselect", NEEDS_A_NODE_OF_ITS_OWN]
+    command += ["--rootdir", str(source), str(source / "tests" / "ros1")]
 
     async def run(number: int, transport: str) -> None:
         host = lab.host(transport, number)
@@ -297,7 +318,7 @@ async def test_roslibpys_own_tests_pass(lab: Lab, agent: AgentFactory, web: WebF
         async with proxy(host, served):
             with Process(host.command(command), env=environ, name=f"roslibpy {transport}") as tests:
                 assert await tests.ended(RUN) == 0, tests.output
-                assert "24 passed" in tests.output
+                assert "25 passed" in tests.output
 
     await asyncio.gather(*(run(number, transport) for number, transport in enumerate(("twisted", "asyncio"))))
 

@@ -127,16 +127,11 @@ class TransformTree:
                 self._places[child] = parent, place
 
     def lookup(self, target: str, source: str) -> Transform | None:
-        """Where ``source`` is in ``target``; ``None``: one of them is not known, or they are in two trees."""
+        """Where ``source`` is in ``target``; ``None``: they are not in one tree. A frame is always in itself."""
         above, _ = self._ancestors(target)
         found, order = self._ancestors(source)
         common = next((each for each in order if each in above), None)
-        known = (
-            source != target or source in self._places or any(parent == source for parent, _ in self._places.values())
-        )
-        if common is None or not known:
-            return None
-        return above[common].inverse().then(found[common])
+        return above[common].inverse().then(found[common]) if common is not None else None
 
     def _ancestors(self, frame: str) -> tuple[Mapping[str, Transform], list[str]]:
         """Where a frame is in itself, in its parent and so on, and these in order."""

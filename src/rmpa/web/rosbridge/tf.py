@@ -157,7 +157,14 @@ class TfRepublisher:
     def cancel_goal(self, action: str, goal: Id) -> list[Values]:
         """End it; the messages for the client, with the status CANCELED of action_msgs/GoalStatus."""
         _check_action(action)
-        ended: Values = {"op": "action_result", "action": action, "id": goal, "values": {}, "status": 5, "result": True}
+        ended: Values = {
+            "op": "action_result",
+            "action": action,
+            "id": goal,
+            "values": {},
+            "status": 5,
+            "result": True,
+        }
         return [ended] if self.cancel("action", str(goal)) else []
 
     def cancel(self, way: str, name: str) -> bool:
