@@ -134,9 +134,11 @@ while not rospy.is_shutdown():
     rospy.sleep(0.02)
 """
 # ros3djs and ros2djs as their users write them.
-VIEWER: Final = """<!doctype html><title>viewer</title><link rel="icon" href="data:,"><div id="map"></div><div id="world"></div>
+VIEWER: Final = """<!doctype html><title>viewer</title><link rel="icon" href="data:,">
+<div id="map"></div><div id="world"></div>
 <script src="/easeljs/lib/easeljs.min.js"></script><script src="/roslib1/build/roslib.js"></script>
-<script src="/eventemitter2/lib/eventemitter2.js"></script><script src="/ros2d/build/ros2d.js"></script><script src="/ros3d/build/ros3d.js"></script>
+<script src="/eventemitter2/lib/eventemitter2.js"></script><script src="/ros2d/build/ros2d.js"></script>
+<script src="/ros3d/build/ros3d.js"></script>
 <script>
 const ros = new ROSLIB.Ros({ url: URL_OF_ROSBRIDGE });
 const tfClient = new ROSLIB.TFClient({ ros, fixedFrame: "odom", angularThres: 0.01, transThres: 0.01, rate: 20 });
@@ -164,14 +166,14 @@ async def test_ros3d_and_ros2d_draw_the_robot_of_another_module(agents: tuple[Ag
         Web(agents[0], port=port, environ={"RMPA_WEB_ORIGINS": origin}) as web,
         Process([ros.PYTHON, "-c", ROBOT], env=ros.environment(agents[1].home, agents[1].core_port), name="robot"),
     ):
-        async with site_of(packages, VIEWER.replace("URL_OF_ROSBRIDGE", json.dumps(url(web))), place):
-            async with Chromium() as page:
-                await page.goto(origin)
-                await page.wait("window.robot?.position.x > 0.2")
-                first = await page.run("window.robot.position.x")
-                await page.wait(f"window.robot.position.x > {first + 0.2}")
-                await page.wait("window.grid.currentGrid?.width > 3.9")
-                assert not page.errors
+        text = VIEWER.replace("URL_OF_ROSBRIDGE", json.dumps(url(web)))
+        async with site_of(packages, text, place), Chromium() as page:
+            await page.goto(origin)
+            await page.wait("window.robot?.position.x > 0.2")
+            first = await page.run("window.robot.position.x")
+            await page.wait(f"window.robot.position.x > {first + 0.2}")
+            await page.wait("window.grid.currentGrid?.width > 3.9")
+            assert not page.errors
 
 
 @contextlib.asynccontextmanager
