@@ -130,7 +130,9 @@ def encode(kind: MessageType, payload: memoryview, wish: Wish) -> tuple[str, byt
     if wish.width or wish.height:
         width, height = image.size
         wanted = wish.width or round(wish.height * width / height), wish.height or round(wish.width * height / width)
-        image = image.resize(tuple(min(max(1, each), limits.PICTURE_SIDE_MAX) for each in wanted))
+        size = tuple(min(max(1, each), limits.PICTURE_SIDE_MAX) for each in wanted)
+        # Whole pixels are averaged first: a sixth of the time.
+        image = image.resize(size, _pillow().Resampling.BILINEAR, reducing_gap=1.0)
     out = io.BytesIO()
     image.save(out, "JPEG", quality=wish.quality or _QUALITY)
     return "image/jpeg", out.getvalue()
