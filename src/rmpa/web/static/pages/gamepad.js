@@ -152,7 +152,7 @@ export function Gamepad({ on, hold, raw }) {
         ${pad.axes.map(
           (value, n) =>
             html`<li key=${n} class="mono">
-              ${n}<svg viewBox="-50 0 100 12" aria-hidden="true">
+              ${n}<svg viewBox="-50 0 100 12" preserveAspectRatio="none" aria-hidden="true">
                 <path class="cross" d="M-50 6H50M0 0V12" />
                 <rect x=${Math.min(0, value * 50)} y="2" width=${Math.abs(value) * 50} height="8" /></svg
               >${value.toFixed(2)}
