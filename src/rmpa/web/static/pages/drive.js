@@ -206,7 +206,7 @@ function Chain({ stick, topic, type, nodes, takers, own }) {
                 )}</span
               >`,
           )
-        : html`<strong>No node subscribes to it</strong>`}
+        : html`<strong>No subscriber is known</strong>`}
     </li>
   </ol>`;
 }
@@ -267,8 +267,8 @@ function Commanded({ at, type, fastest, sent }) {
     ? degrees((sent?.angular || 0) * fastest.steer)
     : `${((sent?.angular || 0) * fastest.angular).toFixed(2)} rad/s`;
   return html`<p class="muted mono" aria-live="off">
-    forward ${(at.y * 100).toFixed(0)} %, turn ${(-at.x * 100).toFixed(0)}
-    %${type !== JOY && html`<br />commanded: ${((sent?.linear || 0) * fastest.linear).toFixed(2)} m/s, ${turn}`}
+    ${`forward ${(at.y * 100).toFixed(0)} %, turn ${(-at.x * 100).toFixed(0)} %`}${type !== JOY &&
+    html`<br />commanded: ${((sent?.linear || 0) * fastest.linear).toFixed(2)} m/s, ${turn}`}
   </p>`;
 }
 
