@@ -6,7 +6,7 @@ import asyncio
 import struct
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
@@ -183,7 +183,7 @@ def web() -> Iterator[WebFactory]:
 
     with ExitStack() as stack:
 
-        def make(agent: Agent, *flags: str, **options: int) -> Web:
+        def make(agent: Agent, *flags: str, **options: Any) -> Web:
             return stack.enter_context(Web(agent, *flags, **options))
 
         yield make

@@ -205,20 +205,22 @@ async def test_pages_of_two_modules_share_one_stick(lab: Lab, modules: ModuleFac
     tablet, phone = lab.host("tablet", 0), lab.host("phone", 0)
     wheels = arm.ros.rospy("wheels", name="wheels", topic="/cmd_vel")
     await wheels.expect_event("up")
-    holder = "document.querySelector('.holder').innerText"
+    holder = "document.querySelector('.chain').innerText"
     async with Chromium(tablet) as first, Chromium(phone) as second:
         for page, served in zip((first, second), servers, strict=True):
             await served.open(page, "drive")
             await page.wait(f"{holder}.includes('is free')")
+        await second.wait(f"/arm\\s+\\/wheels/.test({holder})")
         await first.run("document.querySelector('input[type=checkbox]').click()")
-        await second.wait(f"{holder}.includes('at base has the stick')")
+        await second.wait(f"/The page of [0-9.]+\\s+at base, for/.test({holder})")
         await first.run("document.querySelector('.stick').focus()")
         await first.down("ArrowUp")
         await wheels.expect_event("speed", where=lambda event: event["linear"] == pytest.approx(HELD))
+        await first.wait(f"{holder}.includes('arm')")  # who takes it, now that it is published
         mark = wheels.mark_events()
         await second.click("Take over")
         await first.wait_text("at arm has taken the stick over")
-        await second.wait(f"{holder}.includes('This page has the stick')")
+        await second.wait(f"{holder}.includes('This page')")
         await wheels.expect_event("speed", where=lambda event: event["linear"] == 0, since=mark)
         await second.run("document.querySelector('.stick').focus()")
         await second.down("ArrowDown")

@@ -10,6 +10,7 @@ import contextlib
 import importlib.metadata
 import importlib.util
 import io
+import itertools
 import json
 import os
 import random
@@ -21,9 +22,12 @@ import sys
 import tarfile
 from typing import TYPE_CHECKING, Any, Final
 
+import aiohttp.web
 import pytest
 
+from lab.bed import ros
 from lab.bed.agents import Agent
+from lab.bed.chromium import Chromium
 from lab.bed.http_client import http_client
 from lab.bed.namespaces import MACHINE
 from lab.bed.processes import DEADLINE, Process
@@ -32,7 +36,7 @@ from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import known_specifications, known_types
 from tests.interop import npm
-from tests.interop.web import PORT, Web
+from tests.interop.web import PORT, Web, needs_browser
 from tests.ros.types.filled import filled, filled_message
 from tests.waiting import until
 
@@ -94,6 +98,108 @@ def test_roslibjs_works_unmodified(package: str, served: Web) -> None:
     with Process(["node", npm.CLIENTS / "roslib.mjs", home, url(served)], name=package) as client:
         assert client.wait(RUN) == 0, client.output
         assert client.lines[-1] == "ok"
+
+
+@pytest.mark.parametrize("package", ["roslib1", "roslib2"])
+async def test_roslibs_tf_clients_follow_a_robot_of_another_module(package: str, served: Web, arm: Node) -> None:
+    tf = await arm.advertise("/tf", "tf2_msgs/TFMessage")
+    fixed = await arm.advertise("/tf_static", "tf2_msgs/TFMessage", latch=True)
+    fixed.publish(fixed.make({"transforms": [placed("base", "laser", 0.5)]}))
+    with Process(["node", npm.CLIENTS / "tf.mjs", npm.packages() / package, url(served)], name=package) as client:
+        for number in itertools.count():
+            if client.returncode is not None or "ok" in client.output:
+                break
+            tf.publish(tf.make({"transforms": [placed("odom", "base", number * 0.1)]}))
+            await asyncio.sleep(0.05)
+        assert await client.ended() == 0, client.output
+        assert client.lines[-1] == "ok"
+
+
+# A robot's odometry and map as rospy publishes them; it needs Debian's ROS.
+ROBOT: Final = """
+import rospy, nav_msgs.msg, geometry_msgs.msg, tf2_msgs.msg
+rospy.init_node("robot", disable_signals=True)
+grid = rospy.Publisher("/map", nav_msgs.msg.OccupancyGrid, latch=True, queue_size=1)
+world = nav_msgs.msg.OccupancyGrid()
+world.header.frame_id, world.info.resolution, world.info.width, world.info.height = "odom", 0.1, 40, 30
+world.info.origin.orientation.w, world.data = 1.0, [100 if n % 40 in (0, 39) else 0 for n in range(1200)]
+grid.publish(world)
+tf = rospy.Publisher("/tf", tf2_msgs.msg.TFMessage, queue_size=10)
+place = geometry_msgs.msg.TransformStamped(child_frame_id="base")
+place.header.frame_id, place.transform.rotation.w = "odom", 1.0
+while not rospy.is_shutdown():
+    place.header.stamp = rospy.get_rostime()
+    place.transform.translation.x += 0.01
+    tf.publish([place])
+    rospy.sleep(0.02)
+"""
+# ros3djs and ros2djs as their users write them.
+VIEWER: Final = """<!doctype html><title>viewer</title><link rel="icon" href="data:,">
+<div id="map"></div><div id="world"></div>
+<script src="/easeljs/lib/easeljs.min.js"></script><script src="/roslib1/build/roslib.js"></script>
+<script src="/eventemitter2/lib/eventemitter2.js"></script><script src="/ros2d/build/ros2d.js"></script>
+<script src="/ros3d/build/ros3d.js"></script>
+<script>
+const ros = new ROSLIB.Ros({ url: URL_OF_ROSBRIDGE });
+const tfClient = new ROSLIB.TFClient({ ros, fixedFrame: "odom", angularThres: 0.01, transThres: 0.01, rate: 20 });
+window.axes = new ROS3D.Axes();
+window.robot = new ROS3D.SceneNode({ tfClient, frameID: "base", object: window.axes });
+try {
+  const view = new ROS3D.Viewer({ divID: "world", width: 500, height: 400, antialias: true });
+  view.addObject(new ROS3D.Grid());
+  view.addObject(window.robot);
+  window.drawn = true;
+} catch (error) { window.drawn = String(error); } // without WebGL
+const flat = new ROS2D.Viewer({ divID: "map", width: 400, height: 300 });
+window.grid = new ROS2D.OccupancyGridClient({ ros, rootObject: flat.scene });
+window.grid.on("change", () => flat.scaleToDimensions(window.grid.currentGrid.width, window.grid.currentGrid.height));
+</script>"""
+
+
+@needs_browser
+async def test_ros3d_and_ros2d_draw_the_robot_of_another_module(agents: tuple[Agent, Agent]) -> None:
+    if reason := ros.why_not():
+        pytest.skip(reason)
+    packages, port, place = npm.packages(), free_port(), free_port()
+    origin = f"http://127.0.0.1:{place}"
+    with (
+        Web(agents[0], port=port, environ={"RMPA_WEB_ORIGINS": origin}) as web,
+        Process([ros.PYTHON, "-c", ROBOT], env=ros.environment(agents[1].home, agents[1].core_port), name="robot"),
+    ):
+        text = VIEWER.replace("URL_OF_ROSBRIDGE", json.dumps(url(web)))
+        async with site_of(packages, text, place), Chromium() as page:
+            await page.goto(origin)
+            await page.wait("window.robot?.position.x > 0.2")
+            first = await page.run("window.robot.position.x")
+            await page.wait(f"window.robot.position.x > {first + 0.2}")
+            await page.wait("window.grid.currentGrid?.width > 3.9")
+            assert not page.errors
+
+
+@contextlib.asynccontextmanager
+async def site_of(packages: Path, page: str, port: int) -> AsyncIterator[None]:
+    """A web site with one page, and npm's packages beside it."""
+
+    async def first(_request: aiohttp.web.Request) -> aiohttp.web.Response:
+        return aiohttp.web.Response(text=page, content_type="text/html")
+
+    application = aiohttp.web.Application()
+    application.router.add_get("/", first)
+    application.router.add_static("/", packages)
+    runner = aiohttp.web.AppRunner(application, shutdown_timeout=1.0)
+    await runner.setup()
+    try:
+        await aiohttp.web.TCPSite(runner, "127.0.0.1", port).start()
+        yield
+    finally:
+        await runner.cleanup()
+
+
+def placed(parent: str, child: str, x: float) -> dict[str, Any]:
+    """A geometry_msgs/TransformStamped."""
+    rotation = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+    place = {"translation": {"x": x, "y": 0.0, "z": 0.0}, "rotation": rotation}
+    return {"header": {"frame_id": parent}, "child_frame_id": child, "transform": place}
 
 
 def test_foxglove_ws_protocols_client_works_unmodified(served: Web) -> None:
@@ -239,8 +345,6 @@ async def test_the_parameter_example_follows_and_sets_parameters(
 
 # --- roslibpy -------------------------------------------------------------------------------------------------------
 
-# tf2_web_republisher has to run, which is a node in C++ of its own repository.
-NEEDS_A_NODE_OF_ITS_OWN: Final = "tests/ros1/test_tf.py::test_tf_test"
 # Where roslibpy's tests connect, without a token.
 ROSBRIDGE_PORT: Final = 9090
 
@@ -288,7 +392,7 @@ async def test_roslibpys_own_tests_pass(lab: Lab, agent: AgentFactory, web: WebF
         pytest.skip("roslibpy is not installed (extra web-peers)")
     source = await asyncio.to_thread(roslibpy_source, tmp_path)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", "/dev/null"]
-    command += ["--rootdir", str(source), str(source / "tests" / "ros1"), "--deselect", NEEDS_A_NODE_OF_ITS_OWN]
+    command += ["--rootdir", str(source), str(source / "tests" / "ros1")]
 
     async def run(number: int, transport: str) -> None:
         host = lab.host(transport, number)
@@ -297,7 +401,7 @@ async def test_roslibpys_own_tests_pass(lab: Lab, agent: AgentFactory, web: WebF
         async with proxy(host, served):
             with Process(host.command(command), env=environ, name=f"roslibpy {transport}") as tests:
                 assert await tests.ended(RUN) == 0, tests.output
-                assert "24 passed" in tests.output
+                assert "25 passed" in tests.output
 
     await asyncio.gather(*(run(number, transport) for number, transport in enumerate(("twisted", "asyncio"))))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 from typing import Final, Self
 
@@ -29,11 +29,13 @@ class Web:
         agent: Of its module; on a host of a lab.
         flags: Further arguments.
         port: Its port.
+        environ: Further settings, as ``RMPA_WEB_ORIGINS``.
     """
 
-    def __init__(self, agent: Agent, *flags: str, port: int = PORT) -> None:
+    def __init__(self, agent: Agent, *flags: str, port: int = PORT, environ: Mapping[str, str] | None = None) -> None:
         argv = ["web", "--listen", "0.0.0.0", "--port", str(port), "--agent", agent.name, *flags]
-        self.process = Process(agent.host.command([RMPA, *argv]), env=agent.env, name=f"rmpa web {agent.name}")
+        env = {**agent.env, **(environ or {})}
+        self.process = Process(agent.host.command([RMPA, *argv]), env=env, name=f"rmpa web {agent.name}")
         self.host = f"{agent.host.address}:{port}"
         self.token = ""
 

@@ -20,6 +20,7 @@ from rmpa.web.hub.graph import GraphService, GraphTopic
 from rmpa.web.hub.hub import HubClient
 from rmpa.web.hub.node_link import EVERYTHING
 from rmpa.web.hub.topics import ReceivedMessage
+from rmpa.web.hub.transforms import TransformTree
 
 NOW_NS = 1_700_000_000_000_000_123
 
@@ -148,8 +149,17 @@ class FakeHub:
         self.published: dict[str, str] = {}
         self.params = Params()
         self.link = SimpleNamespace(rules=EVERYTHING)
-        self.topics = SimpleNamespace(publishers=SimpleNamespace(names=self.published))
+        # Of parts that all clients share: what each topic's message is given to, while it is subscribed to.
+        self.shared: dict[str, Callable[[ReceivedMessage], None]] = {}
+        self.topics = SimpleNamespace(publishers=SimpleNamespace(names=self.published), subscribe=self._subscribe)
+        topics: Any = self.topics
+        types: Any = self.types
+        self.transforms = TransformTree(topics, types)
         self.time = SimpleNamespace(now_ns=lambda: NOW_NS, simulated=sim_time)
+
+    def _subscribe(self, topic: str, _type: str | None, receive: Any, _failed: Any) -> Any:
+        self.shared[topic] = receive
+        return SimpleNamespace(close=lambda: self.shared.pop(topic))
 
 
 class Connection:

@@ -53,8 +53,11 @@ _TITLES: Final = {
     404: "Not found",
     405: "Method not allowed",
     413: "Too large",
+    415: "Not an image",
+    429: "Too many streams",
     500: "Internal error",
     503: "The agent does not answer",
+    504: "No picture",
 }
 
 

@@ -184,3 +184,30 @@ WEB_TOKEN_LENGTH_MIN: Final = 16
 WEB_TOKEN_FILE_MAX: Final = 4096
 # Seconds between two looks at the files of the certificate: a renewed one is served long before the old one ends.
 CERTIFICATE_LOOK_PERIOD: Final = 5.0
+# Frames of the tree of transforms that clients ask about; a humanoid has some 100.
+FRAMES_MAX: Final = 5000
+# [Web] Streams of pictures, `/stream`
+# At it: further ones get 429
+# Told in: the response
+# Why: Each takes a connection, and some of a core for raw images.
+STREAMS_MAX: Final = 32
+# [Web] Pictures of a stream a second
+# At it: the newest are sent
+STREAM_RATE_MAX: Final = 30.0
+# [Web] Width and height that are asked of a stream or snapshot, in pixels
+# At it: 400
+# Told in: the response
+PICTURE_SIDE_MAX: Final = 4096
+# [Web] Pixels of an image that is encoded
+# At it: 415
+# Told in: the response
+# Why: They take some bytes each; cameras have up to 50 million.
+PICTURE_PIXELS_MAX: Final = 64_000_000
+# [Web] Time for the first picture
+# At it: a snapshot gets 504; a stream waits on
+# Told in: the response
+PICTURE_WAIT: Final = 5.0
+# Pictures that are encoded at one time, each in a thread: the event loop keeps a core.
+ENCODERS: Final = 2
+# Bytes that the kernel holds of a stream beyond those on their way: the next picture is chosen late.
+STREAM_UNSENT: Final = 64 * KIB

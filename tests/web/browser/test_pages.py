@@ -10,8 +10,6 @@ import pytest
 
 from lab.bed.chromium import Chromium
 from rmpa.web.hub.node_link import Rights
-from rmpa.web.monitor import limits
-from tests.waiting import until
 from tests.web.browser.conftest import Site
 
 AXE = Path(__file__).with_name("vendor") / "axe.min.js"
@@ -552,36 +550,3 @@ async def test_the_line_alone_is_shown_where_the_page_may_not_invite(site: Site)
     page = await site.open("", "knock")
     await page.wait_text("run here: rmpa trust invite --module arm")
     assert await page.run("document.querySelectorAll('.outside button').length") == 0
-
-
-async def test_a_robot_moves_only_while_the_stick_is_held(site: Site) -> None:
-    page = await site.open("drive")
-    await page.run("document.querySelector('.stick').focus()")
-    await page.press("ArrowUp")
-    assert site.server.speeds == []  # it is not armed yet
-    await page.run("document.querySelector('input[type=checkbox]').click()")
-    await page.wait("!document.querySelector('.stick').classList.contains('off')")
-    await page.run("document.querySelector('.stick').focus()")
-    await page.down("ArrowUp")
-    await page.wait("document.querySelector('.stick + p').textContent.includes('forward 60 %')")
-    await until(lambda: len(site.server.speeds) > 1)
-    await page.up("ArrowUp")
-    await page.wait("document.querySelector('.stick + p').textContent.includes('forward 0 %')")
-    await page.wait("window.rmpa.socket.bufferedAmount === 0")
-    await until(lambda: site.server.speeds[-1].linear == 0)
-    assert site.server.speeds[0].linear == 0  # one command alone moves nothing
-    assert site.server.speeds[1].linear == pytest.approx(0.6 * 0.15 * limits.DRIVE_SPEED)
-    assert site.server.speeds[-1].linear == 0
-
-
-async def test_the_warning_of_late_commands_ends_with_the_hold(site: Site) -> None:
-    page = await site.open("drive")
-    await page.wait("window.rmpa.stick")
-    await page.run("document.querySelector('input[type=checkbox]').click()")
-    await page.wait("!document.querySelector('.stick').classList.contains('off')")
-    await page.run("window.rmpa.serverTime = () => -1000")
-    await page.run("document.querySelector('.stick').focus()")
-    await page.down("ArrowUp")
-    await page.wait_text("late, and are dropped")
-    await page.up("ArrowUp")
-    await page.wait("!document.querySelector('.banner')")

@@ -39,6 +39,7 @@ from rmpa.web.clients.frame_writer import Opcode
 from rmpa.web.hub.node_link import FULL
 from rmpa.web.hub.topics import ReceivedMessage
 from rmpa.web.monitor.diagnostics import DiagnosticsFeed
+from rmpa.web.monitor.driving import TYPES
 from rmpa.web.monitor.messages import SUBPROTOCOL, Tree
 from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.session import MonitorSession
@@ -250,6 +251,7 @@ class FakeServer:
             "/base": {"rate": 50.0, "wheel": {"radius": 0.035, "track": 0.23}, "topics": ["odom", "imu"]},
         }
         self.logger = "/base"
+        self.driven = {"/cmd_vel": {"type": "geometry_msgs/Twist", "nodes": ["base:/base", "base:/safety_stop"]}}
         self._params_told: dict[str, Any] = {}
         self._param_changes = 0
         self._builder = StateBuilder("pc")
@@ -362,6 +364,10 @@ class FakeServer:
         text = "no linked peer publishes it"
         failed = {"name": "publisher", "verdict": "fail", "text": text, "remedy": "start the module base"}
         return [{**flows, "flows": False, "stages": [*flows["stages"][:2], failed]}]
+
+    def _answer_driven(self, _args: dict[str, Any]) -> Any:
+        cars = {"/car/drive": {"type": "ackermann_msgs/AckermannDrive", "nodes": []}}
+        return {"topics": {**self.driven, **cars}, "types": [*TYPES]}
 
     def _answer_params(self, args: dict[str, Any]) -> Any:
         digest = str(hash(json.dumps(self.params)))

@@ -13,7 +13,7 @@ import pytest
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.web.hub.node_link import FULL, Rights
 from rmpa.web.hub.topics import ReceivedMessage
-from rmpa.web.monitor import limits
+from rmpa.web.monitor import driving, limits
 from rmpa.web.monitor.session import MonitorSession
 from rmpa.web.monitor.sticks import Sticks
 from tests.web.monitor.patches import apply
@@ -125,6 +125,12 @@ class Page(Recorded):
 @pytest.fixture
 def page() -> Page:
     return Page()
+
+
+@pytest.fixture(autouse=True)
+def _no_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands are obeyed at once; ``test_driving.py`` has the ramp."""
+    monkeypatch.setattr(driving, "ramped", lambda _value, wanted, _step: wanted)
 
 
 def test_a_page_has_the_state_and_then_its_changes_alone(page: Page) -> None:
@@ -260,7 +266,7 @@ def test_what_tcp_kept_over_a_cut_moves_nothing(page: Page) -> None:
     page.after(limits.DRIVE_TIMEOUT)
     page.after(5)  # the cable is cut, and the stick let go; then all comes at once
     page.asked.clear()
-    page.session._driven = None
+    page.session._driver = None
     told = [frame for n in range(30) for frame in page.drive(1, at=made + n / 10)]
     assert page.speeds == []
     assert [frame["error"] for frame in told] == ["commands reach the server 5.3 s late, and are dropped"]
@@ -283,7 +289,7 @@ def test_the_first_command_after_a_gap_is_zero(page: Page) -> None:
 def test_no_command_counts_twice_or_behind_a_newer_one(page: Page) -> None:
     page.drive(0, hold=3)
     page.asked.clear()
-    page.session._driven = None
+    page.session._driver = None
     page.drive(1, hold=2)
     page.drive(1, hold=3, n=1)
     assert page.speeds == []
@@ -313,6 +319,32 @@ def test_a_robot_is_stopped_at_once(page: Page, how: str) -> None:
         page.drive(1, topic="/other")
     assert page.speeds[2] == STOP
     assert page.speeds[3:] == ([("/other", 0.0, 0.0)] if how == "another topic" else [])
+
+
+def test_a_topic_of_another_type_is_driven_by_it_and_stopped_by_any_page(page: Page) -> None:
+    page.session.hub.graph.add_topic("/car", "ackermann_msgs/AckermannDrive")
+    told = page.drive(1, topic="/car")
+    assert told[0]["error"].startswith("/car has the type ackermann_msgs/AckermannDrive")
+    assert page.speeds == []
+    for _ in range(2):
+        page.drive(1, topic="/car", type="ackermann_msgs/AckermannDrive", hold=2)
+    other = Page(sticks=page.session._monitor.sticks)
+    other.session.hub.graph.add_topic("/car", "ackermann_msgs/AckermannDrive")
+    other.send("stick", topic="/car", want="stop")
+    published = [(each.type, struct.unpack("<5f", data)) for each in page.all("advertise") for data in each.published]
+    assert [(type_, values[2]) for type_, values in published] == [
+        ("ackermann_msgs/AckermannDrive", speed) for speed in (0.0, limits.DRIVE_SPEED, 0.0)
+    ]
+    assert [struct.unpack("<5f", data) for data in other.last("advertise").published] == [(0.0,) * 5]
+
+
+def test_a_topic_whose_type_changes_is_stopped_with_the_old_one(page: Page) -> None:
+    page.drive(1)
+    page.drive(1)
+    page.session.hub.graph.add_topic("/cmd_vel", "geometry_msgs/TwistStamped")
+    page.drive(1)
+    assert page.speeds[-1] == STOP
+    assert page.last("advertise").closed
 
 
 WATCH = {"op": "watch", "id": 1, "topic": "/a", "how": "value"}

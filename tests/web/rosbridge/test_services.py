@@ -332,6 +332,9 @@ def test_details_of_types(robot: Client) -> None:
     }
     embedded = "std_msgs/Header time geometry_msgs/Pose geometry_msgs/Point geometry_msgs/Quaternion"
     assert [each["type"] for each in others] == embedded.split()
+    assert (
+        _rosapi(robot, "message_details", type="float64")["typedefs"] == []
+    )  # clients ask for the type of each field
     log = _rosapi(robot, "message_details", type="rosgraph_msgs/Log")["typedefs"][0]
     assert dict(zip(log["constnames"], log["constvalues"], strict=True))["ERROR"] == "8"
     info = _rosapi(robot, "message_details", type="sensor_msgs/CameraInfo")["typedefs"][0]

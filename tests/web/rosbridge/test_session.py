@@ -280,7 +280,7 @@ def test_levels_of_status_messages(client: Client) -> None:
         ('{"op": "png", "data": "AAAA", "num": 0}', "'id', 'num' and 'total'"),
         ('{"op": "service_response", "service": "/s", "id": "i", "result": true}', "is not advertised"),
         ('{"op": "unadvertise_service", "service": "/s"}', "is not advertised"),
-        ('{"op": "send_action_goal", "action": "/a", "action_type": "x/Y"}', "unknown op 'send_action_goal'"),
+        ('{"op": "advertise_action", "action": "/a", "type": "x/Y"}', "unknown op 'advertise_action'"),
         (b"\xff", "CBOR"),
         (b"\x9b\xff\xff\xff\xff\xff\xff\xff\xff", "CBOR"),
         (b"\x5b\x00\x00\x00\xff\xff\xff\xff\xff", "CBOR"),

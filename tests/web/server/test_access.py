@@ -196,7 +196,7 @@ DENIED: Final = NodeRules(
                     ("web",),
                     effect=Effect.DENY,
                     names=dict.fromkeys(
-                        ("subscribe", "publish", "call", "serve", "param"), ("/t", "/s", "/p", "/new")
+                        ("subscribe", "publish", "call", "serve", "param"), ("/t", "/s", "/p", "/new", "/tf")
                     ),
                 ),
             ),
@@ -216,6 +216,8 @@ ROSBRIDGE: Final[dict[str, tuple[str, dict[str, Any], bool]]] = {
     "advertise_service": ("control", {"service": "/s", **EMPTY}, True),
     "unadvertise_service": ("", {"service": "/s"}, False),  # of its own
     "service_response": ("", {"service": "/s", "result": True}, False),  # of its own
+    "send_action_goal": ("", {"action": "/tf2_web_republisher", "id": "g"}, True),  # it subscribes to /tf
+    "cancel_action_goal": ("", {"action": "/tf2_web_republisher", "id": "g"}, False),
     "set_level": ("", {"level": "error"}, False),
     "status": ("", {}, False),
     "fragment": ("", {"id": 1, "data": "{", "num": 0, "total": 2}, False),  # each op in it is judged

@@ -354,7 +354,7 @@ class ClientConnection:
             self._transport = request.transport
             if self._transport is None:
                 return  # it went during the handshake
-            _tune(self._transport)
+            tune(self._transport)
             self._out = FrameWriter(self._transport, writer.drain)
             socket_.before_close = self._out.hand_over
             session.opened()
@@ -526,16 +526,20 @@ def _as_it_is(frame: OutFrame, _: float) -> tuple[OutFrame]:
     return (frame,)
 
 
-def _tune(transport: asyncio.Transport) -> None:
-    """Set the options of a client's connection; those that a kernel lacks are left out."""
+def tune(transport: asyncio.Transport, unsent: int = 512 * KIB) -> None:
+    """Set the options of a client's connection; those that a kernel lacks are left out.
+
+    Args:
+        transport: Its transport.
+        unsent: Bytes that the kernel holds beyond those on their way.
+    """
     transport.set_write_buffer_limits(high=limits.WRITE_BUFFER)
     sock = transport.get_extra_info("socket")
     options = (
         ("TCP_NODELAY", 1),
         ("TCP_USER_TIMEOUT", 30_000),  # ms in which the client's machine must acknowledge what was sent
-        # What the kernel holds beyond the bytes on their way: a ping behind them must pass in time, and commands
-        # overtake images in the queue, not there.
-        ("TCP_NOTSENT_LOWAT", 512 * KIB),
+        # A ping behind them must pass in time, and commands overtake images in the queue, not there.
+        ("TCP_NOTSENT_LOWAT", unsent),
     )
     for name, value in options:
         option = getattr(socket, name, None)

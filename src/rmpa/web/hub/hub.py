@@ -20,6 +20,7 @@ from rmpa.web.hub.node_link import CONTROL_REMEDY, EVERYTHING, READ_REMEDY, Node
 from rmpa.web.hub.params import ParamMirror, RosTime, value_at
 from rmpa.web.hub.services import ServedServices, ServiceCalls, read_asset
 from rmpa.web.hub.topics import HubTopics
+from rmpa.web.hub.transforms import TransformTree
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Mapping
@@ -72,6 +73,7 @@ class Hub:
         self.topics = HubTopics(self.link, self.types, self.graph, now_ns)
         self.time = RosTime(self.topics, self.params, now_ns)
         self.counts = ClientCounts(self, now_ns)
+        self.transforms = TransformTree(self.topics, self.types)
 
     async def __aenter__(self) -> Self:
         return self

@@ -146,6 +146,16 @@ STICK_EXPIRY: Final = 2.0
 DRIVE_SPEED: Final = 2.0
 # Magnitude of an angular speed that a joystick may command, rad/s.
 DRIVE_TURN: Final = 4.0
+# Magnitude of a steering angle that a joystick may command, rad; cars have some 0.6.
+DRIVE_STEER: Final = 0.6
+# [Pages] Acceleration that a joystick commands, m/s²
+# At it: the speed grows by a ramp; it falls at once
+# Told in: the page
+# Why: A gamepad's stick jumps from 0 to 1 in one command.
+DRIVE_ACCELERATION: Final = 4.0
+# Axes and buttons of a gamepad in one command; the largest consoles of joysticks have half of them.
+AXES_MAX: Final = 32
+BUTTONS_MAX: Final = 64
 # [Pages] Smart Resources that are followed
 # At it: others are not shown
 # Why: Paths of them; each is up to nine subscriptions.

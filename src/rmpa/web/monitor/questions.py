@@ -25,6 +25,7 @@ from rmpa.ros.types.descriptor import SERVICE_TYPE
 from rmpa.trust.permissions import InviteReply
 from rmpa.web.hub.params import value_at
 from rmpa.web.monitor import limits
+from rmpa.web.monitor.driving import TYPES
 from rmpa.web.monitor.state import module_facts, node_key
 
 if TYPE_CHECKING:
@@ -48,12 +49,16 @@ def shown_node(own: str) -> str:
 Args: TypeAlias = dict[str, Any]  # the edge: each question has its own
 # All questions, each with the right (``Rights``) that a page needs for it; the method ``_QUESTION`` answers it.
 QUESTIONS: Final = {
-    **dict.fromkeys(("why", "agent", "contract", "node", "describe", "message", "past", "graph", "types"), ""),
+    **dict.fromkeys(
+        ("why", "agent", "contract", "node", "describe", "message", "past", "graph", "types", "driven"), ""
+    ),
     **dict.fromkeys(("params", "param_names"), "view"),
     **dict.fromkeys(("set_param", "delete_param", "invite", "call", "profile", "context", "configure"), "control"),
 }
 _CALL_TIMEOUT: Final = 30.0
 _READ_TIMEOUT: Final = 5.0
+# Topics that a page offers for its joystick.
+_DRIVEN_MAX: Final = 200
 _KINDS: Final = ("topic", "service", "module")
 # The service of a resource that takes another configuration (wiki.ros.org/dynamic_reconfigure).
 _SET_PARAMETERS: Final = "set_parameters"
@@ -186,6 +191,17 @@ class Answers:
             for name, fields in sizes.items()
         }  # fmt: skip
         return {"type": kind.name, "text": kind.definition.strip(), "types": types}
+
+    async def _driven(self, _args: Args) -> Any:
+        """The topics that a joystick can drive, each with its type and the nodes that subscribe to it."""
+        own = self._hub.link.node.name if self._hub.link.node is not None else ""
+        found: dict[str, Any] = {}
+        for topic in self._hub.graph.topics.values():
+            if (type_ := next((each for each in topic.types if each in TYPES), "")) and len(found) < _DRIVEN_MAX:
+                nodes = (each for each in topic.subscribers if each != own)
+                nodes = (each for each in nodes if proxied_node(each) or not is_own(each))
+                found[topic.name] = {"type": type_, "nodes": sorted(map(shown_node, nodes))}
+        return {"topics": found, "types": [*TYPES]}
 
     async def _params(self, args: Args) -> Any:
         """All parameters that the rules let a page see, with their digest; none to a page that ``has`` that one.

@@ -7,7 +7,6 @@ import contextlib
 import dataclasses
 import functools
 import logging
-import struct
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
 
 import msgspec
@@ -20,6 +19,7 @@ from rmpa.core.timers import TokenBucket
 from rmpa.web.clients.connection import Session, decoder_of, ops_of
 from rmpa.web.clients.frame_writer import Opcode
 from rmpa.web.monitor import limits
+from rmpa.web.monitor.driving import TWIST, Command, Driver, Joystick, type_driven
 from rmpa.web.monitor.layers import watch_of
 from rmpa.web.monitor.messages import VERSION, Tree, WatchState, difference
 from rmpa.web.monitor.publishing import FieldError, PagePublications
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Rights
-    from rmpa.web.hub.topics import ClientPublication, ClientSubscription, ReceivedMessage
+    from rmpa.web.hub.topics import ClientSubscription, ReceivedMessage
     from rmpa.web.monitor.monitor import Monitor
     from rmpa.web.monitor.sticks import Stick
 
@@ -48,66 +48,6 @@ _NO_TOKEN: Final = (
 )
 _NO_DRIVE: Final = "this page may not drive", "start rmpa web with --drive"
 _NO_CONTROL: Final = "this page may only look", "start rmpa web with --control"
-_TWIST: Final = "geometry_msgs/Twist"
-# A geometry_msgs/Twist: linear x, y, z in m/s, then angular x, y, z in rad/s.
-_SPEEDS: Final = struct.Struct("<6d")
-
-
-class Joystick:
-    """The holds of one page's stick, and which of its commands drive the robot.
-
-    A hold is from the touch of the stick until it is let go. TCP keeps over a cut what the page has sent, and
-    delivers all of it when the cable is back, long after the stick was let go. So each command says when it was made,
-    and what may be older than ``limits.DRIVE_TIMEOUT`` is dropped.
-
-    The two clocks need not agree. Each ``tick`` has the server's clock; the page takes the one that came fastest
-    among the last few, and its own clock counts on from it. A command's ``at`` is then the server's clock at its
-    making, less the time that this tick took: ``now - at`` is never less than the command's age, and in a steady
-    network it is the round trip. A tick that was held up, or a clock that stood still while the page's machine slept,
-    makes commands seem older, never newer.
-    """
-
-    def __init__(self) -> None:
-        self._hold = 0
-        self._number = 0
-        self._released = 0
-        self._until = 0.0
-        self._told_late = False
-        # The topic that is driven; empty while the robot is stopped.
-        self.topic = ""
-
-    @property
-    def due(self) -> float | None:
-        """When the robot is to be stopped, if no further command comes."""
-        return self._until if self.topic else None
-
-    def takes(self, hold: int, n: int, at: float, now: float) -> bool:
-        """Whether a command is to be obeyed: it is not too old, and of the present hold or a later one."""
-        if abs(now - at) > limits.DRIVE_TIMEOUT:
-            return False
-        if hold <= self._released or (hold, n) <= (self._hold, self._number):
-            return False
-        self._hold, self._number = hold, n
-        self._told_late = False
-        return True
-
-    def drive(self, topic: str, now: float) -> bool:
-        """A command is obeyed; returns whether it may move the robot.
-
-        The first one after a stop only arms: one command alone, whatever kept it, moves nothing.
-        """
-        armed, self.topic = self.topic == topic, topic
-        self._until = now + limits.DRIVE_TIMEOUT
-        return armed
-
-    def is_new_late(self, at: float, now: float) -> bool:
-        """Whether a refused command is the first since the last obeyed one that came too late."""
-        told, self._told_late = self._told_late, self._told_late or now - at > limits.DRIVE_TIMEOUT
-        return self._told_late and not told
-
-    def release(self, hold: int = 0) -> None:
-        """The stick was let go: nothing more of that hold is obeyed, nor of the present one if none is given."""
-        self._released = max(self._released, hold or self._hold)
 
 
 class StatePatches:
@@ -200,14 +140,15 @@ class MonitorSession(Session):
         self._watches: dict[int, tuple[WatchState, ClientSubscription | None]] = {}
         self._questions: set[int] = set()
         self._joystick = Joystick()
-        self._driven: ClientPublication | None = None
+        self._driver: Driver | None = None
         self._stick: Stick | None = None
         self._has_stick = False
         self._publications = PagePublications(self, self._send, self._failed, self._clock)
 
     def opened(self) -> None:
         """Greet the page, and show it the state."""
-        fastest = {"linear": limits.DRIVE_SPEED, "angular": limits.DRIVE_TURN}
+        fastest = {"linear": limits.DRIVE_SPEED, "angular": limits.DRIVE_TURN, "steer": limits.DRIVE_STEER}
+        fastest["acceleration"] = limits.DRIVE_ACCELERATION
         may = [right for right in RIGHTS if getattr(self._may, right)]
         about = {"agent": self._monitor.mesh.agent, "period": limits.PATCH_PERIOD, "fastest": fastest, "may": may}
         self._send({"op": "hello", "version": VERSION, "at": self._opened, **about})
@@ -474,7 +415,14 @@ class MonitorSession(Session):
         if self.connection.unsent == 0:  # left out while the page does not take what was sent
             self._send({"op": "log", "lines": lines})
 
-    def op_stick(self, _: float, *, topic: str, want: Literal["look", "take", "over", "leave", "stop"]) -> None:
+    def op_stick(
+        self,
+        _: float,
+        *,
+        topic: str,
+        want: Literal["look", "take", "over", "leave", "stop"],
+        type: str = TWIST,  # noqa: A002 - the protocol's word
+    ) -> None:
         """The page shows the joystick of a topic (``""``: none), and wants to know the holder, or to be it or not.
 
         ``stop`` ends the hold of any page and stops the robot; every page may.
@@ -486,8 +434,8 @@ class MonitorSession(Session):
             return
         if want == "stop":
             stick.stop(self.address)
-            if self._may.drive:
-                self._publish(topic, 0.0, 0.0)
+            if self._may.drive and (driver := self._driver_of(topic, type, stops=True)) is not None:
+                driver.stop()
         elif want == "leave":
             stick.leave(self)
         elif want != "look":
@@ -524,11 +472,27 @@ class MonitorSession(Session):
         about = {"holder": holder, "mine": self._has_stick, "problem": stick.problem}
         self._send({"op": "stick", "topic": stick.topic, **about})
 
-    def op_drive(self, now: float, *, topic: str, linear: Tilt, angular: Tilt, hold: int, n: int, at: float) -> None:
+    def op_drive(
+        self,
+        now: float,
+        *,
+        topic: str,
+        linear: Tilt,
+        angular: Tilt,
+        hold: int,
+        n: int,
+        at: float,
+        type: str = TWIST,  # noqa: A002 - the protocol's word
+        side: Tilt = 0.0,
+        ramp: Annotated[float, Meta(gt=0, le=limits.DRIVE_ACCELERATION)] = limits.DRIVE_ACCELERATION,
+        axes: Annotated[tuple[Tilt, ...], Meta(max_length=limits.AXES_MAX)] = (),
+        buttons: Annotated[tuple[bool, ...], Meta(max_length=limits.BUTTONS_MAX)] = (),
+    ) -> None:
         """A joystick; repeated every 0.1 s while it is held.
 
         ``hold`` numbers the times that the stick was taken, and ``n`` the commands, both rising; ``at`` is when it
-        was made, by the server's clock as the page knows it (``Joystick``).
+        was made, by the server's clock as the page knows it (``Joystick``). ``ramp`` is in m/s²; ``axes`` and
+        ``buttons`` are a gamepad's, for sensor_msgs/Joy.
         """
         if not self._may.drive:
             self._refuse(0, *_NO_DRIVE)
@@ -549,10 +513,13 @@ class MonitorSession(Session):
         except RmpaError:
             joystick.release(hold)  # said once
             raise
-        if joystick.drive(topic, now):
-            self._publish(topic, linear * limits.DRIVE_SPEED, angular * limits.DRIVE_TURN)
+        if (driver := self._driver_of(topic, type)) is None:
+            joystick.release(hold)
+        elif joystick.drive(topic, now):
+            sent = driver.command(Command(linear, side, angular, axes, buttons), ramp, now)
+            self._send({"op": "driven", "linear": sent.linear, "side": sent.side, "angular": sent.angular})
         else:
-            self._publish(topic, 0.0, 0.0)
+            driver.arm(now)
 
     def op_release(self, _: float, *, hold: int) -> None:
         """The joystick is let go: the robot is stopped at once, and nothing more of that hold drives it."""
@@ -561,23 +528,37 @@ class MonitorSession(Session):
 
     def _stop(self) -> None:
         topic, self._joystick.topic = self._joystick.topic, ""
-        if topic:
-            self._publish(topic, 0.0, 0.0)
+        if topic and self._driver is not None and self._driver.topic == topic:
+            self._driver.stop()
 
-    def _publish(self, topic: str, linear: float, angular: float) -> None:
+    def _end_driver(self) -> None:
+        self._stop()
+        if self._driver is not None:
+            self._driver.close()
+        self._driver = None
+
+    def _driver_of(self, topic: str, wanted: str, *, stops: bool = False) -> Driver | None:
+        """What publishes a topic for this page; ``None``: the page is told why it cannot be driven.
+
+        Args:
+            topic: What is driven.
+            wanted: The type that the page names.
+            stops: Whether it is to stop, in whatever type the topic has.
+        """
+
         def failed(error: RmpaError) -> None:
-            self._driven = None
+            self._end_driver()
             self._failed(0, error)
 
+        driver = self._driver
         try:
-            if self._driven is None or self._driven.topic != topic:
-                if self._driven is not None:
-                    self._driven.close()
-                self._driven = self.advertise(topic, _TWIST, failed)
+            type_ = type_driven(self.hub.graph, topic, wanted, stops=stops)
+            if driver is None or (driver.topic, driver.type) != (topic, type_):
+                self._end_driver()
+                self._driver = Driver(self, topic, type_, failed)
         except RmpaError as error:
             failed(error)
-        else:
-            self._driven.publish(_SPEEDS.pack(linear, 0, 0, 0, 0, angular))
+        return self._driver
 
 
 def _check_topic(topic: str) -> None:

@@ -96,3 +96,17 @@ SHARED_BYTES: Final = 16 * MIB
 PARAMETER_DEPTH_MAX: Final = 32
 # Characters of a status message.
 TEXT_MAX: Final = 500
+# [Rosbridge] Requests for transforms (tf2_web_republisher)
+# At it: further ones are refused
+# Told in: status, the call's failure
+TF_REQUESTS_MAX: Final = 64
+# [Rosbridge] Source frames of one of them
+# At it: it is refused
+# Told in: status, the call's failure
+TF_FRAMES_MAX: Final = 1000
+# [Rosbridge] Transforms a second of one of them
+# At it: the newest are sent
+TF_RATE_MAX: Final = 50.0
+# Seconds that a request is kept whose topic has no subscriber, at least and at most, whatever the client asks for.
+TF_TIMEOUT_MIN: Final = 1.0
+TF_TIMEOUT_MAX: Final = 60.0

@@ -18,10 +18,12 @@ from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import parse_definition
 from rmpa.ros.types.installed import ServiceType
+from rmpa.ros.types.values import SIZES
 from rmpa.web.hub.graph import GraphService, GraphTopic
 from rmpa.web.hub.params import MISSING
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.protocol import OpError, graph_name, type_name
+from rmpa.web.rosbridge.tf import SERVICE, SERVICE_TYPE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable
@@ -198,7 +200,7 @@ class Rosapi:
                 return {"type": await self._graph.find(name)}
             return {"type": ""}
 
-        known = SERVICES.get(name) or self._service(name).type
+        known = SERVICES.get(name) or self._service(name).type or (SERVICE_TYPE if name == SERVICE else "")
         return find() if not known and name in self._graph.services else {"type": known}
 
     def _answer_service_node(self, service: str) -> Values:
@@ -221,6 +223,8 @@ class Rosapi:
         return answer() if name in self._graph.services else self._with_types(answer)
 
     def _answer_message_details(self, type: str) -> Values:  # noqa: A002 - the field's name
+        if type in SIZES or type == "string":
+            return {"typedefs": []}
         return _details(self._client.hub.types.message(type_name(type)))
 
     def _answer_service_request_details(self, type: str) -> Values:  # noqa: A002 - the field's name

@@ -31,6 +31,7 @@ from rmpa.web.rosbridge.protocol import (
     whole,
 )
 from rmpa.web.rosbridge.rosapi import Rosapi
+from rmpa.web.rosbridge.tf import TfRepublisher
 
 if TYPE_CHECKING:
     import asyncio
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
     from rmpa.web.clients.frame_writer import OutFrame
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.node_link import Payload, Rights
+    from rmpa.web.hub.node_link import Follower, Payload, Rights
     from rmpa.web.hub.services import ServedService
     from rmpa.web.hub.topics import ClientPublication, ClientSubscription, ReceivedMessage
 
@@ -59,7 +60,7 @@ class _Topic(ClientStream):
         kind: The type that is wanted; None for any.
     """
 
-    subscription: ClientSubscription
+    subscription: ClientSubscription | Follower
 
     def __init__(self, session: RosbridgeSession, name: str, topic: str, kind: str | None) -> None:
         self._session = session
@@ -158,6 +159,7 @@ class RosbridgeSession(Session):
         super().__init__(hub, rights, priority, address)
         self.encoder = encoder
         self._rosapi = Rosapi(self)
+        self._tf = TfRepublisher(self)
         self._level = "error"
         self._now = 0.0
         self._depth = 0
@@ -172,6 +174,10 @@ class RosbridgeSession(Session):
     def opened(self) -> None:
         """Count the client; nothing is sent first."""
         self.hub.counts.add(self, self.address)
+
+    def closing(self) -> None:
+        """End what the hub does not know of."""
+        self._tf.close()
 
     def received_frame(self, data: str | Part, now: float) -> None:
         """Take a frame of the client: text, or bytes of a binary frame. What is wrong is answered by a status."""
@@ -213,11 +219,16 @@ class RosbridgeSession(Session):
 
     def next_timer(self) -> float | None:
         """When `handle_timer` is to be called; None for never."""
-        times = [self._fragments.next_timer(), *(topic.judged_at for topic in self._topics.values())]
+        times = [
+            self._fragments.next_timer(),
+            self._tf.next_timer(),
+            *(topic.judged_at for topic in self._topics.values()),
+        ]
         return min((at for at in times if at is not None), default=None)
 
     def handle_timer(self, now: float) -> None:
-        """End what waits in vain."""
+        """Send transforms that are due, and end what waits in vain."""
+        self._tf.handle_timer(now)
         for topic in [*self._topics.values()]:
             if topic.judged_at is not None and topic.judged_at <= now:
                 topic.judged_at = None
@@ -314,7 +325,8 @@ class RosbridgeSession(Session):
 
     def _is_there(self, name: str) -> bool:
         known = self.hub.graph.topics.get(name)
-        return bool(known is not None and known.types) or name in self.hub.topics.publishers.names
+        is_own = name in self.hub.topics.publishers.names or self._tf.publishes(name)
+        return bool(known is not None and known.types) or is_own
 
     def _begin_topic(self, spelling: str, name: str, kind: str | None) -> _Topic:
         check_count(len(self._topics), limits.SUBSCRIPTIONS_MAX, "subscribed topics")
@@ -324,7 +336,10 @@ class RosbridgeSession(Session):
         topic = _Topic(self, spelling, name, kind)
         take = partial(self.connection.push_message, topic)
         failed, differs = partial(self._subscription_failed, topic), partial(self._differs, topic)
-        topic.subscription = self.subscribe(name, kind, take, failed, differs)
+        if self._tf.publishes(name):
+            topic.subscription = self._tf.subscribe(name, take)
+        else:
+            topic.subscription = self.subscribe(name, kind, take, failed, differs)
         self._topics[spelling] = topic
         return topic
 
@@ -345,8 +360,10 @@ class RosbridgeSession(Session):
 
     def op_advertise(self, *, id_: Id = None, topic: str, type_: str, latch: bool | None = False) -> None:
         """Begin a publisher, or count one more id of it."""
-        self.check_control("publish")
         name, kind = graph_name(topic), type_name(type_)
+        if self._tf.takes(name):
+            return
+        self.check_control("publish")
         publisher = self._publishers.get(name)
         if publisher is not None and publisher.type != kind:
             raise OpError(f"{name} is advertised as {publisher.type}, not {kind}", "unadvertise it first")
@@ -379,8 +396,11 @@ class RosbridgeSession(Session):
 
     def op_publish(self, *, id_: Id = None, topic: str, msg: Any = None, latch: bool | None = False) -> None:
         """Publish a message; a topic that was not advertised is, with the type that the graph knows."""
-        self.check_control("publish")
         name = graph_name(topic)
+        if self._tf.takes(name):
+            self._tf.publish(name, msg, self._now)
+            return
+        self.check_control("publish")
         publisher = self._publishers.get(name)
         if publisher is None:
             known = self.hub.graph.topics.get(name)
@@ -441,6 +461,8 @@ class RosbridgeSession(Session):
             check_count(len(self._calls), limits.CALLS_MAX, "open calls")
             if self._rosapi.offers(name):
                 self._ask_rosapi(call, name, args)
+            elif self._tf.serves(name):
+                self._answer(call, self._tf.call(args, self._now))
             else:
                 known = self.hub.graph.services.get(name)
                 kind = type_name(type_) if type_ else known.type if known is not None else ""
@@ -484,6 +506,18 @@ class RosbridgeSession(Session):
         op = {"op": "service_response", "service": call.service, "values": values, "result": ok}
         frame = encode(op if call.mid is None else op | {"id": call.mid}, call.compression)
         self.connection.push(*self.split(frame, call.fragment_size, call.mid))
+
+    def op_send_action_goal(
+        self, *, id_: Id, action: str, args: Any = None, fragment_size: float | None = None
+    ) -> None:
+        """A goal of the one action that is answered here; its feedback comes until it is cancelled."""
+        size = _fragment_size(fragment_size)
+        push = lambda op: self.connection.push(*self.split(encode(op), size))  # noqa: E731
+        self._tf.send_goal(graph_name(action), id_, args, self._now, push)
+
+    def op_cancel_action_goal(self, *, id_: Id, action: str) -> None:
+        """End such a goal."""
+        self.connection.push(*map(encode, self._tf.cancel_goal(graph_name(action), id_)))
 
     def op_advertise_service(self, *, id_: Id = None, service: str, type_: str) -> None:
         """Offer a service; one that the client offers already is offered again."""

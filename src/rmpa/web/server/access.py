@@ -57,6 +57,7 @@ class RequestFacts:
         token: The query's ``token``.
         is_page: Whether the path is a page for people, for which a cookie is set.
         is_open: Whether the path needs no token.
+        is_picture: Whether the path gives pictures, which other sites' pages show by ``<img>``.
         is_preflight: Whether a browser asks what a page of another site may send (Fetch standard, "CORS-preflight").
         secure: Whether it came by HTTPS.
     """
@@ -70,6 +71,7 @@ class RequestFacts:
     token: str | None = None
     is_page: bool = False
     is_open: bool = False
+    is_picture: bool = False
     is_preflight: bool = False
     secure: bool = False
 
@@ -149,6 +151,9 @@ class AccessPolicy:
                 return None
             return _foreign(_short(request.origin))
         elsewhere = request.fetch_site in ("cross-site", "same-site")
+        # The token in the URL says who wants a picture; a cookie would be sent along unasked.
+        if request.is_picture and self.token and self._fits(request.token):
+            return None
         # A link on another page may lead here: the browser shows the page, and the other page cannot read it.
         if elsewhere and not (request.fetch_mode == "navigate" and request.is_page):
             return _foreign("another site")
@@ -306,7 +311,7 @@ class ConnectionPhase(Enum):
     ARRIVING = "the rest of a request"
     ANSWERING = "the response of a handler"
     UNREAD = "the client to read"
-    UPGRADED = "a WebSocket, whose handler has limits of its own"
+    UPGRADED = "a WebSocket or a stream, whose handler has limits of its own"
 
 
 class GuardedConnection(asyncio.Protocol):
@@ -326,6 +331,7 @@ class GuardedConnection(asyncio.Protocol):
         self._since_response = 0
         self._mask = MaskCheck()
         self._on_unmasked: Callable[[], None] | None = None
+        self._on_lost: Callable[[], None] = lambda: None
         self.phase = ConnectionPhase.IDLE
         # Bytes of the client so far.
         self.received = 0
@@ -349,6 +355,15 @@ class GuardedConnection(asyncio.Protocol):
             on_unmasked: Called when a frame of the client is not masked; it and all after it is dropped.
         """
         self._on_unmasked = on_unmasked
+        self._enter(ConnectionPhase.UPGRADED)
+
+    def stream(self, on_lost: Callable[[], None]) -> None:
+        """The response goes on for as long as the client reads it: the limits of requests do not hold any more.
+
+        Args:
+            on_lost: Called when the connection has ended.
+        """
+        self._on_lost = on_lost
         self._enter(ConnectionPhase.UPGRADED)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -395,6 +410,7 @@ class GuardedConnection(asyncio.Protocol):
         """Forget the connection."""
         self._forget()
         self._inner.connection_lost(exc)
+        self._on_lost()
 
     def refuse(self, reason: str, text: str) -> None:
         """Close the connection, counted by its reason."""

@@ -33,6 +33,7 @@ from rmpa.web.server.access import (
     host_name,
     is_loopback,
 )
+from rmpa.web.server.video import PICTURES, VIEWER
 
 if TYPE_CHECKING:
     import ssl
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 
     from rmpa.web.clients.clients import WebSocketClients
     from rmpa.web.server.agent_watch import AgentWatch
+    from rmpa.web.server.video import VideoStreams
 
 _log = logging.getLogger(__name__)
 _TYPES: Final = {
@@ -121,6 +123,7 @@ class WebServer:
         sockets: Serve WebSocket upgrades of ``WEBSOCKET_PATHS``.
         ports: Further ports to listen at.
         tls: Serves HTTPS with its certificate; ``None``: HTTP.
+        video: Serves pictures; ``None``: there are none.
     """
 
     # More than twelve fields: a route uses most of what holds for all of them.
@@ -132,12 +135,14 @@ class WebServer:
         sockets: WebSocketClients | None = None,
         ports: Sequence[int] = (),
         tls: ssl.SSLContext | None = None,
+        video: VideoStreams | None = None,
     ) -> None:
         self._watch = watch
         self._policy = policy
         self._addresses = [(host, port) for port in dict.fromkeys((policy.port, *ports))]
         self._clients = sockets
         self._tls = tls
+        self._video = video
         # Refusals, by reason; those of connections too.
         self.counters = Counters()
         self._refusals = RefusalLog(_log, self.counters)
@@ -163,6 +168,10 @@ class WebServer:
         app.router.add_get("/metrics", self._metrics)
         app.router.add_get(_HEALTH, self._health)
         app.router.add_get(api.PREFIX + "/{below:.*}", self._api)
+        if self._video is not None:
+            app.router.add_get(VIEWER, self._video.page)
+            for path in PICTURES:
+                app.router.add_get(path, self._pictures)
         self._runner = runner = web.AppRunner(
             app,
             access_log_class=self._access_logger(),
@@ -209,6 +218,8 @@ class WebServer:
             server.close()
         if self._clients is not None:
             await self._clients.close()
+        if self._video is not None:
+            self._video.close()
         if self._runner is not None:
             await self._runner.cleanup()
         if self._table is not None:
@@ -227,11 +238,17 @@ class WebServer:
             if connection is not None:
                 connection.request_ends()
         if not response.prepared:
-            response.headers.update(HEADERS)
-            response.headers.update(self._sharing(request))
-            if is_loopback(host_name(request.host) or ""):
-                response.headers.update((OPENER_POLICY,))
+            self._dress(request, response)
         return response
+
+    def _dress(self, request: web.Request, response: web.StreamResponse) -> None:
+        """Give a response the headers that all have; pictures are shown by other pages, too, which had the token."""
+        response.headers.update(HEADERS)
+        response.headers.update(self._sharing(request))
+        if request.path in PICTURES and TOKEN_PARAMETER in request.query:
+            response.headers["Cross-Origin-Resource-Policy"] = "cross-origin"
+        if is_loopback(host_name(request.host) or ""):
+            response.headers.update((OPENER_POLICY,))
 
     async def _respond(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         verdict = self._policy.judge(self._facts(request))
@@ -269,7 +286,8 @@ class WebServer:
             return _response(api.problem(500, "the server failed; its log says why"))
 
     def _facts(self, request: web.Request) -> RequestFacts:
-        headers, is_page = request.headers, not is_upgrade(request) and request.path in self._pages
+        headers, path = request.headers, request.path
+        content_type = self._pages[path][1] if path in self._pages and not is_upgrade(request) else ""
         return RequestFacts(
             host=tuple(headers.getall("Host", ())),
             origin=headers.get("Origin"),
@@ -278,7 +296,8 @@ class WebServer:
             authorization=headers.get("Authorization"),
             cookie=request.cookies.get(self._policy.cookie),
             token=request.query.get(TOKEN_PARAMETER),
-            is_page=is_page and self._pages[request.path][1].startswith("text/html"),
+            is_page=content_type.startswith("text/html") or (path == VIEWER and self._video is not None),
+            is_picture=path in PICTURES,
             is_open=request.path == _HEALTH,
             is_preflight=request.method == "OPTIONS"
             and "Access-Control-Request-Method" in headers
@@ -324,6 +343,10 @@ class WebServer:
         if reading.snapshot is None:
             return _response(api.problem(503, "the agent does not answer"))
         return web.Response(text="ok\n")
+
+    async def _pictures(self, request: web.Request) -> web.StreamResponse:
+        assert self._video is not None, "its routes are there"  # noqa: S101 - for the type checker
+        return await self._video.respond(request, _connection(request), lambda made: self._dress(request, made))
 
     async def _api(self, request: web.Request) -> web.Response:
         reading = await self._watch.reading(whole=True)

@@ -31,6 +31,7 @@ from rmpa.web.monitor.monitor import Monitor
 from rmpa.web.server.access import TOKEN_PARAMETER, AccessPolicy, is_loopback, own_names, token_from
 from rmpa.web.server.agent_watch import AgentFollower, AgentWatch, ControlReader
 from rmpa.web.server.app import WebServer
+from rmpa.web.server.video import VideoStreams
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Mapping
@@ -351,7 +352,8 @@ async def serve(
     name, priority = f"RMPA {setup.module or socket.gethostname()}", priority_of(hub, setup.settings.make_contracts())
     sockets = WebSocketClients(hub, name, setup.rights, priority, monitor, other_protocols())
     certificate = ServerCertificate(setup.files)
-    server = WebServer(watch, setup.policy, web.listen, sockets, web.ports, certificate.context)
+    video = VideoStreams(hub)
+    server = WebServer(watch, setup.policy, web.listen, sockets, web.ports, certificate.context, video)
     try:
         async with hub:
             await server.start()

@@ -24,6 +24,7 @@ export class Connection {
     this.notice = null;
     this.driven = ""; // the topic whose joystick is shown
     this.stick = null; // who has its stick
+    this.commanded = null; // what the server commands for this page, while its stick is held
     this.counter = 0;
     this.wait = FIRST_WAIT;
     this.frames = { patches: 0, bytes: 0 };
@@ -155,6 +156,10 @@ export class Connection {
         this.stick = message;
         this.changed();
         break;
+      case "driven":
+        this.commanded = message;
+        this.changed();
+        break;
       case "failed":
         this.failed(message);
         break;
@@ -269,13 +274,14 @@ export class Connection {
   }
 
   // Shows who has the stick of a topic, takes it, takes it over, leaves it, or stops the robot.
-  orderStick(topic, want) {
+  orderStick(topic, want, type) {
     this.driven = topic;
-    this.send({ op: "stick", topic, want });
+    this.send({ op: "stick", topic, want, ...(type && { type }) });
   }
 
   // What was said of one hold of the stick ends with it.
   endHold() {
+    this.commanded = null;
     if (this.notice?.hold === undefined) return;
     this.notice = null;
     this.changed();
