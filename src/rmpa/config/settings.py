@@ -334,6 +334,13 @@ class Settings:
         option="--prefix-peers",
         live=True,
     )
+    rosout: bool = setting(
+        False,
+        BOOL,
+        "Whether /rosout crosses as other topics do; both modules need it. Without it `rmpa log` reads all modules' logs.",
+        key="bridge.rosout",
+        live=True,
+    )
     peers: tuple[peer_rules.PeerRule, ...] = setting(
         (),
         peer_rules.PEER_RULES,
