@@ -207,11 +207,8 @@ class BridgeContext:
     def of(cls, settings: Settings | None = None, gate: PermissionGate = OPEN_GATE) -> BridgeContext:
         """The rules of these settings; without any, those of a module that sets nothing."""
         settings = settings if settings is not None else Settings()
-        policy, names = (
-            Policy(settings.policy, settings.peers, settings.time, rosout=settings.rosout),
-            Names(settings.naming),
-        )
-        services = ServiceRules(settings.services)
+        policy = Policy(settings.policy, settings.peers, settings.time, rosout=settings.rosout)
+        names, services = Names(settings.naming), ServiceRules(settings.services)
         return cls(settings, policy, services, names, settings.make_contracts(), gate)
 
     def limit(self, kind: str) -> int:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge.log_ring import LogLine, LogLines, LogQuery, LogRing
+from rmpa.bridge.log_ring import LogLines, LogQuery, LogRing, ModuleLog
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.sessions import Part
 from rmpa.config import limits as config_limits
@@ -40,26 +40,6 @@ LINES: Final = "log.lines"
 # The request for the levels of a ``node``'s loggers by name; with a ``level``, that of its ``logger`` is set before.
 LEVEL: Final = "log.level"
 _EARLIER: Final = "its agent is of an earlier release, which has no log for others; install this release there"
-
-
-class ModuleLog(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Log lines of one module, as the module sees them that asks.
-
-    Attributes:
-        module: Its name.
-        lines: As of ``LogLines``; ``at`` is by the asking module's clock.
-        next: As of ``LogLines``; 0 where there is a problem.
-        lost: Likewise.
-        error: The bound of the error of these times, seconds; ``None``: the two clocks are not compared yet.
-        problem: Why there are no lines, for people; empty if it answered.
-    """
-
-    module: str
-    lines: tuple[LogLine, ...] = ()
-    next: int = 0
-    lost: tuple[str, ...] = ()
-    error: float | None = None
-    problem: str = ""
 
 
 class _Records(logging.Handler):
@@ -201,7 +181,9 @@ class ModuleLogs(Part):
                 names = [own, *(one.link.name for one in sessions.values())]
                 remedy = "`rmpa peer list` shows which modules are there"
                 asked.append(
-                    _unread(name, f"there is no linked module {name[:80]!r}; {suggestion(name, names, remedy)}")
+                    _unread(
+                        name, f"no linked module has this name; {suggestion(name, names, remedy)}", "unknown-name"
+                    )
                 )
         return await asyncio.gather(*asked)
 
@@ -212,15 +194,18 @@ class ModuleLogs(Part):
     async def _of(self, session: PeerSession, query: LogQuery) -> ModuleLog:
         name, clock = session.link.name, session.time
         if not session.linked:
-            return await _unread(name, "it is silent: there is no link to it now")
+            return await _unread(name, "it is silent: there is no link to it now", "peer-unlinked")
         try:
             args = msgspec.to_builtins(query)
             value = await self._bridge.rpc.request(session, LINES, args, limits.LOG_ASK_TIMEOUT)
             found = msgspec.convert(value, LogLines)
         except PeerRefused as error:
-            return await _unread(name, _EARLIER if error.unknown else str(error))
-        except (RmpaError, msgspec.ValidationError) as error:
-            return await _unread(name, str(error))
+            unknown = error.unknown
+            return await _unread(name, *((_EARLIER, "other-release") if unknown else (error.reason, "not-permitted")))
+        except msgspec.ValidationError as error:
+            return await _unread(name, f"its answer is malformed: {error}", "protocol-error")
+        except RmpaError as error:
+            return await _unread(name, str(error), error.code)
         ahead, error_ns = clock.ahead_ns / 1e9, clock.error_ns
         lines = tuple(msgspec.structs.replace(line, at=line.at - ahead) for line in yielding_to_data(found.lines))
         return ModuleLog(name, lines, found.next, found.lost, None if error_ns is None else error_ns / 1e9)
@@ -259,8 +244,8 @@ class ModuleLogs(Part):
         return levels
 
 
-async def _unread(module: str, problem: str) -> ModuleLog:
-    return ModuleLog(module, problem=problem)
+async def _unread(module: str, problem: str, code: str) -> ModuleLog:
+    return ModuleLog(module, problem=problem, code=code)
 
 
 def _since(query: LogQuery, after: object) -> LogQuery:

@@ -69,6 +69,28 @@ class LogLines(msgspec.Struct, frozen=True, omit_defaults=True):
     lost: Annotated[tuple[str, ...], Meta(max_length=limits.LOG_LINES_ASKED)] = ()
 
 
+class ModuleLog(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Log lines of one module, as the module sees them that asks.
+
+    Attributes:
+        module: Its name.
+        lines: As of ``LogLines``; ``at`` is by the asking module's clock.
+        next: As of ``LogLines``; 0 where there is a problem.
+        lost: Likewise.
+        error: The bound of the error of these times, seconds; ``None``: the two clocks are not compared yet.
+        problem: Why there are no lines, for people; empty if it answered.
+        code: That of the problem.
+    """
+
+    module: str
+    lines: tuple[LogLine, ...] = ()
+    next: int = 0
+    lost: tuple[str, ...] = ()
+    error: float | None = None
+    problem: str = ""
+    code: str = ""
+
+
 class LogQuery(msgspec.Struct, frozen=True, omit_defaults=True):
     """Which lines are asked for.
 

@@ -215,7 +215,7 @@ class Access(StrEnum):
         "log",
         "use the log of",
         "node",
-        "Nodes whose log lines it may read, and whose levels it may set; /rmpa is the agent.",
+        "Nodes whose log lines it may read and levels it may set; /rmpa: the agent.",
     )
 
 

@@ -337,7 +337,7 @@ class Settings:
     rosout: bool = setting(
         False,
         BOOL,
-        "Whether /rosout crosses as other topics do; both modules need it. Without it `rmpa log` reads all modules' logs.",
+        "Whether /rosout crosses; both modules need it. `rmpa log` shows the log of all modules without it.",
         key="bridge.rosout",
         live=True,
     )

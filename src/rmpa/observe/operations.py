@@ -11,7 +11,8 @@ import msgspec
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge import nodes as node_requests
-from rmpa.bridge.log import LEVEL, ModuleLog
+from rmpa.bridge.log import LEVEL
+from rmpa.bridge.log_ring import ModuleLog
 from rmpa.bridge.params import transfer
 from rmpa.config.rules import ROS2
 from rmpa.config.values import suggestion

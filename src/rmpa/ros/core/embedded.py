@@ -32,7 +32,7 @@ from rmpa.runtime.loop import yield_to_data, yielding_to_data
 from rmpa.runtime.tasks import end_tasks, keep_task
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from rmpa.ros.master.parameters import GraphChange
@@ -115,8 +115,9 @@ class ReturnedPublishers:
 class Rosout:
     """The node ``/rosout``: forwards the log messages of all nodes to ``/rosout_agg`` (wiki.ros.org/rosout).
 
-    The messages are never decoded; those of proxies are passed on as of ``/rmpa/PEER/node``. Like roscore it restarts the node when that ends (``rosnode kill /rosout``), at a
-    new address, after ``limits.ROSOUT_RESPAWN`` seconds. While another node has the name, this one does not run.
+    The messages are never decoded; in those of a proxy its name replaces that of the node, so that their origin is
+    seen. Like roscore it restarts the node when that ends (``rosnode kill /rosout``), at a new address, after
+    ``limits.ROSOUT_RESPAWN`` seconds. While another node has the name, this one does not run.
 
     Args:
         core: The core, whose counters count ``rosout.restarted``.
@@ -132,7 +133,7 @@ class Rosout:
         self._loggers: LoggerServices | None = None
         self._keeper: asyncio.Task[None] | None = None
         self._changed = asyncio.Event()
-        self._publishers: dict[str, str] = {}
+        self._publishers: Mapping[str, str] = {}
         self._nodes: dict[str, str] = {}
         # Called with the publishing node and the framed bytes of each message.
         self.listeners: list[Callable[[str, memoryview], None]] = []

@@ -5,8 +5,7 @@ Each message of roscpp has the names of all topics of its node behind that, whic
 
 from __future__ import annotations
 
-from struct import Struct
-from struct import error as StructError
+import struct
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from rmpa.core.errors import RemoteProtocolError
@@ -16,7 +15,7 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer
 
 # The message's length, and its header: seq, the stamp's seconds and nanoseconds, the length of frame_id.
-_BEGIN: Final = Struct("<IIIII")
+_BEGIN: Final = struct.Struct("<IIIII")
 # Of a node's name.
 _NAME_MAX: Final = 1024
 
@@ -50,7 +49,7 @@ def parse_log(framed: Buffer, most: int) -> LogMessage:
         level = view[at]
         name, at = _string(view, at + 1, _NAME_MAX)
         text, _ = _string(view, at, most)
-    except (StructError, IndexError):
+    except (struct.error, IndexError):
         raise RemoteProtocolError(f"{len(view)} bytes are no rosgraph_msgs/Log") from None
     return LogMessage(str(name, "utf-8", "replace"), level, seconds * 1_000_000_000 + nanoseconds, text)
 
@@ -75,11 +74,9 @@ def renamed(framed: Buffer, node: str) -> bytes:
     view = memoryview(framed)
     try:
         start = _BEGIN.size + _BEGIN.unpack_from(view)[4] + 1
-        end = start + LENGTH.size + LENGTH.unpack_from(view, start)[0]
-    except StructError:
-        end = len(view) + 1
-    if end > len(view):
-        raise RemoteProtocolError(f"{len(view)} bytes are no rosgraph_msgs/Log")
+        _, end = _string(view, start, _NAME_MAX)
+    except (struct.error, IndexError):
+        raise RemoteProtocolError(f"{len(view)} bytes are no rosgraph_msgs/Log") from None
     name = node.encode()
     body = b"".join((view[LENGTH.size : start], LENGTH.pack(len(name)), name, view[end:]))
     return LENGTH.pack(len(body)) + body
