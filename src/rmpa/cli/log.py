@@ -123,12 +123,8 @@ def log(
       rmpa log arm --node '/arm/*' --since 5m
       rmpa log --json | jq -r 'select(.agent | not) | .text'
     """
-    query: dict[str, object] = {
-        "level": level,
-        "node": node if node.startswith(("/", "*")) or not node else f"/{node}",
-    }
-    if since:
-        query["since"] = _read_since(since)
+    glob = node if not node or node.startswith(("/", "*")) else f"/{node}"
+    query: dict[str, object] = {"level": level, "node": glob, "since": _read_since(since) if since else 0.0}
     with options.client(timeout=60.0) as client:
         asked = _Log(client, modules, query)
         most = lines or (_BEFORE if follow else LINES)
