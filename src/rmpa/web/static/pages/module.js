@@ -7,6 +7,7 @@ import { Facts, Gone, Link, Mark, Page, Panel, Since, Table, Uptime, Why, useAns
 import { NODE_COLUMNS, NodeRow } from "./nodes.js";
 import { TOPIC_COLUMNS, TopicRow, isData } from "./topics.js";
 import { Lines } from "../plot.js";
+import { Lines as LogLines, Missing, useLog } from "../loglines.js";
 
 const DIRECTIONS = [
   ["bytes_in", "received"],
@@ -68,6 +69,7 @@ export function ModulePage({ name, state, connection }) {
           ${([key, one]) => html`<${NodeRow} key=${key} name=${key} node=${one} />`}<//
         ><//
       >`}
+      <${ModuleLog} name=${name} own=${section(state, "agent").name} connection=${connection} />
       ${own && html`<${Counters} state=${state} connection=${connection} />`}
       <${Panel} title=${`Topics of ${name}`} wide
         ><${TopicTable} list=${topics} empty=${all.length ? "It publishes no data." : "It publishes no topic."} />
@@ -85,6 +87,16 @@ const TopicTable = ({ list, empty }) =>
   html`<${Table} caption="Topics" columns=${TOPIC_COLUMNS} empty=${empty} list=${list}>
     ${([topic, one]) => html`<${TopicRow} key=${topic} name=${topic} topic=${one} />`}<//
   >`;
+
+function ModuleLog({ name, own, connection }) {
+  const log = useLog(connection, { modules: [name], level: "info" });
+  return html`<${Panel} title=${`Log of ${name}`} wide
+    ><${Missing} log=${log} /><${LogLines}
+      lines=${log.lines.slice(0, 50)}
+      empty=${log.waits ? "Asking …" : "There is no line."}
+      own=${own}
+  /><//>`;
+}
 
 const LinkPanel = ({ module, detail }) => {
   const link = section(detail, "link");

@@ -1,9 +1,10 @@
 // All nodes, and one of them: its module, topics, services, connections and log lines.
 
-import { html } from "../markup.js";
+import { html, useState } from "../markup.js";
 import { count, hertz } from "../format.js";
 import { entries, section } from "../state.js";
 import {
+  Editable,
   Facts,
   Failure,
   Gone,
@@ -18,7 +19,7 @@ import {
   useAnswer,
   useFilter,
 } from "../parts.js";
-import { Lines, useLog } from "../loglines.js";
+import { Lines, Missing, useLog } from "../loglines.js";
 
 const NODE_PERIOD = 5; // seconds after which the node that is shown is asked again
 
@@ -145,7 +146,8 @@ export function NodePage({ name, state, connection }) {
           >`,
       )}
       <${Connections} facts=${facts} failure=${failure} module=${peer || own} own=${own} />
-      <${NodeLog} node=${node} peer=${peer} connection=${connection} /></div
+      <${Levels} node=${node} peer=${peer} connection=${connection} />
+      <${NodeLog} node=${node} module=${peer || own} own=${own} connection=${connection} /></div
   ><//>`;
 }
 
@@ -185,15 +187,60 @@ const Connections = ({ facts, failure, module, own }) =>
         >`}<//
   >`;
 
-function NodeLog({ node, peer, connection }) {
-  const lines = useLog(connection, false).filter((line) => line.node === node);
-  return html`<${Panel} title="Log" wide
-    >${peer
-      ? html`<p class="empty">Log lines do not cross: open <code>rmpa web</code> of ${peer}.</p>`
-      : html`<${Lines}
-          lines=${lines.slice(0, 100)}
-          empty="It has written no line since rmpa web started."
-          bare=${true}
-        />`}<//
+const LOG_LEVELS = ["debug", "info", "warn", "error", "fatal"];
+const ROOTS = ["rosout", "ros", "rmpa"]; // the logger of the node's own code: of rospy, of roscpp, of an agent
+
+// The loggers of a node and their levels, which a page with the right `control` changes.
+function Levels({ node, peer, connection }) {
+  const [set, change] = useState(null);
+  const { value, failure } = useAnswer(connection, "log_levels", { name: node, peer });
+  const levels = set || value || {};
+  const names = Object.keys(levels).sort((a, b) => ROOTS.includes(b) - ROOTS.includes(a) || a.localeCompare(b));
+  const save = (logger) => (level) =>
+    connection.ask("set_log_level", { name: node, peer, logger, level }).then(
+      (told) => (change(told), { said: `set to ${level}` }),
+      (reason) => ({ failure: reason }),
+    );
+  const row = (name) =>
+    html`<tr key=${name}>
+      <th scope="row" class="mono">${name}</th>
+      <td>
+        ${connection.hello.may.includes("control")
+          ? html`<${Editable}
+              label=${`the level of ${name}`}
+              shown=${levels[name]}
+              begin=${levels[name]}
+              choices=${LOG_LEVELS}
+              save=${save(name)}
+            />`
+          : levels[name]}
+      </td>
+    </tr>`;
+  return html`<${Panel} title="Log levels"
+    ><${Table}
+      caption="Log levels"
+      columns=${["Logger", "Level"]}
+      empty=${failure ? `Not known: ${failure.error}` : value ? "It has no loggers." : "Asking …"}
+      list=${names.filter((name) => ROOTS.includes(name))}
+      >${row}<//
+    >
+    ${names.some((name) => !ROOTS.includes(name)) &&
+    html`<details>
+      <summary>${names.filter((name) => !ROOTS.includes(name)).length} loggers of its libraries</summary>
+      <${Table} caption="Loggers" columns=${["Logger", "Level"]} list=${names.filter((each) => !ROOTS.includes(each))}
+        >${row}<//
+      >
+    </details>`}<//
   >`;
+}
+
+function NodeLog({ node, module, own, connection }) {
+  const log = useLog(connection, { modules: [module], node, level: "debug" });
+  return html`<${Panel} title="Log" wide
+    ><${Missing} log=${log} /><${Lines}
+      lines=${log.lines.slice(0, 100)}
+      empty=${log.waits ? "Asking …" : "Its module keeps no line of it."}
+      own=${own}
+      bare=${true}
+  /><//>`;
 }
