@@ -6,6 +6,7 @@ Free of I/O. A line is kept as bytes: in the quiet hours of a robot nothing of i
 from __future__ import annotations
 
 import logging
+import re
 from collections import deque
 from struct import Struct
 from typing import TYPE_CHECKING, Annotated, Final
@@ -32,6 +33,8 @@ _NUMBERS: Final = {word: number for number, word in LEVELS.items()}
 _OF_PYTHON: Final = {logging.CRITICAL: 16, logging.ERROR: 8, logging.WARNING: 4, logging.INFO: 2}
 # Of a kept line: its number, its time in ns since 1970, its level; its text follows. Lines compare by their numbers.
 _LINE: Final = Struct(">QqB")
+# Colours, as programs write them for a terminal (ECMA-48, SGR).
+_COLOURS: Final = re.compile(r"\x1b\[[0-9;]*m")
 _SECOND: Final = 1_000_000_000
 
 
@@ -43,7 +46,7 @@ class LogLine(msgspec.Struct, frozen=True, omit_defaults=True):
         at: When it was written, seconds since 1970; where the node's stamp is far off, when it came.
         level: A word of ``LEVELS``.
         node: The node that wrote it; the agent's own node for the agent.
-        text: It; a long one is cut, and says so.
+        text: It, without colours of a terminal; a long one is cut, and says so.
         agent: Whether the agent wrote it.
     """
 
@@ -244,5 +247,5 @@ def _within(found: list[tuple[bytes, str]]) -> list[tuple[bytes, str]]:
 def _told(line: bytes, node: str) -> LogLine:
     number, at_ns, level = _LINE.unpack_from(line)
     word = next((word for least, word in reversed(LEVELS.items()) if level >= least), "debug")
-    text = str(line[_LINE.size :], "utf-8", "replace")
+    text = _COLOURS.sub("", str(line[_LINE.size :], "utf-8", "replace"))
     return LogLine(number, max(0.0, at_ns / 1e9), word, node, text, agent=node == OWN_NODE)

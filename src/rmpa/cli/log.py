@@ -39,8 +39,6 @@ _HELD: Final = 0.3
 # Seconds after which it is said again that lines of a node are lost.
 _LOST_AGAIN: Final = 10.0
 _COLOURS: Final = {"warn": "yellow", "error": "red", "fatal": "red", "debug": "bright_black"}
-# Colours, as programs write them for a terminal.
-_COLOURED: Final = re.compile(r"\x1b\[[0-9;]*m")
 _SINCE: Final = re.compile(r"(\d+(?:\.\d+)?) *(ms|s|sec|m|min|h|d)?")
 _SECONDS: Final = {"ms": 1e-3, "m": 60.0, "min": 60.0, "h": 3600.0, "d": 86_400.0}
 
@@ -191,7 +189,7 @@ def _shown(entry: _Entry, before: _Entry | None, width: int | None) -> Iterator[
     day = "" if at.date() == datetime.now(at.tzinfo).date() else f"{at:%Y-%m-%d} "
     clock = f"{day}{at:%H:%M:%S}.{at.microsecond // 1000:03d}{'±' if _is_unordered(entry, before) else ' '}"
     source = printable(f"{module} agent" if line.agent else f"{module}:{line.node}")
-    text = _COLOURED.sub("", line.text).expandtabs(4)
+    text = line.text.expandtabs(4)
     if width is None:
         shown = [f"{clock}{line.level:<5} {source}: {printable(text)}"]
     else:

@@ -69,7 +69,6 @@ export function ModulePage({ name, state, connection }) {
           ${([key, one]) => html`<${NodeRow} key=${key} name=${key} node=${one} />`}<//
         ><//
       >`}
-      <${ModuleLog} name=${name} own=${section(state, "agent").name} connection=${connection} />
       ${own && html`<${Counters} state=${state} connection=${connection} />`}
       <${Panel} title=${`Topics of ${name}`} wide
         ><${TopicTable} list=${topics} empty=${all.length ? "It publishes no data." : "It publishes no topic."} />
@@ -79,8 +78,8 @@ export function ModulePage({ name, state, connection }) {
           <${TopicTable} list=${all.filter(([topic]) => !isData(topic, state))} />
         </details>`}<//
       >
-    </div><//
-  >`;
+      <${ModuleLog} name=${name} own=${section(state, "agent").name} connection=${connection} /></div
+  ><//>`;
 }
 
 const TopicTable = ({ list, empty }) =>
