@@ -82,7 +82,7 @@ class ModuleLogs(Part):
         self.ring = LogRing(time.time_ns())
         self._handler: _Records | None = None
         self._subscription: Subscription | None = None
-        bridge.rpc.on_request(LINES, self._lines, Needs((Access.LOG,), "the node of each line: others are left out"))
+        bridge.rpc.on_request(LINES, self._lines, Needs((Access.LOG,), "each line's node; others are left out"))
         bridge.rpc.on_request(LEVEL, self._level, Needs((Access.LOG,), "the node"))
 
     def start(self) -> None:

@@ -201,7 +201,3 @@ NODE_KILL_WAIT: Final = 3.0
 # Told in: their error
 # Why: One with a hundred profiles of twenty attributes has about 100 KB.
 DESCRIPTOR_MAX: Final = 1 * MIB
-# Loggers of one node that are shown.
-LOGGERS_MAX: Final = 1000
-# Seconds that a node has to answer a question about its loggers.
-LOGGERS_TIMEOUT: Final = 3.0

@@ -6,7 +6,6 @@ import asyncio
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError, UnreachableError
-from rmpa.ros import limits
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.slave_node import GET, SET, pack_text, read_texts
 from rmpa.ros.wire.tcpros import LENGTH
@@ -17,6 +16,10 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer
 
 LEVELS: Final = ("debug", "info", "warn", "error", "fatal")
+# Loggers of one node that are read.
+_LOGGERS_MAX: Final = 1000
+# Seconds that a node has to answer.
+_TIMEOUT: Final = 3.0
 # The loggers above all that the user's own code logs to: of rospy, of roscpp, of an agent.
 _ROOTS: Final = ("rosout", "ros", "rmpa")
 
@@ -38,7 +41,7 @@ async def node_loggers(uri: str, node: str, caller: str, logger: str = "", level
     if level and level not in LEVELS:
         raise ConfigError("level", f"{level[:40]!r} is not a level", f"use one of {', '.join(LEVELS)}")
     try:
-        async with asyncio.timeout(limits.LOGGERS_TIMEOUT):
+        async with asyncio.timeout(_TIMEOUT):
             levels = _read(await _call(uri, f"{node}/get_loggers", caller, GET.md5sum, b""))
             if not level:
                 return levels
@@ -50,7 +53,7 @@ async def node_loggers(uri: str, node: str, caller: str, logger: str = "", level
             return _read(await _call(uri, f"{node}/get_loggers", caller, GET.md5sum, b""))
     except TimeoutError:
         raise UnreachableError(
-            "server of service", f"{node}/get_loggers within {limits.LOGGERS_TIMEOUT:g} s"
+            "server of service", f"{node}/get_loggers within {_TIMEOUT:g} s"
         ) from None
 
 
@@ -73,8 +76,8 @@ async def _call(uri: str, service: str, caller: str, md5sum: str, request: bytes
 def _read(body: Buffer) -> dict[str, str]:
     """The loggers of a roscpp/GetLoggersResponse, and their levels."""
     what = "roscpp/GetLoggersResponse"
-    count = LENGTH.unpack_from(body)[0] if len(body) >= LENGTH.size else limits.LOGGERS_MAX + 1
-    if count > limits.LOGGERS_MAX:
-        raise RemoteProtocolError(f"{len(body)} bytes are not a {what} of at most {limits.LOGGERS_MAX} loggers")
+    count = LENGTH.unpack_from(body)[0] if len(body) >= LENGTH.size else _LOGGERS_MAX + 1
+    if count > _LOGGERS_MAX:
+        raise RemoteProtocolError(f"{len(body)} bytes are not a {what} of at most {_LOGGERS_MAX} loggers")
     texts = read_texts(memoryview(body)[LENGTH.size :], 2 * count, what)
     return {name[:256]: level[:16].lower() for name, level in zip(texts[::2], texts[1::2], strict=True)}
