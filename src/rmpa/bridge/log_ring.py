@@ -184,7 +184,7 @@ class LogRing:
     def _drop(self) -> None:
         """Drop the oldest lines of the node that has most: many at once, so that it is seldom looked for."""
         node, kept = max(self._nodes.items(), key=lambda item: item[1].size)
-        for _ in range(min(len(kept.lines), limits.LOG_DROPPED_AT_ONCE)):
+        for _ in range(min(len(kept.lines) // 2 + 1, limits.LOG_DROPPED_AT_ONCE)):
             line = kept.lines.popleft()
             size = len(line) - _LINE.size + limits.LOG_LINE_BYTES
             self._size -= size

@@ -52,9 +52,7 @@ async def node_loggers(uri: str, node: str, caller: str, logger: str = "", level
             await _call(uri, f"{node}/set_logger_level", caller, SET.md5sum, pack_text(wanted) + pack_text(level))
             return _read(await _call(uri, f"{node}/get_loggers", caller, GET.md5sum, b""))
     except TimeoutError:
-        raise UnreachableError(
-            "server of service", f"{node}/get_loggers within {_TIMEOUT:g} s"
-        ) from None
+        raise UnreachableError("server of service", f"{node}/get_loggers within {_TIMEOUT:g} s") from None
 
 
 def own_logger(levels: Mapping[str, str]) -> str:
