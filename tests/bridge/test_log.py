@@ -94,7 +94,7 @@ def test_the_kept_bytes_are_bounded_whatever_comes() -> None:
     ring = LogRing(NOW)
     for number in range(400):
         ring.take("/big", message("/big", "x" * 1_000_000), NOW)
-        ring.take(f"/n{number}", message(f"/n{number}", "y" * 3000), NOW)
+        ring.take("/n", message(f"/n{number % 20}", "y" * 3000), NOW)
     found = ask(ring, node="/big")
     assert found.lines[-1].text == "x" * limits.LOG_TEXT_MAX + f"… {1_000_000 - limits.LOG_TEXT_MAX:,} bytes more"
     assert sum(kept.size for kept in ring._nodes.values()) == ring._size <= limits.LOG_BYTES_KEPT
@@ -117,10 +117,8 @@ def test_what_is_no_message_is_left_out_and_no_node_speaks_for_the_agent() -> No
     for name in (OWN_NODE, "/rmpa/arm/talker", "no name", "", "/n" * 900):
         ring.take("/teller", message(name, "forged"), NOW)
     assert {(line.node, line.agent) for line in ask(ring).lines} == {("/teller", False)}
-    ring.take(
-        "/a", message("/a", "\x1b[31mred\x1b[0m \0 \udcff".encode("utf-8", "surrogateescape").decode("latin1")), NOW
-    )
-    assert ask(ring).lines[-1].text.startswith("red \0")
+    ring.take("/a", message("/a", "\x1b[31mred\x1b[0m \0 é").replace(b"\xc3\xa9", b"\xff\xfe"), NOW)
+    assert ask(ring).lines[-1].text == "red \0 \ufffd\ufffd"
 
 
 @pytest.mark.parametrize(
