@@ -21,7 +21,7 @@ from rmpa.config.values import did_you_mean, suggestion
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.core.identity import OWN_NODE, is_global_name, is_meant, is_own, proxied_node
 from rmpa.ros.core.embedded import AGGREGATED, LOG, TOPIC
-from rmpa.ros.node.loggers import node_loggers
+from rmpa.ros.node.loggers import read_levels, set_level
 from rmpa.ros.node.subscription import Subscription
 from rmpa.runtime.loop import yielding_to_data
 from rmpa.trust.permissions import asker_name
@@ -37,7 +37,8 @@ _log = logging.getLogger(__name__)
 
 # The request for log lines of the module's nodes and its agent, as ``LogQuery``; the response is ``LogLines``.
 LINES: Final = "log.lines"
-# The request for the levels of a ``node``'s loggers by name; with a ``level``, that of its ``logger`` is set before.
+# The request for the levels of a ``node``'s loggers by name; with a ``level``: that of its ``logger`` is set, and the
+# response has what was set.
 LEVEL: Final = "log.level"
 _EARLIER: Final = "its agent is of an earlier release, which has no log for others; install this release there"
 
@@ -219,7 +220,7 @@ class ModuleLogs(Part):
         return await self._loggers(args, nodes, asker_name(peer))
 
     async def level(self, args: Mapping[str, Any]) -> dict[str, str]:
-        """The levels of the loggers of a ``node`` of this module, by name; with ``level``, that of ``logger`` is set.
+        """The levels of the loggers of a ``node`` of this module, by name; with ``level``: those that were set to it.
 
         Raises:
             RmpaError: There is no such node, level or logger, or it does not answer.
@@ -238,9 +239,10 @@ class ModuleLogs(Part):
             near = did_you_mean(node, [name for name in nodes if not is_own(name)]) if node not in nodes else ""
             raise RmpaError(problem + (f"; did you mean {near}?" if near else ""), code="unknown-name")
         logger, level = str(args.get("logger", "")), str(args.get("level", "")).lower()
-        levels = await node_loggers(uri, node, OWN_NODE, logger, level)
-        if level:
-            _log.info("= %s has set the level of %s of %s to %s", who, logger or "the logger", node, level)
+        if not level:
+            return await read_levels(uri, self._core.state().nodes[node], node, OWN_NODE)
+        levels = await set_level(uri, node, OWN_NODE, logger, level)
+        _log.info("= %s has set the level of %s of %s to %s", who, " and ".join(levels), node, level)
         return levels
 
 

@@ -22,7 +22,7 @@ from rmpa.ros.core.liveness import end_node, ping_node
 from rmpa.ros.environment import NodeFacts, NodeLine, NodePing, PeerNodes, describe_node, list_nodes
 from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.master.mirror import lookup_calls, read_lookups
-from rmpa.ros.node.loggers import LEVELS, node_loggers, own_logger
+from rmpa.ros.node.loggers import LEVELS, read_levels, set_level
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -382,7 +382,7 @@ def node_log_level(node: str, logger: str, level: str, options: Options) -> None
     """Show the levels of a node's loggers, or set one.
 
     Without LOGGER the LEVEL (debug, info, warn, error or fatal) is that of the node's own code: the logger rosout of
-    rospy, ros of roscpp. The agent of a peer is PEER:/rmpa. The level holds until the node ends.
+    rospy, ros of roscpp. The agent of a peer is PEER:/rmpa. A level applies until the node ends.
 
     ---
     In a secured mesh the peer needs a [[permission]] log.
@@ -396,13 +396,17 @@ def node_log_level(node: str, logger: str, level: str, options: Options) -> None
     if not level and logger.lower() in LEVELS:
         logger, level = "", logger
     level = level.lower()
+    if logger and not level:
+        raise ConfigError("LEVEL", f"{logger!r} is not a level", f"write LOGGER and one of {', '.join(LEVELS)}")
+    if level and level not in LEVELS:
+        raise ConfigError("LEVEL", f"{level!r} is not a level", f"use one of {', '.join(LEVELS)}")
     if wanted.peer is not None:
         levels = _levels_of_peer(master, wanted, logger, level)
     else:
         levels = asyncio.run(_levels(master, wanted.name, logger, level))
     about = {"node": wanted.name, "peer": wanted.peer, "loggers": levels}
     if level:
-        options.show(about, f"{logger or own_logger(levels)} of {wanted}: {level}")
+        options.show(about, f"{' and '.join(levels)} of {wanted}: {level}")
     elif levels:
         options.show(about, Table("LOGGER, LEVEL", sorted(levels.items())))
     else:
@@ -411,10 +415,12 @@ def node_log_level(node: str, logger: str, level: str, options: Options) -> None
 
 async def _levels(master: Master, node: str, logger: str, level: str) -> dict[str, str]:
     reply = await call_api(master.uri, "lookupService", _CALLER_ID, f"{node}/get_loggers")
+    api = await _find_uri(master, await read_graph(master), node)
     if reply.code != 1 or not isinstance(reply.value, str):
-        await _find_uri(master, await read_graph(master), node)  # raises where there is no such node
         raise RmpaError(f"{node} has no loggers: it does not provide {node}/get_loggers", code="unknown-name")
-    return await node_loggers(reply.value, node, _CALLER_ID, logger, level)
+    if level:
+        return await set_level(reply.value, node, _CALLER_ID, logger, level)
+    return await read_levels(reply.value, api, node, _CALLER_ID)
 
 
 def _levels_of_peer(master: Master, wanted: GraphName, logger: str, level: str) -> dict[str, str]:

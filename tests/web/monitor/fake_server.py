@@ -368,8 +368,7 @@ class FakeServer:
         return self.levels
 
     def _answer_set_log_level(self, args: dict[str, Any]) -> Any:
-        self.levels = {**self.levels, args["logger"]: args["level"]}
-        return self.levels
+        return dict.fromkeys((args["logger"],) if args["logger"] else ("rosout", "ros"), args["level"])
 
     def _answer_configure(self, args: dict[str, Any]) -> Any:
         return {"value": args["value"], "text": f"{args['name']} is {args['value']} now"}

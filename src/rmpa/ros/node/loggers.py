@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import re
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.core.identity import OWN_NODE
+from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.slave_node import GET, SET, pack_text, read_texts
 from rmpa.ros.wire.tcpros import LENGTH
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from rmpa.ros.wire.tcpros import Buffer
 
 LEVELS: Final = ("debug", "info", "warn", "error", "fatal")
@@ -20,52 +22,78 @@ LEVELS: Final = ("debug", "info", "warn", "error", "fatal")
 _LOGGERS_MAX: Final = 1000
 # Seconds that a node has to answer.
 _TIMEOUT: Final = 3.0
-# The loggers above all that the user's own code logs to: of rospy, of roscpp, of an agent.
-_ROOTS: Final = ("rosout", "ros", "rmpa")
+# The loggers that the node's own code logs to, or that are above these: of rospy, and of roscpp. Each library takes
+# the other's name without effect.
+_OWN: Final = ("rosout", "ros")
+# roscpp's get_loggers frees what it must not where log4cxx is newer than that of ROS (0.10, libraries .so.10), as in
+# Debian 12: the node crashes at the next use of its loggers (trap 43).
+_LOG4CXX: Final = re.compile(r"liblog4cxx\.so\.(\d+)")
+_LOG4CXX_SAFE: Final = 10
 
 
-async def node_loggers(uri: str, node: str, caller: str, logger: str = "", level: str = "") -> dict[str, str]:
-    """The levels of a node's loggers by name; with ``level``, after one of them was set.
+async def read_levels(uri: str, api: str, node: str, caller: str) -> dict[str, str]:
+    """The levels of a node's loggers, by name.
 
     Args:
         uri: The ``rosrpc://`` URI of the node's services.
+        api: Its slave API.
         node: Its name.
         caller: The calling node.
-        logger: The logger to set; empty: that of the node's own code.
-        level: One of ``LEVELS``; empty: nothing is set.
 
     Raises:
-        ConfigError: There is no such level or logger.
+        RmpaError: The node does not answer, or would not outlive the question.
+    """
+    if await _would_crash(api, caller):
+        raise RmpaError(
+            f"{node} is not asked: this roscpp, built with a newer log4cxx, crashes when it lists its loggers; "
+            "their levels can be set",
+            code="service-failed",
+        )
+    return _read(await _call(uri, f"{node}/get_loggers", caller, GET.md5sum, b""))
+
+
+async def set_level(uri: str, node: str, caller: str, logger: str, level: str) -> dict[str, str]:
+    """Set the level of one of a node's loggers; return the loggers that were set, with it.
+
+    Args:
+        uri: As for ``read_levels``.
+        node: Likewise.
+        caller: Likewise.
+        logger: Its name, which the node may not have yet; empty: those of the node's own code.
+        level: One of ``LEVELS``.
+
+    Raises:
+        ConfigError: There is no such level.
         RmpaError: The node does not answer, or refuses.
     """
-    if level and level not in LEVELS:
+    if level not in LEVELS:
         raise ConfigError("level", f"{level[:40]!r} is not a level", f"use one of {', '.join(LEVELS)}")
+    wanted = (logger,) if logger else ("rmpa",) if node == OWN_NODE else _OWN
+    for each in wanted:
+        await _call(uri, f"{node}/set_logger_level", caller, SET.md5sum, pack_text(each) + pack_text(level))
+    return dict.fromkeys(wanted, level)
+
+
+async def _would_crash(api: str, caller: str) -> bool:
+    """Whether the node is one that does not outlive ``get_loggers``, as far as its process can be seen."""
     try:
-        async with asyncio.timeout(_TIMEOUT):
-            levels = _read(await _call(uri, f"{node}/get_loggers", caller, GET.md5sum, b""))
-            if not level:
-                return levels
-            wanted = logger or own_logger(levels)
-            if wanted not in levels:
-                known = ", ".join(levels) or "none"
-                raise ConfigError("logger", f"{node} has no logger {wanted[:80]!r}", f"it has: {known}")
-            await _call(uri, f"{node}/set_logger_level", caller, SET.md5sum, pack_text(wanted) + pack_text(level))
-            return _read(await _call(uri, f"{node}/get_loggers", caller, GET.md5sum, b""))
-    except TimeoutError:
-        raise UnreachableError("server of service", f"{node}/get_loggers within {_TIMEOUT:g} s") from None
-
-
-def own_logger(levels: Mapping[str, str]) -> str:
-    """The logger to which the node's own code logs, or which is above that; empty where it cannot be told."""
-    return next((name for name in _ROOTS if name in levels), "")
+        reply = await call_api(api, "getPid", caller, timeout=_TIMEOUT)
+        maps = await asyncio.to_thread(Path(f"/proc/{int(str(reply.value))}/maps").read_text)
+    except (RmpaError, OSError, ValueError):
+        return False
+    return any(int(found[1]) > _LOG4CXX_SAFE for found in _LOG4CXX.finditer(maps))
 
 
 async def _call(uri: str, service: str, caller: str, md5sum: str, request: bytes) -> bytes | bytearray:
-    connection = await ServiceConnection.open(uri, service, caller, md5sum=md5sum, persistent=False)
     try:
-        done, body = await connection.call(request)
-    finally:
-        connection.close()
+        async with asyncio.timeout(_TIMEOUT):
+            connection = await ServiceConnection.open(uri, service, caller, md5sum=md5sum, persistent=False)
+            try:
+                done, body = await connection.call(request)
+            finally:
+                connection.close()
+    except TimeoutError:
+        raise UnreachableError("server of service", f"{service} within {_TIMEOUT:g} s") from None
     if not done:
         raise RmpaError(f"{service} failed: {str(body, 'utf-8', 'replace')[:400]}", code="service-failed")
     return body

@@ -4,7 +4,6 @@ import { html, useState } from "../markup.js";
 import { count, hertz } from "../format.js";
 import { entries, section } from "../state.js";
 import {
-  Editable,
   Facts,
   Failure,
   Gone,
@@ -14,6 +13,7 @@ import {
   NodeLink,
   Page,
   Panel,
+  Question,
   Table,
   memo,
   useAnswer,
@@ -188,50 +188,54 @@ const Connections = ({ facts, failure, module, own }) =>
   >`;
 
 const LOG_LEVELS = ["debug", "info", "warn", "error", "fatal"];
-const ROOTS = ["rosout", "ros", "rmpa"]; // the logger of the node's own code: of rospy, of roscpp, of an agent
 
-// The loggers of a node and their levels, which a page with the right `control` changes.
+// The loggers of a node are asked for by a button: the roscpp of some systems does not bear the question.
 function Levels({ node, peer, connection }) {
-  const [set, change] = useState(null);
-  const { value, failure } = useAnswer(connection, "log_levels", { name: node, peer });
-  const levels = set || value || {};
-  const names = Object.keys(levels).sort((a, b) => ROOTS.includes(b) - ROOTS.includes(a) || a.localeCompare(b));
-  const save = (logger) => (level) =>
-    connection.ask("set_log_level", { name: node, peer, logger, level }).then(
-      (told) => (change(told), { said: `set to ${level}` }),
-      (reason) => ({ failure: reason }),
+  const [logger, setLogger] = useState("");
+  const [level, setLevel] = useState("info");
+  const [state, set] = useState({});
+  const submit = (event) => {
+    event.preventDefault();
+    set({ waits: true });
+    connection.ask("set_log_level", { name: node, peer, logger: logger.trim(), level }).then(
+      (told) => set({ said: `${Object.keys(told).join(" and ")}: ${level}` }),
+      (failure) => set({ failure }),
     );
-  const row = (name) =>
-    html`<tr key=${name}>
-      <th scope="row" class="mono">${name}</th>
-      <td>
-        ${connection.hello.may.includes("control")
-          ? html`<${Editable}
-              label=${`the level of ${name}`}
-              shown=${levels[name]}
-              begin=${levels[name]}
-              choices=${LOG_LEVELS}
-              save=${save(name)}
-            />`
-          : levels[name]}
-      </td>
-    </tr>`;
+  };
   return html`<${Panel} title="Log levels"
-    ><${Table}
-      caption="Log levels"
-      columns=${["Logger", "Level"]}
-      empty=${failure ? `Not known: ${failure.error}` : value ? "It has no loggers." : "Asking …"}
-      list=${names.filter((name) => ROOTS.includes(name))}
-      >${row}<//
-    >
-    ${names.some((name) => !ROOTS.includes(name)) &&
-    html`<details>
-      <summary>${names.filter((name) => !ROOTS.includes(name)).length} loggers of its libraries</summary>
-      <${Table} caption="Loggers" columns=${["Logger", "Level"]} list=${names.filter((each) => !ROOTS.includes(each))}
-        >${row}<//
+    >${connection.hello.may.includes("control") &&
+    html`<form class="row" onSubmit=${submit}>
+      <label
+        ><span>Logger</span
+        ><input value=${logger} placeholder="of its own code" onInput=${(event) => setLogger(event.target.value)}
+      /></label>
+      <label
+        ><span>Level</span
+        ><select value=${level} onChange=${(event) => setLevel(event.target.value)}>
+          ${LOG_LEVELS.map((each) => html`<option key=${each} value=${each}>${each}</option>`)}
+        </select></label
       >
-    </details>`}<//
-  >`;
+      <button class="primary" disabled=${state.waits}>Set</button>
+      <span role="status" class="muted said">${state.said}</span><${Failure} failure=${state.failure} />
+    </form>`}
+    <${Question}
+      connection=${connection}
+      what="log_levels"
+      args=${{ name: node, peer }}
+      label="Show its loggers"
+      show=${(levels) =>
+        html`<${Table}
+          caption="Loggers"
+          columns=${["Logger", "Level"]}
+          empty="None."
+          list=${Object.entries(levels).sort()}
+          >${([name, each]) =>
+            html`<tr key=${name}>
+              <th scope="row" class="mono">${name}</th>
+              <td>${each}</td>
+            </tr>`}<//
+        >`}
+  /><//>`;
 }
 
 function NodeLog({ node, module, own, connection }) {
