@@ -21,6 +21,7 @@ from rmpa.config.values import did_you_mean, suggestion
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.core.identity import OWN_NODE, is_global_name, is_meant, is_own, proxied_node
 from rmpa.ros.core.embedded import AGGREGATED, LOG, TOPIC
+from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.node.loggers import read_levels, set_level
 from rmpa.ros.node.subscription import Subscription
 from rmpa.runtime.loop import yielding_to_data
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.node.subscription import PublisherConnection
 
 _log = logging.getLogger(__name__)
@@ -102,6 +104,12 @@ class ModuleLogs(Part):
         """Subscribe to the other topic, if /rosout crosses now, or no more."""
         if self._subscription is not None:
             self._follow()
+
+    def graph_changed(self, change: GraphChange) -> None:
+        """Connect to another publisher: a restarted roscore does not tell of those that were there before."""
+        followed = self._subscription
+        if followed is not None and change.kind is RegistrationKind.PUBLISHER and change.name == followed.topic:
+            followed.update(list(self._core.publishers(followed.topic).values()))
 
     def reconcile(self) -> None:
         """Register again: the roscore has been restarted."""
