@@ -38,6 +38,8 @@ ARGS: Final[dict[str, dict[str, Any]]] = {
     "trust": {"what": "status"},
     "agent": {"peer": "b"},
     "contract": {"topic": "/chatter", "type_name": "std_msgs/String"},
+    "log": {"modules": ["a", "b"], "level": "warn", "most": 5},
+    "log_level": {"peer": "b", "node": "/rmpa"},
     "node": {"what": "node.list", "peer": "b"},
     "site": {"what": "site.report", "args": {}},
 }
@@ -51,6 +53,9 @@ WRONG: Final[tuple[tuple[str, dict[str, Any], str], ...]] = (
     ("why", {"name": "chatter"}, "is not a topic, nor a service"),
     ("param", {"peer": "b", "what": "param.nmes"}, "did you mean param.names?"),
     ("graph", {"wait": -1}, "is not between 0 and"),
+    ("log", {"level": "loud"}, "'loud' is not a level; use one of debug"),
+    ("log_level", {"node": "/nobody"}, "a has no node /nobody"),
+    ("log_level", {"peer": "b", "node": "/rmpa/a/talker"}, "is no node of b: it is a's /talker: ask there"),
     ("node", {"what": "node.lst"}, "did you mean node.list?"),
     ("agent", {"peer": "c"}, "linked peer"),
     ("contract", {"topic": "chatter"}, "is not a topic"),

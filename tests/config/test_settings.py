@@ -92,6 +92,7 @@ SOURCES: tuple[tuple[Any, ...], ...] = (
     ("bridge.deny_types", "policy.deny_types", "RMPA_DENY_TYPES", "", ("std_msgs/Header",)),
     ("bridge.transport", "transport", "RMPA_TRANSPORT", "", Transport.AUTO),
     ("bridge.prefix_peers", "prefix_peers", "RMPA_PREFIX_PEERS", "prefix_peers", True),
+    ("bridge.rosout", "rosout", "RMPA_ROSOUT", "", True),
     ("services.allow", "services.allow", "RMPA_SERVICE_ALLOW", "", ("/arm/**",)),
     ("services.deny", "services.deny", "RMPA_SERVICE_DENY", "", ("/a", "/b")),
     ("services.loggers", "services.loggers", "RMPA_SERVICE_LOGGERS", "", True),

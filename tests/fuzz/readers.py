@@ -31,6 +31,7 @@ from rmpa.ros.types.definitions import SEPARATOR, full_text, md5sum, parse_defin
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageError, MessageType
 from rmpa.ros.wire import tcpros, xmlrpc
+from rmpa.ros.wire.log import parse_log, renamed
 from rmpa.ros.wire.slave_api import read_bus_info
 from rmpa.ros.wire.tcpros import ServiceDescription, TopicDescription
 from rmpa.runtime.kernel_tcp import TcpSocket, destroy_query, read_answer
@@ -468,6 +469,13 @@ READERS: Final[dict[str, Row]] = {
             b"int64 a\nint64 b\n---\nint64 sum",
             b"std_msgs/Header h\nstring X=a#b\n---\n",
         ],
+    ),
+    "log": Row(
+        [
+            Reader(lambda data: parse_log(data, 8), check=lambda said: said.text.decode("utf-8", "replace")),
+            Reader(lambda data: parse_log(renamed(data, "/rmpa/arm/driver"), 8)),
+        ],
+        [b"", bytes(30), bytes((37, *bytes(11), 2, *bytes(3))) + b"ab\x08\x02\0\0\0/n\x04\0\0\0text" + bytes(16)],
     ),
     "tcpros_header": Row(
         [Reader(_header, lambda fields: tcpros.encode_header(fields) if fields is not None else b"", _check_header)],

@@ -14,6 +14,7 @@ from lab.bed.processes import Process, eventually
 from tests.interop.conftest import AgentFactory, ShellFactory
 from tests.interop.modules import Module, flows
 from tests.interop.sites import nodes
+from tests.interop.test_log import clerk, heard, lines, say
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
@@ -171,3 +172,21 @@ def test_a_graph_over_two_machines_is_one_module(lab: Lab, shell: ShellFactory, 
     ros.roscpp("talker", topic="/from_arm", rate=50)
     flows(b.ros.roscpp("listener", topic="/from_arm"))
     assert f"http://{base.address}:" in ros.tool("rostopic", "info", "/from_other")
+
+
+def test_the_log_of_a_roscore_is_read_from_another_module_also_after_its_restart(
+    joined: Callable[..., Joined],
+) -> None:
+    a, b, roscore = joined(whole=True)
+    here = clerk(a, "here")
+    say(here, "by a roscore")
+    assert heard(b.agent, "by a roscore")["node"] == "/here"
+    roscore.terminate()
+    a.ros.roscore()
+    another = clerk(a, "another")
+
+    def again() -> bool:
+        say(another, "after its restart")
+        return any(line["text"] == "after its restart" for line in lines(b.agent))
+
+    eventually(again, what="the log of the new roscore")

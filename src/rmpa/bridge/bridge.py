@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
 from rmpa.bridge.context import BridgeContext
+from rmpa.bridge.log import ModuleLogs
 from rmpa.bridge.messages import decode, op_of
 from rmpa.bridge.nodes import ProxyKills
 from rmpa.bridge.policy import PermissionGate, Relay
@@ -54,6 +55,7 @@ class Bridge:
         counters: Counts what happens, by name.
         context: The rules that hold now; each reading of the settings makes another one.
         gate: Decides what each peer may do.
+        log: The part with the log of this module and its peers.
         proxy_nodes: Makes the nodes that stand for the nodes of peers.
     """
 
@@ -88,7 +90,9 @@ class Bridge:
         self.sessions = PeerSessions(self._parts, self.proxy_nodes, kills.proxy, self.gate)
         self.relay = Relay(enabled=settings.relay)
         self.topics = Topics(self)
+        self.log = ModuleLogs(self)
         self.add(self.topics)
+        self.add(self.log)
         self._reconciler: asyncio.TimerHandle | None = None
 
     def add(self, part: Part) -> None:

@@ -23,7 +23,7 @@ from rmpa.config import limits as config_limits
 from rmpa.config.rules import CLOCK
 from rmpa.config.settings import Settings
 from rmpa.config.values import PEER
-from rmpa.core.identity import is_own, matches
+from rmpa.core.identity import ROSOUT, is_own, matches
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -32,6 +32,10 @@ if TYPE_CHECKING:
     from rmpa.config.peer_rules import PeerRule, ServiceRule
     from rmpa.config.settings import ServiceSettings
     from rmpa.core.contract import Contracts, Transport
+
+
+# Topics that have one name in all modules.
+_FIXED: Final = (CLOCK, ROSOUT)
 
 
 class PeerNames:
@@ -59,14 +63,14 @@ class PeerNames:
 
     def local_name(self, wire: str) -> str:
         """The local name of a peer's topic or service."""
-        if wire == CLOCK:
-            return wire  # nodes read the time from no other topic
+        if wire in _FIXED:
+            return wire  # nodes read the time, and the core the log, from no other topic
         renamed = (_renamed(wire, source, target) for source, target in self._in)
         return next((new for new in renamed if new is not None), self.prefix + wire)
 
     def wire_name(self, local: str) -> str:
         """The wire name, for this peer, of a local topic or service."""
-        if local == CLOCK:
+        if local in _FIXED:
             return local
         renamed = (_renamed(local, source, target) for source, target in self._out)
         plain = local[len(self.prefix) :] if local.startswith(self.prefix + "/") else local
@@ -203,8 +207,8 @@ class BridgeContext:
     def of(cls, settings: Settings | None = None, gate: PermissionGate = OPEN_GATE) -> BridgeContext:
         """The rules of these settings; without any, those of a module that sets nothing."""
         settings = settings if settings is not None else Settings()
-        policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.naming)
-        services = ServiceRules(settings.services)
+        policy = Policy(settings.policy, settings.peers, settings.time, rosout=settings.rosout)
+        names, services = Names(settings.naming), ServiceRules(settings.services)
         return cls(settings, policy, services, names, settings.make_contracts(), gate)
 
     def limit(self, kind: str) -> int:

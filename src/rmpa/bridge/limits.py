@@ -150,6 +150,30 @@ NODE_KILLS_AT_ONCE: Final = 16
 # Told in: log
 # Why: Each further call of it starts the time anew: it asks all nodes of the graph, one after the other.
 NODE_KILL_ALL: Final = 2.0
+# [Core] Bytes of the log lines of a module, its agent's too, that are kept
+# At it: the node with most of them loses its oldest
+# Told in: `log`, the page Log
+# Why: Some 3,000 lines, ``LOG_LINE_BYTES`` counted for each.
+LOG_BYTES_KEPT: Final = 512 * KIB
+# What a kept line counts for beside its text.
+LOG_LINE_BYTES: Final = 96
+# Lines that are dropped at once: the node with most is looked for as seldom.
+LOG_DROPPED_AT_ONCE: Final = 32
+# [Core] Bytes of one line's text
+# At it: the rest is left out
+# Told in: the line
+LOG_TEXT_MAX: Final = 4 * KIB
+# Seconds between a node's stamp and the arrival of its line, above which the line has the time of its arrival: the
+# node follows simulated time, or stamps nothing.
+LOG_STAMP_OFF: Final = 60.0
+# [Core] Log lines of a module in one answer
+# At it: the older ones are left out
+# Told in: `log`, the page Log
+LOG_LINES_ASKED: Final = 500
+# Bytes of them: one answer takes the bulk lane for 10 ms at 100 Mbit/s.
+LOG_ANSWER_BYTES: Final = 128 * KIB
+# Seconds that a peer has to answer a question about its log: one that hangs holds up the lines of the others so long.
+LOG_ASK_TIMEOUT: Final = 2.0
 # Seconds after which a proxy whose subscribers were disconnected is registered again: at once, and once more for slow
 # subscribers.
 CALL_BACK_DELAYS: Final = (0.05, 1.0)

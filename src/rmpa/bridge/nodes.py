@@ -63,7 +63,7 @@ REPLIES: Final[dict[str, object]] = {
 }
 _VISIBLE: Final = Needs(
     (Access.SUBSCRIBE, Access.PUBLISH, Access.CALL),
-    "what the node publishes, subscribes to and provides: the rest is left out, and nodes of which nothing is left",
+    "what the node publishes, subscribes to and provides; nodes without any are left out",
 )
 _HELD: Final = "node"
 _REFUSED: Final = 0

@@ -17,7 +17,7 @@ from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.rules import CLOCK
 from rmpa.config.settings import TimeSettings
 from rmpa.config.values import PEER
-from rmpa.core.identity import NEVER_CROSSING, OUTSIDE_GUID, is_own, matches
+from rmpa.core.identity import NEVER_CROSSING, OUTSIDE_GUID, ROSOUT, is_own, matches
 from rmpa.core.statistics import Counters
 from rmpa.mesh import limits as mesh_limits
 from rmpa.trust.permissions import PermissionDecision, prohibition, refusal
@@ -52,14 +52,21 @@ class Policy:
         settings: The user's globs for all peers.
         peers: Additional globs for single peers.
         time: Whether ``/clock`` crosses, and from which peer it is taken.
+        rosout: Whether ``/rosout`` crosses.
     """
 
     def __init__(
-        self, settings: PolicySettings, peers: tuple[PeerRule, ...] = (), time: TimeSettings = _NO_TIME
+        self,
+        settings: PolicySettings,
+        peers: tuple[PeerRule, ...] = (),
+        time: TimeSettings = _NO_TIME,
+        *,
+        rosout: bool = False,
     ) -> None:
         self._settings = settings
         self._peers = peers
         self._time = time
+        self._rosout = rosout
         self._rules_for = lru_cache(config_limits.NAMES_REMEMBERED)(self._filled)
 
     def judge(self, topic: str, type_name: str, node: str) -> PolicyDecision:
@@ -68,7 +75,7 @@ class Policy:
             return PolicyDecision(False, f"{node} stands for a node of another module, or is the agent itself")
         if topic == CLOCK and self._time.share:
             return PolicyDecision(True, "time.share = true: peers may follow this module's time")
-        if why := never_crosses(topic):
+        if (why := never_crosses(topic)) and not (self._rosout and topic == ROSOUT):
             return PolicyDecision(False, f"built in: {why}")
         return judge_globs(self._settings, "bridge", topic, type_name)
 

@@ -1,4 +1,4 @@
-"""``rmpa node``: lists the nodes of all modules, shows one, asks whether it answers, and ends it."""
+"""``rmpa node``: lists the nodes of all modules, shows one, asks whether it answers, sets its log, and ends it."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from rmpa.ros.core.liveness import end_node, ping_node
 from rmpa.ros.environment import NodeFacts, NodeLine, NodePing, PeerNodes, describe_node, list_nodes
 from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.master.mirror import lookup_calls, read_lookups
+from rmpa.ros.node.loggers import LEVELS, read_levels, set_level
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -374,3 +375,60 @@ def node_info(node: str, options: Options) -> None:
     about |= {"uri": facts.uri, "pid": facts.pid, "reachable": not facts.problem, "problem": facts.problem or None}
     about |= {"publications": facts.publications, "subscriptions": facts.subscriptions}
     options.show(about | {"services": facts.services}, text())
+
+
+@graph_verb(argument("node", nodes), argument("logger", default=""), argument("level", default=""))
+def node_log_level(node: str, logger: str, level: str, options: Options) -> None:
+    """Show the levels of a node's loggers, or set one.
+
+    Without LOGGER the LEVEL (debug, info, warn, error or fatal) is that of the node's own code: the logger rosout of
+    rospy, ros of roscpp. The agent of a peer is PEER:/rmpa. A level applies until the node ends.
+
+    ---
+    In a secured mesh the peer needs a [[permission]] log.
+
+    Examples:
+      rmpa node log-level /talker
+      rmpa node log-level base:/driver debug
+      rmpa node log-level base:/rmpa rmpa.mesh debug
+    """
+    master, wanted = options.master(), _read_node(node)
+    if not level and logger.lower() in LEVELS:
+        logger, level = "", logger
+    level = level.lower()
+    if logger and not level:
+        raise ConfigError("LEVEL", f"{logger!r} is not a level", f"write LOGGER and one of {', '.join(LEVELS)}")
+    if level and level not in LEVELS:
+        raise ConfigError("LEVEL", f"{level!r} is not a level", f"use one of {', '.join(LEVELS)}")
+    if wanted.peer is not None:
+        levels = _levels_of_peer(master, wanted, logger, level)
+    else:
+        levels = asyncio.run(_levels(master, wanted.name, logger, level))
+    about = {"node": wanted.name, "peer": wanted.peer, "loggers": levels}
+    if level:
+        options.show(about, f"{' and '.join(levels)} of {wanted}: {level}")
+    elif levels:
+        options.show(about, Table("LOGGER, LEVEL", sorted(levels.items())))
+    else:
+        options.show(about, f"{wanted} has no loggers")
+
+
+async def _levels(master: Master, node: str, logger: str, level: str) -> dict[str, str]:
+    reply = await call_api(master.uri, "lookupService", _CALLER_ID, f"{node}/get_loggers")
+    api = await _find_uri(master, await read_graph(master), node)
+    if reply.code != 1 or not isinstance(reply.value, str):
+        raise RmpaError(f"{node} has no loggers: it does not provide {node}/get_loggers", code="unknown-name")
+    if level:
+        return await set_level(reply.value, node, _CALLER_ID, logger, level)
+    return await read_levels(reply.value, api, node, _CALLER_ID)
+
+
+def _levels_of_peer(master: Master, wanted: GraphName, logger: str, level: str) -> dict[str, str]:
+    if master.agent is None:
+        raise master.no_agent()
+    with ControlClient(master.agent, timeout=observe_limits.CONTROL_HANDLER_TIMEOUT) as client:
+        try:
+            args = {"peer": wanted.peer, "node": wanted.name, "logger": logger, "level": level}
+            return client.call("log_level", dict[str, str], **args)
+        except PeerRefused as error:
+            raise RmpaError(error.reason, code=error.code) from None

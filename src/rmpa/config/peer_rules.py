@@ -211,6 +211,12 @@ class Access(StrEnum):
     SERVE = "serve", "serve", "service", "Services of the module that it may offer here, by their names here."
     PARAM = "param", "read or set", "parameter", "Parameters of this module that it may read or set, within [params]."
     KILL = "kill", "end", "node", "Nodes of this module that it may end, within [nodes] kill."
+    LOG = (
+        "log",
+        "use the log of",
+        "node",
+        "Nodes whose log lines it may read and levels it may set; /rmpa: the agent.",
+    )
 
 
 # The key of a rule about actions of this module, whose client the other module is.

@@ -334,6 +334,13 @@ class Settings:
         option="--prefix-peers",
         live=True,
     )
+    rosout: bool = setting(
+        False,
+        BOOL,
+        "Whether /rosout crosses; both modules need it. `rmpa log` shows the log of all modules without it.",
+        key="bridge.rosout",
+        live=True,
+    )
     peers: tuple[peer_rules.PeerRule, ...] = setting(
         (),
         peer_rules.PEER_RULES,

@@ -129,10 +129,12 @@ def _is_unicast(first: int) -> bool:
 
 
 _LEGAL: Final = re.compile(r"[~/A-Za-z][\w/]*", re.ASCII)
+# The log of all nodes (wiki.ros.org/rosout).
+ROSOUT: Final = "/rosout"
 # Topics that stay in their module under every policy, and why.
 NEVER_CROSSING: Final = {
-    "/rosout": "log messages do not cross: a bridged /rosout would loop",
-    "/rosout_agg": "log messages do not cross: a bridged /rosout would loop",
+    ROSOUT: "log messages do not cross unless bridge.rosout = true in both modules: `rmpa log` reads all",
+    "/rosout_agg": "it has all messages of /rosout once more",
     "/clock": "time does not cross: with two clocks in one graph it would jump",
     "/rmpa/**": "the agent's own topics do not cross",
 }

@@ -11,6 +11,8 @@ import msgspec
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge import nodes as node_requests
+from rmpa.bridge.log import LEVEL
+from rmpa.bridge.log_ring import ModuleLog
 from rmpa.bridge.params import transfer
 from rmpa.config.rules import ROS2
 from rmpa.config.values import suggestion
@@ -66,7 +68,7 @@ class ControlOperations:
 
     def handlers(self) -> dict[str, Handler]:
         """The handlers of the operations of this class, for ``ControlServer``."""
-        names = ("snapshot", "ping", "param", "followed", "agent", "contract", "node")
+        names = ("snapshot", "ping", "param", "followed", "agent", "contract", "node", "log", "log_level")
         return {"site": self.sites.answer, **{name: getattr(self, name) for name in names}}
 
     def snapshot(self, args: Args) -> Snapshot:
@@ -145,6 +147,17 @@ class ControlOperations:
         """The facts of a peer's module: ``peer``, its name or GUID."""
         return await self.facts.bridge.rpc.request(self._session(args.get("peer", "")), INFO, {})
 
+    async def log(self, args: Args) -> list[ModuleLog]:
+        """Log lines of this module and its peers: as ``ModuleLogs.read``."""
+        return await self.facts.bridge.log.read(args)
+
+    async def log_level(self, args: Args) -> Any:
+        """The levels of a ``node``'s loggers; ``level``: sets that of a ``logger``. ``peer``: the node's module."""
+        request = {name: str(args[name]) for name in ("node", "logger", "level") if args.get(name)}
+        if not (peer := args.get("peer")):
+            return await self.facts.bridge.log.level(request)
+        return await self.facts.bridge.rpc.request(self._session(peer), LEVEL, request)
+
     def contract(self, args: Args) -> dict[str, ContractTerm]:
         """The terms that this module's settings give a ``topic`` of a ``type_name``, by key; it need not exist."""
         topic, type_name = str(args.get("topic", "")), str(args.get("type_name", ""))
@@ -197,6 +210,8 @@ REPLIES: Final[dict[str, object]] = {
     "agent": ModuleFacts,
     "contract": dict[str, ContractTerm],
     "site": object,  # as ``QUESTIONS`` say
+    "log": tuple[ModuleLog, ...],
+    "log_level": dict[str, str],
     "node": object,  # tuple[PeerNodes, ...] for lists, else as node_requests.REPLIES says
 }
 

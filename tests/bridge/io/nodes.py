@@ -63,6 +63,10 @@ class Core:
         """As RosCore's."""
         self._callbacks.append(callback)
 
+    def on_log(self, _callback: object) -> bool:
+        """As RosCore's; nothing is logged."""
+        return True
+
     def publishers(self, topic: str) -> Mapping[str, str]:
         """As RosCore's."""
         return dict(self._topics.get(topic, {}))

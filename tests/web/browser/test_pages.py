@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -266,24 +267,81 @@ async def test_a_node_shows_its_topics_services_connections_and_log(site: Site) 
     page = await site.open("node/base%3A%2Fbase")
     await page.wait_text("4711")
     await page.wait_text("connected")
-    for text in ("/odom", "set_parameters", "Log lines do not cross"):
+    for text in ("/odom", "set_parameters", "of base"):
         assert text in await page.run("document.querySelector('main').innerText")
     await page.run("location.hash = '#/topic/%2Fodom'")
     await page.wait("[...document.querySelectorAll('main a')].some((each) => each.hash === '#/node/base%3A%2Fbase')")
     assert (site.server.reports, page.errors) == ([], [])
 
 
-async def test_a_node_of_this_module_shows_its_lines_of_the_log_alone(site: Site) -> None:
-    own = site.server.logger = "/pc"
-    page = await site.open("node/%2Fpc")
-    await page.wait_text("turn ")
-    site.server.logger = "/somebody_else"
-    await page.run("location.hash = '#/log'")
-    await page.wait_text("/somebody_else")
-    site.server.logger = own
-    await page.run("location.hash = '#/node/%2Fpc'")
-    await page.wait_text("turn ")
-    assert "somebody_else" not in await page.run("document.querySelector('main').innerText")
+async def fill(page: Chromium, field: str, text: str, event: str = "change") -> None:
+    """Give a field of a page, which a selector finds, a value, as a user does."""
+    place = f"document.querySelector({json.dumps(field)})"
+    told = f"{place}.dispatchEvent(new Event('{event}', {{bubbles: true}}))"
+    await page.run(f"{place}.value = {json.dumps(text)}; {told}")
+
+
+LINES = "[...document.querySelectorAll('.logline')].map((each) => each.innerText.replace(/\\s+/g, ' '))"
+
+
+async def test_the_log_of_all_modules_is_one_and_each_filter_chooses_of_it(site: Site) -> None:
+    site.server.logs["base"].add("/base", 8, time.time_ns(), b"the motor is hot")
+    page = await site.open("log")
+    await page.wait_text("the motor is hot")
+    shown = " ".join(await page.run(LINES))
+    for text in ("pc:/pc", "base:/base", "velocity agent", "± 12.0 ms"):
+        assert text in shown
+    await page.wait_text("joystick: its agent is of an earlier release")
+
+    await page.click("Errors")
+    await page.wait("document.querySelectorAll('.logline').length === 1")
+    await page.click("All")
+    await fill(page, "[aria-label=Module]", "base")
+    await page.wait(f"{LINES}.length > 1 && {LINES}.every((each) => each.includes('base:/base'))")
+    await fill(page, "[aria-label=Module]", "")
+    await fill(page, "[aria-label^=Node]", "/rm*")
+    await page.wait(f"{LINES}.length && {LINES}.every((each) => each.includes('velocity agent'))")
+    await fill(page, '[aria-label="Filter by text"]', "no such text", "input")
+    await page.wait_text("No line is like that")
+    assert (site.server.reports, page.errors) == ([], [])
+
+
+async def test_a_log_on_hold_stands_still_and_goes_on_with_what_came_meanwhile(site: Site) -> None:
+    page = await site.open("log")
+    await page.wait(f"{LINES}.length > 3")
+    await page.click("Hold")
+    await page.wait("[...document.querySelectorAll('button')].some((each) => each.textContent.trim() === 'Go on')")
+    asked = len(site.server.asked)
+    site.server.logs["base"].add("/late", 2, time.time_ns(), b"said meanwhile")
+    await page.run("new Promise((done) => setTimeout(done, 1500))")  # longer than a question's period
+    assert [each.what for each in site.server.asked[asked:]].count("log") == 0
+    await page.click("Go on")
+    await page.wait_text("said meanwhile")
+
+
+async def test_a_page_that_shows_no_log_asks_for_none(site: Site) -> None:
+    page = await site.open("log")
+    await page.wait(f"{LINES}.length > 3")
+    await page.run("location.hash = '#/topics'")
+    await page.wait_text("/velocity_order")
+    asked = len(site.server.asked)
+    await page.run("new Promise((done) => setTimeout(done, 1500))")
+    assert "log" not in [each.what for each in site.server.asked[asked:]]
+
+
+async def test_a_node_shows_its_own_lines_and_its_level_is_set(site: Site) -> None:
+    site.server.logs["base"].add("/other", 8, time.time_ns(), b"of somebody else")
+    site.server.rights = Rights(control=True)
+    page = await site.open("node/base%3A%2Fbase")
+    await page.wait(f"{LINES}.length > 1 && !{LINES}.some((each) => each.includes('somebody'))")
+    await fill(page, "form.row select", "debug")
+    await page.click("Set")
+    await page.wait_text("rosout and ros: debug")
+    (order,) = [each.args for each in site.server.asked if each.what == "set_log_level"]
+    assert order == {"name": "/base", "peer": "base", "logger": "", "level": "debug"}
+    assert "log_levels" not in [each.what for each in site.server.asked]  # some roscpp nodes do not outlive it
+    await page.click("Show its loggers")
+    await page.wait_text("rospy.core")
 
 
 async def test_topics_that_carry_data_come_first_and_the_filter_looks_among_all(site: Site) -> None:

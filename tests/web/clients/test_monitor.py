@@ -37,7 +37,6 @@ from tests.web.snapshots import FULL as SNAPSHOT
 
 TEXT = MessageType("std_msgs/String")
 TWIST = MessageType("geometry_msgs/Twist")
-LOG = MessageType("rosgraph_msgs/Log")
 
 
 class Agent:
@@ -179,15 +178,6 @@ async def test_a_service_is_described_and_called(page: Page, talker: Node) -> No
     assert answer["response"] == {"success": True, "message": "as asked"}
     assert "data" in await page.ask("call", service="/light", request={"datum": True})
     assert "no service" in await page.ask("call", service="/none", request={})
-
-
-async def test_the_log_is_kept_for_pages_that_open_it(page: Page, talker: Node) -> None:
-    publisher = await talker.advertise("/rosout", LOG, latch=True)
-    await until(lambda: publisher.subscribers)
-    publisher.publish(LOG.make({"level": 8, "name": "/lonely", "msg": "<b>the motor is hot</b>"}))
-    await page.send("log", on=True)
-    found = [each for each in (await page.next("log"))["lines"] if each["node"] == "/lonely"]
-    assert [(each["level"], each["text"]) for each in found] == [("ERROR", "<b>the motor is hot</b>")]
 
 
 async def test_a_smart_resource_shows_with_its_alarms_and_leaves_with_its_node(page: Page, core: RosCore) -> None:

@@ -20,7 +20,6 @@ import struct
 import sys
 import time
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -28,9 +27,11 @@ from typing import Any, cast
 import msgspec
 from aiohttp import WSMsgType, web
 
+from rmpa.bridge.log_ring import LogQuery, LogRing, ModuleLog
 from rmpa.core.contract import ContractRule, Contracts
 from rmpa.core.errors import RmpaError
 from rmpa.core.facts import LaneInfo, RouteInfo, TopicInfo
+from rmpa.core.identity import OWN_NODE
 from rmpa.observe.peers import judge_stranger
 from rmpa.observe.snapshot import ModuleFacts, PeerInfo, Snapshot
 from rmpa.observe.why.services import diagnose_module
@@ -250,8 +251,11 @@ class FakeServer:
             "/use_sim_time": False,
             "/base": {"rate": 50.0, "wheel": {"radius": 0.035, "track": 0.23}, "topics": ["odom", "imu"]},
         }
-        self.logger = "/base"
         self.driven = {"/cmd_vel": {"type": "geometry_msgs/Twist", "nodes": ["base:/base", "base:/safety_stop"]}}
+        # Of each module the log that its agent keeps: its lines, and what is wrong with it.
+        self.logs = {name: LogRing(time.time_ns()) for name in ("pc", "base", "velocity")}
+        self.log_problems = {"joystick": "its agent is of an earlier release, which has no log for others"}
+        self.levels = {"rosout": "info", "rospy.core": "warn"}
         self._params_told: dict[str, Any] = {}
         self._param_changes = 0
         self._builder = StateBuilder("pc")
@@ -427,6 +431,28 @@ class FakeServer:
     def _answer_invite(self, args: dict[str, Any]) -> Any:
         return {"line": f"rmpa trust join rmpa1-for{args['name']}{'x' * 80}", "until": int(time.time()) + 900}
 
+    def _answer_log(self, args: dict[str, Any]) -> Any:
+        now = time.time_ns()
+        for module, node, level in (("pc", "/pc", 2), ("base", "/base", 4), ("velocity", OWN_NODE, 2)):
+            self.logs[module].add(node, level, now, f"turn {next(self.pages)} of {module}".encode())
+        told = []
+        for module in args.get("modules", [*self.logs, *self.log_problems]):
+            query = LogQuery.of({**args, "after": args["after"].get(module, 0)})
+            found = self.logs[module].find(query, now) if module in self.logs else None
+            error = {"pc": 0.0, "base": 0.0001}.get(module, 0.012)
+            told.append(
+                ModuleLog(module, found.lines, found.next, found.lost, error)
+                if found is not None
+                else ModuleLog(module, problem=self.log_problems.get(module, "it is silent"))
+            )
+        return msgspec.to_builtins(told)
+
+    def _answer_log_levels(self, _args: dict[str, Any]) -> Any:
+        return self.levels
+
+    def _answer_set_log_level(self, args: dict[str, Any]) -> Any:
+        return dict.fromkeys((args["logger"],) if args["logger"] else ("rosout", "ros"), args["level"])
+
     def _answer_configure(self, args: dict[str, Any]) -> Any:
         return {"value": args["value"], "text": f"{args['name']} is {args['value']} now"}
 
@@ -442,22 +468,13 @@ class _Client(Recorded):
     def __init__(self, server: FakeServer, socket: web.WebSocketResponse) -> None:
         self._server = server
         self._socket = socket
-        self._log: Callable[[list[Any]], None] | None = None
         mesh = SimpleNamespace(agent="pc", details=server._details, follow=lambda *_: None, unfollow=lambda _: None)
-        log = SimpleNamespace(follow=self._follow_log, unfollow=self._unfollow_log, refused=None)
         answers, values = SimpleNamespace(answer=server.answer), SimpleNamespace(of=self._decode)
-        monitor: Any = SimpleNamespace(mesh=mesh, log=log, answers=answers, values=values, sticks=server.sticks)
+        monitor: Any = SimpleNamespace(mesh=mesh, answers=answers, values=values, sticks=server.sticks)
         hub: Any = FakeHub()
         address = f"10.0.0.{next(server.pages)}"
         super().__init__(MonitorSession(hub, server.rights, lambda _: 0, address, monitor, time.monotonic))
         self.page = self.connection = self.session.connection = PageConnection(self)
-
-    def _follow_log(self, _page: object, show: Callable[[list[Any]], None]) -> list[Any]:
-        self._log = show
-        return []
-
-    def _unfollow_log(self, _page: object) -> None:
-        self._log = None
 
     def _decode(self, message: ReceivedMessage) -> Any:
         topic = message.topic
@@ -480,9 +497,6 @@ class _Client(Recorded):
                 kind = next((kind for name, kind in _SENSORS.items() if name == asked.topic), "nav_msgs/Odometry")
                 if not asked.closed:
                     asked.receive(ReceivedMessage(asked.topic, kind, memoryview(b"\0" * 712), time.time_ns()))
-            if self._log is not None and tick % 10 == 0:
-                line = {"n": tick, "at": time.time(), "level": "INFO", "node": self._server.logger}
-                self._log([line | {"text": f"turn {tick}"}])
             self.session.handle_timer(time.monotonic())
             await self.flush()
             await asyncio.sleep(TICK)

@@ -475,16 +475,6 @@ def test_a_flood_closes_the_connection(page: Page) -> None:
     assert (page.page.ended, page.page.refusal) == ([1008], "message_rate")
 
 
-def test_new_lines_of_the_log_are_left_out_for_a_slow_page_and_kept_ones_are_not(page: Page) -> None:
-    page.session._log([{"text": "a"}])
-    assert page.take()[0]["lines"] == [{"text": "a"}]
-    page.page.unsent = 5
-    page.session._log([{"text": "b"}])
-    assert page.take() == []
-    page.kept = [{"text": "c"}]
-    assert page.send("log", on=True)[0]["lines"] == [{"text": "c"}]
-
-
 def test_the_first_message_says_the_time_and_what_the_page_may_do_and_signs_of_life_follow(page: Page) -> None:
     assert Page(Rights(control=True)).hello["may"] == ["control"]
     assert page.hello["at"] == page.now

@@ -29,7 +29,6 @@ from rmpa.trust.permissions import InviteReply, TrustStatus
 from rmpa.web.hub.hub import Hub
 from rmpa.web.hub.node_link import EVERYTHING, FULL, READ_ONLY, NodeRules, ParamValue, Rights
 from rmpa.web.monitor import questions
-from rmpa.web.monitor.monitor import LogFeed
 from rmpa.web.monitor.questions import Answers
 from rmpa.web.monitor.resources import MessageValues, ResourceWatch
 from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup
@@ -282,19 +281,41 @@ async def test_a_page_of_the_monitor_gets_no_denied_parameter_and_changes_none(r
     assert await talker.get_param("/motors/pid") == 3
 
 
-@pytest.mark.parametrize("ruled", [denying(subscribe=("/rosout_agg", "/arm/**"))], indirect=True)
+@pytest.mark.parametrize("ruled", [denying(subscribe=("/arm/**",))], indirect=True)
 async def test_a_page_sees_nothing_of_topics_that_are_denied(ruled: Hub, talker: Node) -> None:
     values = MessageValues(ruled)
-    with closing(ResourceWatch(ruled, values)) as resources, closing(LogFeed(ruled, values)) as log:
+    with closing(ResourceWatch(ruled, values)) as resources:
         resources.start()
-        log.start()
         for name in ("arm", "base"):
             publisher = await talker.advertise(f"/{name}/descriptor", TEXT, latch=True)
             descriptor = msgspec.json.encode(describe(Resource(name, role="acting"), talker.name)).decode()
             publisher.publish(TEXT.make({"data": descriptor}))
         await until(lambda: "/base" in resources.facts)
         assert "/arm" not in resources.facts
-        assert "/rosout_agg" in str(log.refused)
+
+
+@pytest.mark.parametrize("ruled", [denying(log=("/arm/**",))], indirect=True)
+async def test_a_page_sees_no_log_of_nodes_that_are_denied(ruled: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    async def agent(_self: Answers, op: str, **args: Any) -> Any:
+        asked.append(f"{op} {args.get('node', '')}")
+        lines = [
+            {"n": n, "at": 1.0, "level": "info", "node": node, "text": "x"}
+            for n, node in enumerate(("/driver", "/arm/hand"))
+        ]
+        return [{"module": "base", "lines": lines, "next": 9}, {"module": "arm", "lines": lines[1:], "next": 9}]
+
+    monkeypatch.setattr(Answers, "_control_call", agent)
+    with closing(answers_of(ruled)) as answers:
+        base, arm = await answers.answer("log", {"level": "info"})
+        assert [line["node"] for line in base["lines"]] == ["/driver"]
+        assert arm["lines"] == []
+        assert "web may not log /arm/hand" in arm["problem"]
+        for what in ("log_levels", "set_log_level"):
+            with pytest.raises(PeerRefused, match="web may not log /arm/hand"):
+                await answers.answer(what, {"name": "/arm/hand", "logger": "ros", "level": "debug"})
+    assert asked == ["log "]
 
 
 async def test_a_change_is_judged_by_the_cores_parameters_that_are_still_being_read(

@@ -12,7 +12,8 @@ import os
 import uuid
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.errors import RmpaError
+from rmpa.core.errors import RemoteProtocolError, RmpaError
+from rmpa.core.identity import is_own
 from rmpa.core.statistics import Counters
 from rmpa.ros import limits
 from rmpa.ros.core.external import LOOPBACK, Core, GraphLog
@@ -25,12 +26,13 @@ from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import LoggerServices, SlaveNode
 from rmpa.ros.node.subscription import PublisherConnection, Subscription
 from rmpa.ros.types.definitions import known_description
+from rmpa.ros.wire.log import renamed
 from rmpa.runtime.accept import Use
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
 from rmpa.runtime.tasks import end_tasks, keep_task
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from rmpa.ros.master.parameters import GraphChange
@@ -113,8 +115,9 @@ class ReturnedPublishers:
 class Rosout:
     """The node ``/rosout``: forwards the log messages of all nodes to ``/rosout_agg`` (wiki.ros.org/rosout).
 
-    The messages are never decoded. Like roscore it restarts the node when that ends (``rosnode kill /rosout``), at a
-    new address, after ``limits.ROSOUT_RESPAWN`` seconds. While another node has the name, this one does not run.
+    The messages are never decoded; in those of a proxy its name replaces that of the node, so that their origin is
+    seen. Like roscore it restarts the node when that ends (``rosnode kill /rosout``), at a new address, after
+    ``limits.ROSOUT_RESPAWN`` seconds. While another node has the name, this one does not run.
 
     Args:
         core: The core, whose counters count ``rosout.restarted``.
@@ -130,6 +133,10 @@ class Rosout:
         self._loggers: LoggerServices | None = None
         self._keeper: asyncio.Task[None] | None = None
         self._changed = asyncio.Event()
+        self._publishers: Mapping[str, str] = {}
+        self._nodes: dict[str, str] = {}
+        # Called with the publishing node and the framed bytes of each message.
+        self.listeners: list[Callable[[str, memoryview], None]] = []
 
     @property
     def uri(self) -> str:
@@ -170,8 +177,14 @@ class Rosout:
         aggregated = Publication(AGGREGATED, NODE, LOG, queue_messages=_ROSOUT_QUEUE)
         node.add_publication(aggregated)
 
-        def pass_on(_publisher: PublisherConnection, framed: memoryview) -> None:
+        def pass_on(publisher: PublisherConnection, framed: memoryview) -> None:
+            source = self._node_at(publisher.uri)
+            if is_own(source):  # another module's node
+                with contextlib.suppress(RemoteProtocolError):
+                    framed = memoryview(renamed(framed, source))
             aggregated.publish_framed(framed)
+            for listener in self.listeners:
+                listener(source, framed)
 
         subscription = Subscription(
             TOPIC,
@@ -190,6 +203,13 @@ class Rosout:
         subscription.update(list(core.publishers(TOPIC).values()))
         self._loggers = LoggerServices(node, core.call, _LOGGERS)
         self._loggers.start()
+
+    def _node_at(self, uri: str) -> str:
+        """The publishing node with a slave API."""
+        known = self._core.publishers(TOPIC)
+        if known is not self._publishers:  # another object after each change
+            self._publishers, self._nodes = known, {each: name for name, each in known.items()}
+        return self._nodes.get(uri, NODE)
 
     async def _end(self) -> None:
         node, self._node = self._node, None
@@ -360,6 +380,11 @@ class RosCore(Core):
     def on_lookup(self, callback: Callable[[str, str, str, str], str]) -> bool:
         self._api.service_lookup = callback
         return True
+
+    def on_log(self, callback: Callable[[str, memoryview], None]) -> bool:
+        if self._rosout is not None:
+            self._rosout.listeners.append(callback)
+        return self._rosout is not None
 
     def notes(self) -> tuple[str, ...]:
         """Problems with storing the core's state; the core itself runs as long as the agent."""

@@ -182,6 +182,14 @@ class Core(Protocol):
         """
         return False
 
+    def on_log(self, callback: Callable[[str, memoryview], None]) -> bool:  # noqa: ARG002 - for the embedded core
+        """Call ``callback`` with the publishing node and the framed bytes of each message of /rosout.
+
+        Returns:
+            Whether this core does so: a real roscore does not.
+        """
+        return False
+
     def unreachable(self) -> Mapping[str, Unreachable]:
         """The registered nodes to which connecting fails, by name; the caller must not change the mapping."""
         return self.liveness.unreachable

@@ -362,11 +362,11 @@ class LoggerServices:
             level = logging.getLogger(logger).getEffectiveLevel()
             # The highest ROS level that is not above the logger's level.
             word = next((w for w, number in reversed(_LEVELS.items()) if number <= level), "debug")
-            parts += [_string(name), _string(word)]
+            parts += [pack_text(name), pack_text(word)]
         call.reply(True, b"".join(parts))
 
     def _set(self, call: ServiceCall) -> None:
-        name, level = _strings(call.request)
+        name, level = read_texts(call.request, 2, "roscpp/SetLoggerLevelRequest")
         logger, number = self._loggers.get(name), _LEVELS.get(level.lower())
         if logger is None:
             known = ", ".join(self._loggers)
@@ -379,19 +379,24 @@ class LoggerServices:
             call.reply(True, b"")
 
 
-def _string(text: str) -> bytes:
+def pack_text(text: str) -> bytes:
+    """A string of a ROS message."""
     raw = text.encode()
     return LENGTH.pack(len(raw)) + raw
 
 
-def _strings(raw: Buffer) -> list[str]:
-    """The strings of a request."""
+def read_texts(raw: Buffer, count: int, what: str) -> list[str]:
+    """The strings of a message ``what`` that has so many, and nothing else.
+
+    Raises:
+        RemoteProtocolError: It is none.
+    """
     found: list[str] = []
     at = 0
-    while len(found) < 2 and at + LENGTH.size <= len(raw):
+    while len(found) < count and at + LENGTH.size <= len(raw):
         start = at + LENGTH.size
         at = start + LENGTH.unpack_from(raw, at)[0]
         found.append(str(raw[start:at], "utf-8", "replace"))
-    if at != len(raw) or len(found) != 2:
-        raise RemoteProtocolError(f"{len(raw)} bytes are not a roscpp/SetLoggerLevelRequest")
+    if at != len(raw) or len(found) != count:
+        raise RemoteProtocolError(f"{len(raw)} bytes are not a {what}")
     return found

@@ -116,10 +116,7 @@ NODES_SHOWN: Final = 2000
 # Told in: the page of the mesh
 # Why: A ring of more could not be read.
 MODULES_SHOWN: Final = 256
-# [Pages] Lines of the log
-# At it: the oldest are forgotten
-LOG_LINES: Final = 500
-# [Pages] Characters of one of them
+# [Pages] Characters of a line of the log
 # At it: the rest is cut
 LOG_CHARACTERS: Final = 1024
 # Topics of a lost link that are named; further ones are counted.

@@ -35,8 +35,6 @@ Tree: TypeAlias = dict[str, Value]
 VERSION: Final = 1
 # The WebSocket subprotocol; a version that older pages cannot read has another one.
 SUBPROTOCOL: Final = "rmpa.monitor.v1"
-# The messages of all nodes, from one publisher: ``/rosout`` would be a connection to each node.
-LOG_TOPIC: Final = "/rosout_agg"
 
 
 def difference(old: Mapping[str, Value], new: Mapping[str, Value]) -> Tree:
@@ -93,6 +91,11 @@ def cut(value: Any) -> Any:
     return _cut(value, [limits.VALUE_NODES])
 
 
+def cut_text(text: str, most: int) -> str:
+    """The first characters of a text, and how many more there are."""
+    return text if len(text) <= most else f"{text[:most]}… {len(text) - most} more"
+
+
 def _cut(value: Any, left: list[int]) -> Any:
     left[0] -= 1
     if left[0] < 0:
@@ -100,8 +103,7 @@ def _cut(value: Any, left: list[int]) -> Any:
     if isinstance(value, dict):
         return {str(key): _cut(inner, left) for key, inner in value.items()}
     if isinstance(value, str):
-        most = limits.VALUE_CHARACTERS
-        return value if len(value) <= most else f"{value[:most]}… {len(value) - most} more"
+        return cut_text(value, limits.VALUE_CHARACTERS)
     if isinstance(value, bytes | bytearray) or (isinstance(value, memoryview) and value.format == "B"):
         return f"{len(value)} bytes"
     if isinstance(value, float):

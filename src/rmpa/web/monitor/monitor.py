@@ -1,4 +1,4 @@
-"""What all pages of the monitor share: the state of the mesh and the log.
+"""What all pages of the monitor share: the state of the mesh.
 
 The server's side of the monitor: what all pages share.
 """
@@ -7,18 +7,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import os
 import time
-from collections import deque
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING
 
-from rmpa.core.errors import RmpaError
 from rmpa.runtime.tasks import end_tasks, keep_task
 from rmpa.web import limits as web_limits
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.diagnostics import DiagnosticsFeed
-from rmpa.web.monitor.messages import LOG_TOPIC
 from rmpa.web.monitor.questions import Answers
 from rmpa.web.monitor.resources import MessageValues, ResourceWatch
 from rmpa.web.monitor.state import StateBuilder, details
@@ -29,12 +25,8 @@ if TYPE_CHECKING:
 
     from rmpa.observe.snapshot import Snapshot
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.topics import ClientSubscription, ReceivedMessage
     from rmpa.web.monitor.messages import Tree
     from rmpa.web.server.agent_watch import AgentWatch, Reading
-
-
-_log = logging.getLogger(__name__)
 
 
 class MeshFeed:
@@ -161,89 +153,8 @@ class MeshFeed:
         self.show()
 
 
-_TYPE: Final = "rosgraph_msgs/Log"
-_LEVELS: Final = {1: "DEBUG", 2: "INFO", 4: "WARN", 8: "ERROR", 16: "FATAL"}
-# Seconds in which lines are gathered into one message to a page.
-_GATHER: Final = 0.1
-
-
-class LogFeed:
-    """Follows the log while it is open.
-
-    Args:
-        hub: Subscribes to it.
-        values: Decodes its messages.
-    """
-
-    def __init__(self, hub: Hub, values: MessageValues) -> None:
-        self._hub = hub
-        self._values = values
-        self._lines: deque[dict[str, Any]] = deque(maxlen=limits.LOG_LINES)
-        self._fresh: list[dict[str, Any]] = []
-        self._followers: dict[object, Callable[[list[dict[str, Any]]], None]] = {}
-        self._timer: asyncio.TimerHandle | None = None
-        self._count = 0
-        self._subscription: ClientSubscription | None = None
-        # Why there is no log to show.
-        self.refused: RmpaError | None = None
-
-    def start(self) -> None:
-        """Begin to keep lines."""
-        try:
-            self._subscription = self._hub.topics.subscribe(LOG_TOPIC, _TYPE, self._take, self._refused)
-        except RmpaError as error:
-            self._refused(error)
-
-    def close(self) -> None:
-        """Keep no more."""
-        if self._timer is not None:
-            self._timer.cancel()
-        if self._subscription is not None:
-            self._subscription.close()
-
-    def follow(self, page: object, show: Callable[[list[dict[str, Any]]], None]) -> list[dict[str, Any]]:
-        """Give a page each further line, by ``show``; returns those that are kept, oldest first."""
-        known, self._followers[page] = page in self._followers, show
-        return [] if known else list(self._lines)
-
-    def unfollow(self, page: object) -> None:
-        """End a ``follow``."""
-        self._followers.pop(page, None)
-
-    def _take(self, message: ReceivedMessage) -> None:
-        try:
-            values = self._values.of(message)
-        except RmpaError:
-            return  # not a message of the log; there is nothing to show
-        stamp = values["header"]["stamp"]
-        at = stamp["secs"] + stamp["nsecs"] * 1e-9
-        self._count += 1
-        line = {
-            "n": self._count,
-            "at": at or message.stamp_ns * 1e-9 or time.time(),
-            "level": _LEVELS.get(values["level"], "INFO"),
-            "node": values["name"][: limits.LOG_CHARACTERS],
-            "text": values["msg"][: limits.LOG_CHARACTERS],
-        }
-        self._lines.append(line)
-        if not self._followers:
-            return
-        self._fresh.append(line)
-        if self._timer is None:
-            self._timer = asyncio.get_running_loop().call_later(_GATHER, self._show)
-
-    def _show(self) -> None:
-        self._timer = None
-        lines, self._fresh = self._fresh[-limits.LOG_LINES :], []
-        for show in [*self._followers.values()]:
-            show(lines)
-
-    def _refused(self, error: RmpaError) -> None:
-        self.refused = error
-
-
 class Monitor:
-    """Follows the mesh for all pages. The log is kept from ``start`` on.
+    """Follows the mesh for all pages.
 
     Args:
         hub: Subscribes, and calls services.
@@ -262,7 +173,6 @@ class Monitor:
         self._hub = hub
         self.values = MessageValues(hub)
         self.resources = ResourceWatch(hub, self.values)
-        self.log = LogFeed(hub, self.values)
         self.mesh = MeshFeed(watch, self.resources, lambda: hub.params.changes)
         self.mesh.diagnostics = self.diagnostics = DiagnosticsFeed(hub, self.values, self.mesh.show)
         self.sticks = Sticks(hub, lambda: self.mesh.agent)
@@ -275,10 +185,9 @@ class Monitor:
         )
 
     def start(self) -> None:
-        """Begin to keep lines of the log; the hub has an event loop by now."""
+        """Begin; the hub has an event loop by now."""
         self._hub.start()
         self.resources.start()
-        self.log.start()
         self.mesh.start()
 
     async def close(self) -> None:
@@ -286,5 +195,4 @@ class Monitor:
         await self.mesh.close()
         self.answers.close()
         self.diagnostics.close()
-        self.log.close()
         self.resources.close()

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 import msgspec
 
 from rmpa.bridge.nodes import NODE_INFO
-from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
+from rmpa.config.peer_rules import Access
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.identity import is_global_name, is_own, proxied_node, proxied_peer
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.control_client import ControlClient, choose_agent
@@ -26,6 +27,7 @@ from rmpa.trust.permissions import InviteReply
 from rmpa.web.hub.params import value_at
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.driving import TYPES
+from rmpa.web.monitor.messages import cut_text
 from rmpa.web.monitor.state import module_facts, node_key
 
 if TYPE_CHECKING:
@@ -49,11 +51,12 @@ def shown_node(own: str) -> str:
 Args: TypeAlias = dict[str, Any]  # the edge: each question has its own
 # All questions, each with the right (``Rights``) that a page needs for it; the method ``_QUESTION`` answers it.
 QUESTIONS: Final = {
-    **dict.fromkeys(
-        ("why", "agent", "contract", "node", "describe", "message", "past", "graph", "types", "driven"), ""
-    ),
+    **dict.fromkeys(("why", "agent", "contract", "node", "describe", "message", "past", "graph", "types"), ""),
+    **dict.fromkeys(("driven", "log", "log_levels"), ""),
     **dict.fromkeys(("params", "param_names"), "view"),
-    **dict.fromkeys(("set_param", "delete_param", "invite", "call", "profile", "context", "configure"), "control"),
+    **dict.fromkeys(
+        ("set_param", "delete_param", "set_log_level", "invite", "call", "profile", "context", "configure"), "control"
+    ),
 }
 _CALL_TIMEOUT: Final = 30.0
 _READ_TIMEOUT: Final = 5.0
@@ -155,6 +158,38 @@ class Answers:
             other = str(each["other"])
             each["other"] = shown_node(other) if not peer or is_own(other) else node_key(peer, other)
         return about
+
+    async def _log(self, args: Args) -> Any:
+        """Log lines of all modules or of ``modules``, of the nodes that the rules let a page see."""
+        known = ("modules", "after", "level", "node", "since", "most")
+        found = await self._control_call("log", **{key: args[key] for key in known if key in args})
+        for module in found:
+            lines = module.get("lines", ())
+            hidden = {node: why for node in {line["node"] for line in lines} if (why := self._no_log(node))}
+            module["lines"] = [line for line in lines if line["node"] not in hidden]
+            for line in module["lines"]:
+                line["text"] = cut_text(line["text"], limits.LOG_CHARACTERS)
+            if hidden and not module["lines"]:
+                module["problem"] = next(iter(hidden.values()))
+        return found
+
+    def _no_log(self, node: str) -> str:
+        """Why a page may not see the log of a node, or empty."""
+        try:
+            self._hub.link.rules.check(Access.LOG, node)
+        except PeerRefused as error:
+            return str(error)
+        return ""
+
+    async def _log_levels(self, args: Args) -> Any:
+        node = _name(args, "name")
+        self._hub.link.rules.check(Access.LOG, node)
+        return await self._control_call("log_level", node=node, peer=_text(args, "peer"))
+
+    async def _set_log_level(self, args: Args) -> Any:
+        node, logger, level = _name(args, "name"), _text(args, "logger"), _text(args, "level")
+        self._hub.link.rules.check(Access.LOG, node)
+        return await self._control_call("log_level", node=node, peer=_text(args, "peer"), logger=logger, level=level)
 
     async def _control_call(self, op: str, **args: object) -> Any:
         """Call an operation of the agent."""

@@ -157,7 +157,6 @@ class MonitorSession(Session):
     def closing(self) -> None:
         """Stop the robot, and all that the page had open."""
         self._monitor.mesh.unfollow(self)
-        self._monitor.log.unfollow(self)
         self._stop()
         self._show_stick("")
         self._publications.close()
@@ -399,21 +398,6 @@ class MonitorSession(Session):
     def op_unpublish(self, _: float, *, id: Id) -> None:  # noqa: A002
         """Publish it no more."""
         self._publications.end(id)
-
-    def op_log(self, _: float, *, on: bool) -> None:
-        """Whether lines of the log are wanted, oldest first; those that are kept come at once."""
-        log = self._monitor.log
-        if not on:
-            log.unfollow(self)
-            return
-        if kept := log.follow(self, self._log):
-            self._send({"op": "log", "lines": kept})
-        if log.refused is not None:
-            self._failed(0, log.refused)
-
-    def _log(self, lines: list[dict[str, Any]]) -> None:
-        if self.connection.unsent == 0:  # left out while the page does not take what was sent
-            self._send({"op": "log", "lines": lines})
 
     def op_stick(
         self,

@@ -20,7 +20,6 @@ export class Connection {
     this.watches = new Map();
     this.questions = new Map();
     this.publishing = new Map(); // what tells the form of each publication
-    this.logSinks = new Set();
     this.notice = null;
     this.driven = ""; // the topic whose joystick is shown
     this.stick = null; // who has its stick
@@ -66,7 +65,6 @@ export class Connection {
       this.wait = FIRST_WAIT;
       if (this.looks.length) this.send({ op: "look", at: this.looks });
       for (const [id, watch] of this.watches) this.send({ op: "watch", id, ...watch.wanted });
-      if (this.logSinks.size) this.send({ op: "log", on: true });
       if (this.driven) this.orderStick(this.driven, "look");
       this.changed();
     };
@@ -163,8 +161,6 @@ export class Connection {
       case "failed":
         this.failed(message);
         break;
-      case "log":
-        for (const sink of this.logSinks) sink(message.lines);
     }
   }
 
@@ -285,14 +281,5 @@ export class Connection {
     if (this.notice?.hold === undefined) return;
     this.notice = null;
     this.changed();
-  }
-
-  followLog(sink) {
-    this.logSinks.add(sink);
-    if (this.logSinks.size === 1) this.send({ op: "log", on: true });
-    return () => {
-      this.logSinks.delete(sink);
-      if (!this.logSinks.size) this.send({ op: "log", on: false });
-    };
   }
 }

@@ -1,40 +1,69 @@
-// The log of all nodes of this module, /rosout, newest first.
+// The log of all modules, of their nodes and agents, newest first.
 
 import { html, useState } from "../markup.js";
-import { section } from "../state.js";
+import { entries, section } from "../state.js";
 import { Choice, Page, Panel, useFilter } from "../parts.js";
-import { Lines, useLog } from "../loglines.js";
+import { Lines, Missing, useLog } from "../loglines.js";
 
-const LEVELS = [
-  ["DEBUG", "All"],
-  ["INFO", "Info"],
-  ["WARN", "Warnings"],
-  ["ERROR", "Errors"],
+export const LEVELS = [
+  ["debug", "All"],
+  ["info", "Info"],
+  ["warn", "Warnings"],
+  ["error", "Errors"],
 ];
-const RANK = { DEBUG: 0, INFO: 1, WARN: 2, ERROR: 3, FATAL: 4 };
 
 export function Log({ state, connection }) {
-  const [level, setLevel] = useState("INFO");
-  const filter = useFilter("text or node");
-  const [held, hold] = useState(false);
   const own = section(state, "agent").name;
-  const lines = useLog(connection, held);
-  const shown = lines.filter((line) => RANK[line.level] >= RANK[level] && filter.matches(`${line.node} ${line.text}`));
+  const [level, setLevel] = useState("info");
+  const [module, setModule] = useState("");
+  const [node, setNode] = useState("");
+  const [held, hold] = useState(false);
+  const filter = useFilter("text");
+  const modules = entries(state, "modules").filter(([, one]) => ["here", "up", "silent"].includes(one.state));
+  const nodes = new Set(
+    entries(state, "nodes")
+      .filter(([, one]) => !module || (one.module || own) === module)
+      .map(([, one]) => one.name),
+  );
+  const wanted = { level, node, ...(module ? { modules: [module] } : {}) };
+  const log = useLog(connection, wanted, held);
+  const shown = log.lines.filter((line) => filter.matches(line.text));
   return html`<${Page}
     title="Log"
-    kind=${`Of the nodes of ${own}, newest first. The log of other modules stays there: their own rmpa web shows it.`}
+    kind=${`Of the nodes and agents of ${module || "all modules"}, newest first, by the clock of ${own}`}
     aside=${html`<button type="button" aria-pressed=${String(held)} onClick=${() => hold(!held)}>
       ${held ? "Go on" : "Hold"}
     </button>`}
   >
     <div class="row filter-row">
-      <${Choice} label="Least level" value=${level} onChoose=${setLevel} options=${LEVELS} />${filter.field}
+      <${Choice} label="Least level" value=${level} onChoose=${setLevel} options=${LEVELS} />
+      <select aria-label="Module" value=${module} onChange=${(event) => setModule(event.target.value)}>
+        <option value="">All modules</option>
+        ${modules.map(([name]) => html`<option key=${name} value=${name}>${name}</option>`)}
+      </select>
+      <input
+        class="filter"
+        type="search"
+        list="log-nodes"
+        placeholder="Node, or a pattern: /arm/*"
+        aria-label="Node, or a pattern such as /arm/*"
+        value=${node}
+        onChange=${(event) => setNode(event.target.value.trim())}
+      />
+      <datalist id="log-nodes">
+        <option value="/rmpa">the agents</option>
+        ${[...nodes].sort().map((name) => html`<option key=${name} value=${name} />`)}
+      </datalist>
+      ${filter.field}
     </div>
     <${Panel}
-      ><${Lines}
+      ><${Missing} log=${log} /><${Lines}
         lines=${shown}
-        empty=${lines.length
-          ? `No line is like that; ${lines.length} others are hidden.`
-          : "No node of this module has written a line since rmpa web started."} /><//
+        own=${own}
+        empty=${log.waits
+          ? "Asking …"
+          : log.lines.length
+            ? `No line is like that; ${log.lines.length} others are hidden.`
+            : "There is no such line among the last ones that the agents keep."} /><//
   ><//>`;
 }

@@ -8,6 +8,7 @@ import { NODE_COLUMNS, NodeRow } from "./nodes.js";
 import { TOPIC_COLUMNS, TopicRow, isData } from "./topics.js";
 import { costs } from "../mandala.js";
 import { Lines } from "../plot.js";
+import { Lines as LogLines, Missing, useLog } from "../loglines.js";
 
 const DIRECTIONS = [
   ["bytes_in", "received"],
@@ -79,14 +80,24 @@ export function ModulePage({ name, state, connection }) {
           <${TopicTable} list=${all.filter(([topic]) => !isData(topic, state))} />
         </details>`}<//
       >
-    </div><//
-  >`;
+      <${ModuleLog} name=${name} own=${section(state, "agent").name} connection=${connection} /></div
+  ><//>`;
 }
 
 const TopicTable = ({ list, empty }) =>
   html`<${Table} caption="Topics" columns=${TOPIC_COLUMNS} empty=${empty} list=${list}>
     ${([topic, one]) => html`<${TopicRow} key=${topic} name=${topic} topic=${one} />`}<//
   >`;
+
+function ModuleLog({ name, own, connection }) {
+  const log = useLog(connection, { modules: [name], level: "info" });
+  return html`<${Panel} title=${`Log of ${name}`} wide
+    ><${Missing} log=${log} /><${LogLines}
+      lines=${log.lines.slice(0, 50)}
+      empty=${log.waits ? "Asking …" : "There is no line."}
+      own=${own}
+  /><//>`;
+}
 
 const LinkPanel = ({ module, detail }) => {
   const link = section(detail, "link");

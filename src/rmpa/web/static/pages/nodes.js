@@ -1,6 +1,6 @@
 // All nodes, and one of them: its module, topics, services, connections and log lines.
 
-import { html } from "../markup.js";
+import { html, useState } from "../markup.js";
 import { count, hertz } from "../format.js";
 import { entries, section } from "../state.js";
 import {
@@ -14,12 +14,13 @@ import {
   nodeName,
   Page,
   Panel,
+  Question,
   Table,
   memo,
   useAnswer,
   useFilter,
 } from "../parts.js";
-import { Lines, useLog } from "../loglines.js";
+import { Lines, Missing, useLog } from "../loglines.js";
 import { useTypes } from "./services.js";
 
 const NODE_PERIOD = 5; // seconds after which the node that is shown is asked again
@@ -148,7 +149,8 @@ export function NodePage({ name, state, connection }) {
           >`,
       )}
       <${Connections} facts=${facts} failure=${failure} module=${peer || own} own=${own} />
-      <${NodeLog} node=${node} peer=${peer} connection=${connection} /></div
+      <${Levels} node=${node} peer=${peer} connection=${connection} />
+      <${NodeLog} node=${node} module=${peer || own} own=${own} connection=${connection} /></div
   ><//>`;
 }
 
@@ -188,15 +190,64 @@ const Connections = ({ facts, failure, module, own }) =>
         >`}<//
   >`;
 
-function NodeLog({ node, peer, connection }) {
-  const lines = useLog(connection, false).filter((line) => line.node === node);
+const LOG_LEVELS = ["debug", "info", "warn", "error", "fatal"];
+
+// The loggers of a node are asked for by a button: the roscpp of some systems does not bear the question.
+function Levels({ node, peer, connection }) {
+  const [logger, setLogger] = useState("");
+  const [level, setLevel] = useState("info");
+  const [state, set] = useState({});
+  const submit = (event) => {
+    event.preventDefault();
+    set({ waits: true });
+    connection.ask("set_log_level", { name: node, peer, logger: logger.trim(), level }).then(
+      (told) => set({ said: `${Object.keys(told).join(" and ")}: ${level}` }),
+      (failure) => set({ failure }),
+    );
+  };
+  return html`<${Panel} title="Log levels"
+    >${connection.hello.may.includes("control") &&
+    html`<form class="row" onSubmit=${submit}>
+      <label
+        ><span>Logger</span
+        ><input value=${logger} placeholder="of its own code" onInput=${(event) => setLogger(event.target.value)}
+      /></label>
+      <label
+        ><span>Level</span
+        ><select value=${level} onChange=${(event) => setLevel(event.target.value)}>
+          ${LOG_LEVELS.map((each) => html`<option key=${each} value=${each}>${each}</option>`)}
+        </select></label
+      >
+      <button class="primary" disabled=${state.waits}>Set</button>
+      <span role="status" class="muted said">${state.said}</span><${Failure} failure=${state.failure} />
+    </form>`}
+    <${Question}
+      connection=${connection}
+      what="log_levels"
+      args=${{ name: node, peer }}
+      label="Show its loggers"
+      show=${(levels) =>
+        html`<${Table}
+          caption="Loggers"
+          columns=${["Logger", "Level"]}
+          empty="None."
+          list=${Object.entries(levels).sort()}
+          >${([name, each]) =>
+            html`<tr key=${name}>
+              <th scope="row" class="mono">${name}</th>
+              <td>${each}</td>
+            </tr>`}<//
+        >`}
+  /><//>`;
+}
+
+function NodeLog({ node, module, own, connection }) {
+  const log = useLog(connection, { modules: [module], node, level: "debug" });
   return html`<${Panel} title="Log" wide
-    >${peer
-      ? html`<p class="empty">Log lines do not cross: open <code>rmpa web</code> of ${peer}.</p>`
-      : html`<${Lines}
-          lines=${lines.slice(0, 100)}
-          empty="It has written no line since rmpa web started."
-          bare=${true}
-        />`}<//
-  >`;
+    ><${Missing} log=${log} /><${Lines}
+      lines=${log.lines.slice(0, 100)}
+      empty=${log.waits ? "Asking …" : "Its module keeps no line of it."}
+      own=${own}
+      bare=${true}
+  /><//>`;
 }

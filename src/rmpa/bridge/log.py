@@ -1,0 +1,262 @@
+"""The log of all modules: each keeps its own last lines, and tells them to those that ask; nothing is streamed."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from rmpa.bridge import limits
+from rmpa.bridge.log_ring import LogLines, LogQuery, LogRing, ModuleLog
+from rmpa.bridge.policy import Needs
+from rmpa.bridge.sessions import Part
+from rmpa.config import limits as config_limits
+from rmpa.config.peer_rules import Access
+from rmpa.config.values import did_you_mean, suggestion
+from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.core.identity import OWN_NODE, is_global_name, is_meant, is_own, proxied_node
+from rmpa.ros.core.embedded import AGGREGATED, LOG, TOPIC
+from rmpa.ros.master.parameters import RegistrationKind
+from rmpa.ros.node.loggers import read_levels, set_level
+from rmpa.ros.node.subscription import Subscription
+from rmpa.runtime.loop import yielding_to_data
+from rmpa.trust.permissions import asker_name
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rmpa.bridge.bridge import Bridge
+    from rmpa.bridge.sessions import PeerSession
+    from rmpa.ros.master.parameters import GraphChange
+    from rmpa.ros.node.subscription import PublisherConnection
+
+_log = logging.getLogger(__name__)
+
+# The request for log lines of the module's nodes and its agent, as ``LogQuery``; the response is ``LogLines``.
+LINES: Final = "log.lines"
+# The request for the levels of a ``node``'s loggers by name; with a ``level``: that of its ``logger`` is set, and the
+# response has what was set.
+LEVEL: Final = "log.level"
+_EARLIER: Final = "its agent is of an earlier release, which has no log for others; install this release there"
+
+
+class _Records(logging.Handler):
+    """Puts the agent's own log into the ring; records may come from any thread."""
+
+    def __init__(self, ring: LogRing) -> None:
+        super().__init__()
+        self._ring = ring
+        self._loop = asyncio.get_running_loop()
+        self._thread = threading.get_ident()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep a record."""
+        try:
+            line = record.levelno, round(record.created * 1e9), self.format(record)
+        except Exception:  # noqa: BLE001 - a line that cannot be formatted must not end what logs it
+            self.handleError(record)
+            return
+        if threading.get_ident() == self._thread:
+            self._ring.take_own(*line)
+        else:
+            with contextlib.suppress(RuntimeError):  # the loop is closed: the agent ends
+                self._loop.call_soon_threadsafe(self._ring.take_own, *line)
+
+
+class ModuleLogs(Part):
+    """The part of the bridge that keeps this module's log, and reads those of the peers.
+
+    The embedded core passes each message of /rosout on. Of a roscore the agent's own node subscribes to /rosout_agg;
+    where /rosout itself crosses, to that, since the other one has no word of the publisher: a proxy's line is kept by
+    its own module alone.
+
+    Args:
+        bridge: The core, the peers and the rules.
+    """
+
+    def __init__(self, bridge: Bridge) -> None:
+        self._bridge = bridge
+        self._core = bridge.core
+        self.ring = LogRing(time.time_ns())
+        self._handler: _Records | None = None
+        self._subscription: Subscription | None = None
+        bridge.rpc.on_request(LINES, self._lines, Needs((Access.LOG,), "each line's node; others are left out"))
+        bridge.rpc.on_request(LEVEL, self._level, Needs((Access.LOG,), "the node"))
+
+    def start(self) -> None:
+        """Begin to keep lines."""
+        self._handler = _Records(self.ring)
+        logging.getLogger().addHandler(self._handler)
+        if not self._core.on_log(self._take):
+            self._follow()
+
+    async def close(self) -> None:
+        """Keep none any more."""
+        if self._handler is not None:
+            logging.getLogger().removeHandler(self._handler)
+
+    def reload(self) -> None:
+        """Subscribe to the other topic, if /rosout crosses now, or no more."""
+        if self._subscription is not None:
+            self._follow()
+
+    def graph_changed(self, change: GraphChange) -> None:
+        """Connect to another publisher: a restarted roscore does not tell of those that were there before."""
+        followed = self._subscription
+        if followed is not None and change.kind is RegistrationKind.PUBLISHER and change.name == followed.topic:
+            followed.update(list(self._core.publishers(followed.topic).values()))
+
+    def reconcile(self) -> None:
+        """Register again: the roscore has been restarted."""
+        if self._subscription is not None and OWN_NODE not in self._core.subscribers(self._subscription.topic):
+            self._register(self._subscription)
+
+    def _take(self, publisher: str, framed: memoryview) -> None:
+        if not is_own(publisher):
+            self.ring.take(publisher, framed, time.time_ns())
+
+    def _follow(self) -> None:
+        node = self._bridge.node
+        topic = TOPIC if self._bridge.context.settings.rosout else AGGREGATED
+        if self._subscription is not None:
+            if self._subscription.topic == topic:
+                return
+            self._core.call("unregisterSubscriber", OWN_NODE, self._subscription.topic, node.uri)
+            node.remove_subscription(self._subscription)
+
+        def received(publisher: PublisherConnection, framed: memoryview) -> None:
+            nodes = self._core.publishers(topic).items()
+            self._take(next((name for name, uri in nodes if uri == publisher.uri), AGGREGATED), framed)
+
+        self._subscription = Subscription(
+            topic,
+            OWN_NODE,
+            on_message=received,
+            own_uri=node.uri,
+            type_name=LOG.type,
+            md5sum=LOG.md5sum,
+            definition=LOG.definition,
+            number=node.next_number,
+        )
+        node.add_subscription(self._subscription)
+        self._register(self._subscription)
+
+    def _register(self, subscription: Subscription) -> None:
+        self._core.call("registerSubscriber", OWN_NODE, subscription.topic, LOG.type, self._bridge.node.uri)
+        subscription.update(list(self._core.publishers(subscription.topic).values()))
+
+    def _lines(self, asker: PeerSession, args: dict[str, Any]) -> LogLines:
+        query, peer, gate = LogQuery.of(args), asker.link.name, self._bridge.context.gate
+        if not gate.on:
+            return self._find(query)
+        allowed = {node for node in self.ring.nodes if gate.judge(Access.LOG, peer, node).allowed}
+        if not allowed and (why := gate.why_not(Access.LOG, peer, query.node or OWN_NODE)):
+            raise RmpaError(why, code="not-permitted")
+        return self.ring.find(query, time.time_ns(), allowed.__contains__, yielding_to_data)
+
+    def _find(self, query: LogQuery) -> LogLines:
+        return self.ring.find(query, time.time_ns(), yielder=yielding_to_data)
+
+    async def read(self, args: Mapping[str, Any]) -> list[ModuleLog]:
+        """Log lines of this module and of its peers, which are asked at one time.
+
+        Args:
+            args: The fields of ``LogQuery``, but ``after`` by name of a module; and ``modules``, names or GUIDs,
+                without which all are asked.
+
+        Raises:
+            ConfigError: One of them is none.
+        """
+        args = dict(args)
+        wanted, after = args.pop("modules", None), args.pop("after", None)
+        wanted = [str(name) for name in wanted] if isinstance(wanted, list) else None
+        after = after if isinstance(after, dict) else {}
+        query, context = LogQuery.of(args), self._bridge.context
+        own = context.settings.name
+        sessions = {session.link.guid: session for session in self._bridge.sessions}
+        asked = []
+        for name in wanted if wanted is not None else [own, *map(str, sessions)]:
+            if name == own:
+                asked.append(self._own(_since(query, after.get(own))))
+                continue
+            found = [one for guid, one in sessions.items() if is_meant(name, one.link.name, str(guid))]
+            asked += [self._of(one, _since(query, after.get(one.link.name))) for one in found]
+            if not found:
+                names = [own, *(one.link.name for one in sessions.values())]
+                remedy = "`rmpa peer list` shows which modules are there"
+                asked.append(
+                    _unread(
+                        name, f"no linked module has this name; {suggestion(name, names, remedy)}", "unknown-name"
+                    )
+                )
+        return await asyncio.gather(*asked)
+
+    async def _own(self, query: LogQuery) -> ModuleLog:
+        found = self._find(query)
+        return ModuleLog(self._bridge.context.settings.name, found.lines, found.next, found.lost, 0.0)
+
+    async def _of(self, session: PeerSession, query: LogQuery) -> ModuleLog:
+        name, clock = session.link.name, session.time
+        if not session.linked:
+            return await _unread(name, "it is silent: there is no link to it now", "peer-unlinked")
+        try:
+            args = msgspec.to_builtins(query)
+            value = await self._bridge.rpc.request(session, LINES, args, limits.LOG_ASK_TIMEOUT)
+            found = msgspec.convert(value, LogLines)
+        except PeerRefused as error:
+            unknown = error.unknown
+            return await _unread(name, *((_EARLIER, "other-release") if unknown else (error.reason, "not-permitted")))
+        except msgspec.ValidationError as error:
+            return await _unread(name, f"its answer is malformed: {error}", "protocol-error")
+        except RmpaError as error:
+            return await _unread(name, str(error), error.code)
+        ahead, error_ns = clock.ahead_ns / 1e9, clock.error_ns
+        lines = tuple(msgspec.structs.replace(line, at=line.at - ahead) for line in yielding_to_data(found.lines))
+        return ModuleLog(name, lines, found.next, found.lost, None if error_ns is None else error_ns / 1e9)
+
+    async def _level(self, asker: PeerSession, args: dict[str, Any]) -> dict[str, str]:
+        peer, gate = asker.link.name, self._bridge.context.gate
+        named = str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
+        if why := gate.why_not(Access.LOG, peer, named):
+            raise RmpaError(why, code="not-permitted")  # before whether there is such a node
+        nodes = [node for node in self._core.state().nodes if gate.judge(Access.LOG, peer, node).allowed]
+        return await self._loggers(args, nodes, asker_name(peer))
+
+    async def level(self, args: Mapping[str, Any]) -> dict[str, str]:
+        """The levels of the loggers of a ``node`` of this module, by name; with ``level``: those that were set to it.
+
+        Raises:
+            RmpaError: There is no such node, level or logger, or it does not answer.
+        """
+        return await self._loggers(args, list(self._core.state().nodes), "this module")
+
+    async def _loggers(self, args: Mapping[str, Any], nodes: list[str], who: str) -> dict[str, str]:
+        node, here = str(args.get("node")), self._bridge.context.settings.name
+        if is_own(node) and node != OWN_NODE:
+            origin = proxied_node(node)
+            whose = f"it is {origin[0]}'s {origin[1]}: ask there" if origin is not None else "it is the agent's"
+            raise RmpaError(f"{node} is no node of {here}: {whose}", code="unknown-name")
+        uri = self._core.registrations.service_uri(f"{node}/get_loggers") if node in nodes else None
+        if uri is None or not is_global_name(node):
+            problem = f"{here} has no node {node[:80]}" if node not in nodes else f"{node} has no loggers"
+            near = did_you_mean(node, [name for name in nodes if not is_own(name)]) if node not in nodes else ""
+            raise RmpaError(problem + (f"; did you mean {near}?" if near else ""), code="unknown-name")
+        logger, level = str(args.get("logger", "")), str(args.get("level", "")).lower()
+        if not level:
+            return await read_levels(uri, self._core.state().nodes[node], node, OWN_NODE)
+        levels = await set_level(uri, node, OWN_NODE, logger, level)
+        _log.info("= %s has set the level of %s of %s to %s", who, " and ".join(levels), node, level)
+        return levels
+
+
+async def _unread(module: str, problem: str, code: str) -> ModuleLog:
+    return ModuleLog(module, problem=problem, code=code)
+
+
+def _since(query: LogQuery, after: object) -> LogQuery:
+    return msgspec.structs.replace(query, after=after) if isinstance(after, int) and after >= 0 else query
