@@ -12,6 +12,7 @@ import msgspec
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge import nodes as node_requests
 from rmpa.bridge.params import transfer
+from rmpa.bridge.topics.rates import RATES
 from rmpa.config.rules import ROS2
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.nodes import Nodes
     from rmpa.bridge.params.follower import Params
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.topics.rates import Rates
     from rmpa.observe.control_client import ControlClient
     from rmpa.observe.control_server import Handler
     from rmpa.observe.sites import SiteRequests
@@ -55,6 +57,7 @@ class ControlOperations:
         snapshots: Builds its snapshots.
         nodes: Knows the nodes of this module.
         sites: Answers questions about other sites.
+        rates: Measures the rates of this module's topics.
     """
 
     name: str
@@ -63,11 +66,12 @@ class ControlOperations:
     snapshots: SnapshotBuilder
     nodes: Nodes
     sites: SiteRequests
+    rates: Rates
 
     def handlers(self) -> dict[str, Handler]:
         """The handlers of the operations of this class, for ``ControlServer``."""
         names = ("snapshot", "ping", "param", "followed", "agent", "contract", "node")
-        return {"site": self.sites.answer, **{name: getattr(self, name) for name in names}}
+        return {"site": self.sites.answer, "rates": self.topic_rates, **{name: getattr(self, name) for name in names}}
 
     def snapshot(self, args: Args) -> Snapshot:
         """A snapshot, or a part of it.
@@ -145,6 +149,19 @@ class ControlOperations:
         """The facts of a peer's module: ``peer``, its name or GUID."""
         return await self.facts.bridge.rpc.request(self._session(args.get("peer", "")), INFO, {})
 
+    async def topic_rates(self, _args: Args) -> dict[str, Any]:
+        """The rates of the topics that each module publishes, by its name; a text where a peer does not tell them."""
+        peers = [*self.facts.bridge.sessions.linked()]
+        told = await asyncio.gather(
+            *(self.facts.bridge.rpc.request(session, RATES, {}) for session in peers), return_exceptions=True
+        )
+        found: dict[str, Any] = {self.name: self.rates.now()}
+        for session, answer in zip(peers, told, strict=True):
+            if isinstance(answer, BaseException) and not isinstance(answer, RmpaError):
+                raise answer
+            found[session.link.name] = str(answer) if isinstance(answer, RmpaError) else answer
+        return found
+
     def contract(self, args: Args) -> dict[str, ContractTerm]:
         """The terms that this module's settings give a ``topic`` of a ``type_name``, by key; it need not exist."""
         topic, type_name = str(args.get("topic", "")), str(args.get("type_name", ""))
@@ -196,6 +213,7 @@ REPLIES: Final[dict[str, object]] = {
     "trust": object,  # TrustStatus, or as the command says (trust.status)
     "agent": ModuleFacts,
     "contract": dict[str, ContractTerm],
+    "rates": object,  # tuple[TopicRate, ...] or a text, by module
     "site": object,  # as ``QUESTIONS`` say
     "node": object,  # tuple[PeerNodes, ...] for lists, else as node_requests.REPLIES says
 }

@@ -8,8 +8,8 @@ from rmpa.core.limits import KIB
 
 # Between two patches of one client: some 7 a second, which looks live and is read at leisure.
 PATCH_PERIOD: Final = 0.15
-# Shortest time from one snapshot of the agent to the next while pages are open. A snapshot of 300 topics takes the agent
-# 12 ms: at 7 a second that was a twelfth of a core.
+# Shortest time from one snapshot of the agent to the next while pages are open: one of 300 topics takes the agent
+# 12 ms.
 STATE_PERIOD: Final = 1.0
 # The pause between two snapshots is at least so many times as long as a snapshot takes: a fifth of a core.
 STATE_SHARE: Final = 4.0
@@ -113,6 +113,8 @@ DRIVE_TURN: Final = 4.0
 RESOURCES_MAX: Final = 256
 # Time for which the details of a Smart Resource are followed after a page has shown it.
 LOOK_KEPT: Final = 10.0
+# Time between two questions for the rates of all topics, while a page shows their list.
+RATES_PERIOD: Final = 2.0
 # Time between two signs of life to a page, which takes its connection for lost after three without any.
 TICK_PERIOD: Final = 2.0
 # Pause before it is looked again whether a page has taken what was sent.

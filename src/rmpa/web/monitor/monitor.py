@@ -19,6 +19,7 @@ from rmpa.web import limits as web_limits
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import LOG_TOPIC
 from rmpa.web.monitor.questions import Answers
+from rmpa.web.monitor.rates import RatesFeed
 from rmpa.web.monitor.resources import MessageValues, ResourceWatch
 from rmpa.web.monitor.state import StateBuilder, details
 from rmpa.web.monitor.sticks import Sticks
@@ -44,6 +45,7 @@ class MeshFeed:
         resources: Knows the Smart Resources.
         parameters: Says how often the parameters of this module's core have changed.
         clock: Seconds since the epoch.
+        rates: Knows the rates of topics.
     """
 
     def __init__(
@@ -52,8 +54,10 @@ class MeshFeed:
         resources: ResourceWatch,
         parameters: Callable[[], int] = lambda: 0,
         clock: Callable[[], float] = time.time,
+        rates: RatesFeed | None = None,
     ) -> None:
         self._parameters = parameters
+        self._rates = rates
         self._watch = watch
         self._resources = resources
         self._clock = clock
@@ -106,6 +110,8 @@ class MeshFeed:
             return None
         if kind == "resource":
             self._resources.look(name)
+        if kind == "rates":
+            return self._rates.look(self._snapshot) if self._rates is not None else {}
         return details(self._snapshot, self._resources.facts, kind, name)
 
     async def _run(self) -> None:
@@ -245,7 +251,8 @@ class Monitor:
         self.values = MessageValues(hub)
         self.resources = ResourceWatch(hub, self.values)
         self.log = LogFeed(hub, self.values)
-        self.mesh = MeshFeed(watch, self.resources, lambda: hub.params.changes)
+        self.rates = RatesFeed(lambda: self.answers.rates())
+        self.mesh = MeshFeed(watch, self.resources, lambda: hub.params.changes, rates=self.rates)
         self.sticks = Sticks(hub, lambda: self.mesh.agent)
         self.answers = Answers(
             hub,
@@ -264,6 +271,7 @@ class Monitor:
     async def close(self) -> None:
         """End, before the hub ends."""
         await self.mesh.close()
+        await self.rates.close()
         self.answers.close()
         self.log.close()
         self.resources.close()

@@ -92,6 +92,10 @@ class Answers:
         """End the threads, once what the agent was asked is answered or has timed out."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
+    async def rates(self) -> Any:
+        """The rates of the topics of all modules, as the agent tells them."""
+        return await self._control_call("rates")
+
     async def _why(self, args: Args) -> Any:
         kind = args.get("kind")
         if kind not in _KINDS:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 Id: TypeAlias = Annotated[int, Meta(gt=0, lt=2**32)]
-Kind: TypeAlias = Literal["module", "topic", "service", "node", "resource", "counters"]
+Kind: TypeAlias = Literal["module", "topic", "service", "node", "resource", "counters", "rates"]
 How: TypeAlias = Literal["value", "plot", "image", "scan"]
 # Of a joystick: a share of the fastest that is allowed.
 Tilt: TypeAlias = Annotated[float, Meta(ge=-1, le=1)]
