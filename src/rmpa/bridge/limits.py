@@ -247,7 +247,7 @@ RATES_KEPT: Final = 6.0
 # Pause between two nodes that are asked for their counts; an answer of 40 topics takes some 2 ms to read.
 RATES_PAUSE: Final = 0.25
 # Topics without a subscriber that are subscribed to at one time, and for how long at most.
-RATES_AT_ONCE: Final = 4
+RATES_AT_ONCE: Final = 8
 RATES_SAMPLE: Final = 2.0
 # Messages, and bytes from the third message on, that are enough for a rate.
 RATES_MESSAGES: Final = 50

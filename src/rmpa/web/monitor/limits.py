@@ -61,9 +61,23 @@ VALUE_NODES: Final = 2000
 # Why: Two a degree.
 SCAN_POINTS: Final = 720
 # [Pages] Pixels of a raw image
-# At it: every n-th row and column is shown
-# Told in: the size below the image
-IMAGE_PIXELS: Final = 320 * 240
+# At it: every n-th row and column is shown, as where its place on the screen is smaller
+# Told in: the sizes below the image
+IMAGE_PIXELS: Final = 1280 * 720
+# Pixels of one with 16 or 32 bits a pixel, each of which is computed.
+DEPTH_PIXELS: Final = 320 * 240
+# The pause after a picture is at least so many times as long as it took to make: a twentieth of a core.
+PICTURE_SHARE: Final = 20.0
+# Pictures that were sent and that the page has not drawn yet; a slow link or browser gets fewer.
+UNSEEN_MAX: Final = 2
+# [Pages] Time without a message after which what is shown is old
+# At it: it is greyed, and its age is shown
+# Why: And five periods of the topic at the least.
+OLD_AFTER: Final = 2.0
+OLD_PERIODS: Final = 5.0
+# Messages by which the rate of a live topic is known, and the share by which it has to change to be told again.
+BEAT_MESSAGES: Final = 32
+BEAT_CHANGE: Final = 0.1
 # [Pages] Topics
 # At it: further ones are counted; `rmpa topic list` has them
 # Told in: the page of all topics

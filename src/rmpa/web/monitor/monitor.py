@@ -251,15 +251,15 @@ class Monitor:
         self.values = MessageValues(hub)
         self.resources = ResourceWatch(hub, self.values)
         self.log = LogFeed(hub, self.values)
-        self.rates = RatesFeed(lambda: self.answers.rates())
-        self.mesh = MeshFeed(watch, self.resources, lambda: hub.params.changes, rates=self.rates)
-        self.sticks = Sticks(hub, lambda: self.mesh.agent)
         self.answers = Answers(
             hub,
             self.resources,
             os.environ if environ is None else environ,
             lambda: agent or self.mesh.agent,
         )
+        self.rates = RatesFeed(self.answers.rates)
+        self.mesh = MeshFeed(watch, self.resources, lambda: hub.params.changes, rates=self.rates)
+        self.sticks = Sticks(hub, lambda: self.mesh.agent)
 
     def start(self) -> None:
         """Begin to keep lines of the log; the hub has an event loop by now."""

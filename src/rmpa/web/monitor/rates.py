@@ -1,4 +1,4 @@
-"""The rate of each topic, measured where it is published: asked of all agents while a page shows the list of topics."""
+"""The rate of each topic, measured where it is published: asked of all agents while a page shows the topics."""
 
 from __future__ import annotations
 

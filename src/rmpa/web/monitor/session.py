@@ -317,8 +317,9 @@ class MonitorSession(Session):
         how: How,
         fields: Annotated[tuple[str, ...], Meta(max_length=limits.FIELDS_MAX)] = (),
         rate: Annotated[float, Meta(gt=0, le=limits.WATCH_RATE_MAX)] = 5.0,
+        width: Annotated[int, Meta(ge=0, le=0xFFFF)] = 0,
     ) -> None:
-        """Messages of a topic: its newest values, lines of a plot, images, or laser scans."""
+        """Messages of a topic: its newest values, lines of a plot, images for a ``width`` in pixels, or scans."""
         if (how == "plot") != bool(fields):
             self._malformed(f"a plot has 1 to {limits.FIELDS_MAX} fields, everything else none")
             return
@@ -327,7 +328,7 @@ class MonitorSession(Session):
             raise RemoteProtocolError(f"watch {id} is in use")
         if len(self._watches) >= limits.WATCHES_MAX:
             raise RemoteProtocolError(f"{limits.WATCHES_MAX} topics are watched already; close one first")
-        watch = WatchState(id, how, fields, rate, self._monitor.values.of)
+        watch = WatchState(id, how, fields, rate, self._monitor.values.of, width)
         self._watches[id] = watch, None
 
         def receive(message: ReceivedMessage) -> None:
@@ -348,6 +349,12 @@ class MonitorSession(Session):
             self._end_watch(id, error)
         else:
             self._watches[id] = watch, subscription
+
+    def op_seen(self, _: float, *, ids: Annotated[tuple[Id, ...], Meta(max_length=limits.WATCHES_MAX)]) -> None:
+        """An image of each of these watches is drawn."""
+        for id_ in ids:
+            if (known := self._watches.get(id_)) is not None:
+                known[0].seen()
 
     def op_unwatch(self, _: float, *, id: Id) -> None:  # noqa: A002
         """No more messages of that watch."""
@@ -370,6 +377,8 @@ class MonitorSession(Session):
             except RmpaError as error:
                 self._end_watch(id_, error)
             else:
+                if (beat := watch.beat.news()) is not None:
+                    self._send({"op": "beat", "id": id_, **beat})
                 self.connection.push((Opcode.BINARY, (frame,))) if isinstance(frame, bytes) else self._send(frame)
 
     def op_ask(self, now: float, *, id: Id, what: str, args: dict[str, Any] = {}, at: float = 0.0) -> None:  # noqa: A002, B006 - copied by msgspec
