@@ -4,7 +4,7 @@ import { html, render, Component } from "./markup.js";
 import { Connection } from "./connection.js";
 import { sentence } from "./format.js";
 import { section } from "./state.js";
-import { Mark, Since } from "./parts.js";
+import { Mark, Since, keep, kept } from "./parts.js";
 import { Mandala } from "./mandala.js";
 import { Search, Shortcuts } from "./search.js";
 import { applyTheme, nextTheme, theme } from "./theme.js";
@@ -60,8 +60,16 @@ class App extends Component {
   componentDidMount() {
     addEventListener("hashchange", () => {
       this.arrives = true;
+      clearTimeout(this.scrolled);
       this.setState({ ...address(), overlay: "" }, () => this.look());
     });
+    history.scrollRestoration = "manual"; // what is to be scrolled may still have to be drawn
+    const place = () => keep({ scroll: Math.round(scrollY) });
+    addEventListener("scroll", () => {
+      clearTimeout(this.scrolled);
+      this.scrolled = setTimeout(place, 200);
+    });
+    addEventListener("click", () => scrollY !== (kept().scroll || 0) && place(), true); // a link leaves the page
     addEventListener("keydown", (event) => this.key(event));
     window.rmpa = this.connection; // for the console and for tests
   }
@@ -72,7 +80,7 @@ class App extends Component {
     if (!heading) return;
     this.arrives = false;
     heading.focus({ preventScroll: true });
-    scrollTo(0, 0);
+    scrollTo(0, kept().scroll || 0);
   }
 
   // Many messages, one drawing: in the next frame, or soon where none comes, as in a tab that is or becomes hidden.
@@ -94,7 +102,8 @@ class App extends Component {
 
   look() {
     const { page, name } = address();
-    this.connection.look(DETAILED.includes(page) && name !== undefined ? [[page, name]] : []);
+    const list = page === "topics" ? [["rates", ""]] : [];
+    this.connection.look(DETAILED.includes(page) && name !== undefined ? [[page, name]] : list);
   }
 
   key(event) {

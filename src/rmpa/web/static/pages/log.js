@@ -2,7 +2,7 @@
 
 import { html, useState } from "../markup.js";
 import { section } from "../state.js";
-import { Choice, Page, Panel, useFilter } from "../parts.js";
+import { Choice, Page, Panel, useFilter, useKept } from "../parts.js";
 import { Lines, useLog } from "../loglines.js";
 
 const LEVELS = [
@@ -14,7 +14,7 @@ const LEVELS = [
 const RANK = { DEBUG: 0, INFO: 1, WARN: 2, ERROR: 3, FATAL: 4 };
 
 export function Log({ state, connection }) {
-  const [level, setLevel] = useState("INFO");
+  const [level, setLevel] = useKept("level", "INFO");
   const filter = useFilter("text or node");
   const [held, hold] = useState(false);
   const own = section(state, "agent").name;
