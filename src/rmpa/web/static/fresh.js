@@ -23,12 +23,12 @@ export function useWatch(connection, wanted, take) {
   const [state, set] = useState({ came: 0 });
   const key = JSON.stringify(wanted);
   useEffect(() => {
-    set({ came: 0 });
     if (!wanted) return undefined;
+    set((before) => (before.topic === wanted.topic ? before : { came: 0, topic: wanted.topic }));
     return connection.watch(wanted, (message) => {
-      if (message.op === "failed") return set({ came: 0, failure: message });
+      if (message.op === "failed") return set({ came: 0, topic: wanted.topic, failure: message });
       if (message.op === "beat") return set((before) => ({ ...before, beat: message }));
-      set((before) => ({ ...before, came: performance.now() }));
+      set((before) => ({ ...before, failure: undefined, came: performance.now() }));
       return take.current(message);
     });
   }, [key]);

@@ -2,7 +2,7 @@
 
 import { html, useEffect, useLayoutEffect, useRef, useState } from "./markup.js";
 import { bandwidth, bytes, clock, hertz } from "./format.js";
-import { Fresh, useWatch as useBeat } from "./fresh.js";
+import { Fresh, useOld, useWatch as useBeat } from "./fresh.js";
 import { Choice, Failure, Mark, Panel } from "./parts.js";
 import { section } from "./state.js";
 import { Plot, append } from "./plot.js";
@@ -198,11 +198,12 @@ function Image({ connection, topic, type, state, onOld }) {
   const shown = compressed && offered ? other : topic;
   const width = usePlace(place);
   const watched = useWatch(connection, width ? { topic: shown, how: "image", rate: 10, width } : null, show);
+  const old = useOld(watched.came, watched.beat?.after);
   const from = (section(section(state, "topics"), shown).from || []).filter(
     (each) => each !== section(state, "agent").name,
   );
   const crossing =
-    type === "sensor_msgs/Image" && shown === topic && from.length > 0 && watched.beat
+    type === "sensor_msgs/Image" && shown === topic && from.length > 0 && watched.beat && !old
       ? `${bandwidth(watched.beat.bandwidth)} cross the mesh from ${from.join(", ")} for it. `
       : "";
   return html`<figure class="wide" ref=${place}>

@@ -26,7 +26,7 @@ import {
 import { Lines } from "../plot.js";
 import { Live } from "../live.js";
 
-export const TOPIC_COLUMNS = ["Topic", "Type", "#Rate", "#Bytes", "#Latency", "#Lost", "From → to"];
+export const TOPIC_COLUMNS = ["Topic", "#Rate", "#Bytes", "Type", "#Latency", "#Lost", "From → to"];
 const lostOf = (topic) => (topic.lost || 0) + (topic.dropped || 0);
 const KEYS = {
   Topic: ([name]) => name,
@@ -61,9 +61,9 @@ export const TopicRow = memo(
         <${Link} page="topic" name=${name} />${topic.problem &&
         html`<div class="muted"><${Mark} state="WARN" word=${""} />${topic.problem}</div>`}
       </th>
-      <td><span class="muted">${topic.type}</span></td>
       <td class="number"><${Rate} topic=${topic} measured=${measured} /></td>
       <td class="number">${bandwidth(measured?.bandwidth || topic.bandwidth)}</td>
+      <td><span class="muted">${topic.type}</span></td>
       <td class="number">${seconds(topic.latency)}</td>
       <td class="number">${lostOf(topic) ? count(lostOf(topic)) : "–"}</td>
       <td>
