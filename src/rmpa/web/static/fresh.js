@@ -49,15 +49,13 @@ export function Fresh({ watched: { came, beat }, onOld, children }) {
   const old = useOld(came, beat?.after);
   useEffect(() => onOld?.(old), [old]);
   const figures = beat && `${hertz(beat.rate)} · ${bandwidth(beat.bandwidth)}`;
+  const before = old ? "the last message is " : `${figures || "one message"} · `;
   return html`<div class=${old ? "fresh old" : "fresh"}>
     ${children}
     ${came > 0 &&
     html`<p class="muted beat">
-      <span role="status">${old && html`<${Mark} state="STALE" word="Nothing comes any more" />, `}</span>${old
-        ? "the last message is "
-        : figures
-          ? `${figures} · `
-          : "one message · "}<${Ago} came=${came} />${" "}old ${old && figures && `, before that ${figures}`}
+      <span role="status">${old && html`<${Mark} state="STALE" word="Nothing comes any more" />, `}</span
+      >${before}<${Ago} came=${came} />${` old${old && figures ? `, before that ${figures}` : ""}`}
     </p>`}
   </div>`;
 }
