@@ -242,7 +242,7 @@ DIRECT_LOOK: Final = 0.02
 # Modules and sites that are logged as refused by one rule for one kind of access; further ones, whose names may be
 # invented, are only counted until the rules change.
 REFUSALS_LOGGED: Final = 128
-# Time for which the rates of topics are measured after they were asked for: a list that is open asks every 2 s.
+# Time for which the rates of topics are measured after they were asked for: a list that is open asks every 3 s.
 RATES_KEPT: Final = 6.0
 # Pause between two nodes that are asked for their counts; an answer of 40 topics takes some 2 ms to read.
 RATES_PAUSE: Final = 0.25

@@ -128,7 +128,7 @@ RESOURCES_MAX: Final = 256
 # Time for which the details of a Smart Resource are followed after a page has shown it.
 LOOK_KEPT: Final = 10.0
 # Time between two questions for the rates of all topics, while a page shows their list.
-RATES_PERIOD: Final = 2.0
+RATES_PERIOD: Final = 3.0
 # Time between two signs of life to a page, which takes its connection for lost after three without any.
 TICK_PERIOD: Final = 2.0
 # Pause before it is looked again whether a page has taken what was sent.
