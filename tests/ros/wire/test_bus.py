@@ -137,5 +137,6 @@ VALUES = st.recursive(st.integers() | st.text(max_size=3) | st.booleans(), lambd
 
 @given(VALUES)
 def test_whatever_a_node_answers_for_its_counts_is_read(value: XmlRpcValue) -> None:
-    for answer in (value, [value], [1, "", value], [1, "", [value]], [1, "", [[["/a", value], ["/a", [value]]]]]):
+    answers: list[XmlRpcValue] = [value, [value], [1, "", value], [1, "", [[["/a", value], ["/a", [value]]]]]]
+    for answer in answers:
         assert all(isinstance(sent, dict) for sent in read_bus_stats(answer).values())

@@ -189,12 +189,16 @@ async def test_rates_are_asked_while_a_page_looks_and_joined_with_the_topics_her
         asked.append(now[0])
         return told
 
+    async def idle() -> None:
+        for _ in range(4):
+            await asyncio.sleep(0)
+
     feed = RatesFeed(ask, lambda: now[0])
     here = TopicInfo(name="/quiet", publishers=("/node",))
     away = TopicInfo(name="/far", routes=(RouteInfo(peer="old", node="/n", direction="in", state="idle"),))
     snapshot = replace(FULL, topics=(FULL.topics[0], here, away))
     assert feed.look(snapshot) == {}
-    await asyncio.sleep(0)
+    await idle()
     found: Any = feed.look(snapshot)
     assert found["/quiet"] == {"rate": 2.0, "bandwidth": 16.0, "how": "counted"}
     assert found["/image"] == {"rate": 30.0, "bandwidth": 900.0, "how": "sampled"}
@@ -202,7 +206,7 @@ async def test_rates_are_asked_while_a_page_looks_and_joined_with_the_topics_her
     told["base"] = [["/quiet", 2.01, 16.0, "counted"]]
     now[0] += limits.RATES_PERIOD
     feed.look(snapshot)
-    await asyncio.sleep(0)
+    await idle()
     assert (feed.look(snapshot)["/quiet"] is found["/quiet"], len(asked)) == (True, 2)
     await feed.close()
 
