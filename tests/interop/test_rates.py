@@ -28,7 +28,9 @@ def wait_rate(asker: Module, of: Module, topic: str, how: str, rate: float) -> N
 
     def told() -> bool:
         found = rates(asker.agent).get(of.name, {}).get(topic)
-        return found is not None and found[2] == how and rate * 0.5 < (found[0] or 0.0) < rate * 1.5
+        if found is None or found[2] != how or not found[1]:
+            return False
+        return rate * 0.5 < found[0] < rate * 1.5 and found[1] / found[0] == pytest.approx(76, abs=1)  # bytes of each
 
     eventually(told, 60.0, what=f"{rate} Hz of {topic}, {how}")
 

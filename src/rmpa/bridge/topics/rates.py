@@ -26,6 +26,7 @@ from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.ros.http.rpc import call
 from rmpa.ros.node.subscription import PublisherConnection
 from rmpa.ros.wire.slave_api import read_bus_stats
+from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.ros.wire.xmlrpc import RosFault
 from rmpa.runtime.tasks import OwnedTasks
 
@@ -152,6 +153,7 @@ class Rates(Part):
             messages, size = max(
                 tuple((new - old) % 2**32 for new, old in zip(sent[link], before[link], strict=True)) for link in same
             )
+            size = max(0, size - LENGTH.size * messages)  # both libraries count it
             self._rates[key] = TopicRate(topic, messages / (now - at), size / (now - at), COUNTED)
 
     async def _sample(self, own: list[tuple[str, str, str, str]]) -> None:
@@ -229,7 +231,7 @@ class _Sample:
             self._latched = False  # what is latched comes first, and says nothing of the rate
             return
         self._ends.append(time.monotonic())
-        self._bytes += self._size
+        self._bytes += self._size - LENGTH.size
         count = len(self._ends)
         if count >= limits.RATES_MESSAGES or (count > 2 and self._bytes >= limits.RATES_BYTES):
             asyncio.get_running_loop().call_soon(self.close)
