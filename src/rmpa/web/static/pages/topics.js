@@ -93,12 +93,15 @@ const FILTERS = {
   all: ["All", () => true],
   wrong: ["With a problem", (one) => one.problem || one.lost || one.dropped],
 };
+let lastRates = {}; // until the server has told them again, as after Back, the order stays
 export function Topics({ state }) {
   const [which, choose] = useKept("which", "data");
   const filter = useFilter("name or type");
   const all = entries(state, "topics");
   const fits = FILTERS[which === "data" && filter.typed ? "all" : which][1]; // what is typed is looked for among all
-  const rates = section(section(state, "detail"), "rates:");
+  const told = section(section(state, "detail"), "rates:");
+  if (Object.keys(told).length) lastRates = told;
+  const rates = lastRates;
   const shown = all
     .filter(([name, one]) => fits(one, name, state) && filter.matches(`${name} ${one.type}`))
     .map(([name, one]) => [name, one, rates[name]]);
