@@ -278,8 +278,10 @@ async def test_topics_are_sorted_by_their_measured_rate_and_back_brings_the_list
     page = await site.open("topics", "large")
     await page.click("All")
     await page.wait("document.querySelectorAll('tbody tr').length === 200")
-    await page.run("document.querySelector('.filter').value = 'module_'")
-    await page.run("document.querySelector('.filter').dispatchEvent(new Event('input', {bubbles: true}))")
+    await page.run(
+        "(() => { const field = document.querySelector('.filter'); field.value = 'module_';"
+        " field.dispatchEvent(new Event('input', {bubbles: true})); })()"
+    )
     await page.run("[...document.querySelectorAll('button.sort')].find((b) => b.innerText.trim() === 'Rate').click()")
     await page.wait("document.querySelector('[aria-sort=descending]')")
     assert "6" in (await page.run(ROWS))[0].split("\t")[1]
