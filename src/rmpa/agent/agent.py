@@ -24,6 +24,7 @@ from rmpa.bridge.params.follower import Params
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.services.part import Services
 from rmpa.bridge.subscriptions import Subscriptions
+from rmpa.bridge.topics.rates import Rates
 from rmpa.bridge.twins import TwinWatch
 from rmpa.config.module_name import core_file
 from rmpa.core import limits
@@ -436,8 +437,8 @@ class Agent:
         self.params, self.services = Params(self.bridge), Services(self.bridge)
         nodes = Nodes(self.bridge, self.bridge.topics, self.services)
         subscriptions = Subscriptions(self.bridge)
-        twins = TwinWatch(self.bridge, subscriptions)
-        for part in (self.params, self.services, nodes, subscriptions, twins):
+        twins, rates = TwinWatch(self.bridge, subscriptions), Rates(self.bridge)
+        for part in (self.params, self.services, nodes, subscriptions, twins, rates):
             self.bridge.add(part)
         self.trust: AgentTrust | None = None
         if membership is not None:
@@ -464,7 +465,9 @@ class Agent:
         self.bridge.rpc.on_request(INFO, lambda _asker, _args: self.snapshots.agent().for_peers(), needs)
         self.sites = SiteRequests(self.bridge)
         self.why = WhyService(settings.name, facts, self.snapshots, self.sites)
-        self.operations = ControlOperations(settings.name, facts, self.params, self.snapshots, nodes, self.sites)
+        self.operations = ControlOperations(
+            settings.name, facts, self.params, self.snapshots, nodes, self.sites, rates
+        )
         self.trust_commands = TrustCommands(settings, self.trust)
         handlers: dict[str, Handler] = {
             **self.operations.handlers(),

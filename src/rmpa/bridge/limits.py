@@ -268,3 +268,17 @@ DIRECT_LOOK: Final = 0.02
 # Modules and sites that are logged as refused by one rule for one kind of access; further ones, whose names may be
 # invented, are only counted until the rules change.
 REFUSALS_LOGGED: Final = 128
+# Time for which the rates of topics are measured after they were asked for: a list that is open asks every 3 s.
+RATES_KEPT: Final = 6.0
+# Pause between two nodes that are asked for their counts; an answer of 40 topics takes some 2 ms to read.
+RATES_PAUSE: Final = 0.25
+# Topics without a subscriber that are subscribed to at one time, and for how long at most.
+RATES_AT_ONCE: Final = 8
+RATES_SAMPLE: Final = 2.0
+# Messages, and bytes from the third message on, that are enough for a rate.
+RATES_MESSAGES: Final = 50
+RATES_BYTES: Final = 1 * MIB
+# [Graph] Topics of one module whose rates are told
+# At it: the rate of others is not known
+# Told in: the page of all topics
+RATES_MAX: Final = 2000

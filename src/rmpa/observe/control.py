@@ -14,6 +14,7 @@ the number of its bytes, and they follow the line.
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
 import msgspec
@@ -77,16 +78,25 @@ def _list(values: Sequence[object]) -> Iterator[bytes]:
 
 
 def _struct(value: msgspec.Struct) -> Iterator[bytes]:
-    omit = type(value).__struct_config__.omit_defaults
     separator = b"{"
-    for field in msgspec.structs.fields(value):
-        content = getattr(value, field.name)
-        if omit and content == _default(field):
+    for name, start, default in _members(type(value)):
+        content = getattr(value, name)
+        if default is not msgspec.NODEFAULT and content == default:
             continue
-        yield separator + msgspec.json.encode(field.encode_name) + b":"
+        yield separator + start
         yield from json_pieces(content)
         separator = b","
     yield b"{}" if separator == b"{" else b"}"
+
+
+@functools.cache  # to read the annotations of a type takes as long as to write a small struct
+def _members(kind: type[msgspec.Struct]) -> tuple[tuple[str, bytes, object], ...]:
+    """Of each field its name, its JSON up to the value, and the value that is left out, ``NODEFAULT`` for none."""
+    omit = kind.__struct_config__.omit_defaults
+    return tuple(
+        (each.name, msgspec.json.encode(each.encode_name) + b":", _default(each) if omit else msgspec.NODEFAULT)
+        for each in msgspec.structs.fields(kind)
+    )
 
 
 def _default(field: msgspec.structs.FieldInfo) -> object:

@@ -14,6 +14,7 @@ from rmpa.bridge import nodes as node_requests
 from rmpa.bridge.log import LEVEL
 from rmpa.bridge.log_ring import ModuleLog
 from rmpa.bridge.params import transfer
+from rmpa.bridge.topics.rates import RATES
 from rmpa.config.rules import ROS2
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.nodes import Nodes
     from rmpa.bridge.params.follower import Params
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.topics.rates import Rates
     from rmpa.observe.control_client import ControlClient
     from rmpa.observe.control_server import Handler
     from rmpa.observe.sites import SiteRequests
@@ -57,6 +59,7 @@ class ControlOperations:
         snapshots: Builds its snapshots.
         nodes: Knows the nodes of this module.
         sites: Answers questions about other sites.
+        rates: Measures the rates of this module's topics.
     """
 
     name: str
@@ -65,11 +68,13 @@ class ControlOperations:
     snapshots: SnapshotBuilder
     nodes: Nodes
     sites: SiteRequests
+    rates: Rates
 
     def handlers(self) -> dict[str, Handler]:
         """The handlers of the operations of this class, for ``ControlServer``."""
         names = ("snapshot", "ping", "param", "followed", "agent", "contract", "node", "log", "log_level")
-        return {"site": self.sites.answer, **{name: getattr(self, name) for name in names}}
+        named = {name: getattr(self, name) for name in names}
+        return {"site": self.sites.answer, "rates": self.topic_rates, **named}
 
     def snapshot(self, args: Args) -> Snapshot:
         """A snapshot, or a part of it.
@@ -158,6 +163,19 @@ class ControlOperations:
             return await self.facts.bridge.log.level(request)
         return await self.facts.bridge.rpc.request(self._session(peer), LEVEL, request)
 
+    async def topic_rates(self, _args: Args) -> dict[str, Any]:
+        """The rates of the topics that each module publishes, by its name; a text where a peer does not tell them."""
+        peers = [*self.facts.bridge.sessions.linked()]
+        told = await asyncio.gather(
+            *(self.facts.bridge.rpc.request(session, RATES, {}) for session in peers), return_exceptions=True
+        )
+        found: dict[str, Any] = {self.name: self.rates.now()}
+        for session, answer in zip(peers, told, strict=True):
+            if isinstance(answer, BaseException) and not isinstance(answer, RmpaError):
+                raise answer
+            found[session.link.name] = str(answer) if isinstance(answer, RmpaError) else answer
+        return found
+
     def contract(self, args: Args) -> dict[str, ContractTerm]:
         """The terms that this module's settings give a ``topic`` of a ``type_name``, by key; it need not exist."""
         topic, type_name = str(args.get("topic", "")), str(args.get("type_name", ""))
@@ -209,6 +227,7 @@ REPLIES: Final[dict[str, object]] = {
     "trust": object,  # TrustStatus, or as the command says (trust.status)
     "agent": ModuleFacts,
     "contract": dict[str, ContractTerm],
+    "rates": object,  # tuple[TopicRate, ...] or a text, by module
     "site": object,  # as ``QUESTIONS`` say
     "log": tuple[ModuleLog, ...],
     "log_level": dict[str, str],

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.ros.wire.slave_api import BusConnection, BusLink, bus_info, read_bus_info
+from rmpa.ros.wire.slave_api import BusConnection, BusLink, bus_info, bus_stats, read_bus_info, read_bus_stats
 from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 TALKER: Final = "http://127.0.0.1:36171/"
@@ -120,3 +120,23 @@ PORTS = st.integers(1, 65535)
 def test_every_address_is_read(local: int, host: str, port: int, socket: str) -> None:
     text = f"TCPROS connection on port {local} to [{host}:{port}{socket}]"
     assert read_bus_info([row(info=text)]) == [link(local_port=local, remote=(host, port))]
+
+
+def test_what_each_library_has_sent_is_read() -> None:
+    rospy: XmlRpcValue = [1, "", [[["/out", 660, [[2, 812, 55, True]]], ["/quiet", 0, []]], [["/in", []]], []]]
+    assert read_bus_stats(rospy) == {"/out": {2: (55, 812)}, "/quiet": {}}
+    # roscpp leaves out code and status, and has the bytes of messages as well.
+    roscpp: XmlRpcValue = [[["/out", [[2, 1032, 1032, 86, 0]]]], [["/in", [[1, 696, 87, 0, 0]]]]]
+    assert read_bus_stats(roscpp) == {"/out": {2: (86, 1032)}}
+    ours = bus_stats(["/out"], [], [BusConnection(1, "/s", "o", "/out", True, "", 70, 7)])
+    assert read_bus_stats([1, "", ours]) == {"/out": {1: (7, 70)}}
+
+
+VALUES = st.recursive(st.integers() | st.text(max_size=3) | st.booleans(), lambda inner: st.lists(inner, max_size=5))
+
+
+@given(VALUES)
+def test_whatever_a_node_answers_for_its_counts_is_read(value: XmlRpcValue) -> None:
+    answers: list[XmlRpcValue] = [value, [value], [1, "", value], [1, "", [[["/a", value], ["/a", [value]]]]]]
+    for answer in answers:
+        assert all(isinstance(sent, dict) for sent in read_bus_stats(answer).values())

@@ -244,6 +244,80 @@ async def test_scans_and_pictures_are_drawn(site: Site, address: str) -> None:
     assert (site.server.reports, page.errors) == ([], [])
 
 
+async def test_what_stopped_is_greyed_with_its_age_until_it_comes_again(site: Site) -> None:
+    page = await site.open("topic/%2Fcamera%2Fimage", "sensors")
+    await page.click("On")
+    await page.wait("document.querySelector('.beat')?.innerText.includes('Hz · ')")
+    assert await page.run("document.querySelector('.fresh.old')") is None
+    site.server.publishes = False
+    await page.wait("document.querySelector('.fresh.old .beat')?.innerText.includes('Nothing comes any more')")
+    await page.wait("/last message is \\d+.s old, before that/.test(document.querySelector('.beat').innerText)")
+    live = "document.querySelector('[aria-label=\"Live messages\"]').parentNode.innerText"
+    assert "nothing comes" in await page.run(live)
+    assert await page.run("getComputedStyle(document.querySelector('canvas.view')).filter") == "grayscale(1)"
+    assert await violations(page) == []
+    site.server.publishes = True
+    await page.wait("document.querySelector('.fresh:not(.old) .beat')")
+    assert "nothing comes" not in await page.run(live)
+
+
+async def test_a_raw_image_says_its_true_size_fits_its_place_and_offers_the_compressed_one(site: Site) -> None:
+    await site.page.look(390, 800)
+    page = await site.open("topic/%2Fcamera%2Fraw", "sensors")
+    await page.click("On")
+    await page.wait("/^1280 . 720 · bgr8 · drawn as 426 . 240/.test(document.querySelector('figcaption').innerText)")
+    colour = "[...document.querySelector('canvas.view').getContext('2d').getImageData(9, 200, 1, 1).data]"
+    assert await page.run(colour) == [255, 0, 0, 255]
+    await page.wait("/B.s cross the mesh from base/.test(document.querySelector('figure').innerText)")
+    await page.click("Show /camera/raw/compressed instead")
+    await page.wait("document.querySelector('figcaption').innerText.includes(' · png · ')")
+    assert "cross the mesh" not in await page.run("document.querySelector('figure').innerText")
+    assert (site.server.reports, page.errors) == ([], [])
+
+
+ROWS = "[...document.querySelectorAll('tbody tr')].map((row) => row.innerText)"
+
+
+async def test_topics_are_sorted_by_their_measured_rate_and_back_brings_the_list_as_it_was(site: Site) -> None:
+    page = await site.open("topics", "large")
+    await page.click("All")
+    await page.wait("document.querySelectorAll('tbody tr').length === 200")
+    await page.run(
+        "(() => { const field = document.querySelector('.filter'); field.value = 'module_';"
+        " field.dispatchEvent(new Event('input', {bubbles: true})); })()"
+    )
+    await page.run("[...document.querySelectorAll('button.sort')].find((b) => b.innerText.trim() === 'Rate').click()")
+    await page.wait("document.querySelector('[aria-sort=descending]')")
+    assert "6" in (await page.run(ROWS))[0].split("\t")[1]
+    await page.wait("document.querySelectorAll('tbody tr').length === 200")
+    await page.run("scrollTo(0, 2000)")
+    before = await page.run(ROWS)
+    await page.run("document.querySelectorAll('tbody a')[30].click()")
+    await page.wait("document.querySelector('h1').innerText.startsWith('/module_') && scrollY === 0")
+    await page.run("history.back()")
+    await page.wait("document.querySelector('h1').innerText === 'Topics' && scrollY === 2000")
+    assert await page.run("document.querySelector('.filter').value") == "module_"
+    assert [row.split()[0] for row in await page.run(ROWS)] == [row.split()[0] for row in before]
+    assert await page.run("document.querySelector('[aria-checked=true]').innerText") == "All"
+    await page.run("location.hash = '#/'")
+    await page.wait("document.querySelector('.ring')")
+    await page.run("location.hash = '#/topics'")
+    await page.wait("document.querySelector('.filter')")
+    assert await page.run("document.querySelector('.filter').value") == ""
+
+
+async def test_the_line_of_a_lost_connection_stays_in_sight(site: Site) -> None:
+    page = await site.open("topics", "large")
+    await page.wait("document.querySelectorAll('tbody tr').length > 100")
+    site.server.agent.scene = "mute"
+    await page.wait("document.querySelector('.banner')")
+    for width in (1280, 390):
+        await page.look(width, 700)
+        await page.run("scrollTo(0, 3000)")
+        await page.wait("scrollY > 2000")
+        assert await page.run("document.querySelector('.banner').getBoundingClientRect().top") >= 0
+
+
 async def test_why_says_where_the_way_ends(site: Site) -> None:
     page = await site.open("topic/%2Fodom", "killed")
     await page.press("w")

@@ -156,6 +156,16 @@ async def test_parameters_are_read_and_set_and_told_where_another_node_sets_them
     assert core.call("getParam", "/test", "/speed").value == 0.4
     assert "speed" not in (await page.ask("delete_param", peer="", name="/speed"))["values"]
     assert "cannot be null" in await page.ask("set_param", peer="", name="/speed", value=None)
+    core.call("setParam", "/other", "/span", [1.0, float("nan")])
+    core.call("setParam", "/other", "/reach", float("nan"))
+    await page.answered("params", lambda told: told.get("values", {}).get("reach") == "nan", peer="")
+    for typed, kept in (("nan", "nan"), ("-inf", "-inf"), (2, 2.0), ("far", "far")):
+        await page.ask("set_param", peer="", name="/reach", value=typed)
+        value = core.call("getParam", "/test", "/reach").value
+        assert (str(value), type(value)) == (str(kept), str if typed == "far" else float)
+    await page.ask("set_param", peer="", name="/span", value=[1, "nan", 3])
+    span: Any = core.call("getParam", "/test", "/span").value
+    assert [str(each) for each in span] == ["1.0", "nan", "3.0"]
     assert "no agent" in await page.ask("params", peer="arm")
     await page.sees(lambda: "parameters" in page.state)
     known, before = await page.ask("params", peer=""), page.state["parameters"]

@@ -22,7 +22,7 @@ import time
 import zlib
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 from aiohttp import WSMsgType, web
@@ -50,12 +50,20 @@ from rmpa.web.server.app import HEADERS
 from tests.web.monitor.test_sticks import Bus
 from tests.web.recorder import FakeHub, PageConnection, Recorded
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
 FIXTURES = Path(__file__).with_name("fixtures")
 STATIC = Path(__file__).parents[3] / "src/rmpa/web/static"
 TICK = 0.1
 replace = msgspec.structs.replace
 _SPEEDS = struct.Struct("<6d")
-_SENSORS = {"/scan": "sensor_msgs/LaserScan", "/camera/image": "sensor_msgs/CompressedImage"}
+_SENSORS = {
+    "/scan": "sensor_msgs/LaserScan",
+    "/camera/image": "sensor_msgs/CompressedImage",
+    "/camera/raw": "sensor_msgs/Image",
+    "/camera/raw/compressed": "sensor_msgs/CompressedImage",
+}
 
 
 def snapshots() -> list[Snapshot]:
@@ -240,6 +248,8 @@ class FakeServer:
         self.rights = dataclasses.replace(FULL, drive=True)
         self.hears = asyncio.Event()
         self.hears.set()
+        # Whether nodes publish; else nothing live comes any more.
+        self.publishes = True
         self.speeds: list[SimpleNamespace] = []
         self.reports: list[str] = []
         self.asked: list[SimpleNamespace] = []
@@ -256,6 +266,7 @@ class FakeServer:
         self.logs = {name: LogRing(time.time_ns()) for name in ("pc", "base", "velocity")}
         self.log_problems = {"joystick": "its agent is of an earlier release, which has no log for others"}
         self.levels = {"rosout": "info", "rospy.core": "warn"}
+        self.raw = bytes(1280 * 3 * 360) + bytes((0, 0, 255)) * (1280 * 360)
         self._params_told: dict[str, Any] = {}
         self._param_changes = 0
         self._builder = StateBuilder("pc")
@@ -313,6 +324,12 @@ class FakeServer:
     def _details(self, kind: str, name: str) -> Tree | None:
         if kind.startswith("diagnostic"):
             return self._diagnostics.all() if kind == "diagnostics" else self._diagnostics.one(name)
+        if kind == "rates":
+            measured: Tree = {
+                topic.name: {"rate": float(number % 7), "bandwidth": 8.0 * number, "how": "counted"}
+                for number, topic in enumerate(self._snapshot.topics)
+            }
+            return measured | {"/odom": {"how": "no subscriber"}}
         return details(self._snapshot, {one.key: one for one in self.agent.facts()}, kind, name)
 
     async def _socket(self, request: web.Request) -> web.WebSocketResponse:
@@ -482,7 +499,9 @@ class _Client(Recorded):
             ranges = [_room(number * math.pi / 180) for number in range(360)]
             limits = {"angle_min": 0.0, "angle_increment": math.pi / 180, "range_min": 0.1, "range_max": 8.0}
             return {**limits, "ranges": ranges}
-        if "image" in topic:
+        if topic == "/camera/raw":
+            return {"width": 1280, "height": 720, "encoding": "bgr8", "step": 3840, "data": self._server.raw}
+        if "camera" in topic:
             return {"format": "png", "data": _png(160, 120, time.time())}
         if topic == "/odom":
             return self._server.odometry()
@@ -495,7 +514,7 @@ class _Client(Recorded):
                 self.session._update(self._server._next_state())
             for asked in self.all("subscribe"):
                 kind = next((kind for name, kind in _SENSORS.items() if name == asked.topic), "nav_msgs/Odometry")
-                if not asked.closed:
+                if not asked.closed and self._server.publishes:
                     asked.receive(ReceivedMessage(asked.topic, kind, memoryview(b"\0" * 712), time.time_ns()))
             self.session.handle_timer(time.monotonic())
             await self.flush()

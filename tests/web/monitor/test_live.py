@@ -76,16 +76,27 @@ def test_a_scan_has_null_where_nothing_was_measured_and_the_nearest_of_each_part
 def test_an_image_of_each_order_of_colours_is_shown_alike() -> None:
     rgb = raw_picture(2, 2, "rgb8", 8, bytes([1, 2, 3, 4, 5, 6, 0, 0, 7, 8, 9, 10, 11, 12]))
     assert (rgb.format, rgb.width, rgb.height, rgb.data) == ("rgb8", 2, 2, bytes(range(1, 13)))
+    bgr = raw_picture(2, 1, "bgr8", 6, bytes([3, 2, 1, 6, 5, 4]))
+    assert (bgr.format, bytes(bgr.data)) == ("bgr8", bytes([3, 2, 1, 6, 5, 4]))
+    whole = bytes(each for pixel in range(16) for each in (pixel, pixel + 100, pixel + 200))
+    assert bytes(raw_picture(4, 4, "bgr8", 12, whole, 2).data)[::3] == bytes([5, 7, 13, 15])
     bgra = raw_picture(1, 1, "bgra8", 4, bytes([3, 2, 1, 255]))
-    assert bgra.data == bytes([1, 2, 3])
+    assert (bgra.format, bgra.data) == ("bgr8", bytes([3, 2, 1]))
     assert raw_picture(2, 1, "mono8", 2, bytes([7, 8])).data == bytes([7, 8])
 
 
-def test_a_large_image_is_thinned() -> None:
+def test_a_large_image_is_thinned_to_its_place_and_says_its_true_size() -> None:
     made = raw_picture(1280, 720, "rgb8", 1280 * 3, bytes(1280 * 720 * 3))
     assert made.width * made.height <= limits.IMAGE_PIXELS
     assert len(made.data) == made.width * made.height * 3
-    assert made.every == 4
+    assert (made.width, made.height, made.whole) == (1280, 720, (1280, 720))
+    for place, width in ((1200, 1280), (780, 640), (320, 320), (1, 1)):
+        made = raw_picture(1280, 720, "rgb8", 1280 * 3, bytes(1280 * 720 * 3), place)
+        assert (made.width, made.whole) == (width, (1280, 720))
+        assert len(made.data) == made.width * made.height * 3
+    assert raw_picture(4000, 3000, "mono8", 4000, bytes(4000 * 3000)).width <= limits.IMAGE_PIXELS**0.5 * 2
+    depth = raw_picture(640, 480, "16UC1", 1280, bytes(640 * 480 * 2), 1280)
+    assert (depth.width, depth.height) == (320, 240)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +118,7 @@ def test_an_image_that_cannot_be_is_refused(width: int, height: int, encoding: s
 def test_a_compressed_image_is_passed_on_as_it_is() -> None:
     jpeg = b"\xff\xd8\xff\xe0 and so on"
     frame = compressed_picture("rgb8; jpeg compressed bgr8", jpeg).frame(7, 123)
-    assert IMAGE_HEADER.unpack_from(frame) == (1, 1, 0, 0, 0, 7, 123)
+    assert IMAGE_HEADER.unpack_from(frame) == (1, 1, 0, 0, 0, 7, 123, 0, 0)
     assert frame[IMAGE_HEADER.size :] == jpeg
     with pytest.raises(RemoteProtocolError, match="neither JPEG nor PNG"):
         compressed_picture("tiff", b"II*\0")

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.web.clients.frame_writer import Opcode
 from rmpa.web.hub.node_link import FULL, Rights
 from rmpa.web.hub.topics import ReceivedMessage
 from rmpa.web.monitor import driving, limits
@@ -30,6 +31,7 @@ class Page(Recorded):
     def __init__(self, rights: Rights = ALL, sticks: Sticks | None = None) -> None:
         self.now = 100.0
         self.details: Any = {("topic", "/odom"): {"rate": 50.0}}
+        self.picture = False
         self.decoded = self.ticks = self.n = self.number = 0
         self.tick_at = 0.0
         self.state: Any = None
@@ -57,6 +59,8 @@ class Page(Recorded):
 
     def _decode(self, message: ReceivedMessage) -> Any:
         self.decoded += 1
+        if self.picture:
+            return {"width": 1, "height": 1, "encoding": "mono8", "step": 1, "data": message.payload}
         return {"x": float(message.payload[0]), "bytes": message.payload}
 
     def _asked(self, what: str, args: Any) -> Asked:
@@ -66,7 +70,10 @@ class Page(Recorded):
     def take(self) -> list[Any]:
         """Act as the page does; the new frames but signs of life."""
         new = []
-        for _, (data,) in self.page.sent:
+        for opcode, (data,) in self.page.sent:
+            if opcode is Opcode.BINARY:
+                new.append(bytes(data))
+                continue
             message = json.loads(bytes(data))
             if message["op"] == "tick":
                 self.ticks += 1
@@ -115,11 +122,16 @@ class Page(Recorded):
         self.session.handle_timer(self.now)
         return self.take()
 
-    def message(self, value: int) -> list[Any]:
-        """A message for the newest watch."""
+    def message(self, value: int, kind: str = "a/B") -> list[Any]:
+        """A message for the newest watch; the new frames, without beats."""
         view = memoryview(bytes([value]))
-        self.last("subscribe").receive(ReceivedMessage("/odom", "a/B", view, int(self.now * 1e9)))
-        return self.take()
+        self.last("subscribe").receive(ReceivedMessage("/odom", kind, view, int(self.now * 1e9)))
+        return [frame for frame in self.take() if isinstance(frame, bytes) or frame["op"] != "beat"]
+
+    @property
+    def beats(self) -> list[Any]:
+        """What was told of the rate of a watch."""
+        return [frame for frame in self.news if not isinstance(frame, bytes) and frame["op"] == "beat"]
 
 
 @pytest.fixture
@@ -185,7 +197,7 @@ def test_values_are_paced_newest_first_and_decoded_only_when_sent(page: Page) ->
         page.now += 0.01
         page.message(value)
     assert page.decoded == 1
-    assert [frame["value"]["x"] for frame in page.after(0.2)] == [19.0]
+    assert [frame["value"]["x"] for frame in page.after(0.2) if frame["op"] == "value"] == [19.0]
 
 
 def test_a_plot_gets_every_sample(page: Page) -> None:
@@ -194,8 +206,36 @@ def test_a_plot_gets_every_sample(page: Page) -> None:
         page.message(value)
         page.now += 0.01
     page.after(1.0)
-    values = [value for frame in page.news for value in frame["columns"][1]]
+    values = [value for frame in page.news if "columns" in frame for value in frame["columns"][1]]
     assert values == list(range(10))
+
+
+def test_a_page_is_told_the_rate_of_all_messages_and_when_the_last_one_is_old(page: Page) -> None:
+    page.send("watch", id=1, topic="/odom", how="value", rate=5)
+    for period, after in ((0.1, 2.0), (1.0, 5.0)):
+        for value in range(40):
+            page.message(value)
+            page.now += period
+        assert page.beats[-1] == {"op": "beat", "id": 1, "rate": pytest.approx(1 / period, 0.11), **page.beats[-1]}
+        assert page.beats[-1]["after"] == pytest.approx(after, 0.11)
+    assert len(page.beats) < 20
+
+
+def test_a_page_that_has_not_drawn_its_pictures_gets_no_more_of_them(page: Page) -> None:
+    page.picture = True
+    page.send("watch", id=1, topic="/odom", how="image", rate=10, width=640)
+
+    def came(count: int) -> int:
+        for value in range(count):
+            page.message(value, "sensor_msgs/Image")
+            page.now += 0.5
+        return sum(isinstance(frame, bytes) for frame in page.news)
+
+    assert came(5) == limits.UNSEEN_MAX
+    page.send("seen", ids=[1, 99])
+    assert came(5) == limits.UNSEEN_MAX + 1
+    page.send("seen", ids=[1, 1])
+    assert came(5) == limits.UNSEEN_MAX + 3
 
 
 def test_a_connection_that_takes_nothing_gets_no_live_frames(page: Page) -> None:

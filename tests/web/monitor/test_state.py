@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 from pathlib import Path
@@ -19,6 +20,7 @@ from rmpa.trust.permissions import TrustStatus
 from rmpa.web import limits as web_limits
 from rmpa.web.monitor import limits, messages, questions, session
 from rmpa.web.monitor.messages import Tree, difference
+from rmpa.web.monitor.rates import RatesFeed
 from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.state import StateBuilder, details, module_state
 from tests.web.monitor.fake_server import resources, snapshots
@@ -173,6 +175,57 @@ def test_noise_changes_nothing() -> None:
     topics = (replace(topic, routes=tuple(map(noise, topic.routes))) for topic in RECORDED[1].topics)
     noisy = replace(RECORDED[1], topics=tuple(topics))
     assert difference(before, builder.build(noisy, RESOURCES)) == {}
+
+
+@pytest.mark.parametrize(
+    ("rate", "age", "stopped"), [(50.0, 1.9, None), (50.0, 12.0, -12.0), (0.5, 9.0, None), (0.5, 11.0, -11.0)]
+)
+def test_what_stopped_is_old_after_some_of_its_own_periods(rate: float, age: float, stopped: float | None) -> None:
+    (flowing, *_) = (each for each in snapshots()[0].topics if each.name == "/odom")
+    routes = tuple(
+        replace(each, rate=rate, age=age, period=None) for each in flowing.routes if each.direction == "in"
+    )
+    snapshot = replace(FULL, topics=(replace(flowing, routes=routes),))
+    state = build(snapshot)
+    moment = None if stopped is None else snapshot.taken + stopped
+    assert state["topics"]["/odom"].get("stopped") == moment
+    assert bool(state["flows"]) == (moment is None)
+    detail: Any = details(snapshot, {}, "topic", "/odom")
+    assert {route.get("stopped") for route in detail["routes"].values()} == {moment}
+
+
+async def test_rates_are_asked_while_a_page_looks_and_joined_with_the_topics_here() -> None:
+    now, asked = [100.0], []
+    told: dict[str, Any] = {
+        "base": [["/quiet", 2.0, 16.0, "counted"]],
+        "arm": [["/image", 30.0, 900.0, "sampled"], ["/other", 1.0, 1.0, "counted"]],
+        "old": "there is no question 'topic.rates'",
+    }
+
+    async def ask() -> Any:
+        asked.append(now[0])
+        return told
+
+    async def idle() -> None:
+        for _ in range(4):
+            await asyncio.sleep(0)
+
+    feed = RatesFeed(ask, lambda: now[0])
+    here = TopicInfo(name="/quiet", publishers=("/node",))
+    away = TopicInfo(name="/far", routes=(RouteInfo(peer="old", node="/n", direction="in", state="idle"),))
+    snapshot = replace(FULL, topics=(FULL.topics[0], here, away))
+    assert feed.look(snapshot) == {}
+    await idle()
+    found: Any = feed.look(snapshot)
+    assert found["/quiet"] == {"rate": 2.0, "bandwidth": 16.0, "how": "counted"}
+    assert found["/image"] == {"rate": 30.0, "bandwidth": 900.0, "how": "sampled"}
+    assert found["/far"] == {"how": told["old"]}
+    told["base"] = [["/quiet", 2.01, 16.0, "counted"]]
+    now[0] += limits.RATES_PERIOD
+    feed.look(snapshot)
+    await idle()
+    assert (feed.look(snapshot)["/quiet"] is found["/quiet"], len(asked)) == (True, 2)
+    await feed.close()
 
 
 def test_patches_of_the_recorded_demo_are_small() -> None:

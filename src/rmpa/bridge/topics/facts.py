@@ -26,7 +26,7 @@ from rmpa.core.facts import (
 )
 from rmpa.core.identity import is_own, proxied_node
 from rmpa.ros.wire.tcpros import LENGTH, printable
-from rmpa.runtime.loop import SystemClock, sorted_yielding, yield_to_data, yielding_to_data
+from rmpa.runtime.loop import SystemClock, sorted_yielding, yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 class TopicFacts:
     """Reads what core and bridge know of topics; changes nothing.
 
-    It yields to data between two topics. What it iterates over is a copy, because data may change the routes.
+    It yields to data every 250 µs. What it iterates over is a copy, because data may change the routes.
 
     Args:
         bridge: The bridge, with the local core.
@@ -89,8 +89,7 @@ class TopicFacts:
         known = {name for name in yielding_to_data(names) if any(name in table for table in tables)}
         unreachable = {info.node: str(info) for info in self._core.unreachable_infos()}
         found = []
-        for name in sorted_yielding(known):
-            yield_to_data()
+        for name in yielding_to_data(sorted_yielding(known)):
             nodes, type_name = tuple(state.publishers.get(name, ())), state.types.get(name, "")
             own, crossing = tuple(node for node in nodes if not is_own(node)), tuple(routes.get(name, ()))
             decision = self._decision(name, type_name, own[0] if own else "/")
@@ -152,7 +151,6 @@ class TopicFacts:
         for entry in yielding_to_data(list(self._bridge.topics.imports)):
             if wanted is not None and entry.name not in wanted:
                 continue
-            yield_to_data()
             session = sessions[entry.peer]
             texts = [f"{session.name}: {entry.hidden}"] if entry.cause == CONFLICT else []
             texts += self._bridge.topics.mismatches.texts(entry.wire)
@@ -252,7 +250,6 @@ class TopicFacts:
         for source, local in yielding_to_data(list(topics.exports.offered.items())):
             if wanted is not None and source.topic not in wanted:
                 continue
-            yield_to_data()
             yield source.topic, None, list(topics.mismatches.texts(source))
             routes = list(topics.exports.routes(source).values())
             flowing = {route.peer for route in routes if route.flows}

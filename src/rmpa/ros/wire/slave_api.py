@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from rmpa.core.identity import is_global_name, is_legal_name
 from rmpa.core.limits import INT32_MAX
@@ -168,6 +168,40 @@ def read_bus_info(answer: XmlRpcValue) -> list[BusLink]:
         case [int(code), _, rows] if not isinstance(code, bool):
             answer = rows if code == 1 else None
     return [link for row in _list(answer) if (link := _link(_list(row))) is not None]
+
+
+# Messages and bytes that went over each outbound connection of one topic, by the connection's number.
+Sent: TypeAlias = dict[int, tuple[int, int]]
+
+
+def read_bus_stats(answer: XmlRpcValue) -> dict[str, Sent]:
+    """What a node has sent on each topic that it publishes.
+
+    rospy answers code, status and value, and has ``[number, bytes, messages, connected]`` for a connection; roscpp
+    answers the value alone, with ``[number, bytes, bytes of messages, messages, 0]``.
+
+    Args:
+        answer: The node's answer to ``getBusStats``.
+    """
+    match answer:
+        case [int(), str(), value]:
+            answer = value
+    found: dict[str, Sent] = {}
+    for row in _list(next(iter(_list(answer)), None)):
+        match row:
+            case [str(topic), *_, links]:
+                sent = found[topic] = {}
+                for link in _list(links):
+                    match link:
+                        case [int(number), int(size), int(messages), _] | [
+                            int(number),
+                            _,
+                            int(size),
+                            int(messages),
+                            _,
+                        ]:
+                            sent[number] = messages, size
+    return found
 
 
 def _link(row: Sequence[XmlRpcValue]) -> BusLink | None:

@@ -328,8 +328,8 @@ class FramesWatch(WatchState):
         return {"op": "tf", "id": self._id, "frames": [*changed.values()], "left_out": self._left_out}
 
 
-def watch_of(id_: int, how: str, fields: Sequence[str], rate: float, decode: Decode) -> WatchState:
+def watch_of(id_: int, how: str, fields: Sequence[str], rate: float, decode: Decode, place: int = 0) -> WatchState:
     """The watch for one way to show a topic."""
     if how == "map":
         return LayerWatch(id_, rate, decode)
-    return FramesWatch(id_, rate, decode) if how == "tf" else WatchState(id_, how, fields, rate, decode)
+    return FramesWatch(id_, rate, decode) if how == "tf" else WatchState(id_, how, fields, rate, decode, place)

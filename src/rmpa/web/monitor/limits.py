@@ -8,8 +8,9 @@ from rmpa.core.limits import KIB
 
 # Between two patches of one client: some 7 a second, which looks live and is read at leisure.
 PATCH_PERIOD: Final = 0.15
-# Shortest time from one snapshot of the agent to the next while pages are open.
-STATE_PERIOD: Final = 0.15
+# Shortest time from one snapshot of the agent to the next while pages are open: one of 300 topics takes the agent
+# 12 ms.
+STATE_PERIOD: Final = 1.0
 # The pause between two snapshots is at least so many times as long as a snapshot takes: a fifth of a core.
 STATE_SHARE: Final = 4.0
 # States and patches that a client has not acknowledged yet. A slow browser gets fewer patches, never a queue.
@@ -98,9 +99,23 @@ PUBLISHED_BYTES: Final = 256 * KIB
 # Why: The page says each second that it is there; a browser stops this in a hidden page.
 PUBLISH_RENEW: Final = 3.0
 # [Pages] Pixels of a raw image
-# At it: every n-th row and column is shown
-# Told in: the size below the image
-IMAGE_PIXELS: Final = 320 * 240
+# At it: every n-th row and column is shown, as where its place on the screen is smaller
+# Told in: the sizes below the image
+IMAGE_PIXELS: Final = 1280 * 720
+# Pixels of one with 16 or 32 bits a pixel, each of which is computed.
+DEPTH_PIXELS: Final = 320 * 240
+# The pause after a picture is at least so many times as long as it took to make: a twentieth of a core.
+PICTURE_SHARE: Final = 20.0
+# Pictures that were sent and that the page has not drawn yet; a slow link or browser gets fewer.
+UNSEEN_MAX: Final = 2
+# [Pages] Time without a message after which what is shown is old
+# At it: it is greyed, and its age is shown
+# Why: And five periods of the topic at the least.
+OLD_AFTER: Final = 2.0
+OLD_PERIODS: Final = 5.0
+# Messages by which the rate of a live topic is known, and the share by which it has to change to be told again.
+BEAT_MESSAGES: Final = 32
+BEAT_CHANGE: Final = 0.1
 # [Pages] Topics
 # At it: further ones are counted; `rmpa topic list` has them
 # Told in: the page of all topics
@@ -169,6 +184,8 @@ DIAGNOSTIC_WORST: Final = 200
 DIAGNOSTIC_ERRORS: Final = 20
 # Of these, errors of one node.
 DIAGNOSTIC_ERRORS_NODE: Final = 5
+# Time between two questions for the rates of all topics, while a page shows their list.
+RATES_PERIOD: Final = 3.0
 # Time between two signs of life to a page, which takes its connection for lost after three without any.
 TICK_PERIOD: Final = 2.0
 # Pause before it is looked again whether a page has taken what was sent.

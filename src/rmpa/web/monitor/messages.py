@@ -11,7 +11,9 @@ import itertools
 import math
 import re
 import struct
+import time
 from array import array
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, Union
 
@@ -70,11 +72,12 @@ def without_nulls(value: object) -> Value:
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
-# Kind 1, format, width, height, spare, watch, nanoseconds since the epoch (UTC): in front of an image's bytes.
-IMAGE_HEADER: Final = struct.Struct("<BBHHHIQ")
+# Kind 1, format, width, height, spare, watch, nanoseconds since the epoch (UTC), width and height of the whole image:
+# in front of an image's bytes.
+IMAGE_HEADER: Final = struct.Struct("<BBHHHIQHH")
 IMAGE: Final = 1
-# Formats of an image's bytes; rgb8 and mono8 are rows of pixels without padding.
-FORMATS: Final = {"jpeg": 1, "png": 2, "rgb8": 3, "mono8": 4}
+# Formats of an image's bytes; rgb8, bgr8 and mono8 are rows of pixels without padding.
+FORMATS: Final = {"jpeg": 1, "png": 2, "rgb8": 3, "mono8": 4, "bgr8": 5}
 _CHANNELS: Final = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}
 # Encodings of one channel, with the letter and bytes of its values; little-endian, as ROS machines are.
 _DEPTHS: Final = {"16UC1": ("H", 2), "mono16": ("H", 2), "32FC1": ("f", 4)}
@@ -171,21 +174,22 @@ def _range(value: Any, low: float, high: float) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """An image for a browser: its size in pixels, the format of ``data``; of its rows and columns, each ``every``-th.
+    """An image for a browser: its size in pixels, the format of ``data``, and the size of the image it was made of.
 
-    Width and height are 0 for a compressed one, which says them itself.
+    All sizes are 0 for a compressed one, which says them itself.
     """
 
     format: str
     width: int
     height: int
     data: Payload
-    every: int = 1
+    whole: tuple[int, int] = (0, 0)
 
     def frame(self, watch: int, stamp_ns: int) -> bytes:
         """The binary frame."""
-        head = IMAGE_HEADER.pack(IMAGE, FORMATS[self.format], self.width, self.height, 0, watch, stamp_ns)
-        return head + self.data
+        size = self.width, self.height
+        whole = (min(each, 0xFFFF) for each in self.whole)
+        return IMAGE_HEADER.pack(IMAGE, FORMATS[self.format], *size, 0, watch, stamp_ns, *whole) + self.data
 
 
 def compressed_picture(format_: str, data: Payload) -> Picture:
@@ -202,8 +206,16 @@ def compressed_picture(format_: str, data: Payload) -> Picture:
     raise RemoteProtocolError(f"an image of the format {format_[:40]!a} is neither JPEG nor PNG")
 
 
-def raw_picture(width: int, height: int, encoding: str, step: int, data: Payload) -> Picture:
-    """Of a sensor_msgs/Image; of a large one every n-th row and column.
+def raw_picture(width: int, height: int, encoding: str, step: int, data: Payload, place: int = 0) -> Picture:
+    """Of a sensor_msgs/Image; of one that is larger than its place every n-th row and column.
+
+    Args:
+        width: Pixels.
+        height: Pixels.
+        encoding: Of ROS (``sensor_msgs/image_encodings.h``).
+        step: Bytes of a row.
+        data: The rows.
+        place: The device's pixels that the page has for the width; 0: not known.
 
     Raises:
         RemoteProtocolError: The encoding cannot be shown, or the sizes do not fit together.
@@ -214,19 +226,31 @@ def raw_picture(width: int, height: int, encoding: str, step: int, data: Payload
         raise RemoteProtocolError(f"images of the encoding {encoding[:40]!a} are not shown; these are: {shown}")
     if width <= 0 or height <= 0 or step < width * size or len(data) < step * (height - 1) + width * size:
         raise RemoteProtocolError(f"{len(data)} bytes are no image of {width} x {height} {encoding}")
-    every = max(1, math.ceil(math.sqrt(width * height / limits.IMAGE_PIXELS)))
-    source = memoryview(data).cast("B")
-    lines = [bytes(source[row * step : row * step + width * size]) for row in range(0, height, every)]
-    columns = -(-width // every)
+    every = _every(width, height, place, limits.DEPTH_PIXELS if letter else limits.IMAGE_PIXELS)
+    source, columns, rows, whole = memoryview(data).cast("B"), width // every, height // every, (width, height)
+    row = columns * every * size  # bytes of a row that are used
+    starts = range(every // 2 * step, step * height, every * step)[:rows]
     if letter:
-        return Picture("mono8", columns, len(lines), _shades([array(letter, line)[::every] for line in lines]), every)
+        lines = [array(letter, bytes(source[at : at + row]))[every // 2 :: every] for at in starts]
+        return Picture("mono8", columns, rows, _shades(lines), whole)
+    used: Payload = (
+        source[: row * rows] if row == step and every == 1 else b"".join(source[a : a + row] for a in starts)
+    )
     if size == 1:
-        return Picture("mono8", columns, len(lines), b"".join(line[::every] for line in lines), every)
-    out = bytearray(columns * len(lines) * 3)
-    for at, line in enumerate(lines):
-        for colour, channel in enumerate((2, 1, 0) if encoding.startswith("bgr") else (0, 1, 2)):
-            out[at * columns * 3 + colour : (at + 1) * columns * 3 : 3] = line[channel :: size * every]
-    return Picture("rgb8", columns, len(lines), bytes(out), every)
+        return Picture("mono8", columns, rows, used[every // 2 :: every] if every > 1 else used, whole)
+    name = "bgr8" if encoding.startswith("bgr") else "rgb8"
+    if size == 3 and every == 1:
+        return Picture(name, columns, rows, used, whole)
+    out = bytearray(columns * rows * 3)
+    for channel in range(3):
+        out[channel::3] = used[every // 2 * size + channel :: size * every]
+    return Picture(name, columns, rows, bytes(out), whole)
+
+
+def _every(width: int, height: int, place: int, most: int) -> int:
+    """Of how many rows and columns one is shown: the width is at most a quarter more than its place."""
+    fits = math.ceil(width / (1.25 * place)) if place else 1
+    return min(max(1, fits, math.ceil(math.sqrt(width * height / most))), width, height)
 
 
 def _shades(lines: Iterable[Iterable[float]]) -> bytes:
@@ -299,6 +323,39 @@ class SampleBuffer:
         return made
 
 
+def old_after(period: float) -> float:
+    """Seconds without a message after which what came last is old: some of its own periods, and 2 s at the least.
+
+    The one rule for all that pages show as live, routes included.
+    """
+    return max(limits.OLD_AFTER, limits.OLD_PERIODS * period)
+
+
+class Beat:
+    """The rate of what comes, by the last messages: what a page is told so that it can tell when they stop."""
+
+    def __init__(self) -> None:
+        self._came: deque[tuple[float, int]] = deque(maxlen=limits.BEAT_MESSAGES)
+        self._told: dict[str, float] = {}
+
+    def receive(self, at: float, size: int) -> None:
+        """A message of ``size`` bytes has come."""
+        self._came.append((at, size))
+
+    def news(self) -> dict[str, float] | None:
+        """``rate``, ``bandwidth`` and ``after`` (``old_after``), or ``None`` if they are what was told."""
+        span = self._came[-1][0] - self._came[0][0] if len(self._came) > 1 else 0.0
+        if span <= 0:
+            return None
+        rate = (len(self._came) - 1) / span
+        told = self._told.get("rate", 0.0)
+        if abs(rate - told) <= limits.BEAT_CHANGE * told:
+            return None
+        size = sum(size for _, size in self._came) / len(self._came)
+        self._told = {"rate": float(f"{rate:.3g}"), "bandwidth": round(rate * size), "after": old_after(1 / rate)}
+        return self._told
+
+
 class WatchState:
     """One watch: the newest message, or samples of its fields, until the next frame is due.
 
@@ -308,17 +365,26 @@ class WatchState:
         fields: The lines of a plot.
         rate: Frames a second.
         decode: Gives a message's values: dicts, lists, numbers, strings; bytes for arrays of bytes.
+        place: The pixels that the page has for an image's width. It tells each image that it has drawn (``seen``).
     """
 
-    def __init__(self, id_: int, how: str, fields: Sequence[str], rate: float, decode: Decode) -> None:
+    # More than 12 fields: four pace the frames, and the others are the watch's arguments.
+    def __init__(
+        self, id_: int, how: str, fields: Sequence[str], rate: float, decode: Decode, place: int = 0
+    ) -> None:
         self._id = id_
         self._how = how
         self._rate = rate
         self._decode = decode
+        self._place = place
         self._newest: ReceivedMessage | None = None
         self._paths = tuple(field_path(field) for field in fields)
         self._samples = SampleBuffer(len(self._paths))
-        self._sent = -1e9
+        self._next = -1e9
+        # Images that the page has not drawn yet.
+        self._unseen = 0
+        # The rate of what comes.
+        self.beat = Beat()
         # Whether a frame is being made in a thread.
         self.busy = False
 
@@ -329,14 +395,19 @@ class WatchState:
             RmpaError: It cannot be decoded.
         """
         self._newest = message
+        self.beat.receive(message.stamp_ns * 1e-9, len(message.payload))
         if self._paths:
             values = self._decode(message)
             self._samples.add(message.stamp_ns * 1e-9, [number_at(values, path) for path in self._paths])
 
+    def seen(self) -> None:
+        """The page has drawn an image."""
+        self._unseen = max(0, self._unseen - 1)
+
     def due(self, now: float) -> float | None:
-        """When the next frame may be sent; ``None`` while there is nothing to send."""
+        """When the next frame may be sent; ``None`` while there is nothing to send, or the page is behind."""
         waiting = len(self._samples) > 0 if self._paths else self._newest is not None
-        return max(now, self._sent + 1 / self._rate) if waiting else None
+        return max(now, self._next) if waiting and self._unseen < limits.UNSEEN_MAX else None
 
     def frame(self, now: float) -> bytes | dict[str, Any] | Callable[[], bytes]:
         """The picture or message that is due.
@@ -344,25 +415,30 @@ class WatchState:
         Raises:
             RmpaError: The message cannot be shown in that way; the text says why.
         """
-        message, self._newest, self._sent = self._newest, None, now
+        message, self._newest, self._next = self._newest, None, now + 1 / self._rate
         if self._paths or message is None:
             return {"op": "points", "id": self._id, "columns": self._samples.take()}
+        began = time.thread_time()
         values = self._decode(message)
         about = {"id": self._id, "stamp": message.stamp_ns / 1e9, "type": message.type}
         if self._how == "image":
-            return _picture(message, values).frame(self._id, message.stamp_ns)
+            self._unseen += self._place > 0
+            frame = _picture(message, values, self._place).frame(self._id, message.stamp_ns)
+            # However large it is, pictures take a bounded share of the processor.
+            self._next = now + max(1 / self._rate, (time.thread_time() - began) * limits.PICTURE_SHARE)
+            return frame
         if self._how == "scan":
             return {"op": "scan", **about, "scan": scan(values)}
         return {"op": "value", **about, "size": len(message.payload), "value": cut(values)}
 
 
-def _picture(message: ReceivedMessage, values: Any) -> Picture:
+def _picture(message: ReceivedMessage, values: Any, place: int) -> Picture:
     try:
         if message.type == "sensor_msgs/CompressedImage":
             return compressed_picture(str(values["format"]), values["data"])
         if message.type == "sensor_msgs/Image":
             width, height, step = (int(values[name]) for name in ("width", "height", "step"))
-            return raw_picture(width, height, str(values["encoding"]), step, values["data"])
+            return raw_picture(width, height, str(values["encoding"]), step, values["data"], place)
     except (KeyError, TypeError, ValueError):
         pass
     raise RemoteProtocolError(f"{message.type} is not an image")

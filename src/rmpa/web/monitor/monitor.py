@@ -16,6 +16,7 @@ from rmpa.web import limits as web_limits
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.diagnostics import DiagnosticsFeed
 from rmpa.web.monitor.questions import Answers
+from rmpa.web.monitor.rates import RatesFeed
 from rmpa.web.monitor.resources import MessageValues, ResourceWatch
 from rmpa.web.monitor.state import StateBuilder, details
 from rmpa.web.monitor.sticks import Sticks
@@ -37,6 +38,7 @@ class MeshFeed:
         resources: Knows the Smart Resources.
         parameters: Says how often the parameters of this module's core have changed.
         clock: Seconds since the epoch.
+        rates: Knows the rates of topics.
     """
 
     def __init__(
@@ -49,6 +51,8 @@ class MeshFeed:
         self._parameters = parameters
         # What nodes say on ``/diagnostics``.
         self.diagnostics: DiagnosticsFeed | None = None
+        # The rates of all topics, while a page shows their list.
+        self.rates: RatesFeed | None = None
         self._watch = watch
         self._resources = resources
         self._clock = clock
@@ -115,6 +119,8 @@ class MeshFeed:
             return None
         if kind == "resource":
             self._resources.look(name)
+        if kind == "rates":
+            return self.rates.look(self._snapshot) if self.rates is not None else {}
         if kind.startswith("diagnostic") and self.diagnostics is not None:
             return self.diagnostics.all() if kind == "diagnostics" else self.diagnostics.one(name)
         return details(self._snapshot, self._resources.facts, kind, name)
@@ -175,7 +181,6 @@ class Monitor:
         self.resources = ResourceWatch(hub, self.values)
         self.mesh = MeshFeed(watch, self.resources, lambda: hub.params.changes)
         self.mesh.diagnostics = self.diagnostics = DiagnosticsFeed(hub, self.values, self.mesh.show)
-        self.sticks = Sticks(hub, lambda: self.mesh.agent)
         self.answers = Answers(
             hub,
             self.resources,
@@ -183,6 +188,8 @@ class Monitor:
             lambda: agent or self.mesh.agent,
             self.diagnostics.past,
         )
+        self.mesh.rates = self.rates = RatesFeed(self.answers.rates)
+        self.sticks = Sticks(hub, lambda: self.mesh.agent)
 
     def start(self) -> None:
         """Begin; the hub has an event loop by now."""
@@ -193,6 +200,7 @@ class Monitor:
     async def close(self) -> None:
         """End, before the hub ends."""
         await self.mesh.close()
+        await self.rates.close()
         self.answers.close()
         self.diagnostics.close()
         self.resources.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import itertools
 import logging
 import math
 import time
@@ -65,6 +66,8 @@ _DRIVEN_MAX: Final = 200
 _KINDS: Final = ("topic", "service", "module")
 # The service of a resource that takes another configuration (wiki.ros.org/dynamic_reconfigure).
 _SET_PARAMETERS: Final = "set_parameters"
+# How a page has floats that JSON cannot write.
+_NOT_FINITE: Final = ("nan", "inf", "-inf")
 # The lists of a ``dynamic_reconfigure/Config`` by the types of parameters.
 _LISTS: Final = {"bool": "bools", "int": "ints", "double": "doubles", "str": "strs"}
 
@@ -106,6 +109,10 @@ class Answers:
     def close(self) -> None:
         """End the threads, once what the agent was asked is answered or has timed out."""
         self._threads.shutdown(wait=False, cancel_futures=True)
+
+    async def rates(self) -> Any:
+        """The rates of the topics of all modules, as the agent tells them."""
+        return await self._control_call("rates")
 
     async def _why(self, args: Args) -> Any:
         kind = args.get("kind")
@@ -392,15 +399,22 @@ async def _in_time(done: Awaitable[Any]) -> None:
 
 
 def _as_before(name: str, present: object, value: object) -> object:
-    """A new value of a parameter, a float where it was one: a page writes 1.0 as 1.
+    """A new value of a parameter, a float where it was one: a page writes 1.0 as 1, and has NaN as a text.
 
     Raises:
         ConfigError: The present value is binary data, of which a page shows only the length.
     """
     if isinstance(present, bytes | bytearray | memoryview):
         raise ConfigError(name, "it holds binary data", "set it with `rmpa param set -b FILE`")
-    is_whole = isinstance(value, int) and not isinstance(value, bool)
-    return float(cast("int", value)) if isinstance(present, float) and is_whole else value
+    if isinstance(present, float):
+        is_whole = isinstance(value, int) and not isinstance(value, bool)
+        return float(cast("float", value)) if is_whole or value in _NOT_FINITE else value
+    if isinstance(present, list | tuple) and isinstance(value, list) and present:
+        pairs = itertools.zip_longest(value, present[: len(value)], fillvalue=present[-1])
+        return [_as_before(name, before, each) for each, before in pairs]
+    if isinstance(present, dict) and isinstance(value, dict):
+        return {key: _as_before(name, present.get(key), each) for key, each in value.items()}
+    return value
 
 
 def _is_of(kind: str, value: object) -> bool:

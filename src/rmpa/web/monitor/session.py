@@ -36,7 +36,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 Id: TypeAlias = Annotated[int, Meta(gt=0, lt=2**32)]
-Kind: TypeAlias = Literal["module", "topic", "service", "node", "resource", "counters", "diagnostics", "diagnostic"]
+Kind: TypeAlias = Literal[
+    "module", "topic", "service", "node", "resource", "counters", "rates", "diagnostics", "diagnostic"
+]
 How: TypeAlias = Literal["value", "plot", "image", "scan", "map", "tf"]
 # Of a joystick: a share of the fastest that is allowed.
 Tilt: TypeAlias = Annotated[float, Meta(ge=-1, le=1)]
@@ -263,8 +265,9 @@ class MonitorSession(Session):
         how: How,
         fields: Annotated[tuple[str, ...], Meta(max_length=limits.FIELDS_MAX)] = (),
         rate: Annotated[float, Meta(gt=0, le=limits.WATCH_RATE_MAX)] = 5.0,
+        width: Annotated[int, Meta(ge=0, le=0xFFFF)] = 0,
     ) -> None:
-        """Messages of a topic: its newest values, lines of a plot, images, or laser scans."""
+        """Messages of a topic: its newest values, lines of a plot, images for a ``width`` in pixels, or scans."""
         if (how == "plot") != bool(fields):
             self._malformed(f"a plot has 1 to {limits.FIELDS_MAX} fields, everything else none")
             return
@@ -273,7 +276,7 @@ class MonitorSession(Session):
             raise RemoteProtocolError(f"watch {id} is in use")
         if len(self._watches) >= limits.WATCHES_MAX:
             raise RemoteProtocolError(f"{limits.WATCHES_MAX} topics are watched already; close one first")
-        watch = watch_of(id, how, fields, rate, self._monitor.values.of)
+        watch = watch_of(id, how, fields, rate, self._monitor.values.of, width)
         self._watches[id] = watch, None
 
         def receive(message: ReceivedMessage) -> None:
@@ -294,6 +297,12 @@ class MonitorSession(Session):
             self._end_watch(id, error)
         else:
             self._watches[id] = watch, subscription
+
+    def op_seen(self, _: float, *, ids: Annotated[tuple[Id, ...], Meta(max_length=limits.WATCHES_MAX)]) -> None:
+        """An image of each of these watches is drawn."""
+        for id_ in ids:
+            if (known := self._watches.get(id_)) is not None:
+                known[0].seen()
 
     def op_unwatch(self, _: float, *, id: Id) -> None:  # noqa: A002
         """No more messages of that watch."""
@@ -316,6 +325,8 @@ class MonitorSession(Session):
             except RmpaError as error:
                 self._end_watch(id_, error)
             else:
+                if (beat := watch.beat.news()) is not None:
+                    self._send({"op": "beat", "id": id_, **beat})
                 if isinstance(frame, bytes):
                     self.connection.push((Opcode.BINARY, (frame,)))
                 elif isinstance(frame, dict):

@@ -14,15 +14,16 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import msgspec
 
+from rmpa.core.facts import TopicInfo
 from rmpa.discovery.limits import HEARTBEAT_LATE
 from rmpa.web.monitor import limits
-from rmpa.web.monitor.messages import Tree, without_nulls
+from rmpa.web.monitor.messages import Tree, old_after, without_nulls
 from rmpa.web.monitor.resources import resource_detail, resource_entry, resource_flows
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from rmpa.core.facts import LinkInfo, ServiceInfo, TopicInfo
+    from rmpa.core.facts import LinkInfo, RouteInfo, ServiceInfo
     from rmpa.observe.snapshot import AgentInfo, ModuleFacts, PeerInfo, Snapshot
     from rmpa.web.monitor.resources import ResourceFacts
 
@@ -32,6 +33,7 @@ _SMALL: Final = 0.03
 # amount, so that noise moves nothing.
 _STEADY: Final[Mapping[str, tuple[float, float]]] = {
     "since": (0.0, 0.5),
+    "stopped": (0.0, 0.5),
     "cpu": (0.15, 1.0),
     "rss": (_SMALL, 0.0),
     "files_open": (_SMALL, 2.0),
@@ -45,8 +47,8 @@ _STEADY: Final[Mapping[str, tuple[float, float]]] = {
     "bytes_in": (0.1, 20.0),
     "bytes_out": (0.1, 20.0),
 }
-# Is computed from a moving age: seconds since the epoch, of which three digits would say nothing.
-_MOMENT: Final = "since"
+# Are computed from a moving age: seconds since the epoch, of which three digits would say nothing.
+_MOMENTS: Final = ("since", "stopped")
 _GONE: Final = "has left the roster: no beacon and no link"
 # States of a module of which nothing comes any more.
 _LOST: Final = frozenset({"linking", "refused", "away", "lost"})
@@ -62,7 +64,7 @@ def steady_entry(before: Mapping[str, Any] | None, entry: Tree) -> Tree:
         elif shown and abs(value - shown) <= max(share * abs(shown), least):
             entry[name] = shown
         else:
-            entry[name] = round(value, 1) if name == _MOMENT else float(f"{value:.3g}")
+            entry[name] = round(value, 1) if name in _MOMENTS else float(f"{value:.3g}")
     return cast("Tree", before) if before == entry else entry
 
 
@@ -105,6 +107,7 @@ class StateBuilder:
         """
         modules = dict(self._modules(snapshot))
         lost = {name for name, module in modules.items() if module["state"] in _LOST}
+        taken = snapshot.taken
         flows = self._flows(snapshot.topics) | resource_flows(resources, self.own)
         nodes = node_entries(snapshot)
         topics, services = snapshot.topics[: limits.TOPICS_SHOWN], snapshot.services[: limits.SERVICES_SHOWN]
@@ -119,7 +122,9 @@ class StateBuilder:
             "agent": self._steady("agent", [("", snapshot.agent)], _agent)[""],
             "modules": self._steady("modules", modules.items()),
             "flows": self._steady("flows", flows.items()),
-            "topics": self._steady("topics", ((each.name, each) for each in topics), self._topic),
+            "topics": self._steady(
+                "topics", ((each.name, each) for each in topics), lambda one: self._topic(one, taken)
+            ),
             "services": self._steady("services", ((service_key(each), each) for each in services), _service),
             "nodes": self._steady("nodes", islice(nodes.items(), limits.NODES_SHOWN)),
             "resources": self._steady(
@@ -252,7 +257,7 @@ class StateBuilder:
         parts: dict[str, list[tuple[float, float, str]]] = {}
         for topic in topics:
             for route in topic.routes:
-                if route.rate:
+                if route.rate and not is_stopped(route):
                     key = f"{route.peer}>{self.own}" if route.direction == "in" else f"{self.own}>{route.peer}"
                     parts.setdefault(key, []).append((-route.rate, route.bandwidth or 0.0, topic.name))
         return {
@@ -264,11 +269,12 @@ class StateBuilder:
             for key, busiest in parts.items()
         }
 
-    def _topic(self, topic: TopicInfo) -> Tree:
+    def _topic(self, topic: TopicInfo, taken: float) -> Tree:
         sources = {self.own} if topic.publishers else set()
         targets = {node.partition(":")[0] for node in topic.remote_subscribers}
         targets |= {self.own} if topic.subscribers else set()
-        rate = bandwidth = latency = 0.0
+        rate = bandwidth = latency = stopped = 0.0
+        flows = False
         lost = dropped = 0
         problem = next(iter((*topic.mismatches, *topic.unreachable)), "")
         for route in topic.routes:  # of thousands of topics: one loop is half as long as one for each figure
@@ -278,6 +284,10 @@ class StateBuilder:
                     latency = route.latency.p50
             elif route.state == "open" or any(each.transport == "direct" for each in route.subscribers):
                 targets.add(route.peer)
+            if route.rate and is_stopped(route):
+                stopped = max(stopped, taken - (route.age or 0.0))
+            elif route.rate:
+                flows = True
             rate = max(rate, route.rate or 0.0)
             bandwidth += route.bandwidth or 0.0
             lost += route.lost + route.expired
@@ -288,6 +298,7 @@ class StateBuilder:
             "from": sorted(sources),
             "to": sorted(targets),
             "rate": rate,
+            "stopped": 0.0 if flows else stopped,
             "bandwidth": bandwidth,
             "latency": latency,
             "lost": lost,
@@ -295,6 +306,12 @@ class StateBuilder:
             "problem": problem,
             "crosses": topic.crosses,
         })  # fmt: skip
+
+
+def is_stopped(route: RouteInfo) -> bool:
+    """Whether the last message of a route is old by the route's own period: its figures say what was."""
+    period = route.period.p50 if route.period is not None else 1 / route.rate if route.rate else 0.0
+    return route.age is not None and route.age > old_after(period)
 
 
 def module_facts(module: ModuleFacts) -> Tree:
@@ -441,8 +458,10 @@ def details(snapshot: Snapshot, resources: Mapping[str, ResourceFacts], kind: st
     if found is None:
         return None
     made: Any = _tree(msgspec.to_builtins(found))
-    if kind == "topic":
-        for route in made["routes"]:
+    if isinstance(found, TopicInfo):
+        for info, route in zip(found.routes, made["routes"], strict=True):
+            if is_stopped(info):
+                route["stopped"] = round(snapshot.taken - route["age"], 1)
             for event in route.get("recent", ()):
                 event["at"] = round(snapshot.taken - event.pop("ago"), 1)  # an age would change all the time
         made["routes"] = {f"{each['direction']} {each['peer']} {each['node']}": each for each in made["routes"]}

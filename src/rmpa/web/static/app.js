@@ -4,7 +4,7 @@ import { html, render, Component } from "./markup.js";
 import { Connection } from "./connection.js";
 import { sentence } from "./format.js";
 import { section } from "./state.js";
-import { Mark, Since, keyOfNode } from "./parts.js";
+import { Mark, Since, keep, kept, keyOfNode } from "./parts.js";
 import { Mandala } from "./mandala.js";
 import { Search, Shortcuts } from "./search.js";
 import { applyTheme, nextTheme, theme } from "./theme.js";
@@ -27,6 +27,8 @@ const PAGES = [
   ["drive", "Drive", "d"],
 ];
 const DETAILED = ["module", "topic", "service", "node", "resource"];
+// What pages without a name look at.
+const LISTS = { diagnostics: [["diagnostics", ""]], panels: [["diagnostics", ""]], topics: [["rates", ""]] };
 // Pages on which a name chooses a part: what was filtered and opened there stays.
 const KEPT = ["diagnostics", "graph"];
 // All pages but the first one are loaded when they are first opened.
@@ -73,8 +75,16 @@ class App extends Component {
   componentDidMount() {
     addEventListener("hashchange", () => {
       this.arrives = !KEPT.includes(address().page) || address().page !== this.state.page;
+      clearTimeout(this.scrolled);
       this.setState({ ...address(), overlay: "" }, () => this.look());
     });
+    history.scrollRestoration = "manual"; // what is to be scrolled may still have to be drawn
+    const place = () => keep({ scroll: Math.round(scrollY) });
+    addEventListener("scroll", () => {
+      clearTimeout(this.scrolled);
+      this.scrolled = setTimeout(place, 200);
+    });
+    addEventListener("click", () => scrollY !== (kept().scroll || 0) && place(), true); // a link leaves the page
     addEventListener("keydown", (event) => this.key(event));
     window.rmpa = this.connection; // for the console and for tests
   }
@@ -85,7 +95,7 @@ class App extends Component {
     if (!heading) return;
     this.arrives = false;
     heading.focus({ preventScroll: true });
-    scrollTo(0, 0);
+    scrollTo(0, kept().scroll || 0);
   }
 
   // Many messages, one drawing: in the next frame, or soon where none comes, as in a tab that is or becomes hidden.
@@ -108,8 +118,8 @@ class App extends Component {
   look() {
     const { page, name } = address();
     const about = page === "diagnostics" ? "diagnostic" : DETAILED.includes(page) && page;
-    const all = page === "diagnostics" ? [["diagnostics", ""]] : [];
-    this.connection.look(about && name !== undefined ? [...all, [about, name]] : all);
+    const lists = LISTS[page] ?? [];
+    this.connection.look(about && name !== undefined ? [...lists, [about, name]] : lists);
   }
 
   key(event) {

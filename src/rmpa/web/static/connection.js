@@ -5,6 +5,7 @@ import { adopt, applyPatch } from "./state.js";
 const FIRST_WAIT = 300; // milliseconds until the next attempt, doubled up to LAST_WAIT
 const LAST_WAIT = 5000;
 const ANSWER_WAIT = 30000;
+const SEEN_GATHER = 40; // milliseconds in which pictures that are drawn are told together
 const TICKS = 10; // of which the fastest counts: over 20 s two clocks do not drift apart
 // Milliseconds without a word after which the connection is lost, or the attempt given up; a tick comes every 2 s.
 const SILENT = 7000;
@@ -25,6 +26,7 @@ export class Connection {
     this.stick = null; // who has its stick
     this.commanded = null; // what the server commands for this page, while its stick is held
     this.counter = 0;
+    this.seen = []; // watches whose pictures have been drawn since that was told
     this.wait = FIRST_WAIT;
     this.frames = { patches: 0, bytes: 0 };
     this.ticks = []; // how far this page's clock was ahead of the server's at each of the last ticks, in seconds
@@ -61,6 +63,7 @@ export class Connection {
       opened = true;
       this.heard = Date.now();
       this.ticks = [];
+      this.seen = [];
       this.phase = "open";
       this.wait = FIRST_WAIT;
       if (this.looks.length) this.send({ op: "look", at: this.looks });
@@ -142,6 +145,7 @@ export class Connection {
       case "points":
       case "scan":
       case "tf":
+      case "beat":
         this.watches.get(message.id)?.sink(message);
         break;
       case "published":
@@ -180,21 +184,29 @@ export class Connection {
     this.changed(() => this.send({ op: "ack", n }));
   }
 
-  receiveBinary(buffer) {
+  async receiveBinary(buffer) {
     const view = new DataView(buffer);
     if (buffer.byteLength > 12 && view.getUint8(0) === 2) return this.receiveLayer(view, buffer);
-    if (buffer.byteLength < 20 || view.getUint8(0) !== 1) return;
-    const format = ["", "jpeg", "png", "rgb8", "mono8"][view.getUint8(1)];
-    const width = view.getUint16(2, true),
-      height = view.getUint16(4, true);
-    this.watches.get(view.getUint32(8, true))?.sink({
+    if (buffer.byteLength < 24 || view.getUint8(0) !== 1) return;
+    const short = (at) => view.getUint16(at, true);
+    const id = view.getUint32(8, true);
+    await this.watches.get(id)?.sink({
       op: "image",
-      format,
-      width,
-      height,
+      format: ["", "jpeg", "png", "rgb8", "mono8", "bgr8"][view.getUint8(1)],
+      width: short(2),
+      height: short(4),
       stamp: Number(view.getBigUint64(12, true)) / 1e9,
-      bytes: new Uint8Array(buffer, 20),
+      whole: [short(20), short(22)],
+      bytes: new Uint8Array(buffer, 24),
     });
+    this.seen.push(id);
+    this.tellsSeen ??= setTimeout(() => this.tellSeen(), SEEN_GATHER);
+  }
+
+  // The server sends further pictures when those that it has sent are drawn.
+  tellSeen() {
+    this.tellsSeen = undefined;
+    this.send({ op: "seen", ids: this.seen.splice(0) });
   }
 
   // The picture or the points of a map's layer, behind what is said of them.

@@ -88,9 +88,28 @@ export function Facts({ rows }) {
   </dl>`;
 }
 
+// Of this entry of the browser's history: *Back* brings the page as it was left, and a link opens it anew.
+export const kept = () => history.state || {};
+export function keep(values) {
+  try {
+    history.replaceState({ ...kept(), ...values }, "");
+  } catch {
+    // a browser allows so many in some seconds
+  }
+}
+// A state that stays with the entry; `first` where the entry has none.
+export function useKept(key, first) {
+  const [value, set] = useState(() => kept()[key] ?? first);
+  const change = (next) => {
+    keep({ [key]: next });
+    set(next);
+  };
+  return [value, change];
+}
+
 // A field by which a list is filtered, and whether a text has what is typed there.
 export function useFilter(by, first = "") {
-  const [text, setText] = useState(first);
+  const [text, setText] = useKept("filter", first);
   const field = html`<input
     class="filter"
     type="search"
@@ -103,11 +122,17 @@ export function useFilter(by, first = "") {
   return { field, typed, matches: (each) => each.toLowerCase().includes(typed) };
 }
 
+const SOON = 40; // entries that fill a screen
 const MOST = 200; // entries of a list that are drawn at first, and more with each press of a button
 
-// The first entries of a list, and the button for more of them, where there are more.
-export function useFirst(list) {
-  const [most, setMost] = useState(MOST);
+// The first entries of a list, and the button for more of them, where there are more. `key` tells apart the lists of a
+// page. A few are drawn at once, and the rest when the browser has shown them.
+export function useFirst(list, key = "") {
+  const [most, setMost] = useKept(`most ${key}`, MOST);
+  const [drawn, setDrawn] = useState(kept().scroll || list.length <= SOON ? Infinity : SOON);
+  useEffect(() => {
+    if (drawn !== Infinity) setTimeout(() => setDrawn(Infinity));
+  }, []);
   const left = list.length - most;
   const more =
     left > 0 &&
@@ -116,12 +141,46 @@ export function useFirst(list) {
         Show ${Math.min(MOST, left)} more of ${count(left)}
       </button>
     </p>`;
-  return [left > 0 ? list.slice(0, most) : list, more];
+  return [left > 0 || drawn < list.length ? list.slice(0, Math.min(most, drawn)) : list, more];
 }
 
-// Its children are its rows; or, of a list that may be long, the function that draws one of `list`.
-export function Table({ caption, columns, list, children, empty }) {
-  const [first, more] = useFirst(list || [children].flat());
+// Entries by what a column has of them; what is not known comes last, whichever way it is sorted.
+export function sorted(list, of, down) {
+  const unknown = (value) => value === undefined || value === null || value === "";
+  const compare = (a, b) => (typeof a === "number" && typeof b === "number" ? a - b : String(a).localeCompare(b));
+  return list
+    .map((each) => [of(each), each])
+    .sort(([a], [b]) => unknown(a) - unknown(b) || (unknown(a) ? 0 : down ? compare(b, a) : compare(a, b)))
+    .map(([, each]) => each);
+}
+
+function Heading({ column, sort, onSort }) {
+  const number = column.startsWith("#"),
+    text = column.replace("#", "");
+  const here = sort?.column === column;
+  return html`<th
+    scope="col"
+    class=${number ? "number" : ""}
+    aria-sort=${here ? (sort.down ? "descending" : "ascending") : undefined}
+  >
+    ${onSort
+      ? html`<button
+          type="button"
+          class="field sort"
+          onClick=${() => onSort({ column, down: here ? !sort.down : number })}
+        >
+          ${text}<span aria-hidden="true">${here ? (sort.down ? " ▼" : " ▲") : ""}</span>
+        </button>`
+      : text || html`<span class="unseen">Action</span>`}
+  </th>`;
+}
+
+// Its children are its rows; or, of a list that may be long, the function that draws one of `list`. It can be sorted by
+// the columns of which `keys` has what an entry has there.
+export function Table({ caption, columns, list, children, empty, keys = {} }) {
+  const [sort, setSort] = useKept(`sort ${caption}`);
+  const of = sort && keys[sort.column];
+  const [first, more] = useFirst(of ? sorted(list, of, sort.down) : list || [children].flat(), caption);
   const rows = list ? first.map(children) : first;
   if (!rows.filter(Boolean).length) return html`<p class="empty">${empty || "Nothing here."}</p>`;
   return html`<div class="scroll" tabindex="0" role="region" aria-label=${caption}>
@@ -133,9 +192,7 @@ export function Table({ caption, columns, list, children, empty }) {
         <tr>
           ${columns.map(
             (column) =>
-              html`<th key=${column} scope="col" class=${column.startsWith("#") ? "number" : ""}>
-                ${column.replace("#", "") || html`<span class="unseen">Action</span>`}
-              </th>`,
+              html`<${Heading} key=${column} column=${column} sort=${sort} onSort=${keys[column] && setSort} />`,
           )}
         </tr>
       </thead>

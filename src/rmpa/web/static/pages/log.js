@@ -2,7 +2,7 @@
 
 import { html, useState } from "../markup.js";
 import { entries, section } from "../state.js";
-import { Choice, Page, Panel, useFilter } from "../parts.js";
+import { Choice, Page, Panel, useFilter, useKept } from "../parts.js";
 import { Lines, Missing, useLog } from "../loglines.js";
 
 export const LEVELS = [
@@ -14,9 +14,9 @@ export const LEVELS = [
 
 export function Log({ state, connection }) {
   const own = section(state, "agent").name;
-  const [level, setLevel] = useState("info");
-  const [module, setModule] = useState("");
-  const [node, setNode] = useState("");
+  const [level, setLevel] = useKept("level", "info");
+  const [module, setModule] = useKept("module", "");
+  const [node, setNode] = useKept("node", "");
   const [held, hold] = useState(false);
   const filter = useFilter("text");
   const modules = entries(state, "modules").filter(([, one]) => ["here", "up", "silent"].includes(one.state));

@@ -2,7 +2,7 @@
 
 import { html, useEffect, useRef, useState } from "../markup.js";
 import { entries, section } from "../state.js";
-import { Choice, Editable, Failure, Page, Panel, useFilter, useFirst } from "../parts.js";
+import { Choice, Editable, Failure, Page, Panel, useFilter, useFirst, useKept } from "../parts.js";
 import { plain } from "../format.js";
 import { another, fresh, kind } from "../typed.js";
 
@@ -27,7 +27,7 @@ const PEER_PERIOD = 3000;
 
 export function Params({ name, state, connection }) {
   const own = section(state, "agent").name;
-  const [module, setModule] = useState(own);
+  const [module, setModule] = useKept("module", own);
   const [values, setValues] = useState(null);
   const [failure, setFailure] = useState(null);
   const filter = useFilter("name", name);
@@ -100,7 +100,7 @@ function Namespace({ tree, path, text, may, ask }) {
   const rows = Object.entries(tree)
     .filter(([key, value]) => holds(value, `${path}/${key}`, text))
     .sort(([a], [b]) => a.localeCompare(b));
-  const [first, more] = useFirst(rows);
+  const [first, more] = useFirst(rows, path);
   if (!rows.length) return html`<p class="empty">No parameter matches.</p>`;
   return html`<ul>
       ${first.map(

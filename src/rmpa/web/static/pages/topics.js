@@ -14,31 +14,59 @@ import {
   NodeLinks,
   Page,
   Panel,
+  Since,
   Table,
   Why,
   memo,
   nodeKey,
   useAnswer,
   useFilter,
+  useKept,
 } from "../parts.js";
 import { Lines } from "../plot.js";
 import { Live } from "../live.js";
 import { PublishPanel } from "../publish.js";
 
-export const TOPIC_COLUMNS = ["Topic", "Type", "#Rate", "#Bytes", "#Latency", "#Lost", "From → to"];
+export const TOPIC_COLUMNS = ["Topic", "#Rate", "#Bytes", "Type", "#Latency", "#Lost", "From → to"];
+const lostOf = (topic) => (topic.lost || 0) + (topic.dropped || 0);
+const KEYS = {
+  Topic: ([name]) => name,
+  Type: ([, topic]) => topic.type,
+  "#Rate": ([, topic, measured]) => measured?.rate ?? topic.rate,
+  "#Bytes": ([, topic, measured]) => measured?.bandwidth ?? topic.bandwidth,
+  "#Latency": ([, topic]) => topic.latency,
+  "#Lost": ([, topic]) => lostOf(topic) || undefined,
+  "From → to": ([, topic]) => (topic.from || []).join(", "),
+};
+
+// How a rate was measured where the topic is published; what is not measured says why.
+const WAYS = {
+  counted: "counted by its publisher",
+  sampled: "measured by a short subscription where it is published",
+  "no subscriber": "its publisher may work for subscribers only, and is not woken: Live on its page measures it",
+};
+function Rate({ topic, measured }) {
+  if (topic.stopped)
+    return html`<span class="muted">${hertz(topic.rate)}</span>
+      <div class="muted">stopped <${Since} moment=${topic.stopped} text=${(shown) => `${shown} ago`} /></div>`;
+  if (!measured) return hertz(topic.rate);
+  if (measured.rate === undefined)
+    return html`–${" "}<span class="muted" title=${WAYS[measured.how]}>${measured.how}</span>`;
+  return html`<span title=${WAYS[measured.how]}>${measured.rate ? hertz(measured.rate) : "none in 2 s"}</span>`;
+}
 
 export const TopicRow = memo(
-  ({ name, topic }) =>
-    html`<tr>
+  ({ name, topic, measured }) =>
+    html`<tr class=${topic.stopped ? "old" : ""}>
       <th scope="row">
         <${Link} page="topic" name=${name} />${topic.problem &&
         html`<div class="muted"><${Mark} state="WARN" word=${""} />${topic.problem}</div>`}
       </th>
+      <td class="number"><${Rate} topic=${topic} measured=${measured} /></td>
+      <td class="number">${bandwidth(measured?.bandwidth || topic.bandwidth)}</td>
       <td><span class="muted">${topic.type}</span></td>
-      <td class="number">${hertz(topic.rate)}</td>
-      <td class="number">${bandwidth(topic.bandwidth)}</td>
       <td class="number">${seconds(topic.latency)}</td>
-      <td class="number">${topic.lost || topic.dropped ? count((topic.lost || 0) + (topic.dropped || 0)) : "–"}</td>
+      <td class="number">${lostOf(topic) ? count(lostOf(topic)) : "–"}</td>
       <td>
         ${(topic.from || []).join(", ") || html`<span class="muted">no publisher</span>`}
         ${" "}→${" "}${(topic.to || []).join(", ") ||
@@ -62,20 +90,27 @@ export function isData(name, state) {
 
 const FILTERS = {
   data: ["Data", (one, name, state) => isData(name, state)],
-  flowing: ["Flowing", (one) => one.rate !== undefined],
+  flowing: ["Flowing", (one) => one.rate !== undefined && !one.stopped],
   all: ["All", () => true],
   wrong: ["With a problem", (one) => one.problem || one.lost || one.dropped],
 };
+let lastRates = {}; // until the server has told them again, as after Back, the order stays
 export function Topics({ state }) {
-  const [which, choose] = useState("data");
+  const [which, choose] = useKept("which", "data");
   const filter = useFilter("name or type");
   const all = entries(state, "topics");
   const fits = FILTERS[which === "data" && filter.typed ? "all" : which][1]; // what is typed is looked for among all
-  const shown = all.filter(([name, one]) => fits(one, name, state) && filter.matches(`${name} ${one.type}`));
+  const told = section(section(state, "detail"), "rates:");
+  if (Object.keys(told).length) lastRates = told;
+  const rates = lastRates;
+  const shown = all
+    .filter(([name, one]) => fits(one, name, state) && filter.matches(`${name} ${one.type}`))
+    .map(([name, one]) => [name, one, rates[name]]);
   const hidden = section(state, "hidden").topics;
+  const flowing = all.filter(([, one]) => FILTERS.flowing[1](one)).length;
   return html`<${Page}
     title="Topics"
-    kind=${`${all.filter(([, one]) => one.rate !== undefined).length} of ${all.length} flow between modules`}
+    kind=${`${flowing} of ${all.length} flow between modules`}
     aside=${html`<${Choice}
       label="Which topics"
       value=${which}
@@ -85,8 +120,8 @@ export function Topics({ state }) {
   >
     ${filter.field}
     <${Panel}
-      ><${Table} caption="Topics" columns=${TOPIC_COLUMNS} empty="No topic matches." list=${shown}>
-        ${([name, one]) => html`<${TopicRow} key=${name} name=${name} topic=${one} />`}<//
+      ><${Table} caption="Topics" columns=${TOPIC_COLUMNS} keys=${KEYS} empty="No topic matches." list=${shown}>
+        ${([name, one, rate]) => html`<${TopicRow} key=${name} name=${name} topic=${one} measured=${rate} />`}<//
       >
       ${which === "data" &&
       all.length > shown.length &&
@@ -208,8 +243,16 @@ const Route = memo(({ route, own }) => {
         <${NodeLink} name=${nodeKey(route.direction === "in" ? route.peer : "", route.node)} />
         <div class="muted">${route.direction === "in" ? `${route.peer} → ${own}` : `${own} → ${route.peer}`}</div>
       </th>
-      <td>${route.state}${route.problem && html`<div class="muted">${route.problem}</div>`}</td>
-      <td class="number">
+      <td>
+        ${route.state}${route.stopped &&
+        html`<div>
+          <${Mark} state="STALE" word="stopped" />${" "}<${Since}
+            moment=${route.stopped}
+            text=${(shown) => `${shown} ago`}
+          />
+        </div>`}${route.problem && html`<div class="muted">${route.problem}</div>`}
+      </td>
+      <td class=${route.stopped ? "number muted" : "number"}>
         ${hertz(route.rate)}
         <div class="muted">${bandwidth(route.bandwidth)}</div>
       </td>
