@@ -174,50 +174,44 @@ class ModuleLogs(Part):
         """
         args = dict(args)
         wanted, after = args.pop("modules", None), args.pop("after", None)
-        wanted = [str(name) for name in wanted] if isinstance(wanted, list) else None
         after = after if isinstance(after, dict) else {}
-        query, context = LogQuery.of(args), self._bridge.context
-        own = context.settings.name
-        sessions = {session.link.guid: session for session in self._bridge.sessions}
-        asked = []
-        for name in wanted if wanted is not None else [own, *map(str, sessions)]:
+        query, own = LogQuery.of(args), self._bridge.context.settings.name
+        sessions = [*self._bridge.sessions]
+        names = map(str, wanted) if isinstance(wanted, list) else (own, *(str(one.link.guid) for one in sessions))
+        asked: list[tuple[str, PeerSession | None]] = []
+        for name in names:
+            found = [(one.link.name, one) for one in sessions if is_meant(name, one.link.name, str(one.link.guid))]
+            asked += [(own, None)] if name == own else found or [(name, None)]
+        return await asyncio.gather(*(self._of(name, one, _since(query, after.get(name))) for name, one in asked))
+
+    async def _ask(self, name: str, session: PeerSession | None, query: LogQuery) -> ModuleLog:
+        """The lines of a peer, or without one of this module, if the name is that."""
+        if session is None:
+            own = self._bridge.context.settings.name
             if name == own:
-                asked.append(self._own(_since(query, after.get(own))))
-                continue
-            found = [one for guid, one in sessions.items() if is_meant(name, one.link.name, str(guid))]
-            asked += [self._of(one, _since(query, after.get(one.link.name))) for one in found]
-            if not found:
-                names = [own, *(one.link.name for one in sessions.values())]
-                remedy = "`rmpa peer list` shows which modules are there"
-                asked.append(
-                    _unread(
-                        name, f"no linked module has this name; {suggestion(name, names, remedy)}", "unknown-name"
-                    )
-                )
-        return await asyncio.gather(*asked)
-
-    async def _own(self, query: LogQuery) -> ModuleLog:
-        found = self._find(query)
-        return ModuleLog(self._bridge.context.settings.name, found.lines, found.next, found.lost, 0.0)
-
-    async def _of(self, session: PeerSession, query: LogQuery) -> ModuleLog:
-        name, clock = session.link.name, session.time
+                return ModuleLog(name, *msgspec.structs.astuple(self._find(query)), 0.0)
+            names = [own, *(one.link.name for one in self._bridge.sessions)]
+            near = suggestion(name, names, "`rmpa peer list` shows which modules are there")
+            raise RmpaError(f"no linked module has this name; {near}", code="unknown-name")
         if not session.linked:
-            return await _unread(name, "it is silent: there is no link to it now", "peer-unlinked")
+            raise RmpaError("it is silent: there is no link to it now", code="peer-unlinked")
+        clock, args = session.time, msgspec.to_builtins(query)
+        value = await self._bridge.rpc.request(session, LINES, args, limits.LOG_ASK_TIMEOUT)
+        found = msgspec.convert(value, LogLines)
+        ahead, bound = clock.ahead_ns / 1e9, clock.error_ns
+        lines = (msgspec.structs.replace(line, at=line.at - ahead) for line in yielding_to_data(found.lines))
+        return ModuleLog(name, (*lines,), found.next, found.lost, None if bound is None else bound / 1e9)
+
+    async def _of(self, name: str, session: PeerSession | None, query: LogQuery) -> ModuleLog:
         try:
-            args = msgspec.to_builtins(query)
-            value = await self._bridge.rpc.request(session, LINES, args, limits.LOG_ASK_TIMEOUT)
-            found = msgspec.convert(value, LogLines)
+            return await self._ask(name, session, query)
         except PeerRefused as error:
-            unknown = error.unknown
-            return await _unread(name, *((_EARLIER, "other-release") if unknown else (error.reason, "not-permitted")))
+            problem, code = (_EARLIER, "other-release") if error.unknown else (error.reason, "not-permitted")
         except msgspec.ValidationError as error:
-            return await _unread(name, f"its answer is malformed: {error}", "protocol-error")
+            problem, code = f"its answer is malformed: {error}", "protocol-error"
         except RmpaError as error:
-            return await _unread(name, str(error), error.code)
-        ahead, error_ns = clock.ahead_ns / 1e9, clock.error_ns
-        lines = tuple(msgspec.structs.replace(line, at=line.at - ahead) for line in yielding_to_data(found.lines))
-        return ModuleLog(name, lines, found.next, found.lost, None if error_ns is None else error_ns / 1e9)
+            problem, code = str(error), error.code
+        return ModuleLog(name, problem=problem, code=code)
 
     async def _level(self, asker: PeerSession, args: dict[str, Any]) -> dict[str, str]:
         peer, gate = asker.link.name, self._bridge.context.gate
@@ -252,10 +246,6 @@ class ModuleLogs(Part):
         levels = await set_level(uri, node, OWN_NODE, logger, level)
         _log.info("= %s has set the level of %s of %s to %s", who, " and ".join(levels), node, level)
         return levels
-
-
-async def _unread(module: str, problem: str, code: str) -> ModuleLog:
-    return ModuleLog(module, problem=problem, code=code)
 
 
 def _since(query: LogQuery, after: object) -> LogQuery:
