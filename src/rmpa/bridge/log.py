@@ -189,7 +189,8 @@ class ModuleLogs(Part):
         if session is None:
             own = self._bridge.context.settings.name
             if name == own:
-                return ModuleLog(name, *msgspec.structs.astuple(self._find(query)), 0.0)
+                found = self._find(query)
+                return ModuleLog(name, found.lines, found.next, found.lost, 0.0)
             names = [own, *(one.link.name for one in self._bridge.sessions)]
             near = suggestion(name, names, "`rmpa peer list` shows which modules are there")
             raise RmpaError(f"no linked module has this name; {near}", code="unknown-name")
