@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.identity import proxied_node
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import WatchState, scan
-from rmpa.web.monitor.state import node_key
+from rmpa.web.monitor.state import shown_node
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -50,7 +49,7 @@ def layer_frame(watch: int, message: ReceivedMessage, values: Any, number: int =
             "frame": str(header["frame_id"]).lstrip("/") if header else "",
             "at": message.stamp_ns / 1e9,
             "stamp": _seconds(header["stamp"]) if header else 0.0,
-            "source": source_key(message),
+            "source": shown_node(message.source),
             "n": number,
             **about,
         }
@@ -58,12 +57,6 @@ def layer_frame(watch: int, message: ReceivedMessage, values: Any, number: int =
         raise RemoteProtocolError(f"a message of {message.type} contradicts itself: its sizes do not fit") from None
     raw = msgspec.json.encode(head)
     return LAYER_HEADER.pack(LAYER, watch, len(raw)) + raw + body
-
-
-def source_key(message: ReceivedMessage) -> str:
-    """The publishing node as pages name it: ``module:/name`` of a peer."""
-    peer = proxied_node(message.source)
-    return node_key(*peer) if peer is not None else message.source
 
 
 def _seconds(stamp: Mapping[str, int]) -> float:
@@ -296,7 +289,7 @@ class FramesWatch(WatchState):
         Raises:
             RmpaError: It cannot be decoded, or is none.
         """
-        source, is_static = source_key(message), message.topic.endswith("tf_static")
+        source, is_static = shown_node(message.source), message.topic.endswith("tf_static")
         try:
             for each in self._decode(message)["transforms"]:
                 cut = limits.FRAME_CHARACTERS

@@ -29,7 +29,7 @@ from rmpa.web.hub.params import value_at
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.driving import TYPES
 from rmpa.web.monitor.messages import cut_text
-from rmpa.web.monitor.state import module_facts, node_key
+from rmpa.web.monitor.state import module_facts, node_key, shown_node
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -41,12 +41,6 @@ if TYPE_CHECKING:
     from rmpa.web.monitor.resources import ResourceWatch
 
 _log = logging.getLogger(__name__)
-
-
-def shown_node(own: str) -> str:
-    """A node of this module's graph as ``node_key`` has it: a proxy is its node in the peer's module."""
-    peer = proxied_node(own)
-    return node_key(*peer) if peer is not None else own
 
 
 Args: TypeAlias = dict[str, Any]  # the edge: each question has its own
@@ -142,10 +136,7 @@ class Answers:
         await _in_time(graph.loaded.wait())
         shown = [*islice(graph.topics.values(), limits.TOPICS_SHOWN)]
         topics = {each.name: [" ".join(each.types), each.publishers, each.subscribers] for each in shown}
-        digest = hashlib.sha256(msgspec.json.encode(topics)).hexdigest()[:16]
-        if args.get("has") == digest:
-            return {"digest": digest}
-        return {"digest": digest, "topics": topics, "hidden": len(graph.topics) - len(shown)}
+        return _if_new(args, topics=topics, hidden=len(graph.topics) - len(shown))
 
     async def _types(self, _args: Args) -> Any:
         """The types of the services of this module's graph, as far as their servers tell them in time, by name."""
@@ -188,15 +179,14 @@ class Answers:
             return str(error)
         return ""
 
-    async def _log_levels(self, args: Args) -> Any:
-        node = _name(args, "name")
-        self._hub.link.rules.check(Access.LOG, node)
-        return await self._control_call("log_level", node=node, peer=_text(args, "peer"))
-
     async def _set_log_level(self, args: Args) -> Any:
-        node, logger, level = _name(args, "name"), _text(args, "logger"), _text(args, "level")
+        """Set the level of a logger of a node."""
+        return await self._log_levels(args, "logger", "level")
+
+    async def _log_levels(self, args: Args, *change: str) -> Any:
+        node, more = _name(args, "name"), {key: _text(args, key) for key in ("peer", *change)}
         self._hub.link.rules.check(Access.LOG, node)
-        return await self._control_call("log_level", node=node, peer=_text(args, "peer"), logger=logger, level=level)
+        return await self._control_call("log_level", node=node, **more)
 
     async def _control_call(self, op: str, **args: object) -> Any:
         """Call an operation of the agent."""
@@ -252,9 +242,7 @@ class Answers:
         """
         peer = _text(args, "peer")
         tree = await self._of_peer(peer, lambda params: params.get("/")) if peer else await self._own_params()
-        values = self._hub.link.rules.visible_tree(_plain(tree))
-        digest = hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()[:16]
-        return {"digest": digest} if args.get("has") == digest else {"values": values, "digest": digest}
+        return _if_new(args, values=self._hub.link.rules.visible_tree(_plain(tree)))
 
     async def _own_params(self) -> Mapping[str, ParamValue]:
         self._hub.link.need()
@@ -396,6 +384,12 @@ async def _in_time(done: Awaitable[Any]) -> None:
             await done
     except TimeoutError:
         raise UnreachableError("parameters of the core", "its API", "is it busy? ask again") from None
+
+
+def _if_new(args: Args, **values: object) -> Args:
+    """Values with their digest; that alone for a page that ``has`` it."""
+    digest = hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()[:16]
+    return {"digest": digest} if args.get("has") == digest else {"digest": digest, **values}
 
 
 def _as_before(name: str, present: object, value: object) -> object:

@@ -226,7 +226,7 @@ class ResourceWatch:
         now: Callable[[], float] = time.time,
     ) -> None:
         self._hub = hub
-        self._values = values
+        self.values = values
         self._clock = clock
         self._now = now
         self._follower: Follower | None = None
@@ -319,7 +319,7 @@ class ResourceWatch:
         peer = proxied_peer(message.source)
         before = path.heard.get(peer) or ResourceFacts(name=path.name, peer=peer)
         try:
-            values = self._values.of(message)  # latched ones may come before the descriptor
+            values = self.values.of(message)  # latched ones may come before the descriptor
             said = _described(values["data"]) if topic == TOPIC else _said(before, topic, values)
         except (RmpaError, msgspec.DecodeError, KeyError, TypeError, RecursionError):
             return  # another program's topic of that name
