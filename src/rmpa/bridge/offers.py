@@ -136,7 +136,6 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
     def offer_for(self, key: KeyT, local: LocalT, wire: str) -> OfferT:
         """The offer of an entry under a name on the wire."""
 
-    @abstractmethod
     def _ended(self, key: KeyT, reason: str) -> None:
         """End what uses an entry: it is not offered any more, or another one has its place."""
 

@@ -84,9 +84,6 @@ class SubscriptionOffers(OfferBook[Source, LocalSubscription, SubscriptionOffer,
         """As of ``OfferBook``."""
         return SubscriptionOffer(wire, key.node, local.type, local.origin)
 
-    def _ended(self, key: Source, reason: str) -> None:
-        """Nothing uses a subscription."""
-
 
 class SubscriptionImports(ImportBook[Source, Remote[Source], SubscriptionOffer]):
     """What nodes of peers subscribe to, and what of it is in the local graph."""

@@ -59,7 +59,8 @@ class DiagnosticsFeed:
         self._dirty = True
         self._worst: deque[tuple[float, str]] = deque(maxlen=limits.DIAGNOSTIC_WORST)
         self._entries: dict[str, Tree] = {}
-        self._summary: Tree = {}
+        # What each page is shown: statuses counted by level, and those that are wrong, without the agent's own.
+        self.summary: Tree = {}
 
     def follow(self, *, wanted: bool) -> None:
         """Whether a page is open."""
@@ -91,16 +92,6 @@ class DiagnosticsFeed:
     def _is_shown(self, now: float) -> bool:
         """Whether a page shows the diagnostics themselves."""
         return now - self._looked < limits.LOOK_KEPT
-
-    def _is_of_use(self, now: float) -> bool:
-        topic = self._hub.graph.topics.get(TOPIC)
-        others = topic is not None and any(node != OWN_NODE for node in topic.publishers)
-        return others or self._is_shown(now)
-
-    @property
-    def summary(self) -> Tree:
-        """What each page is shown: statuses counted by level, and those that are wrong, without the agent's own."""
-        return self._summary
 
     def all(self) -> Tree:
         """All statuses by key; those that did not change are the same objects as before."""
@@ -145,7 +136,8 @@ class DiagnosticsFeed:
     def _look(self) -> None:
         self._timer = asyncio.get_running_loop().call_later(_LOOK, self._look)
         now = self._clock()
-        if not self._is_of_use(now):
+        topic = self._hub.graph.topics.get(TOPIC)
+        if not self._is_shown(now) and (topic is None or {*topic.publishers} <= {OWN_NODE}):
             self._unsubscribe()
             self._table.resume(now)
         elif self._subscription is None and not self._refused:
@@ -163,7 +155,7 @@ class DiagnosticsFeed:
         worst = self._table.worst()
         if not self._worst or self._worst[-1][1] != worst:
             self._worst.append((round(now, 1), worst))
-        self._summary = self._count()
+        self.summary = self._count()
         self._changed()
 
     def _count(self) -> Tree:

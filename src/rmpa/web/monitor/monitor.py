@@ -167,7 +167,7 @@ class Monitor:
         self._hub = hub
         self.values = MessageValues(hub)
         self.resources = ResourceWatch(hub, self.values)
-        self.rates = RatesFeed(lambda: self.answers.rates())  # noqa: PLW0108 - they need its name
+        self.rates = RatesFeed(lambda: self.answers.ask_agent("rates"))
         self.mesh = MeshFeed(hub, watch, self.resources, self.rates)
         self.answers = Answers(
             hub,
