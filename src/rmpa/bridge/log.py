@@ -13,13 +13,13 @@ import msgspec
 
 from rmpa.bridge import limits
 from rmpa.bridge.log_ring import LogLines, LogQuery, LogRing, ModuleLog
+from rmpa.bridge.nodes import own_node, permitted_nodes
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.sessions import Part
-from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
-from rmpa.config.values import did_you_mean, suggestion
+from rmpa.config.values import suggestion
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.core.identity import OWN_NODE, is_global_name, is_meant, is_own, proxied_node
+from rmpa.core.identity import OWN_NODE, is_meant, is_own
 from rmpa.ros.core.embedded import AGGREGATED, LOG, TOPIC
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.node.loggers import read_levels, set_level
@@ -215,11 +215,8 @@ class ModuleLogs(Part):
         return ModuleLog(name, problem=problem, code=code)
 
     async def _level(self, asker: PeerSession, args: dict[str, Any]) -> dict[str, str]:
-        peer, gate = asker.link.name, self._bridge.context.gate
-        named = str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
-        if why := gate.why_not(Access.LOG, peer, named):
-            raise RmpaError(why, code="not-permitted")  # before whether there is such a node
-        nodes = [node for node in self._core.state().nodes if gate.judge(Access.LOG, peer, node).allowed]
+        peer = asker.link.name
+        nodes = permitted_nodes(self._bridge, Access.LOG, peer, args)
         return await self._loggers(args, nodes, asker_name(peer))
 
     async def level(self, args: Mapping[str, Any]) -> dict[str, str]:
@@ -228,22 +225,16 @@ class ModuleLogs(Part):
         Raises:
             RmpaError: There is no such node, level or logger, or it does not answer.
         """
-        return await self._loggers(args, list(self._core.state().nodes), "this module")
+        return await self._loggers(args, None, "this module")
 
-    async def _loggers(self, args: Mapping[str, Any], nodes: list[str], who: str) -> dict[str, str]:
-        node, here = str(args.get("node")), self._bridge.context.settings.name
-        if is_own(node) and node != OWN_NODE:
-            origin = proxied_node(node)
-            whose = f"it is {origin[0]}'s {origin[1]}: ask there" if origin is not None else "it is the agent's"
-            raise RmpaError(f"{node} is no node of {here}: {whose}", code="unknown-name")
-        uri = self._core.registrations.service_uri(f"{node}/get_loggers") if node in nodes else None
-        if uri is None or not is_global_name(node):
-            problem = f"{here} has no node {node[:80]}" if node not in nodes else f"{node} has no loggers"
-            near = did_you_mean(node, [name for name in nodes if not is_own(name)]) if node not in nodes else ""
-            raise RmpaError(problem + (f"; did you mean {near}?" if near else ""), code="unknown-name")
+    async def _loggers(self, args: Mapping[str, Any], nodes: list[str] | None, who: str) -> dict[str, str]:
+        node, api = own_node(self._bridge, args, nodes, agents=True)
+        uri = self._core.registrations.service_uri(f"{node}/get_loggers")
+        if uri is None:
+            raise RmpaError(f"{node} has no loggers", code="unknown-name")
         logger, level = str(args.get("logger", "")), str(args.get("level", "")).lower()
         if not level:
-            return await read_levels(uri, self._core.state().nodes[node], node, OWN_NODE)
+            return await read_levels(uri, api, node, OWN_NODE)
         levels = await set_level(uri, node, OWN_NODE, logger, level)
         _log.info("= %s has set the level of %s of %s to %s", who, " and ".join(levels), node, level)
         return levels

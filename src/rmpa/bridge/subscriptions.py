@@ -23,11 +23,10 @@ from rmpa.bridge.messages import (
     SubscriptionOffer,
     convert,
     is_crossing_name,
-    is_crossing_type,
 )
-from rmpa.bridge.offers import OfferBook
+from rmpa.bridge.offers import TopicBook
 from rmpa.bridge.peer_offers import ImportBook, Remote
-from rmpa.bridge.policy import Local, Needs, PolicyDecision
+from rmpa.bridge.policy import Local, Needs
 from rmpa.bridge.topics.direct import MEASURING
 from rmpa.config.peer_rules import Access
 from rmpa.core.facts import CROWDED
@@ -62,23 +61,11 @@ def _told(*changes: Any) -> Message:
     return Notification(SUBSCRIPTIONS, msgspec.structs.asdict(SubscriptionChanges(*changes)))
 
 
-class SubscriptionOffers(OfferBook[Source, LocalSubscription, SubscriptionOffer, None]):
+class SubscriptionOffers(TopicBook[LocalSubscription, SubscriptionOffer, None]):
     """What nodes of this module subscribe to. A key's ``node`` is the subscriber."""
 
-    kind, counter, access, owner = "topics", "subscriptions.too_many", Access.PUBLISH, "the subscriber"
-    message, reports = staticmethod(_told), False
-
-    def judge(self, key: Source, local: LocalSubscription) -> PolicyDecision:
-        """Decide whether a subscription may cross at all."""
-        typed = local.type == ANY or is_crossing_type(local.type)
-        if not (typed and is_crossing_name(key.topic) and is_crossing_name(key.node)):
-            return PolicyDecision(False, f"no peer takes the type {local.type!r}, or the name of the topic or node")
-        node = key.node if local.origin is None else local.origin.node
-        return self._out.context.policy.judge(key.topic, local.type, node)
-
-    def name_of(self, key: Source) -> str:
-        """The topic."""
-        return key.topic
+    counter, access, owner = "subscriptions.too_many", Access.PUBLISH, "the subscriber"
+    message, reports, any_type = staticmethod(_told), False, True
 
     def offer_for(self, key: Source, local: LocalSubscription, wire: str) -> SubscriptionOffer:
         """As of ``OfferBook``."""
