@@ -41,16 +41,12 @@ class DiagnosticsFeed:
         hub: Subscribes.
         values: Decodes.
         changed: Called when pages are to be shown something new.
-        clock: Seconds since the epoch.
     """
 
-    def __init__(
-        self, hub: Hub, values: MessageValues, changed: Callable[[], None], clock: Callable[[], float] = time.time
-    ) -> None:
+    def __init__(self, hub: Hub, values: MessageValues, changed: Callable[[], None]) -> None:
         self._hub = hub
         self._values = values
         self._changed = changed
-        self._clock = clock
         self._table = StatusTable(limits.DIAGNOSTIC_HISTORY)
         self._subscription: ClientSubscription | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -95,7 +91,7 @@ class DiagnosticsFeed:
 
     def all(self) -> Tree:
         """All statuses by key; those that did not change are the same objects as before."""
-        self._looked = self._clock()
+        self._looked = time.time()
         return {"statuses": dict(self._entries), "worst": [[at, level] for at, level in self._worst]}
 
     def one(self, key: str) -> Tree | None:
@@ -120,7 +116,7 @@ class DiagnosticsFeed:
         self._dirty = True
 
     def _take(self, message: ReceivedMessage) -> None:
-        now = self._clock()
+        now = time.time()
         if message.source == OWN_NODE and not self._is_shown(now):
             self._table.touch(OWN_NODE, now)
             return
@@ -135,7 +131,7 @@ class DiagnosticsFeed:
 
     def _look(self) -> None:
         self._timer = asyncio.get_running_loop().call_later(_LOOK, self._look)
-        now = self._clock()
+        now = time.time()
         topic = self._hub.graph.topics.get(TOPIC)
         if not self._is_shown(now) and (topic is None or {*topic.publishers} <= {OWN_NODE}):
             self._unsubscribe()
