@@ -40,6 +40,7 @@ ARGS: Final[dict[str, dict[str, Any]]] = {
     "contract": {"topic": "/chatter", "type_name": "std_msgs/String"},
     "log": {"modules": ["a", "b"], "level": "warn", "most": 5},
     "log_level": {"peer": "b", "node": "/rmpa"},
+    "rates": {},
     "node": {"what": "node.list", "peer": "b"},
     "site": {"what": "site.report", "args": {}},
 }

@@ -330,7 +330,7 @@ class Recorded:
     def link_down(self, peer: int) -> list[Any]:
         """A peer has no link any more."""
         self.gone_away(peer)
-        if self.forgets == "gone":
+        if self.forgets != "link_down":
             self.known.pop(peer, None)
         deque(getattr(self.book, self.forgets)(peer) or (), 0)
         return self.out.take()
@@ -422,7 +422,7 @@ class Exports(Recorded):
 
 
 class Imports(Recorded):
-    forgets = "gone"
+    forgets = "forget"
 
     def __init__(
         self,

@@ -182,8 +182,6 @@ CALL_BACK_DELAYS: Final = (0.05, 1.0)
 NODES_PAUSE: Final = 1.0
 # Seconds between two comparisons of the plan with what is really open, so that nothing stays stuck.
 RECONCILE_INTERVAL: Final = 5.0
-# Topics that a peer is told nodes here subscribe to, if it may be a twin: 30 KB at most, and a few are enough.
-TWIN_NAMES_MAX: Final = 128
 # Comparisons in a row that leave out names while the local graph has not changed: all are compared once a minute.
 RECONCILE_SKIPS: Final = 11
 # The latest events of a topic's contract that are remembered, to show them to the user; the counts include all

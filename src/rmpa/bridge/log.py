@@ -13,13 +13,13 @@ import msgspec
 
 from rmpa.bridge import limits
 from rmpa.bridge.log_ring import LogLines, LogQuery, LogRing, ModuleLog
+from rmpa.bridge.nodes import own_node, permitted_nodes
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.sessions import Part
-from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
-from rmpa.config.values import did_you_mean, suggestion
+from rmpa.config.values import suggestion
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.core.identity import OWN_NODE, is_global_name, is_meant, is_own, proxied_node
+from rmpa.core.identity import OWN_NODE, is_meant, is_own
 from rmpa.ros.core.embedded import AGGREGATED, LOG, TOPIC
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.node.loggers import read_levels, set_level
@@ -174,57 +174,49 @@ class ModuleLogs(Part):
         """
         args = dict(args)
         wanted, after = args.pop("modules", None), args.pop("after", None)
-        wanted = [str(name) for name in wanted] if isinstance(wanted, list) else None
         after = after if isinstance(after, dict) else {}
-        query, context = LogQuery.of(args), self._bridge.context
-        own = context.settings.name
-        sessions = {session.link.guid: session for session in self._bridge.sessions}
-        asked = []
-        for name in wanted if wanted is not None else [own, *map(str, sessions)]:
+        query, own = LogQuery.of(args), self._bridge.context.settings.name
+        sessions = [*self._bridge.sessions]
+        names = map(str, wanted) if isinstance(wanted, list) else (own, *(str(one.link.guid) for one in sessions))
+        asked: list[tuple[str, PeerSession | None]] = []
+        for name in names:
+            found = [(one.link.name, one) for one in sessions if is_meant(name, one.link.name, str(one.link.guid))]
+            asked += [(own, None)] if name == own else found or [(name, None)]
+        return await asyncio.gather(*(self._of(name, one, _since(query, after.get(name))) for name, one in asked))
+
+    async def _ask(self, name: str, session: PeerSession | None, query: LogQuery) -> ModuleLog:
+        """The lines of a peer, or without one of this module, if the name is that."""
+        if session is None:
+            own = self._bridge.context.settings.name
             if name == own:
-                asked.append(self._own(_since(query, after.get(own))))
-                continue
-            found = [one for guid, one in sessions.items() if is_meant(name, one.link.name, str(guid))]
-            asked += [self._of(one, _since(query, after.get(one.link.name))) for one in found]
-            if not found:
-                names = [own, *(one.link.name for one in sessions.values())]
-                remedy = "`rmpa peer list` shows which modules are there"
-                asked.append(
-                    _unread(
-                        name, f"no linked module has this name; {suggestion(name, names, remedy)}", "unknown-name"
-                    )
-                )
-        return await asyncio.gather(*asked)
-
-    async def _own(self, query: LogQuery) -> ModuleLog:
-        found = self._find(query)
-        return ModuleLog(self._bridge.context.settings.name, found.lines, found.next, found.lost, 0.0)
-
-    async def _of(self, session: PeerSession, query: LogQuery) -> ModuleLog:
-        name, clock = session.link.name, session.time
+                found = self._find(query)
+                return ModuleLog(name, found.lines, found.next, found.lost, 0.0)
+            names = [own, *(one.link.name for one in self._bridge.sessions)]
+            near = suggestion(name, names, "`rmpa peer list` shows which modules are there")
+            raise RmpaError(f"no linked module has this name; {near}", code="unknown-name")
         if not session.linked:
-            return await _unread(name, "it is silent: there is no link to it now", "peer-unlinked")
+            raise RmpaError("it is silent: there is no link to it now", code="peer-unlinked")
+        clock, args = session.time, msgspec.to_builtins(query)
+        value = await self._bridge.rpc.request(session, LINES, args, limits.LOG_ASK_TIMEOUT)
+        found = msgspec.convert(value, LogLines)
+        ahead, bound = clock.ahead_ns / 1e9, clock.error_ns
+        lines = (msgspec.structs.replace(line, at=line.at - ahead) for line in yielding_to_data(found.lines))
+        return ModuleLog(name, (*lines,), found.next, found.lost, None if bound is None else bound / 1e9)
+
+    async def _of(self, name: str, session: PeerSession | None, query: LogQuery) -> ModuleLog:
         try:
-            args = msgspec.to_builtins(query)
-            value = await self._bridge.rpc.request(session, LINES, args, limits.LOG_ASK_TIMEOUT)
-            found = msgspec.convert(value, LogLines)
+            return await self._ask(name, session, query)
         except PeerRefused as error:
-            unknown = error.unknown
-            return await _unread(name, *((_EARLIER, "other-release") if unknown else (error.reason, "not-permitted")))
+            problem, code = (_EARLIER, "other-release") if error.unknown else (error.reason, "not-permitted")
         except msgspec.ValidationError as error:
-            return await _unread(name, f"its answer is malformed: {error}", "protocol-error")
+            problem, code = f"its answer is malformed: {error}", "protocol-error"
         except RmpaError as error:
-            return await _unread(name, str(error), error.code)
-        ahead, error_ns = clock.ahead_ns / 1e9, clock.error_ns
-        lines = tuple(msgspec.structs.replace(line, at=line.at - ahead) for line in yielding_to_data(found.lines))
-        return ModuleLog(name, lines, found.next, found.lost, None if error_ns is None else error_ns / 1e9)
+            problem, code = str(error), error.code
+        return ModuleLog(name, problem=problem, code=code)
 
     async def _level(self, asker: PeerSession, args: dict[str, Any]) -> dict[str, str]:
-        peer, gate = asker.link.name, self._bridge.context.gate
-        named = str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
-        if why := gate.why_not(Access.LOG, peer, named):
-            raise RmpaError(why, code="not-permitted")  # before whether there is such a node
-        nodes = [node for node in self._core.state().nodes if gate.judge(Access.LOG, peer, node).allowed]
+        peer = asker.link.name
+        nodes = permitted_nodes(self._bridge, Access.LOG, peer, args)
         return await self._loggers(args, nodes, asker_name(peer))
 
     async def level(self, args: Mapping[str, Any]) -> dict[str, str]:
@@ -233,29 +225,19 @@ class ModuleLogs(Part):
         Raises:
             RmpaError: There is no such node, level or logger, or it does not answer.
         """
-        return await self._loggers(args, list(self._core.state().nodes), "this module")
+        return await self._loggers(args, None, "this module")
 
-    async def _loggers(self, args: Mapping[str, Any], nodes: list[str], who: str) -> dict[str, str]:
-        node, here = str(args.get("node")), self._bridge.context.settings.name
-        if is_own(node) and node != OWN_NODE:
-            origin = proxied_node(node)
-            whose = f"it is {origin[0]}'s {origin[1]}: ask there" if origin is not None else "it is the agent's"
-            raise RmpaError(f"{node} is no node of {here}: {whose}", code="unknown-name")
-        uri = self._core.registrations.service_uri(f"{node}/get_loggers") if node in nodes else None
-        if uri is None or not is_global_name(node):
-            problem = f"{here} has no node {node[:80]}" if node not in nodes else f"{node} has no loggers"
-            near = did_you_mean(node, [name for name in nodes if not is_own(name)]) if node not in nodes else ""
-            raise RmpaError(problem + (f"; did you mean {near}?" if near else ""), code="unknown-name")
+    async def _loggers(self, args: Mapping[str, Any], nodes: list[str] | None, who: str) -> dict[str, str]:
+        node, api = own_node(self._bridge, args, nodes, agents=True)
+        uri = self._core.registrations.service_uri(f"{node}/get_loggers")
+        if uri is None:
+            raise RmpaError(f"{node} has no loggers", code="unknown-name")
         logger, level = str(args.get("logger", "")), str(args.get("level", "")).lower()
         if not level:
-            return await read_levels(uri, self._core.state().nodes[node], node, OWN_NODE)
+            return await read_levels(uri, api, node, OWN_NODE)
         levels = await set_level(uri, node, OWN_NODE, logger, level)
         _log.info("= %s has set the level of %s of %s to %s", who, " and ".join(levels), node, level)
         return levels
-
-
-async def _unread(module: str, problem: str, code: str) -> ModuleLog:
-    return ModuleLog(module, problem=problem, code=code)
 
 
 def _since(query: LogQuery, after: object) -> LogQuery:

@@ -231,7 +231,7 @@ class Nodes(Part):
         Raises:
             RmpaError: There is no such node.
         """
-        node, uri = self._own(args, self._visible(peer) if peer else None)
+        node, uri = own_node(self._bridge, args, self._visible(peer) if peer else None)
         state, gate = self._core.state(), self._bridge.context.gate
         facts = describe_node(node, uri, *self._tables(peer), state.types)
         try:
@@ -249,16 +249,12 @@ class Nodes(Part):
         return msgspec.structs.replace(facts, pid=answer.pid, connections=connections)
 
     async def _ping(self, asker: PeerSession, args: dict[str, Any]) -> NodePing:
-        node, uri = self._own(args, self._visible(asker.link.name))
+        node, uri = own_node(self._bridge, args, self._visible(asker.link.name))
         return await ping_node(node, uri, OWN_NODE)
 
     async def _kill(self, asker: PeerSession, args: dict[str, Any]) -> dict[str, bool]:
-        peer, gate = asker.link.name, self._bridge.context.gate
-        named = str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
-        if why := gate.why_not(Access.KILL, peer, named):
-            raise RmpaError(why, code="not-permitted")  # before whether there is such a node
-        nodes = [node for node in self._core.state().nodes if gate.judge(Access.KILL, peer, node).allowed]
-        node, uri = self._own(args, nodes)
+        peer = asker.link.name
+        node, uri = own_node(self._bridge, args, permitted_nodes(self._bridge, Access.KILL, peer, args))
         who = f"{peer}'s {str(args.get('by', ''))[: limits.ASK_NAME_MAX]}"
         if not any(matches(glob, node) for glob in self._bridge.context.settings.nodes.kill):
             _log.warning("! %s may not end %s: no glob of nodes.kill fits [not-permitted]", who, node)
@@ -271,32 +267,49 @@ class Nodes(Part):
         self._core.suspect(node)  # roscpp does not unregister when it ends in a hurry
         return {"gone": gone}
 
-    def _own(self, args: Mapping[str, object], told: Collection[str] | None) -> tuple[str, str]:
-        """The node of this module that a request names, and its slave API.
 
-        Args:
-            args: The request's.
-            told: The nodes that may be told of; ``None``: all.
+def permitted_nodes(bridge: Bridge, access: Access, peer: str, args: Mapping[str, object]) -> list[str]:
+    """The nodes of this module with which a peer may do something.
 
-        Raises:
-            RmpaError: There is no such node.
-        """
-        here = self._bridge.context.settings.name
-        node = args.get("node")
-        if not isinstance(node, str) or len(node) > config_limits.CROSSING_NAME_MAX or not is_global_name(node):
-            raise RmpaError("the question names no node")
-        if is_own(node):
-            origin = proxied_node(node)
-            whose = f"it is {origin[0]}'s {origin[1]}: ask there" if origin is not None else "it is its agent"
-            raise RmpaError(f"{node} is no node of {here}: {whose}", code="unknown-name")
-        nodes = self._core.state().nodes
-        known = nodes if told is None else told
-        if node not in known or node not in nodes:
-            near = did_you_mean(node, [name for name in known if not is_own(name)])
-            raise RmpaError(
-                f"{here} has no node {node}" + (f"; did you mean {near}?" if near else ""), code="unknown-name"
-            )
-        return node, nodes[node]
+    Raises:
+        RmpaError: It may not with the ``node`` of its request, whether there is one or not.
+    """
+    gate, named = bridge.context.gate, str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
+    if why := gate.why_not(access, peer, named):
+        raise RmpaError(why, code="not-permitted")
+    return [node for node in bridge.core.state().nodes if gate.judge(access, peer, node).allowed]
+
+
+def own_node(
+    bridge: Bridge, args: Mapping[str, object], told: Collection[str] | None, *, agents: bool = False
+) -> tuple[str, str]:
+    """The node of this module that a request names, and its slave API.
+
+    Args:
+        bridge: Its core.
+        args: The request's.
+        told: The nodes that may be told of; ``None``: all.
+        agents: Whether the agent's own node counts.
+
+    Raises:
+        RmpaError: There is no such node.
+    """
+    here = bridge.context.settings.name
+    node = args.get("node")
+    if not isinstance(node, str) or len(node) > config_limits.CROSSING_NAME_MAX or not is_global_name(node):
+        raise RmpaError("the question names no node")
+    if is_own(node) and not (agents and node == OWN_NODE):
+        origin = proxied_node(node)
+        whose = f"it is {origin[0]}'s {origin[1]}: ask there" if origin is not None else "it is its agent"
+        raise RmpaError(f"{node} is no node of {here}: {whose}", code="unknown-name")
+    nodes = bridge.core.state().nodes
+    known = nodes if told is None else told
+    if node not in known or node not in nodes:
+        near = did_you_mean(node, [name for name in known if not is_own(name)])
+        raise RmpaError(
+            f"{here} has no node {node}" + (f"; did you mean {near}?" if near else ""), code="unknown-name"
+        )
+    return node, nodes[node]
 
 
 def _service(proxy: SlaveNode) -> str:

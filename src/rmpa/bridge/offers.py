@@ -13,8 +13,9 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 from rmpa.bridge import limits
-from rmpa.bridge.messages import TopicOffer, is_crossing_name
+from rmpa.bridge.messages import Source, TopicOffer, is_crossing_name, is_crossing_type
 from rmpa.bridge.policy import Local, PolicyDecision, may_have
+from rmpa.ros.wire.tcpros import ANY
 from rmpa.trust.permissions import PermissionDecision
 
 if TYPE_CHECKING:
@@ -136,7 +137,6 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
     def offer_for(self, key: KeyT, local: LocalT, wire: str) -> OfferT:
         """The offer of an entry under a name on the wire."""
 
-    @abstractmethod
     def _ended(self, key: KeyT, reason: str) -> None:
         """End what uses an entry: it is not offered any more, or another one has its place."""
 
@@ -332,3 +332,27 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
         if told is not None and context.gate.on:
             name = told.session.name
             context.gate.admits(self.access, name, next(iter(context.names.of(name).locals_of(wire)), wire))
+
+
+class TopicBook(OfferBook[Source, LocalT, OfferT, RouteT]):
+    """Of what nodes have to do with topics.
+
+    Attributes:
+        any_type: Whether ``*``, which stands for any type, crosses.
+    """
+
+    kind = "topics"
+    any_type: ClassVar[bool] = False
+
+    def judge(self, key: Source, local: LocalT) -> PolicyDecision:
+        """Decide whether an entry may cross at all."""
+        kind = local.type or ""
+        typed = is_crossing_type(kind) or (self.any_type and kind == ANY)
+        if not (typed and is_crossing_name(key.topic) and is_crossing_name(key.node)):
+            return PolicyDecision(False, f"no peer takes the type {kind!r}, or the name of the topic or node")
+        node = key.node if local.origin is None else local.origin.node
+        return self._out.context.policy.judge(key.topic, kind, node)
+
+    def name_of(self, key: Source) -> str:
+        """The topic."""
+        return key.topic

@@ -12,6 +12,7 @@ import msgspec
 from rmpa.bridge import limits
 from rmpa.bridge.offers import Effects, KeyT, OfferT, wire_of
 from rmpa.bridge.policy import RelayPaths
+from rmpa.core.facts import CROWDED, DENIED
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
@@ -162,11 +163,10 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         self._peers: dict[int, Heard[KeyT, EntryT, OfferT]] = {}
         self.ways = RelayPaths(out.context.gate.may_relay)
 
-    @abstractmethod
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, monotonic seconds; ``None`` if no timer runs."""
+        return None
 
-    @abstractmethod
     def handle_timer(self, now: float) -> None:
         """Handle due timers."""
 
@@ -189,7 +189,6 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
     def _judge(self, entry: EntryT) -> None:
         """Show an entry or hide it, by the facts of now; call it again whenever one has changed."""
 
-    @abstractmethod
     def _came_again(self, entry: EntryT, now: float) -> None:
         """Take an offer that was taken before, over this link or an earlier one."""
 
@@ -224,6 +223,30 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         known.routes, known.last_route = {}, 0
         self._ways_changed(self.ways.linked(peer, session.name, session.instance, session.rank))
         self._ready(peer)
+
+    def link_down(self, peer: int) -> None:
+        """The peer is no way to other modules until it is back; what it offers stays in the graph until ``gone``."""
+        if peer in self._peers:
+            self._ready(peer)
+
+    def gone(self, peer: int, keep: Collection[str] = ()) -> Iterator[None]:
+        """Forget what a peer offers that does not come back, or not soon, an entry with each item.
+
+        Args:
+            peer: The peer's number.
+            keep: The names here of shown entries that stay, as they are used directly.
+        """
+        if (known := self._peers.get(peer)) is None:
+            return
+        self.link_down(peer)
+        known.give_up()
+        for entry in list(known.entries.values()):
+            if not entry.shown or entry.name not in keep:
+                self._drop(entry, f"{known.session.name} is gone")
+                yield
+        if not known.entries:
+            del self._peers[peer]
+            self._ways_changed(self.ways.unlinked(peer))
 
     def changes(
         self, peer: int, message: Advertise | AdvertiseServices | SubscriptionChanges
@@ -315,12 +338,14 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         if entry.origin is not None and another_way:
             self._ways_changed({entry.origin.instance})
 
-    def _crowd(self, entry: EntryT) -> str:
-        """Why an entry has no place in the local graph, or empty; see ``Heard``."""
+    def _no_place(self, entry: EntryT) -> tuple[str, str]:
+        """Why an entry has no permission, or its node no place (see ``Heard``), and the cause; or empty."""
+        if not (permission := self.permission(entry)).allowed:
+            return permission.rule, DENIED
         known, most = self._peers[entry.peer], self._out.context.settings.limits.nodes
         if known.free(entry.node, most):
-            return ""
-        return f"{known.session.name} has more nodes than limits.nodes = {most} of this module"
+            return "", ""
+        return f"{known.session.name} has more nodes than limits.nodes = {most} of this module", CROWDED
 
     def name_here(self, peer: int, wire: str, origin: Origin | None) -> str:
         """The name here of a topic or service, by the rules for its own module, not by those for the relay."""

@@ -23,14 +23,13 @@ from rmpa.bridge.messages import (
     SubscriptionOffer,
     convert,
     is_crossing_name,
-    is_crossing_type,
 )
-from rmpa.bridge.offers import OfferBook
+from rmpa.bridge.offers import TopicBook
 from rmpa.bridge.peer_offers import ImportBook, Remote
-from rmpa.bridge.policy import Local, Needs, PolicyDecision
+from rmpa.bridge.policy import Local, Needs
 from rmpa.bridge.topics.direct import MEASURING
 from rmpa.config.peer_rules import Access
-from rmpa.core.facts import CROWDED, DENIED
+from rmpa.core.facts import CROWDED
 from rmpa.core.identity import is_own
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.wire.slave_api import BusConnection
@@ -62,30 +61,15 @@ def _told(*changes: Any) -> Message:
     return Notification(SUBSCRIPTIONS, msgspec.structs.asdict(SubscriptionChanges(*changes)))
 
 
-class SubscriptionOffers(OfferBook[Source, LocalSubscription, SubscriptionOffer, None]):
+class SubscriptionOffers(TopicBook[LocalSubscription, SubscriptionOffer, None]):
     """What nodes of this module subscribe to. A key's ``node`` is the subscriber."""
 
-    kind, counter, access, owner = "topics", "subscriptions.too_many", Access.PUBLISH, "the subscriber"
-    message, reports = staticmethod(_told), False
-
-    def judge(self, key: Source, local: LocalSubscription) -> PolicyDecision:
-        """Decide whether a subscription may cross at all."""
-        typed = local.type == ANY or is_crossing_type(local.type)
-        if not (typed and is_crossing_name(key.topic) and is_crossing_name(key.node)):
-            return PolicyDecision(False, f"no peer takes the type {local.type!r}, or the name of the topic or node")
-        node = key.node if local.origin is None else local.origin.node
-        return self._out.context.policy.judge(key.topic, local.type, node)
-
-    def name_of(self, key: Source) -> str:
-        """The topic."""
-        return key.topic
+    counter, access, owner = "subscriptions.too_many", Access.PUBLISH, "the subscriber"
+    message, reports, any_type = staticmethod(_told), False, True
 
     def offer_for(self, key: Source, local: LocalSubscription, wire: str) -> SubscriptionOffer:
         """As of ``OfferBook``."""
         return SubscriptionOffer(wire, key.node, local.type, local.origin)
-
-    def _ended(self, key: Source, reason: str) -> None:
-        """Nothing uses a subscription."""
 
 
 class SubscriptionImports(ImportBook[Source, Remote[Source], SubscriptionOffer]):
@@ -94,43 +78,15 @@ class SubscriptionImports(ImportBook[Source, Remote[Source], SubscriptionOffer])
     kind, access = "topics", Access.SUBSCRIBE
     _out: Subscriptions
 
-    def next_timer(self) -> float | None:
-        """None runs."""
-        return None
-
-    def handle_timer(self, now: float) -> None:
-        """None runs."""
-
     def topics(self, peer: int) -> frozenset[str]:
         """The topics here that the peer's own nodes subscribe to, whether that is shown or not."""
         known = self._peers.get(peer)
         entries = known.entries.values() if known is not None else ()
         return frozenset(entry.name for entry in yielding_to_data(list(entries)) if entry.origin is None)
 
-    def link_down(self, peer: int) -> None:
-        """The peer is no way to other modules until it is back; what it subscribes to stays until ``gone``."""
-        if peer in self._peers:
-            self._ready(peer)
-
-    def gone(self, peer: int) -> Iterator[None]:
-        """Forget a peer that does not come back, or not soon, an entry with each item."""
-        if (known := self._peers.get(peer)) is None:
-            return
-        known.give_up()
-        self._ready(peer)
-        for entry in list(known.entries.values()):
-            self._drop(entry, "")
-            yield
-        if not known.entries:
-            del self._peers[peer]
-            self._ways_changed(self.ways.unlinked(peer))
-
     def _entry(self, peer: int, offer: SubscriptionOffer) -> Remote[Source]:
         source, name = offer.source, self.name_here(peer, offer.topic, offer.origin)
         return Remote(peer=peer, wire=source, name=name, node=offer.node, type=offer.type, origin=offer.origin)
-
-    def _came_again(self, entry: Remote[Source], now: float) -> None:
-        """Nothing follows from it."""
 
     def _went(self, entry: Remote[Source], reason: str) -> None:  # noqa: ARG002 - as of ImportBook
         if entry.shown:
@@ -174,10 +130,7 @@ class SubscriptionImports(ImportBook[Source, Remote[Source], SubscriptionOffer])
             return why, ""
         if not is_crossing_name(topic):
             return f"its name here would be {topic}, which is too long", ""
-        if not (permission := self.permission(entry)).allowed:
-            return permission.rule, DENIED
-        crowd = self._crowd(entry)
-        return crowd, CROWDED if crowd else ""
+        return self._no_place(entry)
 
 
 class ShownSubscription:

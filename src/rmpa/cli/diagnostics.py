@@ -68,13 +68,10 @@ def diagnostics(modules: tuple[str, ...], level: str, name: str, values: bool, f
         run_stream(lambda: watch.follow(options, values=values))
     else:
         asyncio.run(watch.listen())
-        found = sorted(watch.wanted(watch.table.statuses.values()), key=_order)
+        wanted = watch.wanted(watch.table.statuses.values())
+        found = sorted(wanted, key=lambda one: (-LEVELS.index(one.level), one.key))
         options.show([watch.json(one) for one in found], watch.text(found, values=values))
     return int(any(one.level == ERROR for one in watch.wanted(watch.table.statuses.values())))
-
-
-def _order(status: Status) -> tuple[Any, ...]:
-    return (-LEVELS.index(status.level), status.key)
 
 
 class _Watch:

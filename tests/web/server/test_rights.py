@@ -306,7 +306,7 @@ async def test_a_page_sees_no_log_of_nodes_that_are_denied(ruled: Hub, monkeypat
         ]
         return [{"module": "base", "lines": lines, "next": 9}, {"module": "arm", "lines": lines[1:], "next": 9}]
 
-    monkeypatch.setattr(Answers, "_control_call", agent)
+    monkeypatch.setattr(Answers, "ask_agent", agent)
     with closing(answers_of(ruled)) as answers:
         base, arm = await answers.answer("log", {"level": "info"})
         assert [line["node"] for line in base["lines"]] == ["/driver"]

@@ -44,7 +44,7 @@ from rmpa.core.facts import CROWDED, DENIED
 from rmpa.ros.wire.tcpros import ServiceDescription
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Iterator
 
     from rmpa.bridge.services.part import Services
 
@@ -266,25 +266,6 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
             for remote in list(known.routes.values()):
                 self._end(remote, f"the link to {known.session.name} was lost")
 
-    def gone(self, peer: int, keep: Collection[str] = ()) -> Iterator[None]:
-        """Take the services of a peer that does not come back, or not soon, out of the local graph, one by one.
-
-        Args:
-            peer: The peer's number.
-            keep: The names here of shown services that stay, as they are called directly.
-        """
-        if (known := self._peers.get(peer)) is None:
-            return
-        self.link_down(peer)
-        known.give_up()
-        for remote in list(known.entries.values()):
-            if not remote.shown or remote.name not in keep:
-                self._drop(remote, f"{known.session.name} is gone")
-                yield
-        if not known.entries:
-            del self._peers[peer]
-            self._ways_changed(self.ways.unlinked(peer))
-
     def _entry(self, peer: int, offer: ServiceOffer) -> RemoteService:
         name = self.name_here(peer, offer.service, offer.origin)
         entry = RemoteService(peer=peer, wire=offer.service, name=name, node=offer.node, origin=offer.origin)
@@ -411,10 +392,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         decision = self._out.context.services.judge(service, remote.node if origin is None else origin.node)
         if why := self._kept_out(remote, decision, remote.wire):
             return f"policy: {why}", ""
-        if not (permission := self.permission(remote)).allowed:
-            return permission.rule, DENIED
-        crowd = self._crowd(remote)
-        return crowd, CROWDED if crowd else ""
+        return self._no_place(remote)
 
     def want(self, remote: RemoteService, now: float) -> None:
         """Open a service that a local node wants to call, or whose type it wants to know.

@@ -30,11 +30,9 @@ from rmpa.bridge.messages import (
     RouteOpened,
     Source,
     TopicOffer,
-    is_crossing_name,
-    is_crossing_type,
 )
-from rmpa.bridge.offers import OfferBook
-from rmpa.bridge.policy import Local, PolicyDecision
+from rmpa.bridge.offers import TopicBook
+from rmpa.bridge.policy import Local
 from rmpa.config.peer_rules import Access
 from rmpa.core.contract import Durability, combine
 from rmpa.mesh import limits as mesh_limits
@@ -57,7 +55,7 @@ class LocalSource(Local):
     origin: Origin | None = None
 
 
-class Exports(OfferBook[Source, LocalSource, TopicOffer, ExportRoute]):
+class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
     """The outbound half of topics.
 
     Attributes:
@@ -65,7 +63,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer, ExportRoute]):
         _cut: The run of each named peer that had no link when a route of it ended, so that it may miss messages.
     """
 
-    kind, counter, access, owner, message = "topics", "sources.too_many", Access.SUBSCRIBE, "the node", Advertise
+    counter, access, owner, message = "sources.too_many", Access.SUBSCRIBE, "the node", Advertise
     _out: Topics
 
     def __init__(self, out: Topics) -> None:
@@ -97,17 +95,6 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer, ExportRoute]):
         """The header of a source's publisher, while the source is connected; else ``None``."""
         flow = self.flows.get(source)
         return flow.description if flow is not None else None
-
-    def judge(self, key: Source, local: LocalSource) -> PolicyDecision:
-        """Decide whether a source may cross at all."""
-        if not (is_crossing_type(local.type) and is_crossing_name(key.topic) and is_crossing_name(key.node)):
-            return PolicyDecision(False, f"no peer takes the type {local.type!r}, or the name of the topic or node")
-        node = key.node if local.origin is None else local.origin.node
-        return self._out.context.policy.judge(key.topic, local.type, node)
-
-    def name_of(self, key: Source) -> str:
-        """The topic."""
-        return key.topic
 
     def offer_for(self, key: Source, local: LocalSource, wire: str) -> TopicOffer:
         """As of ``OfferBook``."""

@@ -160,7 +160,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             self._out.detach(entry, missed=entry.wanted)
         known.routes = {}
 
-    def gone(self, peer: int) -> dict[Source, RemoteTopic]:
+    def forget(self, peer: int) -> dict[Source, RemoteTopic]:
         """Forget a peer for good; other relays may now bring its sources, and those that it relayed.
 
         The peer is unknown when this returns; the caller takes the returned sources out of the local graph.
@@ -282,12 +282,8 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             why = why + "rename one of the topics or use one type" if conflict else ""
         if why and not conflict:
             return why, ""
-        if not (permission := self.permission(entry)).allowed:
-            return permission.rule, DENIED
-        if conflict:
-            return why, CONFLICT
-        crowd = self._crowd(entry)
-        return crowd, CROWDED if crowd else ""
+        problem, cause = self._no_place(entry)
+        return (why, CONFLICT) if conflict and cause != DENIED else (problem, cause)
 
     def _why_left_out(self, entry: RemoteTopic) -> str:
         """Why rules or another source of its node keep a source out, or empty."""

@@ -167,7 +167,7 @@ class Topics(GraphPart):
         peer = session.peer
         super().gone(session)
         self.outbound.gone(peer)
-        entries = self.imports.gone(peer)
+        entries = self.imports.forget(peer)
         self.mismatches.peer_gone(session.link.name)
         self.run(self.exports.gone(peer))
         self._bridge.relay.peer_gone(peer)

@@ -11,13 +11,12 @@ from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError, Unreac
 from rmpa.core.identity import OWN_NODE
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.service_client import ServiceConnection
-from rmpa.ros.node.slave_node import GET, SET, pack_text, read_texts
+from rmpa.ros.node.slave_node import GET, LEVELS, SET, pack_text, read_texts
 from rmpa.ros.wire.tcpros import LENGTH
 
 if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer
 
-LEVELS: Final = ("debug", "info", "warn", "error", "fatal")
 # Loggers of one node that are read.
 _LOGGERS_MAX: Final = 1000
 # Seconds that a node has to answer.

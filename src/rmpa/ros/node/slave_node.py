@@ -313,7 +313,7 @@ async def _as_list(reply: Awaitable[RosReply]) -> XmlRpcValue:
 
 GET: Final = ServiceDescription("roscpp/GetLoggers", "32e97e85527d4678a8f9279894bb64b0")
 SET: Final = ServiceDescription("roscpp/SetLoggerLevel", "51da076440d78ca1684d36c868df61ea")
-_LEVELS: Final = {
+LEVELS: Final = {
     "debug": logging.DEBUG,
     "info": logging.INFO,
     "warn": logging.WARNING,
@@ -361,18 +361,18 @@ class LoggerServices:
         for name, logger in self._loggers.items():
             level = logging.getLogger(logger).getEffectiveLevel()
             # The highest ROS level that is not above the logger's level.
-            word = next((w for w, number in reversed(_LEVELS.items()) if number <= level), "debug")
+            word = next((w for w, number in reversed(LEVELS.items()) if number <= level), "debug")
             parts += [pack_text(name), pack_text(word)]
         call.reply(True, b"".join(parts))
 
     def _set(self, call: ServiceCall) -> None:
         name, level = read_texts(call.request, 2, "roscpp/SetLoggerLevelRequest")
-        logger, number = self._loggers.get(name), _LEVELS.get(level.lower())
+        logger, number = self._loggers.get(name), LEVELS.get(level.lower())
         if logger is None:
             known = ", ".join(self._loggers)
             call.fail(f"{self._node.name} has no logger {printable(name)!r}; it has {known}")
         elif number is None:
-            call.fail(f"{printable(level)!r} is not a level; there are {', '.join(_LEVELS)}")
+            call.fail(f"{printable(level)!r} is not a level; there are {', '.join(LEVELS)}")
         else:
             _log.info("= %s sets the level of %s to %s", printable(call.caller_id), name, level.lower())
             logging.getLogger(logger).setLevel(number)

@@ -43,23 +43,29 @@ def parse_log(framed: Buffer, most: int) -> LogMessage:
         RemoteProtocolError: It is none.
     """
     view = memoryview(framed)
-    try:
-        _, _, seconds, nanoseconds, frame = _BEGIN.unpack_from(view)
-        at = _BEGIN.size + frame
-        level = view[at]
-        name, at = _string(view, at + 1, _NAME_MAX)
-        text, _ = _string(view, at, most)
-    except (struct.error, IndexError):
-        raise RemoteProtocolError(f"{len(view)} bytes are no rosgraph_msgs/Log") from None
-    return LogMessage(str(name, "utf-8", "replace"), level, seconds * 1_000_000_000 + nanoseconds, text)
+    stamp_ns, at = _begin(view)
+    name, end = _string(view, at, _NAME_MAX)
+    text, _ = _string(view, end, most)
+    return LogMessage(str(name, "utf-8", "replace"), view[at - 1], stamp_ns, text)
+
+
+def _begin(view: memoryview) -> tuple[int, int]:
+    """The stamp in nanoseconds, and where the node's name begins, behind the level."""
+    if len(view) < _BEGIN.size:
+        raise _none(view)
+    _, _, seconds, nanoseconds, frame = _BEGIN.unpack_from(view)
+    return seconds * 1_000_000_000 + nanoseconds, _BEGIN.size + frame + 1
+
+
+def _none(view: memoryview) -> RemoteProtocolError:
+    return RemoteProtocolError(f"{len(view)} bytes are no rosgraph_msgs/Log")
 
 
 def _string(view: memoryview, at: int, most: int) -> tuple[bytes, int]:
     """A string, and where the next field begins."""
     start = at + LENGTH.size
-    size = LENGTH.unpack_from(view, at)[0]
-    if start + size > len(view):
-        raise IndexError
+    if start > len(view) or start + (size := LENGTH.unpack_from(view, at)[0]) > len(view):
+        raise _none(view)
     if size <= most:
         return bytes(view[start : start + size]), start + size
     return bytes(view[start : start + most]) + f"… {size - most:,} bytes more".encode(), start + size
@@ -71,12 +77,8 @@ def renamed(framed: Buffer, node: str) -> bytes:
     Raises:
         RemoteProtocolError: It is none.
     """
-    view = memoryview(framed)
-    try:
-        start = _BEGIN.size + _BEGIN.unpack_from(view)[4] + 1
-        _, end = _string(view, start, _NAME_MAX)
-    except (struct.error, IndexError):
-        raise RemoteProtocolError(f"{len(view)} bytes are no rosgraph_msgs/Log") from None
-    name = node.encode()
+    view, name = memoryview(framed), node.encode()
+    _, start = _begin(view)
+    _, end = _string(view, start, _NAME_MAX)
     body = b"".join((view[LENGTH.size : start], LENGTH.pack(len(name)), name, view[end:]))
     return LENGTH.pack(len(body)) + body

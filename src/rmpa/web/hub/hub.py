@@ -46,22 +46,11 @@ class Hub:
     Args:
         where: Finds the master.
         make_node: Makes the node; it is made anew when the master was away or has shut it down.
-        now_ns: The wall clock, in nanoseconds.
-        environ: Where packages are searched for assets.
         rules: What the node may do.
     """
 
     # More than 12 fields: the parts, each once.
-    def __init__(
-        self,
-        where: Where,
-        make_node: MakeNode,
-        *,
-        now_ns: Callable[[], int] = time.time_ns,
-        environ: Mapping[str, str] | None = None,
-        rules: NodeRules = EVERYTHING,
-    ) -> None:
-        self.environ = os.environ if environ is None else environ
+    def __init__(self, where: Where, make_node: MakeNode, *, rules: NodeRules = EVERYTHING) -> None:
         self._started = False
         self._clients: dict[HubClient, None] = {}
         self.link = NodeLink(where, make_node, rules)
@@ -70,9 +59,9 @@ class Hub:
         self.calls = ServiceCalls(self.link)
         self.served = ServedServices(self.link)
         self.graph = GraphWatch(self.link, self.calls, self.params.reload)
-        self.topics = HubTopics(self.link, self.types, self.graph, now_ns)
-        self.time = RosTime(self.topics, self.params, now_ns)
-        self.counts = ClientCounts(self, now_ns)
+        self.topics = HubTopics(self.link, self.types, self.graph, time.time_ns)
+        self.time = RosTime(self.topics, self.params, time.time_ns)
+        self.counts = ClientCounts(self, time.time_ns)
         self.transforms = TransformTree(self.topics, self.types)
 
     async def __aenter__(self) -> Self:
@@ -268,7 +257,7 @@ class HubClient:
     async def fetch_asset(self, uri: str, most: int) -> bytes:
         """A file of a ROS package; see ``read_asset``."""
         self._check_view("fetch assets")
-        return await asyncio.to_thread(read_asset, uri, most, self.hub.environ)
+        return await asyncio.to_thread(read_asset, uri, most, os.environ)
 
     def run(
         self, work: Coroutine[Any, Any, _T], done: Callable[[_T], None], failed: Callable[[RmpaError], None]

@@ -41,16 +41,12 @@ class DiagnosticsFeed:
         hub: Subscribes.
         values: Decodes.
         changed: Called when pages are to be shown something new.
-        clock: Seconds since the epoch.
     """
 
-    def __init__(
-        self, hub: Hub, values: MessageValues, changed: Callable[[], None], clock: Callable[[], float] = time.time
-    ) -> None:
+    def __init__(self, hub: Hub, values: MessageValues, changed: Callable[[], None]) -> None:
         self._hub = hub
         self._values = values
         self._changed = changed
-        self._clock = clock
         self._table = StatusTable(limits.DIAGNOSTIC_HISTORY)
         self._subscription: ClientSubscription | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -59,7 +55,8 @@ class DiagnosticsFeed:
         self._dirty = True
         self._worst: deque[tuple[float, str]] = deque(maxlen=limits.DIAGNOSTIC_WORST)
         self._entries: dict[str, Tree] = {}
-        self._summary: Tree = {}
+        # What each page is shown: statuses counted by level, and those that are wrong, without the agent's own.
+        self.summary: Tree = {}
 
     def follow(self, *, wanted: bool) -> None:
         """Whether a page is open."""
@@ -92,19 +89,9 @@ class DiagnosticsFeed:
         """Whether a page shows the diagnostics themselves."""
         return now - self._looked < limits.LOOK_KEPT
 
-    def _is_of_use(self, now: float) -> bool:
-        topic = self._hub.graph.topics.get(TOPIC)
-        others = topic is not None and any(node != OWN_NODE for node in topic.publishers)
-        return others or self._is_shown(now)
-
-    @property
-    def summary(self) -> Tree:
-        """What each page is shown: statuses counted by level, and those that are wrong, without the agent's own."""
-        return self._summary
-
     def all(self) -> Tree:
         """All statuses by key; those that did not change are the same objects as before."""
-        self._looked = self._clock()
+        self._looked = time.time()
         return {"statuses": dict(self._entries), "worst": [[at, level] for at, level in self._worst]}
 
     def one(self, key: str) -> Tree | None:
@@ -129,7 +116,7 @@ class DiagnosticsFeed:
         self._dirty = True
 
     def _take(self, message: ReceivedMessage) -> None:
-        now = self._clock()
+        now = time.time()
         if message.source == OWN_NODE and not self._is_shown(now):
             self._table.touch(OWN_NODE, now)
             return
@@ -144,8 +131,9 @@ class DiagnosticsFeed:
 
     def _look(self) -> None:
         self._timer = asyncio.get_running_loop().call_later(_LOOK, self._look)
-        now = self._clock()
-        if not self._is_of_use(now):
+        now = time.time()
+        topic = self._hub.graph.topics.get(TOPIC)
+        if not self._is_shown(now) and (topic is None or {*topic.publishers} <= {OWN_NODE}):
             self._unsubscribe()
             self._table.resume(now)
         elif self._subscription is None and not self._refused:
@@ -163,7 +151,7 @@ class DiagnosticsFeed:
         worst = self._table.worst()
         if not self._worst or self._worst[-1][1] != worst:
             self._worst.append((round(now, 1), worst))
-        self._summary = self._count()
+        self.summary = self._count()
         self._changed()
 
     def _count(self) -> Tree:

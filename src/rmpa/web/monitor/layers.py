@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.identity import proxied_node
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import WatchState, scan
-from rmpa.web.monitor.state import node_key
+from rmpa.web.monitor.state import shown_node
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -50,7 +49,7 @@ def layer_frame(watch: int, message: ReceivedMessage, values: Any, number: int =
             "frame": str(header["frame_id"]).lstrip("/") if header else "",
             "at": message.stamp_ns / 1e9,
             "stamp": _seconds(header["stamp"]) if header else 0.0,
-            "source": source_key(message),
+            "source": shown_node(message.source),
             "n": number,
             **about,
         }
@@ -60,31 +59,17 @@ def layer_frame(watch: int, message: ReceivedMessage, values: Any, number: int =
     return LAYER_HEADER.pack(LAYER, watch, len(raw)) + raw + body
 
 
-def source_key(message: ReceivedMessage) -> str:
-    """The publishing node as pages name it: ``module:/name`` of a peer."""
-    peer = proxied_node(message.source)
-    return node_key(*peer) if peer is not None else message.source
-
-
 def _seconds(stamp: Mapping[str, int]) -> float:
     return stamp["secs"] + stamp["nsecs"] * 1e-9
-
-
-def _finite(*values: float) -> list[float]:
-    numbers = [float(value) for value in values]
-    if not all(map(math.isfinite, numbers)):
-        raise RemoteProtocolError("a pose has NaN or infinity in it")
-    return numbers
 
 
 def _pose(pose: Any) -> list[float]:
     """Position x, y, z in metres, and the quaternion x, y, z, w."""
     position, turn = pose["position"], pose["orientation"]
-    return _finite(position["x"], position["y"], position["z"], turn["x"], turn["y"], turn["z"], turn["w"])
-
-
-def _scan(values: Any) -> Made:
-    return scan(values), b""
+    numbers = [float(value) for value in (*(position[name] for name in "xyz"), *(turn[name] for name in "xyzw"))]
+    if not all(map(math.isfinite, numbers)):
+        raise RemoteProtocolError("a pose has NaN or infinity in it")
+    return numbers
 
 
 def _one_pose(path: Sequence[str]) -> Callable[[Any], Made]:
@@ -150,14 +135,10 @@ def _cloud(values: Any) -> Made:
     every = max(1, -(-total // limits.CLOUD_POINTS))
     data = memoryview(values["data"])
     flat = array("f")
-    (at_x, x_of), (at_y, y_of), (at_z, z_of) = readers
+    (at_x, x_of), (at_y, y_of), (at_z, z_of) = ((at, one.unpack_from) for at, one in readers)
     for number in range(0, total, every):
         at = number // width * row + number % width * step
-        (x,), (y,), (z,) = (
-            x_of.unpack_from(data, at + at_x),
-            y_of.unpack_from(data, at + at_y),
-            z_of.unpack_from(data, at + at_z),
-        )
+        (x,), (y,), (z,) = x_of(data, at + at_x), y_of(data, at + at_y), z_of(data, at + at_z)
         if x - x + y - y + z - z == 0:  # neither NaN nor infinite
             flat.extend((x, y, z))
     return {"count": total, "every": every}, flat.tobytes()
@@ -168,18 +149,11 @@ _GRADES: Final = (1, 20, 40, 55, 65, 80, 99)
 _OPACITY: Final = (0, 26, 48, 78, 110, 145, 180, 215, 255)
 
 
-def _levels() -> bytes:
-    """For each byte of a grid (an int8) the level as that many bits: of several cells, *or* is the highest level.
-
-    So a wall of one cell is seen in a thinned grid, and cells are compared thousands at a time.
-    """
-    made = bytearray(256)
-    for value in range(101):
-        made[value] = (1 << (1 + sum(value >= grade for grade in _GRADES))) - 1
-    return bytes(made)
-
-
-_LEVELS: Final = _levels()
+# For each byte of a grid (an int8) the level as that many bits: of several cells, *or* is the highest level. So a
+# wall of one cell is seen in a thinned grid, and cells are compared thousands at a time.
+_LEVELS: Final = bytes(
+    (1 << (1 + sum(value >= grade for grade in _GRADES))) - 1 if value <= 100 else 0 for value in range(256)
+)
 
 
 def _grid(values: Any) -> Made:
@@ -233,7 +207,7 @@ def _png(width: int, height: int, rows: Iterable[bytes]) -> bytes:
 
 # What each type is on a map, and how it is made of its values.
 _LAYERS: Final[dict[str, tuple[str, Callable[[Any], Made]]]] = {
-    "sensor_msgs/LaserScan": ("scan", _scan),
+    "sensor_msgs/LaserScan": ("scan", lambda values: (scan(values), b"")),
     "nav_msgs/OccupancyGrid": ("grid", _grid),
     "nav_msgs/Path": ("path", _path),
     "nav_msgs/Odometry": ("pose", _one_pose(("pose",))),
@@ -296,7 +270,7 @@ class FramesWatch(WatchState):
         Raises:
             RmpaError: It cannot be decoded, or is none.
         """
-        source, is_static = source_key(message), message.topic.endswith("tf_static")
+        source, is_static = shown_node(message.source), message.topic.endswith("tf_static")
         try:
             for each in self._decode(message)["transforms"]:
                 cut = limits.FRAME_CHARACTERS

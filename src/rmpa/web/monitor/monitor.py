@@ -34,28 +34,18 @@ class MeshFeed:
     """Builds one state of each snapshot, and gives it to all pages.
 
     Args:
+        hub: Has ``/diagnostics``, and counts the changes of parameters of this module's core.
         watch: Asks the agent.
         resources: Knows the Smart Resources.
-        parameters: Says how often the parameters of this module's core have changed.
-        clock: Seconds since the epoch.
         rates: Knows the rates of topics.
     """
 
-    def __init__(
-        self,
-        watch: AgentWatch,
-        resources: ResourceWatch,
-        parameters: Callable[[], int] = lambda: 0,
-        clock: Callable[[], float] = time.time,
-    ) -> None:
-        self._parameters = parameters
-        # What nodes say on ``/diagnostics``.
-        self.diagnostics: DiagnosticsFeed | None = None
-        # The rates of all topics, while a page shows their list.
-        self.rates: RatesFeed | None = None
+    def __init__(self, hub: Hub, watch: AgentWatch, resources: ResourceWatch, rates: RatesFeed) -> None:
+        self.diagnostics = DiagnosticsFeed(hub, resources.values, self.show)
+        self._params = hub.params
+        self._rates = rates
         self._watch = watch
         self._resources = resources
-        self._clock = clock
         self._builder: StateBuilder | None = None
         self._snapshot: Snapshot | None = None
         self._silent_since: float | None = None
@@ -84,8 +74,7 @@ class MeshFeed:
         """Give a page each new state, beginning with the last one."""
         self._pages[page] = show
         self._resources.show_all(wanted=True)
-        if self.diagnostics is not None:
-            self.diagnostics.follow(wanted=True)
+        self.diagnostics.follow(wanted=True)
         if self._state is not None:
             show(self._whole(self._state))
         self._wake.set()
@@ -95,8 +84,7 @@ class MeshFeed:
         self._pages.pop(page, None)
         if not self._pages:
             self._resources.show_all(wanted=False)
-            if self.diagnostics is not None:
-                self.diagnostics.follow(wanted=False)
+            self.diagnostics.follow(wanted=False)
 
     def show(self) -> None:
         """Show all pages the state once more: the diagnostics have changed."""
@@ -106,7 +94,7 @@ class MeshFeed:
                 show(state)
 
     def _whole(self, state: Tree) -> Tree:
-        return state | {"diagnostics": self.diagnostics.summary} if self.diagnostics is not None else state
+        return state | {"diagnostics": self.diagnostics.summary}
 
     async def close(self) -> None:
         """End."""
@@ -120,8 +108,8 @@ class MeshFeed:
         if kind == "resource":
             self._resources.look(name)
         if kind == "rates":
-            return self.rates.look(self._snapshot) if self.rates is not None else {}
-        if kind.startswith("diagnostic") and self.diagnostics is not None:
+            return self._rates.look(self._snapshot)
+        if kind.startswith("diagnostic"):
             return self.diagnostics.all() if kind == "diagnostics" else self.diagnostics.one(name)
         return details(self._snapshot, self._resources.facts, kind, name)
 
@@ -144,7 +132,7 @@ class MeshFeed:
         self._number = reading.number
         if reading.snapshot is None:
             if self._silent_since is None:
-                self._silent_since = self._clock()
+                self._silent_since = time.time()
             builder = self._builder or StateBuilder("")
             problem, _, remedy = reading.problem.partition("; ")
             self._state = builder.unreachable(self._silent_since, problem, remedy)
@@ -155,7 +143,7 @@ class MeshFeed:
                 self._builder = StateBuilder(reading.snapshot.agent.name)
             facts = tuple(self._resources.facts.values())
             standing = self._resources.alarms()
-            self._state = self._builder.build(reading.snapshot, facts, standing, self._parameters())
+            self._state = self._builder.build(reading.snapshot, facts, standing, self._params.changes)
         self.show()
 
 
@@ -179,16 +167,15 @@ class Monitor:
         self._hub = hub
         self.values = MessageValues(hub)
         self.resources = ResourceWatch(hub, self.values)
-        self.mesh = MeshFeed(watch, self.resources, lambda: hub.params.changes)
-        self.mesh.diagnostics = self.diagnostics = DiagnosticsFeed(hub, self.values, self.mesh.show)
+        self.rates = RatesFeed(lambda: self.answers.ask_agent("rates"))
+        self.mesh = MeshFeed(hub, watch, self.resources, self.rates)
         self.answers = Answers(
             hub,
             self.resources,
             os.environ if environ is None else environ,
             lambda: agent or self.mesh.agent,
-            self.diagnostics.past,
+            self.mesh.diagnostics.past,
         )
-        self.mesh.rates = self.rates = RatesFeed(self.answers.rates)
         self.sticks = Sticks(hub, lambda: self.mesh.agent)
 
     def start(self) -> None:
@@ -202,5 +189,5 @@ class Monitor:
         await self.mesh.close()
         await self.rates.close()
         self.answers.close()
-        self.diagnostics.close()
+        self.mesh.diagnostics.close()
         self.resources.close()

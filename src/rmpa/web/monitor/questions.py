@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import hashlib
 import itertools
 import logging
@@ -29,7 +30,7 @@ from rmpa.web.hub.params import value_at
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.driving import TYPES
 from rmpa.web.monitor.messages import cut_text
-from rmpa.web.monitor.state import module_facts, node_key
+from rmpa.web.monitor.state import module_facts, node_key, shown_node
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -41,12 +42,6 @@ if TYPE_CHECKING:
     from rmpa.web.monitor.resources import ResourceWatch
 
 _log = logging.getLogger(__name__)
-
-
-def shown_node(own: str) -> str:
-    """A node of this module's graph as ``node_key`` has it: a proxy is its node in the peer's module."""
-    peer = proxied_node(own)
-    return node_key(*peer) if peer is not None else own
 
 
 Args: TypeAlias = dict[str, Any]  # the edge: each question has its own
@@ -110,25 +105,21 @@ class Answers:
         """End the threads, once what the agent was asked is answered or has timed out."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
-    async def rates(self) -> Any:
-        """The rates of the topics of all modules, as the agent tells them."""
-        return await self._control_call("rates")
-
     async def _why(self, args: Args) -> Any:
         kind = args.get("kind")
         if kind not in _KINDS:
             raise ConfigError("kind", f"{str(kind)[:40]!r} is not a topic, a service or a module")
         if kind == "module":
-            return await self._control_call("why", module=_text(args, "name"))
+            return await self.ask_agent("why", module=_text(args, "name"))
         name, peer = _name(args, "name"), _text(args, "peer")
-        return await self._control_call("why", name=name, peer=peer or None, service=kind == "service")
+        return await self.ask_agent("why", name=name, peer=peer or None, service=kind == "service")
 
     async def _agent(self, args: Args) -> Any:
-        answer = await self._control_call("agent", peer=_text(args, "peer"))
+        answer = await self.ask_agent("agent", peer=_text(args, "peer"))
         return module_facts(msgspec.convert(answer, ModuleFacts))
 
     async def _contract(self, args: Args) -> Any:
-        return await self._control_call("contract", topic=_name(args, "topic"), type_name=_text(args, "type"))
+        return await self.ask_agent("contract", topic=_name(args, "topic"), type_name=_text(args, "type"))
 
     async def _past(self, args: Args) -> Any:
         return self._past_of(_text(args, "status"))
@@ -142,10 +133,7 @@ class Answers:
         await _in_time(graph.loaded.wait())
         shown = [*islice(graph.topics.values(), limits.TOPICS_SHOWN)]
         topics = {each.name: [" ".join(each.types), each.publishers, each.subscribers] for each in shown}
-        digest = hashlib.sha256(msgspec.json.encode(topics)).hexdigest()[:16]
-        if args.get("has") == digest:
-            return {"digest": digest}
-        return {"digest": digest, "topics": topics, "hidden": len(graph.topics) - len(shown)}
+        return _if_new(args, topics=topics, hidden=len(graph.topics) - len(shown))
 
     async def _types(self, _args: Args) -> Any:
         """The types of the services of this module's graph, as far as their servers tell them in time, by name."""
@@ -160,7 +148,7 @@ class Answers:
         name, peer = _name(args, "name"), _text(args, "peer")
         if not peer and is_own(name):
             raise RmpaError(f"{name} belongs to the agent of this module; nothing is asked of it")
-        about = await self._control_call("node", what=NODE_INFO, node=name, **({"peer": peer} if peer else {}))
+        about = await self.ask_agent("node", what=NODE_INFO, node=name, **({"peer": peer} if peer else {}))
         for each in about.get("connections") or ():
             other = str(each["other"])
             each["other"] = shown_node(other) if not peer or is_own(other) else node_key(peer, other)
@@ -169,7 +157,7 @@ class Answers:
     async def _log(self, args: Args) -> Any:
         """Log lines of all modules or of ``modules``, of the nodes that the rules let a page see."""
         known = ("modules", "after", "level", "node", "since", "most")
-        found = await self._control_call("log", **{key: args[key] for key in known if key in args})
+        found = await self.ask_agent("log", **{key: args[key] for key in known if key in args})
         for module in found:
             lines = module.get("lines", ())
             hidden = {node: why for node in {line["node"] for line in lines} if (why := self._no_log(node))}
@@ -188,17 +176,14 @@ class Answers:
             return str(error)
         return ""
 
-    async def _log_levels(self, args: Args) -> Any:
-        node = _name(args, "name")
+    async def _log_levels(self, args: Args, change: tuple[str, ...] = ()) -> Any:
+        node, more = _name(args, "name"), {key: _text(args, key) for key in ("peer", *change)}
         self._hub.link.rules.check(Access.LOG, node)
-        return await self._control_call("log_level", node=node, peer=_text(args, "peer"))
+        return await self.ask_agent("log_level", node=node, **more)
 
-    async def _set_log_level(self, args: Args) -> Any:
-        node, logger, level = _name(args, "name"), _text(args, "logger"), _text(args, "level")
-        self._hub.link.rules.check(Access.LOG, node)
-        return await self._control_call("log_level", node=node, peer=_text(args, "peer"), logger=logger, level=level)
+    _set_log_level = functools.partialmethod(_log_levels, change=("logger", "level"))
 
-    async def _control_call(self, op: str, **args: object) -> Any:
+    async def ask_agent(self, op: str, **args: object) -> Any:
         """Call an operation of the agent."""
         return await self._in_thread(lambda client: client.call(op, object, **args))
 
@@ -252,9 +237,7 @@ class Answers:
         """
         peer = _text(args, "peer")
         tree = await self._of_peer(peer, lambda params: params.get("/")) if peer else await self._own_params()
-        values = self._hub.link.rules.visible_tree(_plain(tree))
-        digest = hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()[:16]
-        return {"digest": digest} if args.get("has") == digest else {"values": values, "digest": digest}
+        return _if_new(args, values=self._hub.link.rules.visible_tree(_plain(tree)))
 
     async def _own_params(self) -> Mapping[str, ParamValue]:
         self._hub.link.need()
@@ -318,20 +301,15 @@ class Answers:
 
     async def _call(self, args: Args) -> Any:
         service = self._service(args)
-        request = args.get("request", {})
         kind = await self._type_of(service)
-        body = codec_for(kind.request).write_arguments(request, time.time_ns()).payload
         began = time.monotonic()
+        response = await self._call_service(service, kind, args.get("request", {}))
+        return {"response": response, "seconds": round(time.monotonic() - began, 6)}
+
+    async def _call_service(self, service: str, kind: ServiceType, request: Any) -> Any:
+        body = codec_for(kind.request).write_arguments(request, time.time_ns()).payload
         response = await self._hub.calls.call(service, kind.md5sum, body, _CALL_TIMEOUT)
-        took = time.monotonic() - began
-        values = codec_for(kind.response).json(memoryview(response))
-        return {"response": msgspec.json.decode(values), "seconds": round(took, 6)}
-
-    async def _profile(self, args: Args) -> Any:
-        return await self._choose(args, "profile")
-
-    async def _context(self, args: Args) -> Any:
-        return await self._choose(args, "context")
+        return msgspec.json.decode(codec_for(kind.response).json(memoryview(response)))
 
     async def _configure(self, args: Args) -> Any:
         resource, name, value = _name(args, "resource"), _text(args, "name"), args.get("value")
@@ -354,15 +332,16 @@ class Answers:
         resource = _name(args, "resource")
         service = self._service({"service": f"{resource}/{_SET_PARAMETERS}", "peer": args.get("peer", "")})
         kind = self._hub.types.service(SERVICE_TYPE)
-        body = codec_for(kind.request).write({"config": config}, time.time_ns()).payload
-        response = await self._hub.calls.call(service, kind.md5sum, body, _CALL_TIMEOUT)
-        taken: Args = msgspec.json.decode(codec_for(kind.response).json(memoryview(response)))["config"]
+        taken: Args = (await self._call_service(service, kind, {"config": config}))["config"]
         return taken
 
     async def _choose(self, args: Args, what: str) -> Any:
         choice = _text(args, "choice")
         await self._reconfigure(args, {"strs": [{"name": what, "value": choice}]})
         return {"text": f"{what} {choice} is chosen" if choice else f"the resource chooses its {what}"}
+
+    _profile = functools.partialmethod(_choose, what="profile")
+    _context = functools.partialmethod(_choose, what="context")
 
     def _service(self, args: Args) -> str:
         """The service that is meant, which this module's graph has and, if a peer is named, by that peer.
@@ -396,6 +375,12 @@ async def _in_time(done: Awaitable[Any]) -> None:
             await done
     except TimeoutError:
         raise UnreachableError("parameters of the core", "its API", "is it busy? ask again") from None
+
+
+def _if_new(args: Args, **values: object) -> Args:
+    """Values with their digest; that alone for a page that ``has`` it."""
+    digest = hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()[:16]
+    return {"digest": digest} if args.get("has") == digest else {"digest": digest, **values}
 
 
 def _as_before(name: str, present: object, value: object) -> object:

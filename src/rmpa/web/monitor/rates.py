@@ -14,7 +14,7 @@ from rmpa.web.monitor import limits
 from rmpa.web.monitor.state import steady_entry
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Awaitable, Callable
 
     from rmpa.observe.snapshot import Snapshot
     from rmpa.web.monitor.messages import Tree
@@ -79,11 +79,7 @@ class RatesFeed:
 def _entry(found: list[TopicRate]) -> Tree:
     """Of one topic's sources in all modules; those that are measured count."""
     measured = [one for one in found if one.rate is not None]
-    how = (measured or found)[0].how
-    if not measured:
-        return {"how": how}
-    total: Mapping[str, float] = {
-        "rate": sum(one.rate or 0.0 for one in measured),
-        "bandwidth": sum(one.bandwidth or 0.0 for one in measured),
-    }
-    return {**total, "how": how}
+    entry: Tree = {"how": (measured or found)[0].how}
+    for name in ("rate", "bandwidth") if measured else ():
+        entry[name] = sum(getattr(one, name) or 0.0 for one in measured)
+    return entry

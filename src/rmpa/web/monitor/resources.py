@@ -20,7 +20,7 @@ from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import Tree, without_nulls
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Iterable, Sequence
 
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Follower, Payload
@@ -214,21 +214,11 @@ class ResourceWatch:
     Args:
         hub: Subscribes to their topics.
         values: Decodes their messages.
-        clock: Monotonic seconds.
-        now: Seconds since the epoch.
     """
 
-    def __init__(
-        self,
-        hub: Hub,
-        values: MessageValues,
-        clock: Callable[[], float] = time.monotonic,
-        now: Callable[[], float] = time.time,
-    ) -> None:
+    def __init__(self, hub: Hub, values: MessageValues) -> None:
         self._hub = hub
-        self._values = values
-        self._clock = clock
-        self._now = now
+        self.values = values
         self._follower: Follower | None = None
         self._paths: dict[str, _Path] = {}
         self._wanted = False
@@ -263,7 +253,7 @@ class ResourceWatch:
         facts = self.facts.get(key)
         path = self._paths.get(facts.name) if facts is not None else None
         if path is not None and facts is not None:
-            path.looked = self._clock()
+            path.looked = time.monotonic()
             self._follow(path)
 
     def alarms(self) -> list[Tree]:
@@ -305,7 +295,7 @@ class ResourceWatch:
                 self._follow(path)
 
     def _follow(self, path: _Path) -> None:
-        looked = self._clock() - path.looked < limits.LOOK_KEPT
+        looked = time.monotonic() - path.looked < limits.LOOK_KEPT
         most = (_LOOKED_AT if looked else _SHOWN) if self._wanted else _ALWAYS
         wanted = {topic: type_ for topic, (type_, when) in _TOPICS.items() if when <= most}
         path.unsubscribe(path.subscriptions.keys() - wanted.keys())
@@ -319,13 +309,13 @@ class ResourceWatch:
         peer = proxied_peer(message.source)
         before = path.heard.get(peer) or ResourceFacts(name=path.name, peer=peer)
         try:
-            values = self._values.of(message)  # latched ones may come before the descriptor
+            values = self.values.of(message)  # latched ones may come before the descriptor
             said = _described(values["data"]) if topic == TOPIC else _said(before, topic, values)
         except (RmpaError, msgspec.DecodeError, KeyError, TypeError, RecursionError):
             return  # another program's topic of that name
         path.heard[peer] = after = msgspec.structs.replace(before, **said)
         if after.level != before.level:
-            path.since[peer] = self._now() - max(0.0, after.quality(LEVEL_FOR) or 0.0)
+            path.since[peer] = time.time() - max(0.0, after.quality(LEVEL_FOR) or 0.0)
 
 
 def _described(text: str) -> dict[str, Any]:

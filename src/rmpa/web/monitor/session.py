@@ -359,11 +359,15 @@ class MonitorSession(Session):
             self._refuse(id, f"{len(self._questions)} questions wait for an answer already")
         else:
             self._questions.add(id)
-            self.run(
-                self._monitor.answers.answer(what, args),
-                functools.partial(self._answered, id),
-                functools.partial(self._unanswered, id),
-            )
+
+            def reply(send: Callable[[Any], None], value: Any) -> None:
+                if id in self._questions:
+                    self._questions.discard(id)
+                    send(value)
+
+            done = functools.partial(reply, lambda value: self._send({"op": "answer", "id": id, "value": value}))
+            failed = functools.partial(reply, functools.partial(self._failed, id))
+            self.run(self._monitor.answers.answer(what, args), done, failed)
 
     def _is_late(self, id_: int, now: float, at: float) -> bool:
         """Refuse an order that TCP kept over a cut: it must not act long after the page has given it up."""
@@ -373,16 +377,6 @@ class MonitorSession(Session):
         text = f"the order may have come {late:.0f} s late, and is not carried out"
         self._refuse(id_, text, "look at what is, and repeat it")
         return True
-
-    def _answered(self, id_: int, value: Any) -> None:
-        if id_ in self._questions:
-            self._questions.discard(id_)
-            self._send({"op": "answer", "id": id_, "value": value})
-
-    def _unanswered(self, id_: int, error: RmpaError) -> None:
-        if id_ in self._questions:
-            self._questions.discard(id_)
-            self._failed(id_, error)
 
     def op_publish(
         self,

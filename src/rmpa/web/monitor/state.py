@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 import msgspec
 
 from rmpa.core.facts import TopicInfo
+from rmpa.core.identity import proxied_node
 from rmpa.discovery.limits import HEARTBEAT_LATE
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import Tree, old_after, without_nulls
@@ -380,6 +381,12 @@ def _service(service: ServiceInfo) -> Tree:
 def node_key(module: str, node: str) -> str:
     """``module:/name`` for a node of a peer, ``/name`` for one of this module, whose ``module`` is empty."""
     return f"{module}:{node}" if module else node
+
+
+def shown_node(own: str) -> str:
+    """A node of this module's graph as ``node_key`` has it: a proxy is its node in the peer's module."""
+    peer = proxied_node(own)
+    return node_key(*peer) if peer is not None else own
 
 
 def node_entries(snapshot: Snapshot) -> dict[str, Tree]:

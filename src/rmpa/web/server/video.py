@@ -326,16 +326,15 @@ class VideoStreams:
             raise ConnectionResetError
         if streams and guard is not None:
             guard.stream(camera.wake)
-        first: Encoded | None = None
         try:
             async with asyncio.timeout(limits.PICTURE_WAIT):
                 first = await camera.next(0, transport)
         except TimeoutError:
-            if not streams:
-                error = RmpaError(f"no picture came within {limits.PICTURE_WAIT:g} s: does its publisher run?")
-                return _problem(504, error)
-        if not streams:
-            assert first is not None  # noqa: S101 - for the type checker
+            first = None
+        if not streams and first is None:
+            error = RmpaError(f"no picture came within {limits.PICTURE_WAIT:g} s: does its publisher run?")
+            return _problem(504, error)
+        if first is not None and not streams:
             return web.Response(body=first.data, headers=_headers(first))
         response = web.StreamResponse(headers={"Content-Type": f"multipart/x-mixed-replace;boundary={_BOUNDARY}"})
         response.force_close()
