@@ -1,10 +1,12 @@
 // The frame around all pages: address, navigation, search, keys, colours, and what to say when the agent is gone.
 
-import { html, render, Component } from "./markup.js";
+import { Component, html, render } from "./markup.js";
 import { Connection } from "./connection.js";
 import { sentence } from "./format.js";
 import { section } from "./state.js";
-import { Mark, Since, keep, kept, keyOfNode } from "./parts.js";
+import { Mark, Since } from "./parts.js";
+import { keep, kept } from "./lists.js";
+import { keyOfNode } from "./links.js";
 import { Mandala } from "./mandala.js";
 import { Search, Shortcuts } from "./search.js";
 import { applyTheme, nextTheme, theme } from "./theme.js";

@@ -1,8 +1,9 @@
 // Lines of the log of all modules or of some: asked for while a page shows them, and it is seen.
 
-import { html, useEffect, useRef, useState } from "./markup.js";
+import { useEffect, useRef, useState, html, memo } from "./markup.js";
 import { clock, seconds } from "./format.js";
-import { Failure, Mark, ModuleLink, NodeLink, memo, nodeKey } from "./parts.js";
+import { Failure, Mark } from "./parts.js";
+import { ModuleLink, NodeLink, nodeKey } from "./links.js";
 
 const KEPT = 500; // lines of a page
 const PERIOD = 1000; // ms from an answer to the next question

@@ -1,11 +1,13 @@
 // The first page: all modules on a ring, their links, and what flows.
 
-import { html, useEffect, useRef, useState } from "./markup.js";
+import { useEffect, useRef, useState, html, memo } from "./markup.js";
 import { bandwidth, hertz, seconds } from "./format.js";
 import { entries, section } from "./state.js";
 import { Outside } from "./outside.js";
 import { CENTRE, SIZE, arrange, chord, emptyRing, geometry, outside, place } from "./ring.js";
-import { Link, Mark, Page, Panel, Since, Table, href, known, memo, shape } from "./parts.js";
+import { Mark, Page, Panel, Since, known, shape } from "./parts.js";
+import { Table } from "./lists.js";
+import { Link, href } from "./links.js";
 
 const SPEEDS = [
   [0, "still"],

@@ -1,7 +1,7 @@
 // Plots by uPlot, which is loaded when the first one is shown. Without it, and for those who read by ear, there are the
 // newest figures as text.
 
-import { html, useEffect, useRef, useState } from "./markup.js";
+import { useEffect, useRef, useState, html } from "./markup.js";
 
 const KEPT = 600; // samples of each line
 const DASHES = [[], [7, 4], [2, 3], [10, 3, 2, 3]];

@@ -1,9 +1,10 @@
 // A form for a message of any type, made from its definition, and what publishes it: once, or at a rate.
 
-import { html, useEffect, useRef, useState } from "./markup.js";
+import { useEffect, useRef, useState, html } from "./markup.js";
 import { count } from "./format.js";
 import { section } from "./state.js";
-import { Failure, Mark, Panel, Question } from "./parts.js";
+import { Failure, Mark, Panel } from "./parts.js";
+import { Question } from "./asking.js";
 import { number, primitive } from "./typed.js";
 
 const FASTEST = 50; // messages a second

@@ -1,8 +1,8 @@
 // Search over all that has a name, and the list of keys.
 
-import { html, useEffect, useLayoutEffect, useRef, useState } from "./markup.js";
+import { useEffect, useLayoutEffect, useRef, useState, html } from "./markup.js";
 import { entries } from "./state.js";
-import { href, nodeName } from "./parts.js";
+import { nodeName, href } from "./links.js";
 
 const MOST = 40;
 const KINDS = [

@@ -1,25 +1,11 @@
 // What nodes of all modules say on /diagnostics: a tree by module, hardware and name, and one status with its past.
 
-import { html, useEffect, useRef, useState } from "../markup.js";
+import { useEffect, useRef, useState, html, memo } from "../markup.js";
 import { count, plain } from "../format.js";
 import { adopt, entries, section } from "../state.js";
-import {
-  Choice,
-  Facts,
-  Mark,
-  ModuleLink,
-  NodeLink,
-  Page,
-  Panel,
-  Since,
-  Table,
-  href,
-  known,
-  memo,
-  nodeKey,
-  useFilter,
-  useFirst,
-} from "../parts.js";
+import { Choice, Facts, Mark, Page, Panel, Since, known } from "../parts.js";
+import { Table, useFilter, useFirst } from "../lists.js";
+import { ModuleLink, NodeLink, nodeKey, href } from "../links.js";
 import { Plot } from "../plot.js";
 
 const LEVELS = ["OK", "WARN", "STALE", "ERROR"]; // the best first, as in observe/diagnostics.py

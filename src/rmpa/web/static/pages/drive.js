@@ -1,10 +1,12 @@
 // A joystick for a robot, by touch, keys or a gamepad. It drives only while it is held; the server stops the robot
 // 0.3 s after the last command.
 
-import { html, useEffect, useRef, useState } from "../markup.js";
+import { useEffect, useRef, useState, html } from "../markup.js";
 import { sentence } from "../format.js";
 import { section } from "../state.js";
-import { Link, ModuleLink, NodeLink, Page, Panel, Since, useAnswer } from "../parts.js";
+import { Page, Panel, Since } from "../parts.js";
+import { Link, ModuleLink, NodeLink } from "../links.js";
+import { useAnswer } from "../asking.js";
 import { Gamepad } from "./gamepad.js";
 
 const PERIOD = 100; // milliseconds between two commands

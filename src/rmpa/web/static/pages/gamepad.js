@@ -1,7 +1,7 @@
 // A gamepad as the stick of the page Drive (w3.org/TR/gamepad): which of its axes drive, and a dead man's button that
 // must be held. What the user chooses is kept in this browser, for each kind of gamepad.
 
-import { html, useEffect, useRef, useState } from "../markup.js";
+import { useEffect, useRef, useState, html } from "../markup.js";
 
 const POLL = 50; // milliseconds between two looks at the gamepad; 500 while there is none
 const ASLEEP = 10; // seconds without any change, after which a gamepad whose button is held may be out of reach

@@ -1,10 +1,12 @@
 // The graph of nodes and topics as rqt_graph draws it: nodes in a lane for each module, topics between them.
 
-import { html, useEffect, useLayoutEffect, useRef, useState } from "../markup.js";
+import { useEffect, useLayoutEffect, useRef, useState, html, memo } from "../markup.js";
 import { count, hertz } from "../format.js";
 import { section } from "../state.js";
 import { curve, layout } from "../layout.js";
-import { Choice, Failure, Link, Mark, NodeLink, Page, Panel, Table, href, memo, useFilter } from "../parts.js";
+import { Choice, Failure, Mark, Page, Panel } from "../parts.js";
+import { Table, useFilter } from "../lists.js";
+import { Link, NodeLink, href } from "../links.js";
 import { isData } from "./topics.js";
 
 const PERIOD = 2000; // milliseconds between two questions for a graph that may have changed

@@ -1,8 +1,9 @@
 // The log of all modules, of their nodes and agents, newest first.
 
-import { html, useState } from "../markup.js";
+import { useState, html } from "../markup.js";
 import { entries, section } from "../state.js";
-import { Choice, Page, Panel, useFilter, useKept } from "../parts.js";
+import { Choice, Page, Panel } from "../parts.js";
+import { useFilter, useKept } from "../lists.js";
 import { Lines, Missing, useLog } from "../loglines.js";
 
 export const LEVELS = [

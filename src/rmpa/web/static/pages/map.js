@@ -1,6 +1,6 @@
 // Scans, grids, paths, poses, clouds and frames of all robots in one map from above, in a frame that is chosen.
 
-import { html, useContext, useEffect, useRef, useState } from "../markup.js";
+import { useContext, useEffect, useRef, useState, html } from "../markup.js";
 import { duration, hertz } from "../format.js";
 import { entries, section } from "../state.js";
 import { AsPanel, Failure, Mark, Page, Panel } from "../parts.js";

@@ -1,6 +1,6 @@
 // Several things beside each other: messages, plots, pictures, a map, the log and more, in a grid that is kept by name.
 
-import { html, useEffect, useRef, useState } from "../markup.js";
+import { useEffect, useRef, useState, html } from "../markup.js";
 import { entries, section } from "../state.js";
 import { AsPanel, Failure, Page, Panel } from "../parts.js";
 import { Fields, IMAGES, Image, Value } from "../live.js";

@@ -1,8 +1,10 @@
 // The parameters of this module's core, or of a peer's, as a tree; each value can be changed.
 
-import { html, useEffect, useRef, useState } from "../markup.js";
+import { useEffect, useRef, useState, html } from "../markup.js";
 import { entries, section } from "../state.js";
-import { Choice, Editable, Failure, Page, Panel, useFilter, useFirst, useKept } from "../parts.js";
+import { Choice, Failure, Page, Panel } from "../parts.js";
+import { useFilter, useFirst, useKept } from "../lists.js";
+import { Editable } from "../asking.js";
 import { plain } from "../format.js";
 import { another, fresh, kind } from "../typed.js";
 

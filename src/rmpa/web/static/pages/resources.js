@@ -1,9 +1,12 @@
 // Smart Resources, and one of them: profiles and why one of them runs, what clients asked, contexts, configuration.
 
-import { html, useState } from "../markup.js";
+import { useState, html, memo } from "../markup.js";
 import { seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import { Editable, Facts, Failure, Gone, Link, Mark, ModuleLink, Page, Panel, Table, memo } from "../parts.js";
+import { Facts, Failure, Gone, Mark, Page, Panel } from "../parts.js";
+import { Table } from "../lists.js";
+import { Link, ModuleLink } from "../links.js";
+import { Editable } from "../asking.js";
 import { setting } from "../typed.js";
 
 const Row = memo(

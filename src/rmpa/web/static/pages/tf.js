@@ -1,9 +1,11 @@
 // The frames of tf as a tree: parent, age, rate and sender of each transform, what is wrong, and one frame in another.
 
-import { html, useEffect, useRef, useState } from "../markup.js";
+import { useEffect, useRef, useState, html } from "../markup.js";
 import { count, duration, hertz } from "../format.js";
 import { entries, section } from "../state.js";
-import { Failure, Facts, Mark, ModuleLink, NodeLink, Page, Panel, Table, useFilter } from "../parts.js";
+import { Facts, Failure, Mark, Page, Panel } from "../parts.js";
+import { Table, useFilter } from "../lists.js";
+import { ModuleLink, NodeLink } from "../links.js";
 import { Frames, SILENT, angles } from "../frames.js";
 
 const TYPES = ["tf2_msgs/TFMessage", "tf/tfMessage"];

@@ -1,43 +1,17 @@
 // All topics, and one of them: which node sends it to which, how fast, how late, what is lost, and what is in it.
 
-import { html, useState } from "../markup.js";
+import { useState, html, memo } from "../markup.js";
 import { bandwidth, clock, count, hertz, seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import {
-  Choice,
-  Facts,
-  Failure,
-  Gone,
-  Link,
-  Mark,
-  NodeLink,
-  NodeLinks,
-  Page,
-  Panel,
-  Since,
-  Table,
-  Why,
-  memo,
-  nodeKey,
-  useAnswer,
-  useFilter,
-  useKept,
-} from "../parts.js";
+import { Choice, Facts, Failure, Gone, Mark, Page, Panel, Since } from "../parts.js";
+import { Table, useFilter, useKept } from "../lists.js";
+import { Link, NodeLink, NodeLinks, nodeKey } from "../links.js";
+import { Why, useAnswer } from "../asking.js";
 import { Lines } from "../plot.js";
 import { Live } from "../live.js";
 import { PublishPanel } from "../publish.js";
 
-export const TOPIC_COLUMNS = ["Topic", "#Rate", "#Bytes", "Type", "#Latency", "#Lost", "From → to"];
 const lostOf = (topic) => (topic.lost || 0) + (topic.dropped || 0);
-const KEYS = {
-  Topic: ([name]) => name,
-  Type: ([, topic]) => topic.type,
-  "#Rate": ([, topic, measured]) => measured?.rate ?? topic.rate,
-  "#Bytes": ([, topic, measured]) => measured?.bandwidth ?? topic.bandwidth,
-  "#Latency": ([, topic]) => topic.latency,
-  "#Lost": ([, topic]) => lostOf(topic) || undefined,
-  "From → to": ([, topic]) => (topic.from || []).join(", "),
-};
 
 // How a rate was measured where the topic is published; what is not measured says why.
 const WAYS = {
@@ -55,27 +29,44 @@ function Rate({ topic, measured }) {
   return html`<span title=${WAYS[measured.how]}>${measured.rate ? hertz(measured.rate) : "none in 2 s"}</span>`;
 }
 
-export const TopicRow = memo(
-  ({ name, topic, measured }) =>
-    html`<tr class=${topic.stopped ? "old" : ""}>
-      <th scope="row">
-        <${Link} page="topic" name=${name} />${topic.problem &&
-        html`<div class="muted"><${Mark} state="WARN" word=${""} />${topic.problem}</div>`}
-      </th>
-      <td class="number"><${Rate} topic=${topic} measured=${measured} /></td>
-      <td class="number">${bandwidth(measured?.bandwidth || topic.bandwidth)}</td>
-      <td><span class="muted">${topic.type}</span></td>
-      <td class="number">${seconds(topic.latency)}</td>
-      <td class="number">${lostOf(topic) ? count(lostOf(topic)) : "–"}</td>
-      <td>
-        ${(topic.from || []).join(", ") || html`<span class="muted">no publisher</span>`}
-        ${" "}→${" "}${(topic.to || []).join(", ") ||
-        html`<span class="muted">no subscriber here</span>`}${topic.crosses
-          ? ""
-          : html` <span class="muted">does not cross</span>`}
-      </td>
-    </tr>`,
-);
+const muted = (text) => html`<span class="muted">${text}</span>`;
+// Of entries [name, topic, what was measured].
+const TOPIC_COLUMNS = [
+  [
+    "Topic",
+    ([name, topic]) =>
+      html`<${Link} page="topic" name=${name} />${topic.problem &&
+        html`<div class="muted"><${Mark} state="WARN" word="" />${topic.problem}</div>`}`,
+    ([name]) => name,
+  ],
+  [
+    "#Rate",
+    ([, topic, measured]) => html`<${Rate} ...${{ topic, measured }} />`,
+    ([, topic, measured]) => measured?.rate ?? topic.rate,
+  ],
+  [
+    "#Bytes",
+    ([, topic, measured]) => bandwidth(measured?.bandwidth || topic.bandwidth),
+    ([, topic, measured]) => measured?.bandwidth ?? topic.bandwidth,
+  ],
+  ["~Type", ([, topic]) => topic.type, ([, topic]) => topic.type],
+  ["#Latency", ([, topic]) => seconds(topic.latency), ([, topic]) => topic.latency],
+  ["#Lost", ([, topic]) => count(lostOf(topic) || undefined), ([, topic]) => lostOf(topic) || undefined],
+  [
+    "From → to",
+    ([, { from = [], to = [], crosses }]) =>
+      html`${from.join(", ") || muted("no publisher")}${" → "}${to.join(", ") ||
+      muted("no subscriber here")}${!crosses && html` ${muted("does not cross")}`}`,
+    ([, topic]) => (topic.from || []).join(", "),
+  ],
+];
+export const TopicTable = ({ list, empty }) =>
+  html`<${Table}
+    caption="Topics"
+    columns=${TOPIC_COLUMNS}
+    tone=${([, topic]) => (topic.stopped ? "old" : "")}
+    ...${{ list, empty }}
+  />`;
 
 // What Smart Resources and the log publish about themselves, next to the topics that carry data.
 const ABOUT = new RegExp(
@@ -120,10 +111,7 @@ export function Topics({ state }) {
   >
     ${filter.field}
     <${Panel}
-      ><${Table} caption="Topics" columns=${TOPIC_COLUMNS} keys=${KEYS} empty="No topic matches." list=${shown}>
-        ${([name, one, rate]) => html`<${TopicRow} key=${name} name=${name} topic=${one} measured=${rate} />`}<//
-      >
-      ${which === "data" &&
+      ><${TopicTable} empty="No topic matches." list=${shown} /> ${which === "data" &&
       all.length > shown.length &&
       !filter.typed &&
       html`<p class="empty">
@@ -176,11 +164,11 @@ export function TopicPage({ name, state, connection }) {
             ["Subscribed in", (topic.to || []).join(", ")],
             [
               `Publishers in ${own}`,
-              (detail.publishers || []).length > 0 ? html`<${NodeLinks} names=${detail.publishers} />` : "",
+              detail.publishers?.length > 0 && html`<${NodeLinks} names=${detail.publishers} />`,
             ],
             [
               `Subscribers in ${own}`,
-              (detail.subscribers || []).length > 0 ? html`<${NodeLinks} names=${detail.subscribers} />` : "",
+              detail.subscribers?.length > 0 && html`<${NodeLinks} names=${detail.subscribers} />`,
             ],
             ["Elsewhere", detail.remote_subscribers && html`<${NodeLinks} names=${detail.remote_subscribers} />`],
             ["Crosses", topic.crosses ? "yes" : "no"],
@@ -209,22 +197,7 @@ export function TopicPage({ name, state, connection }) {
           series=${flowing.map(([key, route]) => ({ label: key, value: figureOf(route, figure) }))}
       /><//>`}
       <${Panel} title="Routes" wide
-        ><${Table}
-          caption="Routes"
-          columns=${[
-            "Source",
-            "State",
-            "#Rate",
-            "#Jitter p99",
-            "#Latency p50, p99",
-            "#Lost",
-            "#Dropped",
-            "Transport",
-            "Contract",
-          ]}
-          empty="It has no route to or from a peer."
-          list=${routes}
-        >
+        ><${Table} caption="Routes" columns=${ROUTE_COLUMNS} empty="It has no route to or from a peer." list=${routes}>
           ${([key, route]) => html`<${Route} key=${key} route=${route} own=${own} />`}<//
         ><//
       >
@@ -233,6 +206,7 @@ export function TopicPage({ name, state, connection }) {
   ><//>`;
 }
 
+const ROUTE_COLUMNS = "Source|State|#Rate|#Jitter p99|#Latency p50, p99|#Lost|#Dropped|Transport|Contract".split("|");
 const Route = memo(({ route, own }) => {
   const latency = section(route, "latency");
   const contract = Object.entries(route.contract || {})
@@ -293,11 +267,7 @@ const Subscriber = ({ one }) => {
   return html`<tr>
     <th scope="row" class="inner"><span class="mono">→ ${one.node}</span></th>
     <td>${one.state}${said && html`<div class="muted">${said}</div>`}</td>
-    <td class="number">–</td>
-    <td class="number">–</td>
-    <td class="number">–</td>
-    <td class="number">–</td>
-    <td class="number">–</td>
+    ${[1, 2, 3, 4, 5].map((each) => html`<td key=${each} class="number">–</td>`)}
     <td>${one.transport || "–"}${one.endpoint && html`<div class="muted">${one.endpoint}</div>`}</td>
     <td>${one.wanted || ""}</td>
   </tr>`;
@@ -327,25 +297,23 @@ const term = (key, value) =>
         ? hertz(value)
         : String(value).replaceAll("_", " ");
 
+const TERMS = [
+  [
+    "Term",
+    ([key]) =>
+      html`${key.replaceAll("_", " ")}
+        <div class="muted">${MEANINGS[key] || ""}</div>`,
+  ],
+  ["Value", ([key, one]) => term(key, one.value)],
+  ["~Set by", ([, one]) => one.rule],
+];
+
 // What the settings of this module ask for the topic, whether a route is open or not.
 function ContractPanel({ connection, topic, type, own, routes }) {
   const { value, failure } = useAnswer(connection, "contract", { topic, type: type === "*" ? "" : type || "" });
   const rows = Object.entries(value || {});
   const set = rows.filter(([, one]) => one.rule !== "default");
-  const table = (shown) =>
-    html`<${Table} caption="Contract" columns=${["Term", "Value", "Set by"]}
-      >${shown.map(
-        ([key, one]) =>
-          html`<tr key=${key}>
-            <th scope="row">
-              ${key.replaceAll("_", " ")}
-              <div class="muted">${MEANINGS[key] || ""}</div>
-            </th>
-            <td>${term(key, one.value)}</td>
-            <td class="muted">${one.rule}</td>
-          </tr>`,
-      )}<//
-    >`;
+  const table = (list) => html`<${Table} caption="Contract" columns=${TERMS} list=${list} />`;
   return html`<${Panel} title=${`Contract, by the settings of ${own}`} wide
     ><${Failure} failure=${failure} /> ${value &&
     (set.length
@@ -362,26 +330,19 @@ function ContractPanel({ connection, topic, type, own, routes }) {
   >`;
 }
 
+const EVENTS = [
+  ["Time", (event) => clock(event.at)],
+  ["Event", (event) => event.kind.replaceAll("_", " ")],
+  ["Source", (event) => event.from],
+  ["Text", (event) => event.text],
+];
 const Events = ({ routes }) => {
   const events = routes.flatMap(([, route]) =>
     (route.recent || []).map((event) => ({ ...event, from: `${route.peer} ${route.node}` })),
   );
+  const list = events.sort((a, b) => b.at - a.at);
   return (
-    events.length > 0 &&
-    html`<${Panel} title="Events of its contract" wide
-      ><${Table} caption="Events" columns=${["Time", "Event", "Source", "Text"]}
-        >${events
-          .sort((a, b) => b.at - a.at)
-          .map(
-            (event) =>
-              html`<tr key=${event.from + event.kind + event.at}>
-                <th scope="row">${clock(event.at)}</th>
-                <td>${event.kind.replaceAll("_", " ")}</td>
-                <td>${event.from}</td>
-                <td>${event.text}</td>
-              </tr>`,
-          )}<//
-      ><//
-    >`
+    list.length > 0 &&
+    html`<${Panel} title="Events of its contract" wide><${Table} caption="Events" columns=${EVENTS} list=${list} /><//>`
   );
 };
