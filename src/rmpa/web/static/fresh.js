@@ -3,7 +3,7 @@
 
 import { useEffect, useState, html } from "./markup.js";
 import { bandwidth, duration, hertz } from "./format.js";
-import { Mark } from "./parts.js";
+import { Mark, useTick } from "./parts.js";
 
 // `came`: when the last message came, by performance.now(); `after`: seconds, 0 while no period is known.
 export const isOld = (came, after) => after > 0 && performance.now() - came >= after * 1000;
@@ -36,11 +36,7 @@ export function useWatch(connection, wanted, take) {
 }
 
 const Ago = ({ came }) => {
-  const [, tick] = useState(0);
-  useEffect(() => {
-    const timer = setInterval(() => tick((n) => n + 1), 1000);
-    return () => clearInterval(timer);
-  }, []);
+  useTick(1);
   return duration((performance.now() - came) / 1000);
 };
 

@@ -91,7 +91,7 @@ function Heading({ column, sort, onSort }) {
 }
 
 const Row = memo(
-  ({ one, columns, about, tone }) =>
+  ({ one, columns, tone, ...about }) =>
     html`<tr class=${tone}>
       ${columns.map(([heading, cell], at) =>
         at
@@ -100,7 +100,7 @@ const Row = memo(
       )}
     </tr>`,
 );
-const nameOf = (one, at) => (Array.isArray(one) ? one[0] : typeof one === "string" ? one : (one.name ?? at));
+const nameOf = (one, at) => (typeof one === "string" ? one : typeof one[0] === "string" ? one[0] : (one.name ?? at));
 
 // Columns are [heading, what an entry of `list` has there, and by what it is sorted]; `about` goes to each of them.
 // Or, of rows that are more than that, they are headings, and the children draw an entry.
@@ -110,7 +110,7 @@ export function Table({ caption, columns, list, about, tone, children, empty }) 
   const of = sort && headings.find(([heading]) => heading === sort.column)?.[2];
   const [first, more] = useFirst(of ? sorted(list, of, sort.down) : list, caption);
   const draw = (one, at) =>
-    children?.(one, at) ?? html`<${Row} key=${nameOf(one, at)} ...${{ one, columns, about, tone: tone?.(one) }} />`;
+    children?.(one, at) ?? html`<${Row} key=${nameOf(one, at)} ...${{ ...about, one, columns, tone: tone?.(one) }} />`;
   if (!first.length) return html`<p class="empty">${empty || "Nothing here."}</p>`;
   return html`<div class="scroll" tabindex="0" role="region" aria-label=${caption}>
     <table>

@@ -213,19 +213,6 @@ function sizes(slots, compact) {
   if (!shapes.has(key)) shapes.set(key, geometry(slots, compact));
   return shapes.get(key);
 }
-const lists = new Map();
-function same(key, list) {
-  const before = lists.get(key);
-  if (
-    before &&
-    before.length === list.length &&
-    before.every((each, at) => each[0] === list[at][0] && each[1] === list[at][1])
-  )
-    return before;
-  lists.set(key, list);
-  return list;
-}
-
 const around = emptyRing();
 const arranged = (state) => arrange(around, section(state, "agent").name, Object.keys(section(state, "modules")));
 
@@ -319,10 +306,7 @@ export function Ring({ state, current }) {
               at=${at(name)}
               geo=${geo}
               compact=${compact}
-              resources=${same(
-                name,
-                resources.filter(([, one]) => one.module === name),
-              )}
+              resources=${resources.filter(([, one]) => one.module === name)}
               alarms=${alarms.filter(([, one]) => one.module === name).length}
             />`,
         )}
@@ -342,10 +326,11 @@ export function costs(lost) {
   return `${stopped}${rest}${kept}${lost.dropped ? `; ${count(lost.dropped, "message")} dropped` : ""}`;
 }
 
+const some = (names) => `${names.slice(0, 3).join(", ")}${names.length > 3 ? " …" : ""}`;
+
 // What nodes say on /diagnostics: each error, and a line for all warnings.
 function diagnosed({ errors, more, warnings = [], stale = [], problems = [] }, own, modules) {
   const to = href("diagnostics");
-  const some = (names) => `${names.slice(0, 3).join(", ")}${names.length > 3 ? " …" : ""}`;
   // What a module said whose link is lost is old, which the line of the module says already.
   const here = (module) => !module || !["lost", "away"].includes(modules[module]?.state);
   const those = (list) => list.filter(([module]) => here(module)).map(([, name]) => name);
@@ -370,83 +355,41 @@ const count = (number, one, several = `${one}s`) => `${number} ${number > 1 ? se
 
 function concerns(state) {
   const found = [];
-  for (const [id, alarm] of entries(state, "alarms"))
-    found.push({
-      id,
-      level: alarm.level,
-      text: alarm.text,
-      who: alarm.resource || alarm.module,
-      to: alarm.resource ? href("resource", alarm.resource) : href("alarms"),
-      since: alarm.at,
-    });
-  for (const [name, module] of entries(state, "modules")) {
-    if (module.state !== "up" && module.state !== "here" && module.state !== "relayed")
-      found.push({
-        id: `m${name}`,
-        level: { refused: "ERROR", lost: "ERROR", away: "STALE" }[module.state] || "WARN",
-        text: `${known(module.state).word}${module.error ? `: ${module.error}` : ""}${costs(module.lost)}`,
-        who: name,
-        to: href("module", name),
-        since: module.since,
-      });
-    else if (module.error)
-      found.push({ id: `m${name}`, level: "WARN", text: module.error, who: name, to: href("module", name) });
+  const say = (id, level, who, text, to, since) => found.push({ id, level, who, text, to, since });
+  for (const [id, { level, text, resource, module, at }] of entries(state, "alarms"))
+    say(id, level, resource || module, text, resource ? href("resource", resource) : href("alarms"), at);
+  for (const [name, { state: link, error, lost, since }] of entries(state, "modules")) {
+    const to = href("module", name);
+    if (["up", "here", "relayed"].includes(link)) {
+      if (error) say(`m${name}`, "WARN", name, error, to);
+      continue;
+    }
+    const level = { refused: "ERROR", lost: "ERROR", away: "STALE" }[link] || "WARN";
+    say(`m${name}`, level, name, `${known(link).word}${error ? `: ${error}` : ""}${costs(lost)}`, to, since);
   }
   found.push(...diagnosed(section(state, "diagnostics"), section(state, "agent").name, section(state, "modules")));
   const troubled = new Map(); // many topics have one trouble when a module is lost: that is one line
   for (const [name, topic] of entries(state, "topics"))
     if (topic.problem) troubled.set(topic.problem, [...(troubled.get(topic.problem) || []), name]);
-  for (const [text, names] of troubled) {
-    const several = names.length > 1;
-    found.push({
-      id: `t${text}`,
-      level: "WARN",
-      text: several ? `${text}: ${names.slice(0, 3).join(", ")}${names.length > 3 ? " …" : ""}` : text,
-      who: several ? `${names.length} topics` : names[0],
-      to: several ? href("topics") : href("topic", names[0]),
-    });
-  }
+  for (const [text, names] of troubled)
+    if (names.length > 1) say(`t${text}`, "WARN", `${names.length} topics`, `${text}: ${some(names)}`, href("topics"));
+    else say(`t${text}`, "WARN", names[0], text, href("topic", names[0]));
   const pending = entries(state, "outside").filter(([, one]) => one.state === "pending");
-  if (pending.length)
-    found.push({
-      id: "pending",
-      level: "WARN",
-      text: "pending: an invitation is needed for a link; see Not in this mesh",
-      who: pending.map(([, one]) => one.name).join(", "),
-      to: href(""),
-    });
+  const invite = "pending: an invitation is needed for a link; see Not in this mesh";
+  if (pending.length) say("pending", "WARN", pending.map(([, one]) => one.name).join(", "), invite, href(""));
   for (const note of state.notes || [])
-    found.push({
-      id: `n${note}`,
-      level: "WARN",
-      text: note,
-      who: "the agent",
-      to: href("module", section(state, "agent").name),
-    });
+    say(`n${note}`, "WARN", "the agent", note, href("module", section(state, "agent").name));
   return found.sort((a, b) => LEVELS.indexOf(a.level) - LEVELS.indexOf(b.level)); // of one level: causes first
 }
 
 export function Concerns({ state, connection }) {
   const found = concerns(state);
   const reach = section(state, "reach");
+  const first = (id, who, text, since) =>
+    found.unshift({ id, level: "ERROR", who, text, to: location.hash || "#/", since });
   if (connection.phase === "lost")
-    found.unshift({
-      id: "lost",
-      level: "ERROR",
-      who: "rmpa web",
-      text: "no connection: the page shows what was last known",
-      to: location.hash || "#/",
-      since: connection.lostAt / 1000,
-    });
-  else if (reach.ok === false)
-    found.unshift({
-      id: "mute",
-      level: "ERROR",
-      who: "the agent",
-      text: `does not answer: ${reach.error}`,
-      to: location.hash || "#/",
-      since: reach.since,
-    });
+    first("lost", "rmpa web", "no connection: the page shows what was last known", connection.lostAt / 1000);
+  else if (reach.ok === false) first("mute", "the agent", `does not answer: ${reach.error}`, reach.since);
   if (!found.length) return html`<p class="well"><${Mark} state="OK" word="Nothing is wrong." /></p>`;
   return html`<ul class="concerns">
     ${found.slice(0, 50).map(
@@ -461,34 +404,32 @@ export function Concerns({ state, connection }) {
   </ul>`;
 }
 
-const Row = memo(
-  ({ name, module, resources }) =>
-    html`<tr>
-      <th scope="row"><${Link} page="module" name=${name} /></th>
-      <td><${Mark} state=${module.state} /></td>
-      <td class="number">${seconds(module.rtt)}</td>
-      <td class="number">${bandwidth(module.bytes_in)}</td>
-      <td class="number">${bandwidth(module.bytes_out)}</td>
-      <td>
-        ${resources.map(
-          ([key, one]) =>
-            html`<div key=${key}>
-              <a href=${href("resource", key)}><${Mark} state=${one.level} word=${one.profile || "no profile"} /></a>
-            </div>`,
-        )}
-      </td>
-    </tr>`,
-);
-
-const FlowRow = memo(
-  ({ from, to, flow }) =>
-    html`<tr>
-      <th scope="row">${from} → ${to}</th>
-      <td class="number">${hertz(flow.rate)}</td>
-      <td class="number">${bandwidth(flow.bandwidth)}</td>
-      <td>${flow.topics.map((topic, at) => html`${at > 0 && ", "}<a href=${href("topic", topic)}>${topic}</a>`)}</td>
-    </tr>`,
-);
+const MODULES = [
+  ["Module", ([name]) => html`<${Link} page="module" name=${name} />`],
+  ["Link", ([, module]) => html`<${Mark} state=${module.state} />`],
+  ["#Round trip", ([, module]) => seconds(module.rtt)],
+  ["#In", ([, module]) => bandwidth(module.bytes_in)],
+  ["#Out", ([, module]) => bandwidth(module.bytes_out)],
+  [
+    "Profile",
+    ([, , resources]) =>
+      resources.map(
+        ([key, one]) =>
+          html`<div key=${key}>
+            <a href=${href("resource", key)}><${Mark} state=${one.level} word=${one.profile || "no profile"} /></a>
+          </div>`,
+      ),
+  ],
+];
+const FLOWS = [
+  ["From → to", ([key]) => key.replace(">", " → ")],
+  ["#Messages", ([, flow]) => hertz(flow.rate)],
+  ["#Bytes", ([, flow]) => bandwidth(flow.bandwidth)],
+  [
+    "Topics",
+    ([, flow]) => flow.topics.map((topic, at) => html`${at > 0 && ", "}<a href=${href("topic", topic)}>${topic}</a>`),
+  ],
+];
 
 export function Mandala({ state, connection }) {
   const current = connection.phase !== "lost" && section(state, "reach").ok !== false;
@@ -501,7 +442,9 @@ export function Mandala({ state, connection }) {
     (each) => !["relayed", "lost"].includes(each) || modules.some(([, one]) => one.state === each),
   );
   const { places } = arranged(state);
-  const ordered = modules.sort(([a], [b]) => (places[a] ?? 1e9) - (places[b] ?? 1e9));
+  const ordered = modules
+    .sort(([a], [b]) => (places[a] ?? 1e9) - (places[b] ?? 1e9))
+    .map(([name, module]) => [name, module, resources.filter(([, one]) => one.module === name)]);
   return html`<${Page}
     title="Mesh"
     kind=${`Domain ${domain} · ${up} of ${total} modules up${current ? "" : " when last heard of"}`}
@@ -519,39 +462,16 @@ export function Mandala({ state, connection }) {
         <${Panel} title="What is wrong"><${Concerns} state=${state} connection=${connection} /><//>
         <${Outside} state=${state} connection=${connection} />
         <${Panel} title="Modules"
-          ><${Table}
-            caption="Modules"
-            columns=${["Module", "Link", "#Round trip", "#In", "#Out", "Profile"]}
-            list=${ordered}
-          >
-            ${([name, module]) =>
-              html`<${Row}
-                key=${name}
-                name=${name}
-                module=${module}
-                resources=${same(
-                  `row ${name}`,
-                  resources.filter(([, one]) => one.module === name),
-                )}
-              />`}<//
-          >
-          ${total > modules.length &&
+          ><${Table} caption="Modules" columns=${MODULES} list=${ordered} /> ${total > modules.length &&
           html`<p class="empty">The server leaves out ${total - modules.length} further modules.</p>`}<//
         >
         <${Panel} title="Flows"
           ><${Table}
             caption="Flows between modules"
-            columns=${["From → to", "#Messages", "#Bytes", "Topics"]}
+            columns=${FLOWS}
             empty="No messages cross at present."
             list=${entries(state, "flows")}
-          >
-            ${([key, flow]) => {
-              const [from, to] = key.split(">");
-              return html`<${FlowRow} key=${key} from=${from} to=${to} flow=${flow} />`;
-            }}<//
-          ><//
-        >
-      </div>
-    </div><//
-  >`;
+        /><//>
+      </div></div
+  ><//>`;
 }

@@ -139,6 +139,11 @@ export const Choice = ({ label, value, options, onChoose, disabled }) =>
     )}
   </div>`;
 
+export const IconButton = ({ label, title = label, press, look = "", children, ...more }) =>
+  html`<button type="button" class="icon ${look}" aria-label=${label} title=${title} onClick=${press} ...${more}>
+    ${children}
+  </button>`;
+
 // Fields of forms, each with its label.
 export const Text = ({ label, onInput, ...more }) =>
   html`<label>${label}<input ...${more} onInput=${(event) => onInput(event.target.value)} /></label>`;

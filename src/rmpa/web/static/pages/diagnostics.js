@@ -186,6 +186,25 @@ export function Diagnostics({ name, state, connection }) {
   >`;
 }
 
+const VALUES = [
+  ["Key", ([key]) => key],
+  ["Value", ([, text]) => text],
+  [
+    "",
+    ([key, text], { fields, toggle, past }) =>
+      (past[key] || numberOf(text) !== null) &&
+      html`<button
+        type="button"
+        class="plotted"
+        aria-pressed=${String(fields.includes(key))}
+        aria-label=${`Plot ${plain(key)}`}
+        onClick=${() => toggle(key)}
+      >
+        Plot
+      </button>`,
+  ],
+];
+
 function Chosen({ name, one, own, state, connection }) {
   const detail = section(section(state, "detail"), `diagnostic:${name}`);
   const values = Object.entries(detail.values || {});
@@ -230,25 +249,13 @@ function Chosen({ name, one, own, state, connection }) {
         ["Last news", detail.heard && html`<${Since} moment=${detail.heard} text=${(ago) => `${ago} ago`} />`],
       ]}
     />
-    <${Table} caption="Values" columns=${["Key", "Value", ""]} empty="It has no values." list=${values}>
-      ${([key, text]) =>
-        html`<tr key=${key}>
-          <th scope="row">${key}</th>
-          <td>${text}</td>
-          <td>
-            ${(past.current[key] || numberOf(text) !== null) &&
-            html`<button
-              type="button"
-              class="plotted"
-              aria-pressed=${String(fields.includes(key))}
-              aria-label=${`Plot ${plain(key)}`}
-              onClick=${() => toggle(key)}
-            >
-              Plot
-            </button>`}
-          </td>
-        </tr>`}<//
-    >
+    <${Table}
+      caption="Values"
+      columns=${VALUES}
+      about=${{ fields, toggle, past: past.current, version }}
+      empty="It has no values."
+      list=${values}
+    />
     ${plotted.length > 0 &&
     html`<${Plot}
       labels=${plotted}

@@ -3,13 +3,15 @@
 import { useEffect, useLayoutEffect, useRef, useState, html, memo } from "../markup.js";
 import { count, hertz } from "../format.js";
 import { section } from "../state.js";
+import { useAgain } from "../asking.js";
+import { download } from "../storage.js";
 import { curve, layout } from "../layout.js";
-import { Choice, Failure, Mark, Page, Panel } from "../parts.js";
+import { Check, Choice, Select, Failure, Mark, Page, Panel } from "../parts.js";
 import { Table, useFilter } from "../lists.js";
 import { Link, NodeLink, href } from "../links.js";
 import { isData } from "./topics.js";
 
-const PERIOD = 2000; // milliseconds between two questions for a graph that may have changed
+const PERIOD = 2; // seconds between two questions for a graph that may have changed
 const LETTERS = 26;
 const NAMED = 170; // between columns, where edges have names
 const STACK = 4; // topics of the same nodes that are named in one box; the others are counted
@@ -132,30 +134,17 @@ function flow(names, topics) {
 
 function useGraph(connection) {
   const [graph, set] = useState({});
-  const open = connection.phase === "open";
-  useEffect(() => {
-    if (!open) return undefined;
-    let ended = false,
-      timer,
-      has = "";
-    const ask = async () => {
-      if (!document.hidden || !has)
-        await connection.ask("graph", { has }).then(
-          (found) => {
-            if (ended) return;
-            has = found.digest;
-            if (found.topics) set(found);
-          },
-          (failure) => !ended && set((before) => ({ ...before, failure })),
-        );
-      if (!ended) timer = setTimeout(ask, PERIOD);
-    };
-    ask();
-    return () => {
-      ended = true;
-      clearTimeout(timer);
-    };
-  }, [open]);
+  const has = useRef("");
+  useAgain(connection.phase === "open", PERIOD, "", (wanted) =>
+    connection.ask("graph", { has: has.current }).then(
+      (found) => {
+        if (!wanted()) return;
+        has.current = found.digest;
+        set((before) => (found.topics ? found : before.failure ? { ...before, failure: undefined } : before));
+      },
+      (failure) => wanted() && set((before) => ({ ...before, failure })),
+    ),
+  );
   return graph;
 }
 
@@ -163,16 +152,6 @@ const VIEWS = [
   ["both", "Nodes and topics"],
   ["nodes", "Nodes only"],
 ];
-const Check = ({ label, checked, onChange }) =>
-  html`<label class="check"><input type="checkbox" checked=${checked} onChange=${onChange} /> ${label}</label>`;
-const Select = ({ label, value, names, all, onChange }) =>
-  html`<label class="pick"
-    >${label}<select value=${value} onChange=${(event) => onChange(event.target.value)}>
-      <option value="">${all}</option>
-      ${names.map((name) => html`<option key=${name} value=${name}>${name}</option>`)}
-    </select></label
-  >`;
-
 // First parts of names that several nodes and topics have in common.
 function namespaces(topics, own) {
   const counts = new Map();
@@ -221,6 +200,7 @@ export function GraphPage({ name, state, connection }) {
     };
   }
   const { chosen, vertices = [], edges = [], drawn } = memory.current;
+  const all = ["", "all"];
   const modules = [...new Set(Object.values(topics).flatMap(([, from, to]) => [...from, ...to]))]
     .map((node) => nodeOf(node, own).module)
     .filter((each, at, list) => list.indexOf(each) === at)
@@ -233,16 +213,22 @@ export function GraphPage({ name, state, connection }) {
     aside=${html`<${Choice} label="What is drawn" value=${view} onChoose=${setView} options=${VIEWS} />`}
   >
     <div class="row filter-row">
-      ${filter.field}<${Select} label="Module" value=${module} names=${modules} all="all" onChange=${setModule} />
+      ${filter.field}<${Select}
+        look="pick"
+        label="Module"
+        value=${module}
+        names=${[all, ...modules]}
+        onChange=${setModule}
+      />
       <${Select}
+        look="pick"
         label="Namespace"
         value=${namespace}
-        names=${namespaces(topics, own)}
-        all="all"
+        names=${[all, ...namespaces(topics, own)]}
         onChange=${setNamespace}
       />
-      <${Check} label="Debug topics" checked=${debug} onChange=${() => setDebug(!debug)} />
-      <${Check} label="Topics with one end" checked=${leaves} onChange=${() => setLeaves(!leaves)} />
+      <${Check} label="Debug topics" checked=${debug} onChange=${setDebug} />
+      <${Check} label="Topics with one end" checked=${leaves} onChange=${setLeaves} />
     </div>
     <${Failure} failure=${graph.failure} />
     ${graph.hidden > 0 && html`<p class="empty">The server leaves out ${count(graph.hidden)} further topics.</p>`}
@@ -505,11 +491,7 @@ function save(svg, drawn) {
   const ground = document.createElementNS("http://www.w3.org/2000/svg", "rect");
   give(ground, { x: -10, y: -10, width, height, fill: getComputedStyle(svg).backgroundColor });
   copy.prepend(ground);
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(new Blob([new XMLSerializer().serializeToString(copy)], { type: "image/svg+xml" }));
-  link.download = "graph.svg";
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+  download("graph.svg", "image/svg+xml", new XMLSerializer().serializeToString(copy));
 }
 
 const Names = ({ names, page }) =>
@@ -550,20 +532,18 @@ function About({ name, chosen, vertices, own, state, children }) {
   >`;
 }
 
+const COLUMNS = [
+  ["Topic", (one) => html`<${Link} page="topic" name=${one.name} />`],
+  ["~Type", (one) => one.type],
+  ["#Rate", (one, { topics }) => hertz(topics[one.name]?.rate)],
+  ["Publishers", (one) => html`<${Names} names=${one.from} />`],
+  ["Subscribers", (one) => html`<${Names} names=${one.to} />`],
+];
 const AsTable = ({ chosen, state }) =>
   html`<${Panel} title="As a table"
     ><${Table}
       caption="Topics of the graph"
-      columns=${["Topic", "Type", "#Rate", "Publishers", "Subscribers"]}
+      columns=${COLUMNS}
+      about=${{ topics: section(state, "topics") }}
       list=${[...chosen.topics.values()].sort((a, b) => (a.name < b.name ? -1 : 1))}
-    >
-      ${(one) =>
-        html`<tr key=${one.name}>
-          <th scope="row"><${Link} page="topic" name=${one.name} /></th>
-          <td class="muted">${one.type}</td>
-          <td class="number">${hertz(section(state, "topics")[one.name]?.rate)}</td>
-          <td><${Names} names=${one.from} /></td>
-          <td><${Names} names=${one.to} /></td>
-        </tr>`}<//
-    ><//
-  >`;
+  /><//>`;
