@@ -166,10 +166,9 @@ export function Diagnosis({ value }) {
 
 export const Why = ({ connection, kind, name, peer, now }) =>
   html`<${Question}
-    connection=${connection}
+    ...${{ connection, now }}
     what="why"
     args=${{ kind, name, ...(peer ? { peer } : {}) }}
     label="Why?"
-    now=${now}
     show=${(value) => html`<${Diagnosis} value=${value} />`}
   />`;

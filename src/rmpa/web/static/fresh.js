@@ -1,4 +1,4 @@
-// Whether what is shown as live is old, and how old: one rule for values, plots, pictures and scans. How long a topic
+// Whether what is shown as live is old, and how old: one rule for values, plots, pictures and maps. How long a topic
 // may be silent is told by the server (`after` of a beat); routes it judges itself by the same rule (`stopped`).
 
 import { useEffect, useState, html } from "./markup.js";

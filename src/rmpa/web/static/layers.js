@@ -16,7 +16,6 @@ export const LAYERS = {
 const HUES = [192, 34, 282, 110, 338, 62, 228, 158]; // of modules
 const TRAIL = 600; // poses
 const JUMP = 1; // metres between two poses, beyond which the trail begins anew
-const OLD = 2; // seconds; or a few periods of its own
 const NEAREST = 2000,
   FARTHEST = 0.02; // pixels a metre
 
@@ -104,12 +103,6 @@ export class Layer {
       this.tint = "";
     }
     picture.close();
-  }
-
-  // What came once, as a latched map, is old when its publisher has gone; else after a few of its own periods.
-  isOld(now, isThere) {
-    if (!isThere) return true;
-    return this.rate > 0 && now - this.heard > Math.max(OLD, 3 / this.rate);
   }
 
   // The picture of a grid in the colour of the text: its pixels have an opacity alone.

@@ -83,7 +83,7 @@ export function Fields({ connection, topic, fields, onOld }) {
   });
   const number = (value) => (value === null || value === undefined ? "–" : Number(value.toPrecision(5)).toString());
   return html`<div class="wide">
-    <${Fresh} watched=${watched} onOld=${onOld}
+    <${Fresh} ...${{ watched, onOld }}
       ><${Failure} failure=${watched.failure} /><${Plot}
         labels=${fields}
         data=${data.current}
@@ -151,7 +151,7 @@ export function Image({ connection, topic, type, state, onOld }) {
       ? `${bandwidth(watched.beat.bandwidth)} cross the mesh from ${from.join(", ")} for it. `
       : "";
   return html`<figure class="wide" ref=${place}>
-    <${Fresh} watched=${watched} onOld=${onOld}
+    <${Fresh} ...${{ watched, onOld }}
       ><${Failure} failure=${watched.failure} /><canvas
         class="view"
         ref=${canvas}

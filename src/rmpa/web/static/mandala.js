@@ -71,10 +71,9 @@ const Streams = ({ flows, at, both, geo, moves }) => {
         ([from, to, flow]) =>
           html`<${Stream}
             key=${`${from}>${to}`}
-            flow=${flow}
+            ...${{ flow, geo }}
             a=${at(from)}
             b=${at(to)}
-            geo=${geo}
             both=${both(from, to)}
           />`,
       );
@@ -284,14 +283,9 @@ export function Ring({ state, current }) {
           ([from, to, flow]) =>
             html`<${Flow}
               key=${`${from}>${to}`}
-              from=${from}
-              to=${to}
-              flow=${flow}
+              ...${{ from, to, flow, geo, labelled, compact }}
               a=${at(from)}
               b=${at(to)}
-              geo=${geo}
-              labelled=${labelled}
-              compact=${compact}
               both=${both(from, to)}
             />`,
         )}
@@ -301,11 +295,9 @@ export function Ring({ state, current }) {
           (name) =>
             html`<${Module}
               key=${name}
-              name=${name}
+              ...${{ name, geo, compact }}
               module=${modules[name]}
               at=${at(name)}
-              geo=${geo}
-              compact=${compact}
               resources=${resources.filter(([, one]) => one.module === name)}
               alarms=${alarms.filter(([, one]) => one.module === name).length}
             />`,

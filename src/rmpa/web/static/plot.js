@@ -133,12 +133,5 @@ export function Lines({ series, format, label }) {
     return () => clearInterval(timer);
   }, [labels.join("\n")]);
   if (data.current.length !== labels.length + 1) data.current = [[], ...labels.map(() => [])];
-  return html`<${Plot}
-    labels=${labels}
-    data=${data.current}
-    version=${version}
-    format=${format}
-    label=${label}
-    zero=${true}
-  />`;
+  return html`<${Plot} ...${{ labels, version, format, label }} data=${data.current} zero=${true} />`;
 }

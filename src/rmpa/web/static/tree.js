@@ -55,7 +55,7 @@ const Line = ({ values, path, plots, length }) =>
     >${values.map(
       ([key, value]) =>
         html`<span key=${key}
-          ><span class="key">${key}</span> <${Leaf} value=${value} path=${`${path}.${key}`} plots=${plots}
+          ><span class="key">${key}</span> <${Leaf} ...${{ value, plots }} path=${`${path}.${key}`}
         /></span>`,
     )}${length > values.length && html`<span class="muted">… ${count(length - values.length)} more</span>`}</span
   >`;
@@ -124,14 +124,7 @@ const Rows = ({ rows, path, depth, plots, length }) =>
   html`<ul>
     ${rows.map(
       ([key, value]) =>
-        html`<${Row}
-          key=${key}
-          name=${key}
-          value=${value}
-          path=${path ? `${path}.${key}` : key}
-          depth=${depth}
-          plots=${plots}
-        />`,
+        html`<${Row} key=${key} name=${key} ...${{ value, depth, plots }} path=${path ? `${path}.${key}` : key} />`,
     )}${length > rows.length && html`<li class="muted">… ${count(length - rows.length)} more</li>`}
   </ul>`;
 

@@ -174,14 +174,7 @@ export function Diagnostics({ name, state, connection }) {
         >
       </div>
       ${name &&
-      html`<${Chosen}
-        key=${name}
-        name=${name}
-        one=${section(told, "statuses")[name]}
-        own=${own}
-        state=${state}
-        connection=${connection}
-      />`}
+      html`<${Chosen} key=${name} ...${{ name, own, state, connection }} one=${section(told, "statuses")[name]} />`}
     </div><//
   >`;
 }
@@ -259,8 +252,7 @@ function Chosen({ name, one, own, state, connection }) {
     ${plotted.length > 0 &&
     html`<${Plot}
       labels=${plotted}
-      data=${data}
-      version=${version}
+      ...${{ data, version }}
       format=${(value) => (value === null || value === undefined ? "–" : String(Number(value.toPrecision(5))))}
       label=${`Values of ${one.name}`}
     />`}

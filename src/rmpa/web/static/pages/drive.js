@@ -116,9 +116,7 @@ export function DrivePage({ state, connection }) {
     ><div class="grid">
       <${Panel} title="Who drives what" wide
         ><${Chain}
-          stick=${stick}
-          topic=${topic}
-          type=${type}
+          ...${{ stick, topic, type }}
           nodes=${known.topics[topic]?.nodes || []}
           takers=${section(state, "topics")[topic]?.to || []}
           own=${section(state, "agent").name || connection.hello.agent}
@@ -150,9 +148,7 @@ export function DrivePage({ state, connection }) {
       >
       <${Panel} title="Joystick"
         ><${Stick} on=${on} hold=${hold} at=${at} /><${Commanded}
-          at=${at}
-          type=${type}
-          fastest=${fastest}
+          ...${{ at, type, fastest }}
           sent=${hold.by() && connection.commanded}
         />
         <p class="muted">${allowed ? HELD : DENIED}</p><//
@@ -161,9 +157,7 @@ export function DrivePage({ state, connection }) {
         <${Panel} title="What is driven, and how fast"
           ><div class="form">
             <${Target}
-              known=${known}
-              topic=${topic}
-              type=${type}
+              ...${{ known, topic, type }}
               fixed=${Boolean(known.topics[topic])}
               onTopic=${choose}
               onType=${setType}

@@ -2,6 +2,7 @@
 // must be held. What the user chooses is kept in this browser, for each kind of gamepad.
 
 import { useEffect, useRef, useState, html } from "../markup.js";
+import { store, stored } from "../storage.js";
 
 const POLL = 50; // milliseconds between two looks at the gamepad; 500 while there is none
 const ASLEEP = 10; // seconds without any change, after which a gamepad whose button is held may be out of reach
@@ -17,31 +18,18 @@ const AXES = [
   ["side", "Sideways"],
 ];
 
-function kept() {
-  try {
-    const found = JSON.parse(localStorage.getItem(KEPT));
-    return found && typeof found === "object" && !Array.isArray(found) ? found : {};
-  } catch {
-    return {};
-  }
-}
-
 const whole = (value, least) => Number.isInteger(value) && value >= least && value < 64;
 
 // The mapping of a kind of gamepad: what is kept, as far as it can be one.
-export function mappingOf(id, all = kept()) {
+export function mappingOf(id, all = stored(KEPT)) {
   const found = { ...FIRST, ...(Object.hasOwn(all, id) ? all[id] : {}) };
   const fits = whole(found.hold, 0) && AXES.every(([name]) => whole(found[name], -1)) && Array.isArray(found.reversed);
   return fits ? found : FIRST;
 }
 
 function keep(id, mapping) {
-  const others = Object.entries(kept()).filter(([each]) => each !== id);
-  try {
-    localStorage.setItem(KEPT, JSON.stringify(Object.fromEntries([...others.slice(1 - MOST), [id, mapping]])));
-  } catch {
-    // A browser that keeps nothing has the mapping until the page is left.
-  }
+  const others = Object.entries(stored(KEPT)).filter(([each]) => each !== id);
+  store(KEPT, Object.fromEntries([...others.slice(1 - MOST), [id, mapping]]));
 }
 
 const isDown = (button) => Boolean(button) && (button.pressed || button.value > 0.5);

@@ -5,6 +5,7 @@ import { count, hertz } from "../format.js";
 import { section } from "../state.js";
 import { useAgain } from "../asking.js";
 import { download } from "../storage.js";
+import { gestures } from "../viewport.js";
 import { curve, layout } from "../layout.js";
 import { Check, Choice, Select, Failure, Mark, Page, Panel } from "../parts.js";
 import { Table, useFilter } from "../lists.js";
@@ -235,9 +236,7 @@ export function GraphPage({ name, state, connection }) {
     ${chosen &&
     (vertices.length
       ? html`<div class="beside-graph">
-          <${Panel}
-            ><${Drawing} drawn=${drawn} vertices=${vertices} edges=${edges} name=${name} state=${state} own=${own}
-          /><//>
+          <${Panel}><${Drawing} ...${{ drawn, vertices, edges, name, state, own }} /><//>
           ${name
             ? html`<${About} name=${name} chosen=${chosen} vertices=${vertices} own=${own} state=${state}>
                 <button type="button" aria-pressed=${String(focused)} onClick=${() => focus(!focused)}>
@@ -256,7 +255,6 @@ export function GraphPage({ name, state, connection }) {
 
 const FACTOR = 1.25;
 const LEGIBLE = 1.5; // units of the drawing a pixel: smaller letters are not read
-const NEXT = { ArrowRight: [1, 0], ArrowLeft: [-1, 0], ArrowDown: [0, 1], ArrowUp: [0, -1] };
 
 // Where one looks: the upper left corner, and how many units of the drawing a pixel has; all of it until it is moved.
 function useView(box, drawn) {
@@ -279,7 +277,7 @@ function useView(box, drawn) {
   const change = (next) => set((before) => next(before || now));
   const zoom = (factor, px = w / 2, py = h / 2) =>
     change((at) => {
-      const next = Math.max(0.2, Math.min(8, at.scale * factor));
+      const next = Math.max(0.2, Math.min(8, at.scale / factor));
       return { scale: next, x: at.x + px * (at.scale - next), y: at.y + py * (at.scale - next) };
     });
   const pan = (dx, dy) => change((at) => ({ ...at, x: at.x - dx * at.scale, y: at.y - dy * at.scale }));
@@ -289,55 +287,8 @@ function useView(box, drawn) {
         Math.min(Math.max(low, spot + (60 - length) * at.scale), spot - 60 * at.scale);
       return { ...at, x: inside(x, at.x, w), y: inside(y, at.y, h) };
     });
-  return {
-    viewBox: `${now.x} ${now.y} ${w * now.scale} ${h * now.scale}`,
-    left: now.x,
-    zoom,
-    pan,
-    fit: () => set(null),
-    show,
-  };
-}
-
-// One pointer pans, two zoom; the wheel zooms where it points.
-function usePointers(box, latest) {
-  const pointers = useRef(new Map());
-  useEffect(() => {
-    const wheel = (event) => {
-      event.preventDefault();
-      const { left, top } = box.current.getBoundingClientRect();
-      latest.current.zoom(event.deltaY > 0 ? FACTOR ** 0.5 : FACTOR ** -0.5, event.clientX - left, event.clientY - top);
-    };
-    box.current.addEventListener("wheel", wheel, { passive: false });
-    return () => box.current?.removeEventListener("wheel", wheel);
-  }, []);
-  const move = (event) => {
-    const known = pointers.current.get(event.pointerId);
-    if (!known) return;
-    const others = [...pointers.current.entries()].filter(([id]) => id !== event.pointerId);
-    const at = { x: event.clientX, y: event.clientY };
-    if (others.length) {
-      const [[, other]] = others;
-      const far = (one) => Math.hypot(one.x - other.x, one.y - other.y) || 1;
-      const { left, top } = box.current.getBoundingClientRect();
-      latest.current.zoom(far(known) / far(at), (at.x + other.x) / 2 - left, (at.y + other.y) / 2 - top);
-    } else {
-      latest.current.pan(at.x - known.x, at.y - known.y);
-      const moved = Math.abs(at.x - known.x) + Math.abs(at.y - known.y);
-      known.far = (known.far || 0) + moved;
-      if (known.far > 6 && !box.current.hasPointerCapture(event.pointerId))
-        box.current.setPointerCapture(event.pointerId);
-    }
-    pointers.current.set(event.pointerId, { ...known, ...at });
-  };
-  const up = (event) => pointers.current.delete(event.pointerId);
-  return {
-    onPointerDown: (event) => pointers.current.set(event.pointerId, { x: event.clientX, y: event.clientY }),
-    onPointerMove: move,
-    onPointerUp: up,
-    onPointerCancel: up,
-    onPointerLeave: (event) => !box.current.hasPointerCapture(event.pointerId) && up(event),
-  };
+  const viewBox = `${now.x} ${now.y} ${w * now.scale} ${h * now.scale}`;
+  return { viewBox, left: now.x, zoom, pan, show, fit: () => set(null) };
 }
 
 const MARKER = { viewBox: "0 0 8 8", refX: 7, refY: 4, markerWidth: 9, markerHeight: 9 };
@@ -345,27 +296,21 @@ const MARKER = { viewBox: "0 0 8 8", refX: 7, refY: 4, markerWidth: 9, markerHei
 function Drawing({ drawn, vertices, edges, name, state, own }) {
   const box = useRef();
   const view = useView(box, drawn);
+  const step = ({ target }, ...way) => {
+    const here = target.closest("[data-id]")?.dataset.id;
+    if (here) neighbour(drawn, vertices, here, way, box.current);
+    return here;
+  };
   const latest = useRef(view);
-  latest.current = view;
-  const pointers = usePointers(box, latest);
+  latest.current = { ...view, step };
+  useEffect(() => gestures(box.current, () => latest.current), []);
   const topics = section(state, "topics");
   useEffect(() => drawn.at.has(name) && view.show(drawn.at.get(name)), [name, drawn]);
   const selected = (edge) => edge.from === name || edge.to === name;
   const lit = new Set([name, ...edges.filter(selected).flatMap((edge) => [edge.from, edge.to])]);
-  const key = (event) => {
-    const here = event.target.closest("[data-id]")?.dataset.id;
-    const step = NEXT[event.key];
-    const larger = () => view.zoom(1 / FACTOR);
-    const act = { "+": larger, "=": larger, "-": () => view.zoom(FACTOR), 0: view.fit }[event.key];
-    if (act) act();
-    else if (step && here) neighbour(drawn, vertices, here, step, box.current);
-    else if (step) view.pan(-60 * step[0], -60 * step[1]);
-    else return;
-    event.preventDefault();
-  };
   return html`<div class="row tools-row">
-      <button type="button" onClick=${() => view.zoom(1 / FACTOR)} aria-label="Larger (+)">+</button>
-      <button type="button" onClick=${() => view.zoom(FACTOR)} aria-label="Smaller (−)">−</button>
+      <button type="button" onClick=${() => view.zoom(FACTOR)} aria-label="Larger (+)">+</button>
+      <button type="button" onClick=${() => view.zoom(1 / FACTOR)} aria-label="Smaller (−)">−</button>
       <button type="button" onClick=${view.fit}>Whole</button>
       <button type="button" onClick=${() => save(box.current, drawn)}>Save as SVG</button>
       ${["flows", "bad"].map(
@@ -383,8 +328,6 @@ function Drawing({ drawn, vertices, edges, name, state, own }) {
       tabindex="0"
       role="group"
       aria-label="The graph; the table below says the same"
-      onKeyDown=${key}
-      ...${pointers}
     >
       <defs>
         <marker id="tip" markerUnits="userSpaceOnUse" orient="auto" ...${MARKER}>
@@ -411,11 +354,10 @@ function Drawing({ drawn, vertices, edges, name, state, own }) {
         (one) =>
           html`<${Vertex}
             key=${one.id}
-            one=${one}
+            ...${{ one, own }}
             at=${drawn.at.get(one.id)}
             lit=${lit.has(one.id)}
             chosen=${one.id === name}
-            own=${own}
             ...${flow(one.topics || [], topics)}
             view=${latest}
           />`,

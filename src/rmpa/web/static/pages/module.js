@@ -41,9 +41,8 @@ export function ModulePage({ name, state, connection }) {
         : html`<${LinkPanel} module=${module} detail=${detail} />`}
       ${!own &&
       html`<${PeerAgent}
-          name=${name}
+          ...${{ name, connection }}
           up=${module.state === "up" || module.state === "silent"}
-          connection=${connection}
           version=${section(state, "agent").version}
         />
         <${Panel} title="Lanes"><${Lanes} lanes=${section(detail, "link").lanes} linked=${Boolean(detail.link)} /><//>

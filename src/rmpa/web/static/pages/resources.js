@@ -217,13 +217,7 @@ function Setting({ value, about, set }) {
     );
   };
   const choices = about.choices?.length ? about.choices.map(String) : about.type === "bool" ? ["true", "false"] : null;
-  return html`<${Editable}
-    label=${about.name}
-    shown=${shown}
-    begin=${written ?? ""}
-    save=${save}
-    choices=${choices}
-  />`;
+  return html`<${Editable} label=${about.name} ...${{ shown, save, choices }} begin=${written ?? ""} />`;
 }
 
 // "0.000797688 m/s²" with four digits.

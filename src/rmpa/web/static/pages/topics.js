@@ -148,7 +148,7 @@ export function TopicPage({ name, state, connection }) {
     return html`<${Page} title=${name} kind="Topic"
       ><${Gone} kind="topic" name=${name} /><${Panel} title="Why?"
         ><${Why} connection=${connection} kind="topic" name=${name} /><//
-      ><${PublishPanel} connection=${connection} state=${state} topic=${name}
+      ><${PublishPanel} ...${{ connection, state }} topic=${name}
     /><//>`;
   const routes = entries(detail, "routes");
   const own = section(state, "agent").name;
