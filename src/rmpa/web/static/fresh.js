@@ -1,7 +1,7 @@
 // Whether what is shown as live is old, and how old: one rule for values, plots, pictures and maps. How long a topic
 // may be silent is told by the server (`after` of a beat); routes it judges itself by the same rule (`stopped`).
 
-import { useEffect, useState, html } from "./markup.js";
+import { useEffect, useRef, useState, html } from "./markup.js";
 import { bandwidth, duration, hertz } from "./format.js";
 import { Mark, useTick } from "./parts.js";
 
@@ -22,6 +22,8 @@ export function useOld(came, after) {
 export function useWatch(connection, wanted, take) {
   const [state, set] = useState({ came: 0 });
   const key = JSON.stringify(wanted);
+  const sink = useRef(take);
+  sink.current = take;
   useEffect(() => {
     if (!wanted) return undefined;
     set((before) => (before.topic === wanted.topic ? before : { came: 0, topic: wanted.topic }));
@@ -29,7 +31,7 @@ export function useWatch(connection, wanted, take) {
       if (message.op === "failed") return set({ came: 0, topic: wanted.topic, failure: message });
       if (message.op === "beat") return set((before) => ({ ...before, beat: message }));
       set((before) => ({ ...before, failure: undefined, came: performance.now() }));
-      return take.current(message);
+      return sink.current(message);
     });
   }, [key]);
   return state;

@@ -1,6 +1,7 @@
 // What a map from above is drawn of: the view, and the layers that messages become.
 
 import { count } from "./format.js";
+import { ink } from "./theme.js";
 import { SAME, angles, composed, turned } from "./frames.js";
 
 export const LAYERS = {
@@ -19,7 +20,6 @@ const JUMP = 1; // metres between two poses, beyond which the trail begins anew
 const NEAREST = 2000,
   FARTHEST = 0.02; // pixels a metre
 
-export const ink = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 export const moduleColour = (at) => `hsl(${HUES[at % HUES.length]} 70% ${ink("color-scheme") === "light" ? 32 : 64}%)`;
 
 // x to the right and y up, in metres of the fixed frame; the size is in pixels of CSS.

@@ -25,11 +25,8 @@ const width = (bytes) => Math.min(9, 2 + Math.max(0, Math.log10((bytes || 0) / 1
 // What moves is a picture of its own beneath the others, which are not drawn again with it.
 const Stream = memo(({ flow, a, b, geo, both }) => {
   const line = chord(a, b, geo.node, both ? 9 : 0);
-  return html`<path
-    class="stream ${flow.by === "resource" ? "declared" : ""}"
-    d=${line.d}
-    stroke-width=${width(flow.bandwidth)}
-  />`;
+  const look = `stream ${flow.by === "resource" ? "declared" : ""}`;
+  return html`<path class=${look} d=${line.d} stroke-width=${width(flow.bandwidth)} />`;
 });
 
 const Flow = memo(({ flow, from, to, a, b, geo, both, labelled, compact }) => {
@@ -38,20 +35,16 @@ const Flow = memo(({ flow, from, to, a, b, geo, both, labelled, compact }) => {
   const label = line.at(geo.slots > 8 ? 0.16 : far ? 0.33 : 0.5); // near its source, where chords are apart
   const text = flow.rate === undefined ? "" : hertz(flow.rate);
   labelled = labelled && !(compact && geo.slots > 6 && flow.by === "resource");
+  const rates = labelled && !compact && text && geo.slots <= 8 && flow.bandwidth;
   return html`<g class="flow ${flow.by === "resource" ? "declared" : ""}">
     <title>${from} to ${to}: ${text || "rate not known"}, ${flow.topics.join(", ")}</title>
     <path class="pipe" d=${line.d} stroke-width=${width(flow.bandwidth) + 4} marker-end="url(#arrow)" />
     ${labelled && text && html`<text class="rate" x=${label.x} y=${label.y + 6}>${text}</text>`}
-    ${labelled &&
-    !compact &&
-    text &&
-    geo.slots <= 8 &&
-    flow.bandwidth &&
-    html`<text class="minor" x=${label.x} y=${label.y + 30}>${bandwidth(flow.bandwidth)}</text>`}
+    ${rates && html`<text class="minor" x=${label.x} y=${label.y + 30}>${bandwidth(flow.bandwidth)}</text>`}
   </g>`;
 });
 
-const Streams = ({ flows, at, both, geo, moves }) => {
+const Streams = ({ flows, moves }) => {
   const picture = useRef();
   useEffect(() => {
     if (!moves) return undefined;
@@ -65,18 +58,7 @@ const Streams = ({ flows, at, both, geo, moves }) => {
     return () => clearInterval(timer);
   }, [moves]);
   const of = (speed) =>
-    flows
-      .filter(([, , flow]) => speedOf(flow.rate || 0) === speed)
-      .map(
-        ([from, to, flow]) =>
-          html`<${Stream}
-            key=${`${from}>${to}`}
-            ...${{ flow, geo }}
-            a=${at(from)}
-            b=${at(to)}
-            both=${both(from, to)}
-          />`,
-      );
+    flows.filter(({ flow }) => speedOf(flow.rate || 0) === speed).map((one) => html`<${Stream} ...${one} />`);
   return html`<svg ref=${picture} class="streams" viewBox="0 0 ${SIZE} ${SIZE}" aria-hidden="true">
     ${SPEEDS.map(([, speed]) => html`<g key=${speed} class=${speed}>${of(speed)}</g>`)}
   </svg>`;
@@ -126,27 +108,29 @@ const Module = memo(({ name, module, at, geo, resources, alarms, compact }) => {
   const level = worst(resources);
   const label = small ? outside(at, geo) : { x: at.x, y: at.y - (compact ? 22 : 16), anchor: "middle" };
   const mark = small ? (geo.node > 30 ? 24 : 18) : compact ? 32 : 20;
+  const markBox = {
+    x: at.x - mark / 2,
+    y: at.y - mark / 2 + (small ? 0 : compact ? 18 : 13),
+    width: mark,
+    height: mark,
+  };
   const limit = compact ? 9 : small ? 12 : geo.slots > 8 ? 9 : 11;
   const short = name.length > limit ? `${name.slice(0, limit - 1)}…` : name;
-  const word = small
-    ? ""
-    : profile && !["away", "linking", "lost"].includes(module.state)
-      ? profile.slice(0, limit)
-      : compact && module.state === "here"
-        ? "here"
-        : about.word;
+  const running = profile && !["away", "linking", "lost"].includes(module.state) && profile.slice(0, limit);
+  const word = small ? "" : running || (compact && module.state === "here" ? "here" : about.word);
   // The name begins with the text that is seen, so that a user can say what they see.
-  const said = [
+  const quality = level && `quality ${known(level).word}`;
+  const bell = alarms && `${alarms} alarm${alarms > 1 ? "s" : ""}`;
+  const parts = [
     short,
     word,
-    alarms && `${alarms} alarm${alarms > 1 ? "s" : ""}`,
+    bell,
     short !== name && name,
     `link ${about.word}`,
     profile && `profile ${profile}`,
-    level && `quality ${known(level).word}`,
-  ]
-    .filter(Boolean)
-    .join(", ");
+    quality,
+  ];
+  const said = parts.filter(Boolean).join(", ");
   return html`<a
     class="module ${module.state} ${about.tone}"
     href=${href("module", name)}
@@ -157,17 +141,7 @@ const Module = memo(({ name, module, at, geo, resources, alarms, compact }) => {
     <circle class="body" cx=${at.x} cy=${at.y} r=${geo.node} />
     ${resources.length > 0 && html`<${Arcs} at=${at} geo=${geo} resources=${resources} />`}
     <text class="name" x=${label.x} y=${label.y} text-anchor=${label.anchor}>${short}</text>
-    <g class="state"
-      ><svg
-        x=${at.x - mark / 2}
-        y=${at.y - mark / 2 + (small ? 0 : compact ? 18 : 13)}
-        width=${mark}
-        height=${mark}
-        viewBox="0 0 16 16"
-      >
-        ${shape(module.state)}
-      </svg></g
-    >
+    <g class="state"><svg ...${markBox} viewBox="0 0 16 16">${shape(module.state)}</svg></g>
     ${" "}${!small && html`<text class="word" x=${at.x} y=${at.y + (compact ? 66 : 46)}>${word}</text>`}
     ${" "}${alarms > 0 &&
     html`<g class="bell" transform="translate(${at.x + geo.node * 0.72} ${at.y - geo.node * 0.72})"
@@ -200,20 +174,23 @@ function useQuery(text) {
   return matches;
 }
 
-const fixed = new Map(); // one object for each place, so that what did not move is not drawn again
-function point(slot, geo) {
-  const key = `${slot} ${geo.slots} ${geo.node}`;
-  if (!fixed.has(key)) fixed.set(key, place(slot, geo));
-  return fixed.get(key);
+// The same object for the same arguments, so that what did not move is not drawn again.
+function cached(make) {
+  const made = new Map();
+  return (...given) => {
+    const key = JSON.stringify(given);
+    if (!made.has(key)) made.set(key, make(...given));
+    return made.get(key);
+  };
 }
-const shapes = new Map();
-function sizes(slots, compact) {
-  const key = `${slots} ${compact}`;
-  if (!shapes.has(key)) shapes.set(key, geometry(slots, compact));
-  return shapes.get(key);
-}
+const point = cached(place);
+const sizes = cached(geometry);
+
 const around = emptyRing();
 const arranged = (state) => arrange(around, section(state, "agent").name, Object.keys(section(state, "modules")));
+
+const SQUARE = { viewBox: "0 0 8 8", refX: 6.5, refY: 4, markerWidth: 14, markerHeight: 14 };
+const MARKER = { ...SQUARE, markerUnits: "userSpaceOnUse", orient: "auto" };
 
 export function Ring({ state, current }) {
   const compact = useQuery("(max-width: 640px)");
@@ -226,16 +203,18 @@ export function Ring({ state, current }) {
     .sort((a, b) => places[a] - places[b]);
   const at = (name) => point(places[name], geo);
   const own = section(state, "agent").name;
+  const both = (from, to) => `${to}>${from}` in section(state, "flows");
   const flows = entries(state, "flows")
-    .map(([key, flow]) => [...key.split(">"), flow])
-    .filter(([from, to]) => from in places && to in places);
+    .map(([key, flow]) => [key, ...key.split(">"), flow])
+    .filter(([, from, to]) => from in places && to in places)
+    .map(([key, from, to, flow]) => ({ key, from, to, flow, geo, a: at(from), b: at(to), both: both(from, to) }));
   const resources = entries(state, "resources");
   const alarms = entries(state, "alarms");
   const labelled = names.length <= 16;
   const taken = new Set(names.map((name) => places[name]));
-  const both = (from, to) => `${to}>${from}` in section(state, "flows");
+  const vacant = Array.from({ length: geo.slots }, (_, slot) => slot).filter((slot) => !taken.has(slot));
   return html`<div class="ring">
-    <${Streams} flows=${flows} at=${at} both=${both} geo=${geo} moves=${current && !still && flows.length > 0} />
+    <${Streams} flows=${flows} moves=${current && !still && flows.length > 0} />
     <svg
       class="mandala ${compact ? "compact" : ""} ${geo.slots > 8 ? "many" : ""}"
       viewBox="0 0 ${SIZE} ${SIZE}"
@@ -244,60 +223,27 @@ export function Ring({ state, current }) {
       onKeyDown=${(event) => step(event, names)}
     >
       <defs>
-        <marker
-          id="arrow"
-          viewBox="0 0 8 8"
-          refX="6.5"
-          refY="4"
-          markerWidth="14"
-          markerHeight="14"
-          markerUnits="userSpaceOnUse"
-          orient="auto"
-        >
+        <marker id="arrow" ...${MARKER}>
           <path class="head" d="M.8.8 7 4 .8 7.2 2.6 4Z" />
         </marker>
       </defs>
       <circle class="dial" cx=${CENTRE} cy=${CENTRE} r=${geo.ring} />
-      ${Array.from({ length: geo.slots }, (_, slot) => slot)
-        .filter((slot) => !taken.has(slot))
-        .map(
-          (slot) => html`<circle key=${slot} class="vacant" cx=${point(slot, geo).x} cy=${point(slot, geo).y} r="5" />`,
-        )}
+      ${vacant
+        .map((slot) => point(slot, geo))
+        .map(({ x, y }, key) => html`<circle key=${key} class="vacant" cx=${x} cy=${y} r="5" />`)}
       <g>
         ${names
           .filter((name) => name !== own)
-          .map(
-            (name) =>
-              html`<${Wire}
-                key=${name}
-                module=${modules[name]}
-                a=${at(own)}
-                b=${at(name)}
-                geo=${geo}
-                labelled=${labelled && !compact}
-              />`,
-          )}
+          .map((name) => ({ key: name, module: modules[name], a: at(own), b: at(name), geo }))
+          .map((wire) => html`<${Wire} ...${wire} labelled=${labelled && !compact} />`)}
       </g>
-      <g>
-        ${flows.map(
-          ([from, to, flow]) =>
-            html`<${Flow}
-              key=${`${from}>${to}`}
-              ...${{ from, to, flow, geo, labelled, compact }}
-              a=${at(from)}
-              b=${at(to)}
-              both=${both(from, to)}
-            />`,
-        )}
-      </g>
+      <g>${flows.map((one) => html`<${Flow} ...${{ ...one, labelled, compact }} />`)}</g>
       <g>
         ${names.map(
           (name) =>
             html`<${Module}
               key=${name}
-              ...${{ name, geo, compact }}
-              module=${modules[name]}
-              at=${at(name)}
+              ...${{ name, geo, compact, module: modules[name], at: at(name) }}
               resources=${resources.filter(([, one]) => one.module === name)}
               alarms=${alarms.filter(([, one]) => one.module === name).length}
             />`,

@@ -145,8 +145,8 @@ export const IconButton = ({ label, title = label, press, look = "", children, .
   </button>`;
 
 // Fields of forms, each with its label.
-export const Text = ({ label, onInput, ...more }) =>
-  html`<label>${label}<input ...${more} onInput=${(event) => onInput(event.target.value)} /></label>`;
+export const Text = ({ label, look, onInput, ...more }) =>
+  html`<label class=${look}>${label}<input ...${more} onInput=${(event) => onInput(event.target.value)} /></label>`;
 export const Check = ({ label, onChange, ...more }) =>
   html`<label class="check"
     ><input type="checkbox" ...${more} onChange=${(event) => onChange(event.target.checked)} /><span

@@ -37,17 +37,15 @@ function Fold({ name, about, first, draw }) {
   </details>`;
 }
 
+const Plotted = ({ on, path, onClick, children }) =>
+  html`<button type="button" class="field" aria-pressed=${String(on)} title=${`Plot ${path}`} onClick=${onClick}>
+    ${on ? "● " : ""}${children}
+  </button>`;
 const Leaf = ({ value, path, text, plots }) =>
   isScalar(value) || text !== undefined
-    ? html`<button
-        type="button"
-        class="field"
-        aria-pressed=${String(plots.chosen.includes(path))}
-        title=${`Plot ${path}`}
-        onClick=${() => plots.choose(path)}
-      >
-        ${plots.chosen.includes(path) ? "● " : ""}${text ?? written(value)}
-      </button>`
+    ? html`<${Plotted} on=${plots.chosen.includes(path)} path=${path} onClick=${() => plots.choose(path)}
+        >${text ?? written(value)}<//
+      >`
     : html`<span>${typeof value === "string" ? JSON.stringify(value) : String(value)}</span>`;
 
 const Line = ({ values, path, plots, length }) =>

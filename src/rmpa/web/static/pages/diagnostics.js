@@ -6,14 +6,13 @@ import { adopt, entries, section } from "../state.js";
 import { Choice, Facts, Mark, Page, Panel, Since, known } from "../parts.js";
 import { Table, useFilter, useFirst } from "../lists.js";
 import { ModuleLink, NodeLink, nodeKey, href } from "../links.js";
-import { Plot } from "../plot.js";
+import { Plot, figure, toggled } from "../plot.js";
 
 const LEVELS = ["OK", "WARN", "STALE", "ERROR"]; // the best first, as in observe/diagnostics.py
 const rank = (level) => LEVELS.indexOf(level);
 const SPAN = 600; // seconds of a strip
 const WIDTH = 120;
 const HEIGHTS = { OK: 3, STALE: 6, WARN: 9, ERROR: 14 }; // by its height a level is seen without its colour
-const LINES = 8; // of a plot
 const KEPT = 600; // moments of it
 const NUMBER = /^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?:[^\d\s.:/-][^\d:/]*)?$/; // with a unit or without
 const numberOf = (text) => {
@@ -224,8 +223,7 @@ function Chosen({ name, one, own, state, connection }) {
   }, [detail.heard]);
   if (!one) return html`<${Panel} title="Status"><p class="empty">There is no such status at present.</p><//>`;
   const module = one.module || own;
-  const toggle = (key) =>
-    setFields(fields.includes(key) ? fields.filter((each) => each !== key) : [...fields, key].slice(-LINES));
+  const toggle = (key) => setFields(toggled(fields, key));
   const plotted = fields.filter((key) => past.current[key]);
   const data = ["", ...plotted].map((key) => past.current[key] || []);
   return html`<${Panel} title=${one.name}>
@@ -250,12 +248,7 @@ function Chosen({ name, one, own, state, connection }) {
       list=${values}
     />
     ${plotted.length > 0 &&
-    html`<${Plot}
-      labels=${plotted}
-      ...${{ data, version }}
-      format=${(value) => (value === null || value === undefined ? "–" : String(Number(value.toPrecision(5))))}
-      label=${`Values of ${one.name}`}
-    />`}
+    html`<${Plot} labels=${plotted} ...${{ data, version }} format=${figure} label=${`Values of ${one.name}`} />`}
     <p class="row"><a class="button" href="#/diagnostics">Close</a></p><//
   >`;
 }

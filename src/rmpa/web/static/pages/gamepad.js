@@ -2,6 +2,7 @@
 // must be held. What the user chooses is kept in this browser, for each kind of gamepad.
 
 import { useEffect, useRef, useState, html } from "../markup.js";
+import { toggled } from "../plot.js";
 import { store, stored } from "../storage.js";
 
 const POLL = 50; // milliseconds between two looks at the gamepad; 500 while there is none
@@ -164,8 +165,8 @@ export function Gamepad({ on, hold, raw }) {
       <summary>Choose the button and the axes</summary>
       <div class="form">
         <div class="row">
-          <span class="grow">Dead man's button: ${mapping.hold}</span
-          ><button type="button" onClick=${() => setLearns("hold")}>
+          <span class="grow">Dead man's button: ${mapping.hold}</span>
+          <button type="button" onClick=${() => setLearns("hold")}>
             ${learns === "hold" ? "Press it now …" : "Choose"}
           </button>
         </div>
@@ -178,13 +179,7 @@ export function Gamepad({ on, hold, raw }) {
                   ><input
                     type="checkbox"
                     checked=${mapping.reversed.includes(name)}
-                    onChange=${(event) =>
-                      change({
-                        ...mapping,
-                        reversed: [...mapping.reversed.filter((each) => each !== name)].concat(
-                          event.target.checked ? name : [],
-                        ),
-                      })}
+                    onChange=${() => change({ ...mapping, reversed: toggled(mapping.reversed, name) })}
                   />${" "}reverse<span class="unseen"> ${title}</span></span
                 ></label
               >

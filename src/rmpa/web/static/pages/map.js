@@ -5,21 +5,11 @@ import { duration, hertz } from "../format.js";
 import { entries, section } from "../state.js";
 import { AsPanel, Check, IconButton, Select, useTick, Failure, Mark, Page, Panel } from "../parts.js";
 import { isOld } from "../fresh.js";
+import { ink, onTheme } from "../theme.js";
 import { store, stored } from "../storage.js";
 import { gestures } from "../viewport.js";
 import { Frames } from "../frames.js";
-import {
-  LAYERS,
-  Layer,
-  View,
-  bounds,
-  drawFrames,
-  drawGround,
-  drawLayer,
-  drawScale,
-  ink,
-  moduleColour,
-} from "../layers.js";
+import { LAYERS, Layer, View, bounds, drawFrames, drawGround, drawLayer, drawScale, moduleColour } from "../layers.js";
 import { now, transformTopics, useFrames } from "./tf.js";
 
 const MOST = 12; // layers: a page may watch 16 topics, of which some are tf's
@@ -263,14 +253,13 @@ class MapCanvas {
     const gone = gestures(canvas, () => this);
     const sizes = new ResizeObserver(() => this.draw(true));
     sizes.observe(canvas);
-    const themes = new MutationObserver(() => this.draw());
-    themes.observe(document.documentElement, { attributeFilter: ["data-theme"] });
+    const themes = onTheme(() => this.draw());
     this.old = setInterval(() => this.draw(), 1000); // what is old becomes grey
     this.draw(true);
     return () => {
       gone();
       sizes.disconnect();
-      themes.disconnect();
+      themes();
       clearInterval(this.old);
       this.canvas = null;
     };

@@ -4,6 +4,7 @@ import { useEffect, useRef, useState, html } from "../markup.js";
 import { entries, section } from "../state.js";
 import { AsPanel, Failure, Page, IconButton, Panel, Select, Text } from "../parts.js";
 import { download, store, stored } from "../storage.js";
+import { toggled } from "../plot.js";
 import { Fields, IMAGES, Image, Value } from "../live.js";
 
 const STORE = "rmpa.panels"; // in the browser: { current, layouts: { name: panels } }
@@ -86,9 +87,7 @@ export function Panels({ state, connection, pages }) {
   const plot = (topic, path) => {
     const at = panels.findIndex((one) => one.kind === "plot" && one.topic === topic);
     if (at < 0) return add({ kind: "plot", topic, fields: [path], wide: 2 });
-    const fields = panels[at].fields.includes(path)
-      ? panels[at].fields.filter((each) => each !== path)
-      : [...panels[at].fields, path].slice(-MOST_FIELDS);
+    const fields = toggled(panels[at].fields, path);
     return fields.length ? replace(at, { fields }) : change(panels.filter((_, each) => each !== at));
   };
   const plotted = (topic) =>

@@ -14,11 +14,7 @@ export function grow(values) {
   for (const [name, value] of Object.entries(values)) {
     const steps = name.split("/").filter(Boolean);
     let at = root;
-    for (const step of steps.slice(0, -1))
-      at =
-        at[step] && typeof at[step] === "object" && !Array.isArray(at[step])
-          ? at[step]
-          : (at[step] = Object.create(null));
+    for (const step of steps.slice(0, -1)) at = isTree(at[step]) ? at[step] : (at[step] = Object.create(null));
     at[steps[steps.length - 1]] = value;
   }
   return root;

@@ -109,6 +109,8 @@ function age(edge) {
   return `${old.toFixed(1)} s`;
 }
 
+const late = (behind) => `${duration(Math.abs(behind))} ${behind > 0 ? "behind" : "ahead of"}`;
+
 export function FramesPage({ state, connection }) {
   const { frames, failure, topics } = useFrames(connection, state, () => {});
   useTick(0.5);
@@ -125,9 +127,7 @@ export function FramesPage({ state, connection }) {
       problems.push({
         frame: name,
         level: "WARN",
-        text:
-          `has stamps ${duration(Math.abs(behind))} ${behind > 0 ? "behind" : "ahead of"} the clock here, ` +
-          `sent by ${edge.source}`,
+        text: `has stamps ${late(behind)} the clock here, sent by ${edge.source}`,
       });
   }
   const rows = rowsOf(frames)

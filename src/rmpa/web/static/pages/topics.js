@@ -255,15 +255,14 @@ const Route = memo(({ route, own }) => {
 
 // A subscriber of a route where its transport is known: the agents see no message of direct ones.
 const Subscriber = ({ one }) => {
-  const said = [
+  const gap =
+    one.interruptions && `interrupted ${count(one.interruptions)} times, the last for ${seconds(one.interrupted)}`;
+  const parts = [
     one.condition && one.text,
     one.transport === "direct" && "not measured: the nodes are connected directly",
-    one.interruptions &&
-      `interrupted ${count(one.interruptions)} times, the last for ${seconds(one.interrupted)}: ` +
-        "what is lost of that time is not counted",
-  ]
-    .filter(Boolean)
-    .join("; ");
+    gap && `${gap}: what is lost of that time is not counted`,
+  ];
+  const said = parts.filter(Boolean).join("; ");
   return html`<tr>
     <th scope="row" class="inner"><span class="mono">→ ${one.node}</span></th>
     <td>${one.state}${said && html`<div class="muted">${said}</div>`}</td>
@@ -288,15 +287,11 @@ const MEANINGS = {
   transport: "through the agents, or from node to node",
 };
 const SECONDS = ["deadline", "lifespan", "liveliness_lease", "outage"];
-const term = (key, value) =>
-  value === null || value === undefined
-    ? "none"
-    : SECONDS.includes(key)
-      ? seconds(value)
-      : key === "max_rate"
-        ? hertz(value)
-        : String(value).replaceAll("_", " ");
-
+function term(key, value) {
+  if (value === null || value === undefined) return "none";
+  if (SECONDS.includes(key)) return seconds(value);
+  return key === "max_rate" ? hertz(value) : String(value).replaceAll("_", " ");
+}
 const TERMS = [
   [
     "Term",
