@@ -176,19 +176,18 @@ class App extends Component {
         ${this.state.broken ? "This page cannot be loaded: rmpa web does not answer." : "Loading …"}
       </p>`;
     }
-    return html`<${loaded[lazy[1]]}
-      key=${KEPT.includes(page) ? page : `${page} ${name}`}
-      name=${name}
-      state=${connection.state}
-      connection=${connection}
-      pages=${LAZY}
-    />`;
+    const key = KEPT.includes(page) ? page : `${page} ${name}`;
+    return html`<${loaded[lazy[1]]} ...${{ key, name, connection, state: connection.state, pages: LAZY }} />`;
   }
 
   banner() {
     const { connection } = this;
     const reach = section(connection.state, "reach");
     const { notice } = connection;
+    const close = () => {
+      connection.notice = null;
+      this.setState({});
+    };
     if (connection.phase === "lost") {
       const known = connection.state ? "What is shown and typed stays here, but nothing can be sent." : "";
       return html`<${Banner} mark="refused" action="Try now" act=${() => connection.retry()}>
@@ -203,14 +202,7 @@ class App extends Component {
         back by itself.<//
       >`;
     if (notice)
-      return html`<${Banner}
-        mark="WARN"
-        action="Close"
-        act=${() => {
-          connection.notice = null;
-          this.setState({});
-        }}
-      >
+      return html`<${Banner} mark="WARN" action="Close" act=${close}>
         ${sentence(notice.error)} ${sentence(notice.remedy)}<//
       >`;
     return null;
@@ -225,15 +217,11 @@ class App extends Component {
     const gone = connection.phase === "lost" || section(state, "reach").ok === false;
     const current = LISTED[page] ?? page;
     const dark = theme() === "dark";
-    return html`<a
-        class="skip"
-        href="#main"
-        onClick=${(event) => {
-          event.preventDefault();
-          document.querySelector("h1")?.focus();
-        }}
-        >To the content</a
-      >
+    const skip = (event) => {
+      event.preventDefault();
+      document.querySelector("h1")?.focus();
+    };
+    return html`<a class="skip" href="#main" onClick=${skip}>To the content</a>
       <header class="top">
         <a class="brand" href="#/"
           >${ICON}<span>RMPA<small>${agent || "…"}</small></span></a

@@ -165,71 +165,53 @@ function namespaces(topics, own) {
 }
 
 export function GraphPage({ name, state, connection }) {
-  const [view, setView] = useState("both");
-  const [debug, setDebug] = useState(false);
-  const [leaves, setLeaves] = useState(true);
-  const [module, setModule] = useState("");
-  const [namespace, setNamespace] = useState("");
+  const [options, set] = useState({ view: "both", debug: false, leaves: true, module: "", namespace: "" });
+  const choice = (option) => (value) => set({ ...options, [option]: value });
   const [focused, focus] = useState(false);
   const filter = useFilter("name");
   const memory = useRef({});
   const graph = useGraph(connection);
   const own = section(state, "agent").name;
   const topics = graph.topics || {};
-  const key = JSON.stringify([
-    graph.digest,
-    view,
-    debug,
-    leaves,
-    module,
-    namespace,
-    filter.typed,
-    focused && name,
-    own,
-  ]);
+  const wanted = { ...options, text: filter.typed, only: focused && name, own };
+  const key = JSON.stringify([graph.digest, wanted]);
   if (memory.current.key !== key && graph.topics) {
-    const only = focused && name;
-    const chosen = choose(topics, { text: filter.typed, module, namespace, debug, leaves, only, own, state });
-    const { vertices, edges } = shapes(chosen, own, view === "nodes");
-    const lanes = [...new Set([own, ...vertices.map((each) => each.lane).sort()])];
-    memory.current = {
-      key,
-      chosen,
-      vertices,
-      edges,
-      drawn: layout(vertices, edges, lanes, memory.current.drawn, view === "nodes" ? NAMED : undefined),
-    };
+    const merged = options.view === "nodes";
+    const found = choose(topics, { ...wanted, state });
+    const made = shapes(found, own, merged);
+    const lanes = [...new Set([own, ...made.vertices.map((each) => each.lane).sort()])];
+    const placed = layout(made.vertices, made.edges, lanes, memory.current.drawn, merged ? NAMED : undefined);
+    memory.current = { key, chosen: found, ...made, drawn: placed };
   }
   const { chosen, vertices = [], edges = [], drawn } = memory.current;
-  const all = ["", "all"];
-  const modules = [...new Set(Object.values(topics).flatMap(([, from, to]) => [...from, ...to]))]
-    .map((node) => nodeOf(node, own).module)
-    .filter((each, at, list) => list.indexOf(each) === at)
-    .sort();
+  const ends = Object.values(topics).flatMap(([, from, to]) => [...from, ...to]);
+  const modules = [...new Set(ends.map((node) => nodeOf(node, own).module))].sort();
+  const filters = [
+    ["module", "Module", modules],
+    ["namespace", "Namespace", namespaces(topics, own)],
+  ];
   return html`<${Page}
     title="Graph"
     kind=${chosen
       ? `${count(chosen.nodes.size)} nodes and ${count(chosen.topics.size)} topics of all modules`
       : "Asking …"}
-    aside=${html`<${Choice} label="What is drawn" value=${view} onChoose=${setView} options=${VIEWS} />`}
+    aside=${html`<${Choice} label="What is drawn" value=${options.view} onChoose=${choice("view")} options=${VIEWS} />`}
   >
     <div class="row filter-row">
-      ${filter.field}<${Select}
-        look="pick"
-        label="Module"
-        value=${module}
-        names=${[all, ...modules]}
-        onChange=${setModule}
-      />
-      <${Select}
-        look="pick"
-        label="Namespace"
-        value=${namespace}
-        names=${[all, ...namespaces(topics, own)]}
-        onChange=${setNamespace}
-      />
-      <${Check} label="Debug topics" checked=${debug} onChange=${setDebug} />
-      <${Check} label="Topics with one end" checked=${leaves} onChange=${setLeaves} />
+      ${filter.field}
+      ${filters.map(
+        ([option, label, names]) =>
+          html`<${Select}
+            key=${option}
+            look="pick"
+            label=${label}
+            value=${options[option]}
+            names=${[["", "all"], ...names]}
+            onChange=${choice(option)}
+          />`,
+      )}
+      <${Check} label="Debug topics" checked=${options.debug} onChange=${choice("debug")} />
+      <${Check} label="Topics with one end" checked=${options.leaves} onChange=${choice("leaves")} />
     </div>
     <${Failure} failure=${graph.failure} />
     ${graph.hidden > 0 && html`<p class="empty">The server leaves out ${count(graph.hidden)} further topics.</p>`}

@@ -110,6 +110,7 @@ function Call({ connection, service, about }) {
   const [text, setText] = useState(JSON.stringify(about.request ?? {}, null, 2));
   const [state, ask, set] = useAsk(connection, (answer) => ({ answer }));
   const allowed = connection.may("control");
+  const field = { value: text, onInput: (event) => setText(event.target.value), disabled: !allowed };
   const call = (event) => {
     event.preventDefault();
     const { value: request, error } = json(text.trim() || "{}");
@@ -122,14 +123,7 @@ function Call({ connection, service, about }) {
       <pre class="tree" tabindex="0">${about.text}</pre>
     </div>
     <form class="form" onSubmit=${call}>
-      <label
-        >Request as JSON<textarea
-          spellcheck="false"
-          value=${text}
-          onInput=${(event) => setText(event.target.value)}
-          disabled=${!allowed}
-        ></textarea>
-      </label>
+      <label>Request as JSON<textarea spellcheck="false" ...${field}></textarea></label>
       <div class="row">
         <button class="primary" disabled=${!allowed || state.waits}>
           ${state.waits ? "Waiting for the response …" : "Call it"}</button
