@@ -103,14 +103,10 @@ const Row = memo(
 const nameOf = (one, at) => (typeof one === "string" ? one : typeof one[0] === "string" ? one[0] : (one.name ?? at));
 
 // Columns are [heading, what an entry of `list` has there, and by what it is sorted]; `about` goes to each of them.
-// Or, of rows that are more than that, they are headings, and the children draw an entry.
-export function Table({ caption, columns, list, about, tone, children, empty }) {
-  const headings = columns.map((each) => [each].flat());
+export function Table({ caption, columns, list, about, tone, empty }) {
   const [sort, setSort] = useKept(`sort ${caption}`);
-  const of = sort && headings.find(([heading]) => heading === sort.column)?.[2];
+  const of = sort && columns.find(([heading]) => heading === sort.column)?.[2];
   const [first, more] = useFirst(of ? sorted(list, of, sort.down) : list, caption);
-  const draw = (one, at) =>
-    children?.(one, at) ?? html`<${Row} key=${nameOf(one, at)} ...${{ ...about, one, columns, tone: tone?.(one) }} />`;
   if (!first.length) return html`<p class="empty">${empty || "Nothing here."}</p>`;
   return html`<div class="scroll" tabindex="0" role="region" aria-label=${caption}>
     <table>
@@ -119,13 +115,15 @@ export function Table({ caption, columns, list, about, tone, children, empty }) 
       </caption>
       <thead>
         <tr>
-          ${headings.map(
+          ${columns.map(
             ([column, , key]) => html`<${Heading} key=${column} ...${{ column, sort }} onSort=${key && setSort} />`,
           )}
         </tr>
       </thead>
       <tbody>
-        ${first.map(draw)}
+        ${first.map(
+          (one, at) => html`<${Row} key=${nameOf(one, at)} ...${{ ...about, one, columns, tone: tone?.(one) }} />`,
+        )}
       </tbody>
     </table>
     ${more}

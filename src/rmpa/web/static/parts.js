@@ -63,6 +63,10 @@ export const Panel = ({ title, children, aside, wide }) =>
     </header>`}${children}
   </section>`;
 
+// What a cell of a table says, and what else below it.
+export const under = (head, ...below) =>
+  html`${head}${below.filter(Boolean).map((each, at) => html`<div key=${at} class="muted">${each}</div>`)}`;
+
 // Set where a page is shown as a panel beside others.
 export const AsPanel = createContext(false);
 

@@ -3,7 +3,7 @@
 import { html } from "../markup.js";
 import { bandwidth, bounded, bytes, count, duration, percent, seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import { Facts, Gone, Mark, Page, Panel, Since } from "../parts.js";
+import { Facts, Gone, Mark, Page, Panel, Since, under } from "../parts.js";
 import { Table } from "../lists.js";
 import { Link } from "../links.js";
 import { Why, useAnswer } from "../asking.js";
@@ -163,12 +163,7 @@ const PURPOSE = { express: "control, small messages", bulk: "large messages" };
 const laneState = (lane) =>
   lane.connected ? ["up", "connected"] : lane.unneeded ? ["away", "not needed now"] : ["linking", "no connection"];
 const LANES = [
-  [
-    "Lane",
-    (lane) =>
-      html`${lane.name}
-        <div class="muted">${PURPOSE[lane.name] || ""}</div>`,
-  ],
+  ["Lane", (lane) => under(lane.name, PURPOSE[lane.name])],
   ["State", (lane) => html`<${Mark} state=${laneState(lane)[0]} word=${laneState(lane)[1]} />`],
   ["#In", (lane) => bytes(lane.bytes_in)],
   ["#Out", (lane) => bytes(lane.bytes_out)],

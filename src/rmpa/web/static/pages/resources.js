@@ -3,27 +3,17 @@
 import { html, useState } from "../markup.js";
 import { seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import { Facts, Failure, Gone, Mark, Page, Panel } from "../parts.js";
+import { Facts, Failure, Gone, Mark, Page, Panel, under } from "../parts.js";
 import { Table } from "../lists.js";
 import { Link, ModuleLink } from "../links.js";
 import { Editable } from "../asking.js";
 import { setting } from "../typed.js";
 
 const RESOURCES = [
-  [
-    "Resource",
-    ([name, one]) =>
-      html`<${Link} page="resource" name=${name}>${one.name}<//>
-        <div class="muted">${one.description}</div>`,
-  ],
+  ["Resource", ([name, one]) => under(html`<${Link} page="resource" name=${name}>${one.name}<//>`, one.description)],
   ["Module", ([, one]) => html`<${ModuleLink} name=${one.module} />`],
   ["Role", ([, one]) => html`${one.role}${!one.physical && html` <span class="muted">simulated</span>`}`],
-  [
-    "Quality",
-    ([, one]) =>
-      html`<${Mark} state=${one.level} />
-        <div class="muted">${one.message}</div>`,
-  ],
+  ["Quality", ([, one]) => under(html`<${Mark} state=${one.level} />`, one.message)],
   ["Profile", ([, one]) => one.profile || "none"],
   ["Context", ([, one]) => one.context || "–"],
   ["#Clients", ([, one]) => one.clients || 0],

@@ -3,7 +3,7 @@
 import { html, useState } from "../markup.js";
 import { count, seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import { Facts, Failure, Gone, Page, Panel } from "../parts.js";
+import { Facts, Failure, Gone, Page, Panel, under } from "../parts.js";
 import { Table, useFilter } from "../lists.js";
 import { Link, ModuleLink, NodeLink, nodeKey } from "../links.js";
 import { Question, Why, useAnswer, useAsk } from "../asking.js";
@@ -22,12 +22,7 @@ export function useTypes(connection, state) {
 }
 
 const COLUMNS = [
-  [
-    "Service",
-    ([name, service]) =>
-      html`<${Link} page="service" name=${name}>${service.name}<//>${service.problem &&
-        html`<div class="muted">${service.problem}</div>`}`,
-  ],
+  ["Service", ([name, one]) => under(html`<${Link} page="service" name=${name}>${one.name}<//>`, one.problem)],
   ["Module", ([, service], { own }) => html`<${ModuleLink} name=${service.module || own} />`],
   ["Node", ([, service]) => html`<${NodeLink} name=${nodeKey(service.module, service.node)} />`],
   ["Type", ([, , type]) => type],

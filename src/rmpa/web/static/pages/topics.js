@@ -1,9 +1,9 @@
 // All topics, and one of them: which node sends it to which, how fast, how late, what is lost, and what is in it.
 
-import { useState, html, memo } from "../markup.js";
+import { html, useState } from "../markup.js";
 import { bandwidth, clock, count, hertz, seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import { Choice, Facts, Failure, Gone, Mark, Page, Panel, Since } from "../parts.js";
+import { Choice, Facts, Failure, Gone, Mark, Page, Panel, Since, under } from "../parts.js";
 import { Table, useFilter, useKept } from "../lists.js";
 import { Link, NodeLink, NodeLinks, nodeKey } from "../links.js";
 import { Why, useAnswer } from "../asking.js";
@@ -19,10 +19,11 @@ const WAYS = {
   sampled: "measured by a short subscription where it is published",
   "no subscriber": "its publisher may work for subscribers only, and is not woken: Live on its page measures it",
 };
+const Ago = ({ moment }) => html`<${Since} moment=${moment} text=${(shown) => `${shown} ago`} />`;
 function Rate({ topic, measured }) {
   if (topic.stopped)
     return html`<span class="muted">${hertz(topic.rate)}</span>
-      <div class="muted">stopped <${Since} moment=${topic.stopped} text=${(shown) => `${shown} ago`} /></div>`;
+      <div class="muted">stopped <${Ago} moment=${topic.stopped} /></div>`;
   if (!measured) return hertz(topic.rate);
   if (measured.rate === undefined)
     return html`–${" "}<span class="muted" title=${WAYS[measured.how]}>${measured.how}</span>`;
@@ -170,7 +171,10 @@ export function TopicPage({ name, state, connection }) {
               `Subscribers in ${own}`,
               detail.subscribers?.length > 0 && html`<${NodeLinks} names=${detail.subscribers} />`,
             ],
-            ["Elsewhere", detail.remote_subscribers && html`<${NodeLinks} names=${detail.remote_subscribers} />`],
+            [
+              "Elsewhere",
+              detail.remote_subscribers?.length > 0 && html`<${NodeLinks} names=${detail.remote_subscribers} />`,
+            ],
             ["Crosses", topic.crosses ? "yes" : "no"],
             ["Because", detail.policy],
             ["MD5 sum", detail.md5 && html`<code>${detail.md5}</code>`],
@@ -197,80 +201,87 @@ export function TopicPage({ name, state, connection }) {
           series=${flowing.map(([key, route]) => ({ label: key, value: figureOf(route, figure) }))}
       /><//>`}
       <${Panel} title="Routes" wide
-        ><${Table} caption="Routes" columns=${ROUTE_COLUMNS} empty="It has no route to or from a peer." list=${routes}>
-          ${([key, route]) => html`<${Route} key=${key} route=${route} own=${own} />`}<//
-        ><//
-      >
+        ><${Table}
+          caption="Routes"
+          columns=${ROUTES}
+          about=${{ own }}
+          empty="It has no route to or from a peer."
+          list=${routes.flatMap(withSubscribers)}
+      /><//>
       <${ContractPanel} connection=${connection} topic=${name} type=${topic.type} own=${own} routes=${routes.length} />
       <${Events} routes=${routes} /></div
   ><//>`;
 }
 
-const ROUTE_COLUMNS = "Source|State|#Rate|#Jitter p99|#Latency p50, p99|#Lost|#Dropped|Transport|Contract".split("|");
-const Route = memo(({ route, own }) => {
-  const latency = section(route, "latency");
-  const contract = Object.entries(route.contract || {})
+const contract = (route) =>
+  Object.entries(route.contract || {})
     .map(([key, value]) => `${key} ${value}`)
     .join(", ");
-  return html`<tr>
-      <th scope="row">
-        <${NodeLink} name=${nodeKey(route.direction === "in" ? route.peer : "", route.node)} />
-        <div class="muted">${route.direction === "in" ? `${route.peer} → ${own}` : `${own} → ${route.peer}`}</div>
-      </th>
-      <td>
-        ${route.state}${route.stopped &&
-        html`<div>
-          <${Mark} state="STALE" word="stopped" />${" "}<${Since}
-            moment=${route.stopped}
-            text=${(shown) => `${shown} ago`}
-          />
-        </div>`}${route.problem && html`<div class="muted">${route.problem}</div>`}
-      </td>
-      <td class=${route.stopped ? "number muted" : "number"}>
-        ${hertz(route.rate)}
-        <div class="muted">${bandwidth(route.bandwidth)}</div>
-      </td>
-      <td class="number">${seconds(route.jitter)}</td>
-      <td class="number">
-        ${seconds(latency.p50)}, ${seconds(latency.p99)}
-        <div class="muted">± ${seconds(latency.error)}</div>
-      </td>
-      <td class="number">
-        ${(route.events || {}).loss_unknown ? "unknown, ≥ " : ""}${count((route.lost || 0) + (route.expired || 0))}
-      </td>
-      <td class="number">${count((route.dropped || 0) + (route.oversized || 0))}</td>
-      <td>
-        ${route.transport || "–"}${route.lane &&
-        html`<div class="muted">${route.lane} lane</div>`}${route.condition_text &&
-        html`<div class="muted">${route.condition_text}</div>`}
-      </td>
-      <td>
-        ${contract || "default"}${Object.entries(route.events || {}).map(
-          ([kind, times]) => html`<div class="muted" key=${kind}>${kind.replaceAll("_", " ")}: ${count(times)}</div>`,
-        )}
-      </td>
-    </tr>
-    ${(route.subscribers || []).map((one) => html`<${Subscriber} key=${one.node} one=${one} />`)}`;
-});
+const eventsOf = (route) =>
+  Object.entries(route.events || {}).map(([kind, times]) => `${kind.replaceAll("_", " ")}: ${count(times)}`);
+const ROUTES = [
+  [
+    "Source",
+    (one, { own }) => {
+      if (one.inner) return html`<span class="inner mono">→ ${one.node}</span>`;
+      const [peer, way] = one.direction === "in" ? [one.peer, [one.peer, own]] : ["", [own, one.peer]];
+      return under(html`<${NodeLink} name=${nodeKey(peer, one.node)} />`, way.join(" → "));
+    },
+  ],
+  [
+    "State",
+    (one) =>
+      under(
+        one.state,
+        one.stopped && html`<${Mark} state="STALE" word="stopped" />${" "}<${Ago} moment=${one.stopped} />`,
+        one.problem,
+      ),
+  ],
+  [
+    "#Rate",
+    (one) =>
+      under(
+        html`<span class=${one.stopped ? "muted" : ""}>${hertz(one.rate)}</span>`,
+        !one.inner && bandwidth(one.bandwidth),
+      ),
+  ],
+  ["#Jitter p99", (one) => seconds(one.jitter)],
+  [
+    "#Latency p50, p99",
+    ({ inner, latency = {} }) =>
+      inner ? "–" : under(`${seconds(latency.p50)}, ${seconds(latency.p99)}`, `± ${seconds(latency.error)}`),
+  ],
+  [
+    "#Lost",
+    (one) =>
+      one.inner
+        ? "–"
+        : `${one.events?.loss_unknown ? "unknown, ≥ " : ""}${count((one.lost || 0) + (one.expired || 0))}`,
+  ],
+  ["#Dropped", (one) => (one.inner ? "–" : count((one.dropped || 0) + (one.oversized || 0)))],
+  ["Transport", (one) => under(one.transport || "–", one.lane && `${one.lane} lane`, one.condition_text, one.endpoint)],
+  ["Contract", (one) => (one.inner ? one.wanted || "" : under(contract(one) || "default", ...eventsOf(one)))],
+];
 
-// A subscriber of a route where its transport is known: the agents see no message of direct ones.
-const Subscriber = ({ one }) => {
-  const gap =
-    one.interruptions && `interrupted ${count(one.interruptions)} times, the last for ${seconds(one.interrupted)}`;
+// The subscribers of a route stand below it where their transport is known: the agents see no message of direct ones.
+const withSubscribers = ([key, route]) => [
+  { ...route, name: key },
+  ...(route.subscribers || []).map((one) => ({
+    ...one,
+    inner: true,
+    name: `${key} ${one.node}`,
+    problem: troubleOf(one),
+  })),
+];
+function troubleOf(one) {
+  const gap = `interrupted ${count(one.interruptions)} times, the last for ${seconds(one.interrupted)}`;
   const parts = [
     one.condition && one.text,
     one.transport === "direct" && "not measured: the nodes are connected directly",
-    gap && `${gap}: what is lost of that time is not counted`,
+    one.interruptions && `${gap}: what is lost of that time is not counted`,
   ];
-  const said = parts.filter(Boolean).join("; ");
-  return html`<tr>
-    <th scope="row" class="inner"><span class="mono">→ ${one.node}</span></th>
-    <td>${one.state}${said && html`<div class="muted">${said}</div>`}</td>
-    ${[1, 2, 3, 4, 5].map((each) => html`<td key=${each} class="number">–</td>`)}
-    <td>${one.transport || "–"}${one.endpoint && html`<div class="muted">${one.endpoint}</div>`}</td>
-    <td>${one.wanted || ""}</td>
-  </tr>`;
-};
+  return parts.filter(Boolean).join("; ");
+}
 
 const MEANINGS = {
   reliability: "whether messages survive the loss of a link",
@@ -293,12 +304,7 @@ function term(key, value) {
   return key === "max_rate" ? hertz(value) : String(value).replaceAll("_", " ");
 }
 const TERMS = [
-  [
-    "Term",
-    ([key]) =>
-      html`${key.replaceAll("_", " ")}
-        <div class="muted">${MEANINGS[key] || ""}</div>`,
-  ],
+  ["Term", ([key]) => under(key.replaceAll("_", " "), MEANINGS[key])],
   ["Value", ([key, one]) => term(key, one.value)],
   ["~Set by", ([, one]) => one.rule],
 ];
