@@ -267,7 +267,7 @@ class MonitorSession(Session):
         rate: Annotated[float, Meta(gt=0, le=limits.WATCH_RATE_MAX)] = 5.0,
         width: Annotated[int, Meta(ge=0, le=0xFFFF)] = 0,
     ) -> None:
-        """Messages of a topic: its newest values, lines of a plot, images for a ``width`` in pixels, or a map's layers."""
+        """Messages of a topic: its newest values, lines of a plot, images for a ``width`` in pixels, or layers."""
         if (how == "plot") != bool(fields):
             self._malformed(f"a plot has 1 to {limits.FIELDS_MAX} fields, everything else none")
             return
