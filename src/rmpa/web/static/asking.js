@@ -1,6 +1,6 @@
 // Questions to the server, asked by a button, at once or again and again, and values that can be changed.
 
-import { useEffect, useLayoutEffect, useRef, useState, html } from "./markup.js";
+import { html, useEffect, useLayoutEffect, useRef, useState } from "./markup.js";
 import { Failure, Mark, known, shape } from "./parts.js";
 
 // A value that can be changed: a button, and once it is pressed a field, which has the cursor. Escape or a button

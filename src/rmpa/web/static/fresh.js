@@ -1,7 +1,7 @@
 // Whether what is shown as live is old, and how old: one rule for values, plots, pictures and maps. How long a topic
 // may be silent is told by the server (`after` of a beat); routes it judges itself by the same rule (`stopped`).
 
-import { useEffect, useRef, useState, html } from "./markup.js";
+import { html, useEffect, useRef, useState } from "./markup.js";
 import { bandwidth, duration, hertz } from "./format.js";
 import { Mark, useTick } from "./parts.js";
 

@@ -1,6 +1,6 @@
 // Lists: kept as they were left, filtered, sorted, their first entries drawn, and as tables.
 
-import { useEffect, useState, html, memo } from "./markup.js";
+import { html, memo, useEffect, useState } from "./markup.js";
 import { count } from "./format.js";
 
 // Of this entry of the browser's history: *Back* brings the page as it was left, and a link opens it anew.

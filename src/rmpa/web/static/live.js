@@ -1,6 +1,6 @@
 // Live messages of one topic: the newest value, plots of any number in it, images, and what a map has layers of.
 
-import { useLayoutEffect, useRef, useState, html } from "./markup.js";
+import { html, useLayoutEffect, useRef, useState } from "./markup.js";
 import { bandwidth, bytes, clock, hertz } from "./format.js";
 import { Fresh, useOld, useWatch } from "./fresh.js";
 import { Choice, Failure, Mark, Panel } from "./parts.js";

@@ -1,6 +1,6 @@
 // Lines of the log of all modules or of some: asked for while a page shows them, and it is seen.
 
-import { useEffect, useRef, useState, html, memo } from "./markup.js";
+import { html, memo, useEffect, useRef, useState } from "./markup.js";
 import { useAgain } from "./asking.js";
 import { clock, seconds } from "./format.js";
 import { Failure, Mark } from "./parts.js";

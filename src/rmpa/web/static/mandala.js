@@ -1,6 +1,6 @@
 // The first page: all modules on a ring, their links, and what flows.
 
-import { useEffect, useRef, useState, html, memo } from "./markup.js";
+import { html, memo, useEffect, useRef, useState } from "./markup.js";
 import { bandwidth, hertz, seconds } from "./format.js";
 import { entries, section } from "./state.js";
 import { Outside } from "./outside.js";

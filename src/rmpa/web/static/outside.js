@@ -1,6 +1,6 @@
 // Modules that are heard and are not of this mesh: why, and the line or the button that lets one in.
 
-import { useState, html } from "./markup.js";
+import { html, useState } from "./markup.js";
 import { useAsk } from "./asking.js";
 import { entries } from "./state.js";
 import { Failure, Mark, Panel, Since } from "./parts.js";

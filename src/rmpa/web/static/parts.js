@@ -1,6 +1,6 @@
 // Small parts that all pages are made of.
 
-import { createContext, useContext, useEffect, useRef, useState, html } from "./markup.js";
+import { createContext, html, useContext, useEffect, useRef, useState } from "./markup.js";
 import { ago, plain } from "./format.js";
 
 const stroke = (d) => html`<path class="stroke" d=${d} />`;

@@ -1,7 +1,7 @@
 // Plots by uPlot, which is loaded when the first one is shown. Without it, and for those who read by ear, there are the
 // newest figures as text.
 
-import { useEffect, useRef, useState, html } from "./markup.js";
+import { html, useEffect, useRef, useState } from "./markup.js";
 import { ink, onTheme } from "./theme.js";
 
 const LINES = 8; // of a plot

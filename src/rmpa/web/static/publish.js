@@ -1,6 +1,6 @@
 // A form for a message of any type, made from its definition, and what publishes it: once, or at a rate.
 
-import { useEffect, useRef, useState, html } from "./markup.js";
+import { html, useEffect, useRef, useState } from "./markup.js";
 import { count } from "./format.js";
 import { section } from "./state.js";
 import { Failure, Mark, Panel, Pick, Text } from "./parts.js";

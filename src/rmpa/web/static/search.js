@@ -1,8 +1,8 @@
 // Search over all that has a name, and the list of keys.
 
-import { useEffect, useLayoutEffect, useRef, useState, html } from "./markup.js";
+import { html, useEffect, useLayoutEffect, useRef, useState } from "./markup.js";
 import { entries } from "./state.js";
-import { nodeName, href } from "./links.js";
+import { href, nodeName } from "./links.js";
 
 const MOST = 40;
 const KINDS = [

@@ -1,6 +1,6 @@
 // A live message as a tree. What is nested is folded; a covariance is a matrix; an array says its true length.
 
-import { useState, html } from "./markup.js";
+import { html, useState } from "./markup.js";
 import { clock, count } from "./format.js";
 
 const INLINE = 12; // elements of an array that stand in one line

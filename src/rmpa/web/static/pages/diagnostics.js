@@ -1,11 +1,11 @@
 // What nodes of all modules say on /diagnostics: a tree by module, hardware and name, and one status with its past.
 
-import { useEffect, useRef, useState, html, memo } from "../markup.js";
+import { html, memo, useEffect, useRef, useState } from "../markup.js";
 import { count, plain } from "../format.js";
 import { adopt, entries, section } from "../state.js";
 import { Choice, Facts, Mark, Page, Panel, Since, known } from "../parts.js";
 import { Table, useFilter, useFirst } from "../lists.js";
-import { ModuleLink, NodeLink, nodeKey, href } from "../links.js";
+import { ModuleLink, NodeLink, href, nodeKey } from "../links.js";
 import { Plot, figure, toggled } from "../plot.js";
 
 const LEVELS = ["OK", "WARN", "STALE", "ERROR"]; // the best first, as in observe/diagnostics.py
@@ -104,24 +104,19 @@ function Group({ node, chosen, wide, level }) {
       <summary>
         <${Mark} state=${node.worst} word="" /> <strong>${node.label}</strong> <span class="muted">${node.total}</span>
       </summary>
-      ${open && html`<${Branch} nodes=${node.children} chosen=${chosen} wide=${wide} level=${level + 1} />`}
+      ${open && html`<${Branch} nodes=${node.children} ...${{ chosen, wide }} level=${level + 1} />`}
     </details>
   </li>`;
 }
 
+const leafOf = ({ label, leaf: [name, one] }, chosen) => ({ label, name, one, chosen: name === chosen });
 function Branch({ nodes, chosen, wide, level = 0 }) {
   const [shown, more] = useFirst(nodes);
   return html`<ul class=${level ? "" : "diagnostics"}>
       ${shown.map((node) =>
         node.leaf
-          ? html`<${Leaf}
-              key=${`${node.label} ${node.leaf[0]}`}
-              label=${node.label}
-              name=${node.leaf[0]}
-              one=${node.leaf[1]}
-              chosen=${node.leaf[0] === chosen}
-            />`
-          : html`<${Group} key=${node.label} node=${node} chosen=${chosen} wide=${wide} level=${level} />`,
+          ? html`<${Leaf} key=${`${node.label} ${node.leaf[0]}`} ...${leafOf(node, chosen)} />`
+          : html`<${Group} key=${node.label} ...${{ node, chosen, wide, level }} />`,
       )}
     </ul>
     ${more}`;

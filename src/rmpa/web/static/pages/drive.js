@@ -1,7 +1,7 @@
 // A joystick for a robot, by touch, keys or a gamepad. It drives only while it is held; the server stops the robot
 // 0.3 s after the last command.
 
-import { useEffect, useRef, useState, html } from "../markup.js";
+import { html, useEffect, useRef, useState } from "../markup.js";
 import { sentence } from "../format.js";
 import { section } from "../state.js";
 import { Page, Panel, Select, Since, Text } from "../parts.js";

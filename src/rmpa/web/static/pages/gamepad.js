@@ -1,7 +1,7 @@
 // A gamepad as the stick of the page Drive (w3.org/TR/gamepad): which of its axes drive, and a dead man's button that
 // must be held. What the user chooses is kept in this browser, for each kind of gamepad.
 
-import { useEffect, useRef, useState, html } from "../markup.js";
+import { html, useEffect, useRef, useState } from "../markup.js";
 import { toggled } from "../plot.js";
 import { store, stored } from "../storage.js";
 

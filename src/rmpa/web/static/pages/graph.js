@@ -1,13 +1,13 @@
 // The graph of nodes and topics as rqt_graph draws it: nodes in a lane for each module, topics between them.
 
-import { useEffect, useLayoutEffect, useRef, useState, html, memo } from "../markup.js";
+import { html, memo, useEffect, useLayoutEffect, useRef, useState } from "../markup.js";
 import { count, hertz } from "../format.js";
 import { section } from "../state.js";
 import { useAgain } from "../asking.js";
 import { download } from "../storage.js";
 import { gestures } from "../viewport.js";
 import { curve, layout } from "../layout.js";
-import { Check, Choice, Select, Failure, Mark, Page, Panel } from "../parts.js";
+import { Check, Choice, Failure, Mark, Page, Panel, Select } from "../parts.js";
 import { Table, useFilter } from "../lists.js";
 import { Link, NodeLink, href } from "../links.js";
 import { isData } from "./topics.js";

@@ -1,6 +1,6 @@
 // The log of all modules, of their nodes and agents, newest first.
 
-import { useState, html } from "../markup.js";
+import { html, useState } from "../markup.js";
 import { entries, section } from "../state.js";
 import { Choice, Page, Panel, Pick } from "../parts.js";
 import { useFilter, useKept } from "../lists.js";

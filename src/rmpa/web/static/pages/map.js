@@ -1,14 +1,14 @@
 // Scans, grids, paths, poses, clouds and frames of all robots in one map from above, in a frame that is chosen.
 
-import { useContext, useEffect, useRef, useState, html } from "../markup.js";
+import { html, useContext, useEffect, useRef, useState } from "../markup.js";
 import { duration, hertz } from "../format.js";
 import { entries, section } from "../state.js";
-import { AsPanel, Check, IconButton, Select, useTick, Failure, Mark, Page, Panel } from "../parts.js";
+import { AsPanel, Check, Failure, IconButton, Mark, Page, Panel, Select, useTick } from "../parts.js";
 import { isOld } from "../fresh.js";
 import { ink, onTheme } from "../theme.js";
 import { store, stored } from "../storage.js";
 import { gestures } from "../viewport.js";
-import { Frames } from "../frames.js";
+import { Frames, isLate } from "../frames.js";
 import { LAYERS, Layer, View, bounds, drawFrames, drawGround, drawLayer, drawScale, moduleColour } from "../layers.js";
 import { now, transformTopics, useFrames } from "./tf.js";
 
@@ -16,7 +16,7 @@ const MOST = 12; // layers: a page may watch 16 topics, of which some are tf's
 const KEPT = "rmpa.map"; // in the browser: { fixed, follow, frames, on: { topic: true or false } }
 const PREFERRED = ["map", "world", "odom"];
 const GATHER = 100; // milliseconds in which messages are drawn together
-const OLD = 2; // seconds after which a transform on the way to a layer is old
+const OLD = 2; // seconds after which the age of what came once is told
 const SETTLED = 1; // seconds in which transforms come that belong to a message
 const LASTING = ["grid", "path"];
 const NO_FRAMES = new Frames();
@@ -296,7 +296,7 @@ class MapCanvas {
     for (const layer of this.all) {
       if (!layer.head) continue;
       const { pose, problem, edges } = this.poseOf(layer, frames, fixed);
-      const late = (edges || []).find((edge) => !edge.fixed && now() - edge.heard > OLD);
+      const late = (edges || []).find((edge) => isLate(edge, now()));
       layer.problem = problem ?? (late && `the transform of ${late.child} is ${duration(now() - late.heard)} old`);
       if (pose) found.push({ layer, pose, old: Boolean(late) || this.isOld(layer) });
     }
@@ -353,7 +353,7 @@ class MapCanvas {
     return frames.names.flatMap((name) => {
       const { pose, edges } = frames.lookup(fixed, name);
       if (!pose) return [];
-      const old = !live || edges.some((edge) => !edge.fixed && now() - edge.heard > OLD);
+      const old = !live || edges.some((edge) => isLate(edge, now()));
       const sender = frames.edge(name)?.source ?? "";
       return [{ name, pose, old, colour: this.colourOf(Frames.module(sender) || own) }];
     });

@@ -1,8 +1,8 @@
 // Several things beside each other: messages, plots, pictures, a map, the log and more, in a grid that is kept by name.
 
-import { useEffect, useRef, useState, html } from "../markup.js";
+import { html, useEffect, useRef, useState } from "../markup.js";
 import { entries, section } from "../state.js";
-import { AsPanel, Failure, Page, IconButton, Panel, Select, Text } from "../parts.js";
+import { AsPanel, Failure, IconButton, Page, Panel, Select, Text } from "../parts.js";
 import { download, store, stored } from "../storage.js";
 import { toggled } from "../plot.js";
 import { Fields, IMAGES, Image, Value } from "../live.js";

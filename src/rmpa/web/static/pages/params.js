@@ -1,6 +1,6 @@
 // The parameters of this module's core, or of a peer's, as a tree; each value can be changed.
 
-import { useEffect, useRef, useState, html } from "../markup.js";
+import { html, useEffect, useRef, useState } from "../markup.js";
 import { entries, section } from "../state.js";
 import { Choice, Failure, Page, Panel, Text } from "../parts.js";
 import { useFilter, useFirst, useKept } from "../lists.js";

@@ -1,18 +1,17 @@
 // The frames of tf as a tree: parent, age, rate and sender of each transform, what is wrong, and one frame in another.
 
-import { useEffect, useRef, useState, html } from "../markup.js";
+import { html, useEffect, useRef, useState } from "../markup.js";
 import { count, duration, hertz } from "../format.js";
 import { entries, section } from "../state.js";
 import { Facts, Failure, Mark, Page, Panel, Select, useTick } from "../parts.js";
 import { Table, useFilter } from "../lists.js";
 import { ModuleLink, NodeLink } from "../links.js";
-import { Frames, SILENT, angles } from "../frames.js";
+import { Frames, SILENT, angles, isLate } from "../frames.js";
 
 const TYPES = ["tf2_msgs/TFMessage", "tf/tfMessage"];
 const MOST = 4; // topics: a page may watch 16
 const BEHIND = 1; // seconds between stamp and receipt
 const SIMULATED = 1e8; // stamps below it are of a simulated clock
-const STALE = 2; // seconds; a transform that moves is sent more often
 
 export const now = () => performance.now() / 1000;
 export const transformTopics = (state) =>
@@ -105,7 +104,7 @@ const COLUMNS = [
 function age(edge) {
   if (edge.fixed) return html`<span class="muted">–</span>`;
   const old = ageOf(edge);
-  if (old > STALE) return html`<${Mark} state="STALE" word=${duration(old)} />`;
+  if (isLate(edge, now())) return html`<${Mark} state="STALE" word=${duration(old)} />`;
   return `${old.toFixed(1)} s`;
 }
 
