@@ -244,6 +244,17 @@ async def test_scans_and_pictures_are_drawn(site: Site, address: str) -> None:
     assert (site.server.reports, page.errors) == ([], [])
 
 
+async def test_a_layer_of_a_map_that_stopped_says_how_old_it_is(site: Site) -> None:
+    page = await site.open("topic/%2Fscan", "sensors")
+    await page.click("On")
+    await page.wait("document.querySelector('.layers .about')?.innerText.includes('Hz')")
+    assert await page.run("document.querySelector('.layers .mark.idle')") is None
+    site.server.publishes = False
+    await page.wait("document.querySelector('.layers .mark.idle')")
+    site.server.publishes = True
+    await page.wait("!document.querySelector('.layers .mark.idle')")
+
+
 async def test_what_stopped_is_greyed_with_its_age_until_it_comes_again(site: Site) -> None:
     page = await site.open("topic/%2Fcamera%2Fimage", "sensors")
     await page.click("On")

@@ -234,6 +234,7 @@ class LayerWatch(WatchState):
         if message.source in self._sources or len(self._sources) < limits.LAYER_SOURCES:
             self._sources[message.source] = self._sources.get(message.source, 0) + 1
             self._waiting[message.source] = message
+            self.beat.receive(message.stamp_ns * 1e-9, len(message.payload))
 
     def due(self, now: float) -> float | None:
         """When the next frame may be sent; ``None`` while there is nothing to send."""

@@ -361,7 +361,7 @@ class WatchState:
 
     Args:
         id_: Of the watch.
-        how: ``value``, ``plot``, ``image`` or ``scan``.
+        how: ``value``, ``plot`` or ``image``.
         fields: The lines of a plot.
         rate: Frames a second.
         decode: Gives a message's values: dicts, lists, numbers, strings; bytes for arrays of bytes.
@@ -427,8 +427,6 @@ class WatchState:
             # However large it is, pictures take a bounded share of the processor.
             self._next = now + max(1 / self._rate, (time.thread_time() - began) * limits.PICTURE_SHARE)
             return frame
-        if self._how == "scan":
-            return {"op": "scan", **about, "scan": scan(values)}
         return {"op": "value", **about, "size": len(message.payload), "value": cut(values)}
 
 

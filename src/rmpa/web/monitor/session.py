@@ -39,7 +39,7 @@ Id: TypeAlias = Annotated[int, Meta(gt=0, lt=2**32)]
 Kind: TypeAlias = Literal[
     "module", "topic", "service", "node", "resource", "counters", "rates", "diagnostics", "diagnostic"
 ]
-How: TypeAlias = Literal["value", "plot", "image", "scan", "map", "tf"]
+How: TypeAlias = Literal["value", "plot", "image", "map", "tf"]
 # Of a joystick: a share of the fastest that is allowed.
 Tilt: TypeAlias = Annotated[float, Meta(ge=-1, le=1)]
 # What a page may have, as ``hello`` lists it.
@@ -267,7 +267,7 @@ class MonitorSession(Session):
         rate: Annotated[float, Meta(gt=0, le=limits.WATCH_RATE_MAX)] = 5.0,
         width: Annotated[int, Meta(ge=0, le=0xFFFF)] = 0,
     ) -> None:
-        """Messages of a topic: its newest values, lines of a plot, images for a ``width`` in pixels, or scans."""
+        """Messages of a topic: its newest values, lines of a plot, images for a ``width`` in pixels, or layers."""
         if (how == "plot") != bool(fields):
             self._malformed(f"a plot has 1 to {limits.FIELDS_MAX} fields, everything else none")
             return

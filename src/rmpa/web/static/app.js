@@ -1,57 +1,47 @@
 // The frame around all pages: address, navigation, search, keys, colours, and what to say when the agent is gone.
 
-import { html, render, Component } from "./markup.js";
+import { Component, html, render } from "./markup.js";
 import { Connection } from "./connection.js";
 import { sentence } from "./format.js";
 import { section } from "./state.js";
-import { Mark, Since, keep, kept, keyOfNode } from "./parts.js";
+import { IconButton, Mark, Since } from "./parts.js";
+import { keep, kept } from "./lists.js";
+import { keyOfNode } from "./links.js";
 import { Mandala } from "./mandala.js";
 import { Search, Shortcuts } from "./search.js";
 import { applyTheme, nextTheme, theme } from "./theme.js";
 
 const ICON = html`<img src="static/icon.svg" alt="" width="28" height="28" />`;
-const PAGES = [
-  ["", "Mesh", "m"],
-  ["topics", "Topics", "t"],
-  ["services", "Services", "s"],
-  ["nodes", "Nodes", "n"],
-  ["graph", "Graph", "g"],
-  ["params", "Parameters", "p"],
-  ["resources", "Resources", "r"],
-  ["map", "Map", "o"],
-  ["tf", "Frames", "f"],
-  ["panels", "Panels", "b"],
-  ["alarms", "Alarms", "a"],
-  ["diagnostics", "Diagnostics", "i"],
-  ["log", "Log", "l"],
-  ["drive", "Drive", "d"],
-];
-const DETAILED = ["module", "topic", "service", "node", "resource"];
+// Pages by address: title and key of those in the navigation, and the file and export of all but the first one, which
+// are loaded when they are first opened.
+const PLACES = {
+  "": ["Mesh", "m"],
+  topics: ["Topics", "t", "topics.js", "Topics"],
+  services: ["Services", "s", "services.js", "Services"],
+  nodes: ["Nodes", "n", "nodes.js", "Nodes"],
+  graph: ["Graph", "g", "graph.js", "GraphPage"],
+  params: ["Parameters", "p", "params.js", "Params"],
+  resources: ["Resources", "r", "resources.js", "Resources"],
+  map: ["Map", "o", "map.js", "MapPage"],
+  tf: ["Frames", "f", "tf.js", "FramesPage"],
+  panels: ["Panels", "b", "panels.js", "Panels"],
+  alarms: ["Alarms", "a", "alarms.js", "Alarms"],
+  diagnostics: ["Diagnostics", "i", "diagnostics.js", "Diagnostics"],
+  log: ["Log", "l", "log.js", "Log"],
+  drive: ["Drive", "d", "drive.js", "DrivePage"],
+  module: ["", "", "module.js", "ModulePage"],
+  topic: ["", "", "topics.js", "TopicPage"],
+  service: ["", "", "services.js", "ServicePage"],
+  node: ["", "", "nodes.js", "NodePage"],
+  resource: ["", "", "resources.js", "ResourcePage"],
+};
+const PAGES = Object.entries(PLACES).flatMap(([page, [title, key]]) => (title ? [[page, title, key]] : []));
+const LAZY = Object.fromEntries(Object.entries(PLACES).map(([page, [, , ...where]]) => [page, where]));
+const LISTED = { topic: "topics", service: "services", node: "nodes", resource: "resources", module: "" };
 // What pages without a name look at.
 const LISTS = { diagnostics: [["diagnostics", ""]], panels: [["diagnostics", ""]], topics: [["rates", ""]] };
 // Pages on which a name chooses a part: what was filtered and opened there stays.
 const KEPT = ["diagnostics", "graph"];
-// All pages but the first one are loaded when they are first opened.
-const LAZY = {
-  module: ["module.js", "ModulePage"],
-  topics: ["topics.js", "Topics"],
-  topic: ["topics.js", "TopicPage"],
-  services: ["services.js", "Services"],
-  service: ["services.js", "ServicePage"],
-  params: ["params.js", "Params"],
-  nodes: ["nodes.js", "Nodes"],
-  node: ["nodes.js", "NodePage"],
-  resources: ["resources.js", "Resources"],
-  resource: ["resources.js", "ResourcePage"],
-  map: ["map.js", "MapPage"],
-  tf: ["tf.js", "FramesPage"],
-  panels: ["panels.js", "Panels"],
-  alarms: ["alarms.js", "Alarms"],
-  diagnostics: ["diagnostics.js", "Diagnostics"],
-  graph: ["graph.js", "GraphPage"],
-  log: ["log.js", "Log"],
-  drive: ["drive.js", "DrivePage"],
-};
 
 function address() {
   const [page = "", name] = location.hash.replace(/^#\/?/, "").split("/");
@@ -117,7 +107,7 @@ class App extends Component {
 
   look() {
     const { page, name } = address();
-    const about = page === "diagnostics" ? "diagnostic" : DETAILED.includes(page) && page;
+    const about = page === "diagnostics" ? "diagnostic" : page in LISTED && page;
     const lists = LISTS[page] ?? [];
     this.connection.look(about && name !== undefined ? [...lists, [about, name]] : lists);
   }
@@ -186,19 +176,18 @@ class App extends Component {
         ${this.state.broken ? "This page cannot be loaded: rmpa web does not answer." : "Loading …"}
       </p>`;
     }
-    return html`<${loaded[lazy[1]]}
-      key=${KEPT.includes(page) ? page : `${page} ${name}`}
-      name=${name}
-      state=${connection.state}
-      connection=${connection}
-      pages=${LAZY}
-    />`;
+    const key = KEPT.includes(page) ? page : `${page} ${name}`;
+    return html`<${loaded[lazy[1]]} ...${{ key, name, connection, state: connection.state, pages: LAZY }} />`;
   }
 
   banner() {
     const { connection } = this;
     const reach = section(connection.state, "reach");
     const { notice } = connection;
+    const close = () => {
+      connection.notice = null;
+      this.setState({});
+    };
     if (connection.phase === "lost") {
       const known = connection.state ? "What is shown and typed stays here, but nothing can be sent." : "";
       return html`<${Banner} mark="refused" action="Try now" act=${() => connection.retry()}>
@@ -213,14 +202,7 @@ class App extends Component {
         back by itself.<//
       >`;
     if (notice)
-      return html`<${Banner}
-        mark="WARN"
-        action="Close"
-        act=${() => {
-          connection.notice = null;
-          this.setState({});
-        }}
-      >
+      return html`<${Banner} mark="WARN" action="Close" act=${close}>
         ${sentence(notice.error)} ${sentence(notice.remedy)}<//
       >`;
     return null;
@@ -233,18 +215,13 @@ class App extends Component {
     const agent = section(state, "agent").name || connection.hello.agent;
     const alarms = Object.keys(section(state, "alarms")).length;
     const gone = connection.phase === "lost" || section(state, "reach").ok === false;
-    const current =
-      { topic: "topics", service: "services", node: "nodes", resource: "resources", module: "" }[page] ?? page;
+    const current = LISTED[page] ?? page;
     const dark = theme() === "dark";
-    return html`<a
-        class="skip"
-        href="#main"
-        onClick=${(event) => {
-          event.preventDefault();
-          document.querySelector("h1")?.focus();
-        }}
-        >To the content</a
-      >
+    const skip = (event) => {
+      event.preventDefault();
+      document.querySelector("h1")?.focus();
+    };
+    return html`<a class="skip" href="#main" onClick=${skip}>To the content</a>
       <header class="top">
         <a class="brand" href="#/"
           >${ICON}<span>RMPA<small>${agent || "…"}</small></span></a
@@ -264,41 +241,24 @@ class App extends Component {
           )}
         </nav>
         <div class="tools">
-          <button
-            type="button"
-            class="icon"
-            aria-label="Search (/)"
-            title="Search (/)"
-            onClick=${() => this.setState({ overlay: "search" })}
-          >
+          <${IconButton} label="Search (/)" press=${() => this.setState({ overlay: "search" })}>
             <svg viewBox="0 0 20 20" aria-hidden="true">
               <circle cx="8.5" cy="8.5" r="5.5" />
-              <path d="m12.5 12.5 5 5" />
-            </svg>
-          </button>
-          <button
-            type="button"
-            class="icon"
-            aria-label=${dark ? "Light colours (c)" : "Dark colours (c)"}
+              <path d="m12.5 12.5 5 5" /></svg
+          ><//>
+          <${IconButton}
+            label=${dark ? "Light colours (c)" : "Dark colours (c)"}
             title="Colours (c)"
-            onClick=${() => this.turn()}
+            press=${() => this.turn()}
           >
             <svg viewBox="0 0 20 20" aria-hidden="true">
               <circle cx="10" cy="10" r="7" />
-              <path class="fill" d="M10 3a7 7 0 0 1 0 14Z" />
-            </svg>
-          </button>
-          <button
-            type="button"
-            class="icon help"
-            aria-label="Keys (?)"
-            title="Keys (?)"
-            onClick=${() => this.setState({ overlay: "keys" })}
-          >
+              <path class="fill" d="M10 3a7 7 0 0 1 0 14Z" /></svg
+          ><//>
+          <${IconButton} label="Keys (?)" look="help" press=${() => this.setState({ overlay: "keys" })}>
             <svg viewBox="0 0 20 20" aria-hidden="true">
-              <path d="M7 7.5a3 3 0 1 1 4.5 2.6c-1 .6-1.5 1.1-1.5 2.4M10 15.5v.5" />
-            </svg>
-          </button>
+              <path d="M7 7.5a3 3 0 1 1 4.5 2.6c-1 .6-1.5 1.1-1.5 2.4M10 15.5v.5" /></svg
+          ><//>
         </div>
       </header>
       ${this.banner()}

@@ -10,6 +10,31 @@ const TICKS = 10; // of which the fastest counts: over 20 s two clocks do not dr
 // Milliseconds without a word after which the connection is lost, or the attempt given up; a tick comes every 2 s.
 const SILENT = 7000;
 
+const shown = (what) => (to, message) => {
+  to[what] = message;
+  to.changed();
+};
+const toWatch = (to, message) => to.watches.get(message.id)?.sink(message);
+// What a message of the server is to a connection.
+const RECEIVE = {
+  hello: (to, message) => (to.tick(message.at), shown("hello")(to, message)),
+  tick: (to, { at }) => to.tick(at),
+  state: (to, { state, n }) => to.shown(n, adopt(state)),
+  patch(to, { patch, n }) {
+    to.frames.patches += 1;
+    to.shown(n, applyPatch(to.state, patch));
+  },
+  value: toWatch,
+  points: toWatch,
+  tf: toWatch,
+  beat: toWatch,
+  published: (to, message) => to.publishing.get(message.id)?.(message),
+  answer: (to, { id, value }) => to.settle(id)?.resolve(value),
+  stick: shown("stick"),
+  driven: shown("commanded"),
+  failed: (to, message) => to.failed(message),
+};
+
 export class Connection {
   constructor(changed) {
     this.changed = changed; // called after each change that a page can show
@@ -101,17 +126,10 @@ export class Connection {
 
   // A browser does not tell why a WebSocket was refused, as for a wrong token: the same question over HTTP does.
   explain() {
+    const why = (problem) => problem && this.phase === "lost" && ((this.reason = problem.detail), this.changed());
     fetch(new URL("api/v1/agent", document.baseURI))
       .then((response) => (response.ok || response.status === 503 ? null : response.json()))
-      .then(
-        (problem) => {
-          if (problem && this.phase === "lost") {
-            this.reason = problem.detail;
-            this.changed();
-          }
-        },
-        () => {},
-      );
+      .then(why, () => {});
   }
 
   send(message) {
@@ -123,49 +141,7 @@ export class Connection {
     if (typeof data !== "string") return this.receiveBinary(data);
     this.frames.bytes += data.length;
     const message = JSON.parse(data);
-    switch (message.op) {
-      case "hello":
-        this.hello = message;
-        this.tick(message.at);
-        this.changed();
-        break;
-      case "tick":
-        this.tick(message.at);
-        break;
-      case "state":
-        this.state = adopt(message.state);
-        this.shown(message.n);
-        break;
-      case "patch":
-        this.frames.patches += 1;
-        this.state = applyPatch(this.state, message.patch);
-        this.shown(message.n);
-        break;
-      case "value":
-      case "points":
-      case "scan":
-      case "tf":
-      case "beat":
-        this.watches.get(message.id)?.sink(message);
-        break;
-      case "published":
-        this.publishing.get(message.id)?.(message);
-        break;
-      case "answer":
-        this.settle(message.id)?.resolve(message.value);
-        break;
-      case "stick":
-        this.stick = message;
-        this.changed();
-        break;
-      case "driven":
-        this.commanded = message;
-        this.changed();
-        break;
-      case "failed":
-        this.failed(message);
-        break;
-    }
+    RECEIVE[message.op]?.(this, message);
   }
 
   tick(at) {
@@ -180,7 +156,8 @@ export class Connection {
 
   // The acknowledgement is sent when the browser has drawn: the server waits for it before it sends more than one
   // further patch.
-  shown(n) {
+  shown(n, state) {
+    this.state = state;
     this.changed(() => this.send({ op: "ack", n }));
   }
 

@@ -4,6 +4,7 @@
 const KEPT = 30; // transforms of each frame, of the last seconds, for a stamp between two of them
 const MEASURED = 3; // seconds over which a rate is measured
 const DEEPEST = 200; // frames from one to its root
+const LATE = 2; // seconds; a transform that moves is sent more often
 export const SILENT = 10; // seconds after which a sender does not count any more beside another one
 
 export function turned([x, y, z, w], [px, py, pz]) {
@@ -53,6 +54,8 @@ export function angles([, , , x, y, z, w]) {
     Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
   ];
 }
+
+export const isLate = ({ fixed, heard }, now) => !fixed && now - heard > LATE;
 
 export class Frames {
   constructor() {

@@ -1,9 +1,9 @@
-// Whether what is shown as live is old, and how old: one rule for values, plots, pictures and scans. How long a topic
+// Whether what is shown as live is old, and how old: one rule for values, plots, pictures and maps. How long a topic
 // may be silent is told by the server (`after` of a beat); routes it judges itself by the same rule (`stopped`).
 
-import { html, useEffect, useState } from "./markup.js";
+import { html, useEffect, useRef, useState } from "./markup.js";
 import { bandwidth, duration, hertz } from "./format.js";
-import { Mark } from "./parts.js";
+import { Mark, useTick } from "./parts.js";
 
 // `came`: when the last message came, by performance.now(); `after`: seconds, 0 while no period is known.
 export const isOld = (came, after) => after > 0 && performance.now() - came >= after * 1000;
@@ -22,6 +22,8 @@ export function useOld(came, after) {
 export function useWatch(connection, wanted, take) {
   const [state, set] = useState({ came: 0 });
   const key = JSON.stringify(wanted);
+  const sink = useRef(take);
+  sink.current = take;
   useEffect(() => {
     if (!wanted) return undefined;
     set((before) => (before.topic === wanted.topic ? before : { came: 0, topic: wanted.topic }));
@@ -29,18 +31,14 @@ export function useWatch(connection, wanted, take) {
       if (message.op === "failed") return set({ came: 0, topic: wanted.topic, failure: message });
       if (message.op === "beat") return set((before) => ({ ...before, beat: message }));
       set((before) => ({ ...before, failure: undefined, came: performance.now() }));
-      return take.current(message);
+      return sink.current(message);
     });
   }, [key]);
   return state;
 }
 
 const Ago = ({ came }) => {
-  const [, tick] = useState(0);
-  useEffect(() => {
-    const timer = setInterval(() => tick((n) => n + 1), 1000);
-    return () => clearInterval(timer);
-  }, []);
+  useTick(1);
   return duration((performance.now() - came) / 1000);
 };
 

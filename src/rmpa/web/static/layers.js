@@ -1,6 +1,7 @@
 // What a map from above is drawn of: the view, and the layers that messages become.
 
 import { count } from "./format.js";
+import { ink } from "./theme.js";
 import { SAME, angles, composed, turned } from "./frames.js";
 
 export const LAYERS = {
@@ -16,11 +17,9 @@ export const LAYERS = {
 const HUES = [192, 34, 282, 110, 338, 62, 228, 158]; // of modules
 const TRAIL = 600; // poses
 const JUMP = 1; // metres between two poses, beyond which the trail begins anew
-const OLD = 2; // seconds; or a few periods of its own
 const NEAREST = 2000,
   FARTHEST = 0.02; // pixels a metre
 
-export const ink = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 export const moduleColour = (at) => `hsl(${HUES[at % HUES.length]} 70% ${ink("color-scheme") === "light" ? 32 : 64}%)`;
 
 // x to the right and y up, in metres of the fixed frame; the size is in pixels of CSS.
@@ -106,12 +105,6 @@ export class Layer {
     picture.close();
   }
 
-  // What came once, as a latched map, is old when its publisher has gone; else after a few of its own periods.
-  isOld(now, isThere) {
-    if (!isThere) return true;
-    return this.rate > 0 && now - this.heard > Math.max(OLD, 3 / this.rate);
-  }
-
   // The picture of a grid in the colour of the text: its pixels have an opacity alone.
   tinted(colour) {
     if (this.canvas && this.tint !== colour) {
@@ -175,24 +168,28 @@ export function bounds(placed) {
   return box[0] <= box[2] ? box : null;
 }
 
+function trace(context, width, points) {
+  context.lineWidth = width;
+  context.beginPath();
+  points.forEach(([x, y], at) => (at ? context.lineTo(x, y) : context.moveTo(x, y)));
+  context.stroke();
+}
+const line = (context, width, from, to) => trace(context, width, [from, to]);
+
 export function drawGround(context, view, colours) {
   const step = niceLength(view.scale, 48);
   const [low, top] = view.from(0, 0),
     [high, bottom] = view.from(view.width, view.height);
-  context.lineWidth = 1;
   context.strokeStyle = colours.line;
-  context.beginPath();
+  const sharp = (at) => Math.round(at) + 0.5;
   for (let x = Math.ceil(low / step) * step; x < high; x += step) {
-    const [px] = view.to(x, 0);
-    context.moveTo(Math.round(px) + 0.5, 0);
-    context.lineTo(Math.round(px) + 0.5, view.height);
+    const px = sharp(view.to(x, 0)[0]);
+    line(context, 1, [px, 0], [px, view.height]);
   }
   for (let y = Math.ceil(bottom / step) * step; y < top; y += step) {
-    const [, py] = view.to(0, y);
-    context.moveTo(0, Math.round(py) + 0.5);
-    context.lineTo(view.width, Math.round(py) + 0.5);
+    const py = sharp(view.to(0, y)[1]);
+    line(context, 1, [0, py], [view.width, py]);
   }
-  context.stroke();
 }
 
 export function drawScale(context, view, colours) {
@@ -201,13 +198,8 @@ export function drawScale(context, view, colours) {
     y = view.height - 16;
   context.globalAlpha = 1;
   context.strokeStyle = context.fillStyle = colours.text;
-  context.lineWidth = 2;
-  context.beginPath();
-  context.moveTo(16, y - 6);
-  context.lineTo(16, y);
-  context.lineTo(16 + size, y);
-  context.lineTo(16 + size, y - 6);
-  context.stroke();
+  const [left, right] = [16, 16 + size];
+  trace(context, 2, [[left, y - 6], [left, y], [right, y], [right, y - 6]]); // prettier-ignore
   context.font = "13px system-ui";
   context.fillText(metres(length), 22, y - 8);
 }
@@ -230,13 +222,14 @@ const DRAW = {
   scan: (context, view, layer, place) => dots(context, view, layer.points, place, 2, 3),
   cloud: (context, view, layer, place) => dots(context, view, layer.points, place, 3, 2),
   path(context, view, { points }, place) {
-    line(context, view, place, points.length / 3, (at) => [points[3 * at], points[3 * at + 1], points[3 * at + 2]]);
+    const poses = Array.from({ length: points.length / 3 }, (_, at) => points.subarray(3 * at, 3 * at + 3));
+    way(context, view, place, poses);
   },
   pose(context, view, layer, place) {
     const { trail, head } = layer;
     context.save();
     context.globalAlpha *= 0.55;
-    line(context, view, place, trail.length, (at) => trail[at]);
+    way(context, view, place, trail);
     context.restore();
     const at = planar(composed(layer.pose, head.pose));
     const [x, y] = view.to(at.tx, at.ty);
@@ -264,25 +257,22 @@ function dots(context, view, points, { a, b, c, d, e, f, tx, ty }, step, size) {
   }
 }
 
-function line(context, view, place, points, of) {
-  context.lineWidth = 2.5;
+function way(context, view, place, poses) {
   context.lineJoin = "round";
-  context.beginPath();
-  for (let at = 0; at < points; at += 1) context[at ? "lineTo" : "moveTo"](...view.to(...apply(place, ...of(at))));
-  context.stroke();
+  trace(
+    context,
+    2.5,
+    poses.map(([x, y, z]) => view.to(...apply(place, x, y, z))),
+  );
 }
 
+const ARROW = new Path2D("M1 0 -.65 .6 -.35 0 -.65 -.6Z");
 function arrow(context, x, y, forward, left, size) {
   context.save();
   context.translate(x, y);
   context.rotate(-Math.atan2(left, forward));
-  context.beginPath();
-  context.moveTo(size, 0);
-  context.lineTo(-size * 0.65, size * 0.6);
-  context.lineTo(-size * 0.35, 0);
-  context.lineTo(-size * 0.65, -size * 0.6);
-  context.closePath();
-  context.fill();
+  context.scale(size, size);
+  context.fill(ARROW);
   context.restore();
 }
 
@@ -315,17 +305,8 @@ export function drawFrames(context, view, placed, colours) {
     const [x, y] = view.to(tx, ty);
     context.globalAlpha = old ? 0.4 : 1;
     context.strokeStyle = old ? colours.idle : colour;
-    for (const [dx, dy, size, wide] of [
-      [a, b, 22, 3],
-      [c, d, 13, 2],
-    ]) {
-      // prettier-ignore
-      context.lineWidth = wide;
-      context.beginPath();
-      context.moveTo(x, y);
-      context.lineTo(x + dx * size, y - dy * size);
-      context.stroke();
-    }
+    line(context, 3, [x, y], [x + a * 22, y - b * 22]);
+    line(context, 2, [x, y], [x + c * 13, y - d * 13]);
     const near = named.find((one) => Math.abs(one.x - x) < 90 && Math.abs(one.y - y) < 14);
     if (near) near.others += 1;
     else named.push({ name, x, y, others: 0 });

@@ -10,133 +10,107 @@ const SHAPE = 8; // rows to a column: boxes are wide, and so are screens
 const SWEEPS = 8;
 const ALIGNS = 6;
 
+// What each of `ids` has by pairs of it and something.
+function lists(ids, pairs) {
+  const made = new Map(ids.map((id) => [id, []]));
+  for (const [id, each] of pairs) made.get(id).push(each);
+  return made;
+}
+const mean = (list) => list.reduce((sum, each) => sum + each, 0) / list.length;
+const ends = ({ from, to, turned }) => (turned ? [to, from] : [from, to]);
+
 // Edges that close a cycle are turned: a depth-first walk, from those that have the most outputs and no input.
 function acyclic(ids, edges) {
-  const out = new Map(ids.map((id) => [id, []])),
-    degree = new Map(ids.map((id) => [id, 0]));
-  for (const edge of edges) {
-    out.get(edge.from).push(edge);
-    degree.set(edge.from, degree.get(edge.from) - 1);
-    degree.set(edge.to, degree.get(edge.to) + 1);
-  }
-  const place = new Map(ids.map((id, at) => [id, at]));
-  const starts = [...ids].sort((a, b) => degree.get(a) - degree.get(b) || place.get(a) - place.get(b));
-  const state = new Map();
-  for (const start of starts) {
-    if (state.has(start)) continue;
-    const stack = [[start, 0]];
-    state.set(start, 1);
-    while (stack.length) {
-      const top = stack[stack.length - 1];
-      const edge = out.get(top[0])[top[1]++];
-      if (!edge) {
-        state.set(top[0], 2);
-        stack.pop();
-      } else if (state.get(edge.to) === 1) edge.turned = true;
-      else if (!state.has(edge.to)) {
-        state.set(edge.to, 1);
-        stack.push([edge.to, 0]);
-      }
-    }
-  }
+  const out = lists(
+    ids,
+    edges.map((edge) => [edge.from, edge]),
+  );
+  const inputs = lists(
+    ids,
+    edges.map(({ from, to }) => [to, from]),
+  );
+  const degree = (id) => inputs.get(id).length - out.get(id).length;
+  const open = new Map();
+  const visit = (id) => {
+    open.set(id, true);
+    for (const edge of out.get(id))
+      if (open.get(edge.to)) edge.turned = true;
+      else if (!open.has(edge.to)) visit(edge.to);
+    open.set(id, false);
+  };
+  for (const id of [...ids].sort((a, b) => degree(a) - degree(b))) if (!open.has(id)) visit(id);
 }
 
-// The column of each vertex; what only sends stands directly before what it sends to.
+// The column of each vertex: the longest way to it; what only sends stands directly before what it sends to.
 function ranks(ids, edges) {
-  const after = new Map(ids.map((id) => [id, []])),
-    before = new Map(ids.map((id) => [id, 0]));
-  for (const { from, to, turned } of edges) {
-    const [a, b] = turned ? [to, from] : [from, to];
-    after.get(a).push(b);
-    before.set(b, before.get(b) + 1);
-  }
-  const rank = new Map(ids.map((id) => [id, 0]));
-  const left = new Map(before);
-  const queue = ids.filter((id) => !left.get(id));
-  for (let at = 0; at < queue.length; at++)
-    for (const next of after.get(queue[at])) {
-      rank.set(next, Math.max(rank.get(next), rank.get(queue[at]) + 1));
-      left.set(next, left.get(next) - 1);
-      if (!left.get(next)) queue.push(next);
-    }
+  const after = lists(ids, edges.map(ends)),
+    before = lists(
+      ids,
+      edges.map((edge) => ends(edge).reverse()),
+    );
+  const rank = new Map();
+  const of = (id) => {
+    if (!rank.has(id)) rank.set(id, Math.max(-1, ...before.get(id).map(of)) + 1);
+    return rank.get(id);
+  };
+  ids.forEach(of);
   for (const id of ids)
-    if (!before.get(id) && after.get(id).length)
-      rank.set(id, Math.min(...after.get(id).map((next) => rank.get(next))) - 1);
+    if (!before.get(id).length && after.get(id).length) rank.set(id, Math.min(...after.get(id).map(of)) - 1);
   return rank;
 }
 
 // Where many cycles make long chains, each vertex stands as near to the sources as it can instead, and the edges that
 // lead back are turned.
 function nearest(ids, edges) {
-  const after = new Map(ids.map((id) => [id, []])),
-    inputs = new Map(ids.map((id) => [id, 0]));
-  for (const { from, to } of edges) {
-    after.get(from).push(to);
-    inputs.set(to, inputs.get(to) + 1);
-  }
+  const after = lists(
+      ids,
+      edges.map(({ from, to }) => [from, to]),
+    ),
+    before = lists(
+      ids,
+      edges.map(({ from, to }) => [to, from]),
+    );
   const rank = new Map();
-  const starts = [...ids].sort((a, b) => inputs.get(a) - inputs.get(b));
-  let queue = starts.filter((id) => !inputs.get(id));
-  for (const id of queue) rank.set(id, 0);
-  for (const start of [...starts.slice(0, 1), ...starts]) {
-    if (!queue.length && !rank.has(start)) {
-      queue = [start];
-      rank.set(start, 0);
-    }
-    for (let at = 0; at < queue.length; at++)
-      for (const next of after.get(queue[at]))
-        if (!rank.has(next)) {
-          rank.set(next, rank.get(queue[at]) + 1);
-          queue.push(next);
-        }
-    queue = [];
-  }
+  const spread = (queue) => {
+    for (const id of queue) rank.set(id, 0);
+    for (const id of queue)
+      for (const next of after.get(id)) if (!rank.has(next)) rank.set(queue[queue.push(next) - 1], rank.get(id) + 1);
+  };
+  const starts = [...ids].sort((a, b) => before.get(a).length - before.get(b).length);
+  spread(starts.filter((id) => !before.get(id).length));
+  for (const id of starts) if (!rank.has(id)) spread([id]);
   for (const edge of edges) edge.turned = rank.get(edge.to) < rank.get(edge.from);
   return rank;
 }
 
 // A column with many vertices of one lane becomes several, so that the whole is as wide as it is high.
 function split(ids, rank, known) {
-  const lanes = new Set(ids.map((id) => known.get(id).lane)).size;
-  const most = Math.max(5, Math.ceil(Math.sqrt(SHAPE * ids.length) / lanes));
+  const lane = (id) => known.get(id).lane;
+  const most = Math.max(5, Math.ceil(Math.sqrt(SHAPE * ids.length) / new Set(ids.map(lane)).size));
   const counts = new Map(),
-    parts = new Map(),
-    widest = [];
+    part = new Map(),
+    first = [0]; // of the columns of each rank
   for (const id of ids) {
-    const key = `${rank.get(id)} ${known.get(id).lane}`;
-    const number = counts.get(key) || 0;
-    counts.set(key, number + 1);
-    parts.set(id, Math.floor(number / most));
-    widest[rank.get(id)] = Math.max(widest[rank.get(id)] || 0, parts.get(id));
+    const key = `${rank.get(id)} ${lane(id)}`;
+    counts.set(key, (counts.get(key) ?? -1) + 1);
+    part.set(id, Math.floor(counts.get(key) / most));
   }
-  let sum = 0;
-  const first = Array.from(widest, (wide = 0) => {
-    const at = sum;
-    sum += wide + 1;
-    return at;
-  });
-  return new Map(ids.map((id) => [id, first[rank.get(id)] + parts.get(id)]));
+  for (let at = 0; at <= Math.max(0, ...rank.values()); at++)
+    first.push(first[at] + Math.max(0, ...ids.filter((id) => rank.get(id) === at).map((id) => part.get(id))) + 1);
+  return new Map(ids.map((id) => [id, first[rank.get(id)] + part.get(id)]));
 }
 
 // Pairs of edges that cross: inversions of their ends, counted as they are inserted in order.
 function crossings(columns, place, before) {
   let sum = 0;
   for (const column of columns) {
-    const ends = column.flatMap((one) =>
-      (before.get(one) || []).map((other) => place.get(other)).sort((a, b) => a - b),
-    );
     const seen = [];
-    for (const end of ends) {
-      let low = 0,
-        high = seen.length;
-      while (low < high) {
-        const middle = (low + high) >> 1;
-        if (seen[middle] <= end) low = middle + 1;
-        else high = middle;
+    for (const one of column)
+      for (const end of (before.get(one) || []).map((other) => place.get(other)).sort((a, b) => a - b)) {
+        const at = seen.findLastIndex((each) => each <= end) + 1;
+        sum += seen.length - at;
+        seen.splice(at, 0, end);
       }
-      sum += seen.length - low;
-      seen.splice(low, 0, end);
-    }
   }
   return sum;
 }
@@ -144,24 +118,17 @@ function crossings(columns, place, before) {
 // Columns of vertices and dummies, in the order of their lanes and, within, of few crossings.
 function order(columns, before, after, lane) {
   const place = new Map();
-  const number = () => columns.forEach((column) => column.forEach((one, at) => place.set(one, at / column.length)));
-  number();
+  const number = (column) => column.forEach((one, at) => place.set(one, at / column.length));
+  columns.forEach(number);
   let best = columns.map((column) => [...column]),
     fewest = crossings(columns, place, before);
   for (let sweep = 0; sweep < SWEEPS && fewest; sweep++) {
     const down = sweep % 2 === 0;
     for (const column of down ? columns : [...columns].reverse()) {
-      const wanted = new Map(
-        column.map((one) => {
-          const near = (down ? before : after).get(one) || [];
-          return [
-            one,
-            near.length ? near.reduce((sum, each) => sum + place.get(each), 0) / near.length : place.get(one),
-          ];
-        }),
-      );
+      const near = (one) => ((down ? before : after).get(one) || []).map((other) => place.get(other));
+      const wanted = new Map(column.map((one) => [one, near(one).length ? mean(near(one)) : place.get(one)]));
       column.sort((a, b) => lane(a) - lane(b) || wanted.get(a) - wanted.get(b) || place.get(a) - place.get(b));
-      column.forEach((one, at) => place.set(one, at / column.length));
+      number(column);
     }
     const now = crossings(columns, place, before);
     if (now < fewest) [fewest, best] = [now, columns.map((column) => [...column])];
@@ -205,18 +172,16 @@ export function layout(vertices, edges, lanes, before, gap = GAP.column) {
     known,
   );
   const boxes = new Map(known);
-  const inputs = new Map(),
-    outputs = new Map();
+  const [inputs, outputs] = [new Map(), new Map()];
   const columns = Array.from({ length: Math.max(0, ...rank.values()) + 1 }, () => []);
   for (const id of ids) columns[rank.get(id)].push(id);
+  const add = (map, key, value) => map.set(key, [...(map.get(key) || []), value]);
   const join = (a, b) => {
-    if (!outputs.has(a)) outputs.set(a, []);
-    if (!inputs.has(b)) inputs.set(b, []);
-    outputs.get(a).push(b);
-    inputs.get(b).push(a);
+    add(outputs, a, b);
+    add(inputs, b, a);
   };
   links.forEach((edge, number) => {
-    const [a, b] = edge.turned ? [edge.to, edge.from] : [edge.from, edge.to];
+    const [a, b] = ends(edge);
     edge.chain = [a];
     for (let at = rank.get(a) + 1; at < rank.get(b); at++) {
       const dummy = `\u0000${number} ${at}`;
@@ -246,29 +211,16 @@ function drawn({ ordered, lanes, boxes, inputs, outputs, links, known, gap }) {
     top += tall + GAP.title + 12 + GAP.lane;
   }
   const y = new Map();
-  for (const { parts, low, high } of bands)
-    for (const part of parts) {
-      const start = (low + high - height(part)) / 2;
-      let sum = start;
-      for (const id of part) {
-        y.set(id, sum + boxes.get(id).h / 2);
-        sum += boxes.get(id).h + GAP.row;
-      }
-    }
-  for (let turn = 0; turn < ALIGNS; turn++)
+  for (let turn = -1; turn < ALIGNS; turn++)
     for (const { parts, low, high } of bands)
       for (const part of turn % 2 ? [...parts].reverse() : parts) {
-        if (!part.length) continue;
         const wanted = part.map((id) => {
           const near = [...(inputs.get(id) || []), ...(outputs.get(id) || [])].map((other) => y.get(other));
-          return near.length ? near.reduce((all, each) => all + each, 0) / near.length : y.get(id);
+          if (turn < 0) return (low + high) / 2;
+          return near.length ? mean(near) : y.get(id);
         });
-        settle(
-          wanted,
-          part.map((id) => boxes.get(id).h),
-          low,
-          high,
-        ).forEach((at, index) => y.set(part[index], at));
+        const sizes = part.map((id) => boxes.get(id).h);
+        settle(wanted, sizes, low, high).forEach((at, index) => y.set(part[index], at));
       }
   const x = [];
   let right = 16;
@@ -282,13 +234,7 @@ function drawn({ ordered, lanes, boxes, inputs, outputs, links, known, gap }) {
   const paths = links.map((edge) => ({ ...edge, points: points(edge, at, boxes) }));
   for (const id of [...at.keys()]) if (!known.has(id)) at.delete(id);
   const width = Math.max(right - gap + 16, 120);
-  return {
-    at,
-    paths,
-    lanes: bands.map(({ name, y: from, h }) => ({ name, y: from, h })),
-    width,
-    height: top - GAP.lane,
-  };
+  return { at, paths, lanes: bands, width, height: top - GAP.lane };
 }
 
 // From the side of the one box to the side of the other, through the dummies.

@@ -2,26 +2,26 @@
 
 import { html, useLayoutEffect, useRef, useState } from "./markup.js";
 import { bandwidth, bytes, clock, hertz } from "./format.js";
-import { Fresh, useOld, useWatch as useBeat } from "./fresh.js";
+import { Fresh, useOld, useWatch } from "./fresh.js";
 import { Choice, Failure, Mark, Panel } from "./parts.js";
 import { section } from "./state.js";
-import { Plot, append } from "./plot.js";
+import { Plot, append, figure, toggled } from "./plot.js";
 import { LAYERS } from "./layers.js";
 import { TopicMap } from "./pages/map.js";
 import { MessageTree } from "./tree.js";
 
 export const IMAGES = ["sensor_msgs/Image", "sensor_msgs/CompressedImage"];
-const MOST_LINES = 8;
+const SWITCH = [
+  [false, "Off"],
+  [true, "On"],
+];
 
 export function Live({ connection, topic, type, state }) {
   const [on, setOn] = useState(false);
   const [old, setOld] = useState(false);
   const [fields, setFields] = useState([]);
   const view = IMAGES.includes(type) ? "image" : type in LAYERS || type === "geometry_msgs/Pose" ? "map" : "";
-  const toggle = (path) =>
-    setFields((before) =>
-      before.includes(path) ? before.filter((each) => each !== path) : [...before, path].slice(-MOST_LINES),
-    );
+  const toggle = (path) => setFields((before) => toggled(before, path));
   const shared = { connection, topic, onOld: setOld };
   return html`<${Panel}
     title="Live"
@@ -33,10 +33,7 @@ export function Live({ connection, topic, type, state }) {
           setOn(next);
           setOld(false);
         }}
-        options=${[
-          [false, "Off"],
-          [true, "On"],
-        ]}
+        options=${SWITCH}
       />`}
   >
     ${!on
@@ -53,12 +50,6 @@ export function Live({ connection, topic, type, state }) {
           <${Value} ...${shared} chosen=${fields} onChoose=${toggle} />
         </div>`}<//
   >`;
-}
-
-function useWatch(connection, wanted, take) {
-  const sink = useRef(take);
-  sink.current = take;
-  return useBeat(connection, wanted, sink);
 }
 
 export function Value({ connection, topic, chosen, onChoose, onOld }) {
@@ -81,14 +72,13 @@ export function Fields({ connection, topic, fields, onOld }) {
     append(data.current, message.columns);
     grow((n) => n + 1);
   });
-  const number = (value) => (value === null || value === undefined ? "–" : Number(value.toPrecision(5)).toString());
   return html`<div class="wide">
-    <${Fresh} watched=${watched} onOld=${onOld}
+    <${Fresh} ...${{ watched, onOld }}
       ><${Failure} failure=${watched.failure} /><${Plot}
         labels=${fields}
         data=${data.current}
         version=${version}
-        format=${number}
+        format=${figure}
         label="Fields"
     /><//>
   </div>`;
@@ -151,7 +141,7 @@ export function Image({ connection, topic, type, state, onOld }) {
       ? `${bandwidth(watched.beat.bandwidth)} cross the mesh from ${from.join(", ")} for it. `
       : "";
   return html`<figure class="wide" ref=${place}>
-    <${Fresh} watched=${watched} onOld=${onOld}
+    <${Fresh} ...${{ watched, onOld }}
       ><${Failure} failure=${watched.failure} /><canvas
         class="view"
         ref=${canvas}

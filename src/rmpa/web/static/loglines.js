@@ -1,11 +1,13 @@
 // Lines of the log of all modules or of some: asked for while a page shows them, and it is seen.
 
-import { html, useEffect, useRef, useState } from "./markup.js";
+import { html, memo, useEffect, useRef, useState } from "./markup.js";
+import { useAgain } from "./asking.js";
 import { clock, seconds } from "./format.js";
-import { Failure, Mark, ModuleLink, NodeLink, memo, nodeKey } from "./parts.js";
+import { Failure, Mark } from "./parts.js";
+import { ModuleLink, NodeLink, nodeKey } from "./links.js";
 
 const KEPT = 500; // lines of a page
-const PERIOD = 1000; // ms from an answer to the next question
+const PERIOD = 1; // seconds from an answer to the next question
 const MARKS = { debug: "", info: "OK", warn: "WARN", error: "ERROR", fatal: "ERROR" };
 const SURE = 1e-3; // s; a bound of a line's time that is smaller is not shown
 
@@ -14,33 +16,18 @@ const SURE = 1e-3; // s; a bound of a line's time that is smaller is not shown
 export function useLog(connection, wanted, held = false) {
   const [state, set] = useState({ lines: [], problems: [] });
   const after = useRef({});
-  const open = connection.phase === "open";
   const key = JSON.stringify(wanted);
   useEffect(() => {
     after.current = {};
     set({ lines: [], problems: [], waits: true });
   }, [key]);
-  useEffect(() => {
-    if (held || !open) return undefined;
-    let ended = false,
-      timer;
-    const ask = async (first) => {
-      if (first || !document.hidden) {
-        const told = await connection.ask("log", { ...wanted, after: after.current }).then(
-          (value) => ({ value }),
-          (failure) => ({ failure }),
-        );
-        if (ended) return;
-        set((before) => merged(before, told, after.current));
-      }
-      timer = setTimeout(ask, PERIOD);
-    };
-    ask(true);
-    return () => {
-      ended = true;
-      clearTimeout(timer);
-    };
-  }, [key, held, open]);
+  useAgain(!held && connection.phase === "open", PERIOD, key, async (still) => {
+    const told = await connection.ask("log", { ...wanted, after: after.current }).then(
+      (value) => ({ value }),
+      (failure) => ({ failure }),
+    );
+    if (still()) set((before) => merged(before, told, after.current));
+  });
   return state;
 }
 

@@ -1,11 +1,13 @@
 // The first page: all modules on a ring, their links, and what flows.
 
-import { html, useEffect, useRef, useState } from "./markup.js";
+import { html, memo, useEffect, useRef, useState } from "./markup.js";
 import { bandwidth, hertz, seconds } from "./format.js";
 import { entries, section } from "./state.js";
 import { Outside } from "./outside.js";
 import { CENTRE, SIZE, arrange, chord, emptyRing, geometry, outside, place } from "./ring.js";
-import { Link, Mark, Page, Panel, Since, Table, href, known, memo, shape } from "./parts.js";
+import { Mark, Page, Panel, Since, known, shape } from "./parts.js";
+import { Table } from "./lists.js";
+import { Link, href } from "./links.js";
 
 const SPEEDS = [
   [0, "still"],
@@ -23,11 +25,8 @@ const width = (bytes) => Math.min(9, 2 + Math.max(0, Math.log10((bytes || 0) / 1
 // What moves is a picture of its own beneath the others, which are not drawn again with it.
 const Stream = memo(({ flow, a, b, geo, both }) => {
   const line = chord(a, b, geo.node, both ? 9 : 0);
-  return html`<path
-    class="stream ${flow.by === "resource" ? "declared" : ""}"
-    d=${line.d}
-    stroke-width=${width(flow.bandwidth)}
-  />`;
+  const look = `stream ${flow.by === "resource" ? "declared" : ""}`;
+  return html`<path class=${look} d=${line.d} stroke-width=${width(flow.bandwidth)} />`;
 });
 
 const Flow = memo(({ flow, from, to, a, b, geo, both, labelled, compact }) => {
@@ -36,20 +35,16 @@ const Flow = memo(({ flow, from, to, a, b, geo, both, labelled, compact }) => {
   const label = line.at(geo.slots > 8 ? 0.16 : far ? 0.33 : 0.5); // near its source, where chords are apart
   const text = flow.rate === undefined ? "" : hertz(flow.rate);
   labelled = labelled && !(compact && geo.slots > 6 && flow.by === "resource");
+  const rates = labelled && !compact && text && geo.slots <= 8 && flow.bandwidth;
   return html`<g class="flow ${flow.by === "resource" ? "declared" : ""}">
     <title>${from} to ${to}: ${text || "rate not known"}, ${flow.topics.join(", ")}</title>
     <path class="pipe" d=${line.d} stroke-width=${width(flow.bandwidth) + 4} marker-end="url(#arrow)" />
     ${labelled && text && html`<text class="rate" x=${label.x} y=${label.y + 6}>${text}</text>`}
-    ${labelled &&
-    !compact &&
-    text &&
-    geo.slots <= 8 &&
-    flow.bandwidth &&
-    html`<text class="minor" x=${label.x} y=${label.y + 30}>${bandwidth(flow.bandwidth)}</text>`}
+    ${rates && html`<text class="minor" x=${label.x} y=${label.y + 30}>${bandwidth(flow.bandwidth)}</text>`}
   </g>`;
 });
 
-const Streams = ({ flows, at, both, geo, moves }) => {
+const Streams = ({ flows, moves }) => {
   const picture = useRef();
   useEffect(() => {
     if (!moves) return undefined;
@@ -63,19 +58,7 @@ const Streams = ({ flows, at, both, geo, moves }) => {
     return () => clearInterval(timer);
   }, [moves]);
   const of = (speed) =>
-    flows
-      .filter(([, , flow]) => speedOf(flow.rate || 0) === speed)
-      .map(
-        ([from, to, flow]) =>
-          html`<${Stream}
-            key=${`${from}>${to}`}
-            flow=${flow}
-            a=${at(from)}
-            b=${at(to)}
-            geo=${geo}
-            both=${both(from, to)}
-          />`,
-      );
+    flows.filter(({ flow }) => speedOf(flow.rate || 0) === speed).map((one) => html`<${Stream} ...${one} />`);
   return html`<svg ref=${picture} class="streams" viewBox="0 0 ${SIZE} ${SIZE}" aria-hidden="true">
     ${SPEEDS.map(([, speed]) => html`<g key=${speed} class=${speed}>${of(speed)}</g>`)}
   </svg>`;
@@ -125,27 +108,29 @@ const Module = memo(({ name, module, at, geo, resources, alarms, compact }) => {
   const level = worst(resources);
   const label = small ? outside(at, geo) : { x: at.x, y: at.y - (compact ? 22 : 16), anchor: "middle" };
   const mark = small ? (geo.node > 30 ? 24 : 18) : compact ? 32 : 20;
+  const markBox = {
+    x: at.x - mark / 2,
+    y: at.y - mark / 2 + (small ? 0 : compact ? 18 : 13),
+    width: mark,
+    height: mark,
+  };
   const limit = compact ? 9 : small ? 12 : geo.slots > 8 ? 9 : 11;
   const short = name.length > limit ? `${name.slice(0, limit - 1)}…` : name;
-  const word = small
-    ? ""
-    : profile && !["away", "linking", "lost"].includes(module.state)
-      ? profile.slice(0, limit)
-      : compact && module.state === "here"
-        ? "here"
-        : about.word;
+  const running = profile && !["away", "linking", "lost"].includes(module.state) && profile.slice(0, limit);
+  const word = small ? "" : running || (compact && module.state === "here" ? "here" : about.word);
   // The name begins with the text that is seen, so that a user can say what they see.
-  const said = [
+  const quality = level && `quality ${known(level).word}`;
+  const bell = alarms && `${alarms} alarm${alarms > 1 ? "s" : ""}`;
+  const parts = [
     short,
     word,
-    alarms && `${alarms} alarm${alarms > 1 ? "s" : ""}`,
+    bell,
     short !== name && name,
     `link ${about.word}`,
     profile && `profile ${profile}`,
-    level && `quality ${known(level).word}`,
-  ]
-    .filter(Boolean)
-    .join(", ");
+    quality,
+  ];
+  const said = parts.filter(Boolean).join(", ");
   return html`<a
     class="module ${module.state} ${about.tone}"
     href=${href("module", name)}
@@ -156,17 +141,7 @@ const Module = memo(({ name, module, at, geo, resources, alarms, compact }) => {
     <circle class="body" cx=${at.x} cy=${at.y} r=${geo.node} />
     ${resources.length > 0 && html`<${Arcs} at=${at} geo=${geo} resources=${resources} />`}
     <text class="name" x=${label.x} y=${label.y} text-anchor=${label.anchor}>${short}</text>
-    <g class="state"
-      ><svg
-        x=${at.x - mark / 2}
-        y=${at.y - mark / 2 + (small ? 0 : compact ? 18 : 13)}
-        width=${mark}
-        height=${mark}
-        viewBox="0 0 16 16"
-      >
-        ${shape(module.state)}
-      </svg></g
-    >
+    <g class="state"><svg ...${markBox} viewBox="0 0 16 16">${shape(module.state)}</svg></g>
     ${" "}${!small && html`<text class="word" x=${at.x} y=${at.y + (compact ? 66 : 46)}>${word}</text>`}
     ${" "}${alarms > 0 &&
     html`<g class="bell" transform="translate(${at.x + geo.node * 0.72} ${at.y - geo.node * 0.72})"
@@ -199,33 +174,23 @@ function useQuery(text) {
   return matches;
 }
 
-const fixed = new Map(); // one object for each place, so that what did not move is not drawn again
-function point(slot, geo) {
-  const key = `${slot} ${geo.slots} ${geo.node}`;
-  if (!fixed.has(key)) fixed.set(key, place(slot, geo));
-  return fixed.get(key);
+// The same object for the same arguments, so that what did not move is not drawn again.
+function cached(make) {
+  const made = new Map();
+  return (...given) => {
+    const key = JSON.stringify(given);
+    if (!made.has(key)) made.set(key, make(...given));
+    return made.get(key);
+  };
 }
-const shapes = new Map();
-function sizes(slots, compact) {
-  const key = `${slots} ${compact}`;
-  if (!shapes.has(key)) shapes.set(key, geometry(slots, compact));
-  return shapes.get(key);
-}
-const lists = new Map();
-function same(key, list) {
-  const before = lists.get(key);
-  if (
-    before &&
-    before.length === list.length &&
-    before.every((each, at) => each[0] === list[at][0] && each[1] === list[at][1])
-  )
-    return before;
-  lists.set(key, list);
-  return list;
-}
+const point = cached(place);
+const sizes = cached(geometry);
 
 const around = emptyRing();
 const arranged = (state) => arrange(around, section(state, "agent").name, Object.keys(section(state, "modules")));
+
+const SQUARE = { viewBox: "0 0 8 8", refX: 6.5, refY: 4, markerWidth: 14, markerHeight: 14 };
+const MARKER = { ...SQUARE, markerUnits: "userSpaceOnUse", orient: "auto" };
 
 export function Ring({ state, current }) {
   const compact = useQuery("(max-width: 640px)");
@@ -238,16 +203,18 @@ export function Ring({ state, current }) {
     .sort((a, b) => places[a] - places[b]);
   const at = (name) => point(places[name], geo);
   const own = section(state, "agent").name;
+  const both = (from, to) => `${to}>${from}` in section(state, "flows");
   const flows = entries(state, "flows")
-    .map(([key, flow]) => [...key.split(">"), flow])
-    .filter(([from, to]) => from in places && to in places);
+    .map(([key, flow]) => [key, ...key.split(">"), flow])
+    .filter(([, from, to]) => from in places && to in places)
+    .map(([key, from, to, flow]) => ({ key, from, to, flow, geo, a: at(from), b: at(to), both: both(from, to) }));
   const resources = entries(state, "resources");
   const alarms = entries(state, "alarms");
   const labelled = names.length <= 16;
   const taken = new Set(names.map((name) => places[name]));
-  const both = (from, to) => `${to}>${from}` in section(state, "flows");
+  const vacant = Array.from({ length: geo.slots }, (_, slot) => slot).filter((slot) => !taken.has(slot));
   return html`<div class="ring">
-    <${Streams} flows=${flows} at=${at} both=${both} geo=${geo} moves=${current && !still && flows.length > 0} />
+    <${Streams} flows=${flows} moves=${current && !still && flows.length > 0} />
     <svg
       class="mandala ${compact ? "compact" : ""} ${geo.slots > 8 ? "many" : ""}"
       viewBox="0 0 ${SIZE} ${SIZE}"
@@ -256,71 +223,28 @@ export function Ring({ state, current }) {
       onKeyDown=${(event) => step(event, names)}
     >
       <defs>
-        <marker
-          id="arrow"
-          viewBox="0 0 8 8"
-          refX="6.5"
-          refY="4"
-          markerWidth="14"
-          markerHeight="14"
-          markerUnits="userSpaceOnUse"
-          orient="auto"
-        >
+        <marker id="arrow" ...${MARKER}>
           <path class="head" d="M.8.8 7 4 .8 7.2 2.6 4Z" />
         </marker>
       </defs>
       <circle class="dial" cx=${CENTRE} cy=${CENTRE} r=${geo.ring} />
-      ${Array.from({ length: geo.slots }, (_, slot) => slot)
-        .filter((slot) => !taken.has(slot))
-        .map(
-          (slot) => html`<circle key=${slot} class="vacant" cx=${point(slot, geo).x} cy=${point(slot, geo).y} r="5" />`,
-        )}
+      ${vacant
+        .map((slot) => point(slot, geo))
+        .map(({ x, y }, key) => html`<circle key=${key} class="vacant" cx=${x} cy=${y} r="5" />`)}
       <g>
         ${names
           .filter((name) => name !== own)
-          .map(
-            (name) =>
-              html`<${Wire}
-                key=${name}
-                module=${modules[name]}
-                a=${at(own)}
-                b=${at(name)}
-                geo=${geo}
-                labelled=${labelled && !compact}
-              />`,
-          )}
+          .map((name) => ({ key: name, module: modules[name], a: at(own), b: at(name), geo }))
+          .map((wire) => html`<${Wire} ...${wire} labelled=${labelled && !compact} />`)}
       </g>
-      <g>
-        ${flows.map(
-          ([from, to, flow]) =>
-            html`<${Flow}
-              key=${`${from}>${to}`}
-              from=${from}
-              to=${to}
-              flow=${flow}
-              a=${at(from)}
-              b=${at(to)}
-              geo=${geo}
-              labelled=${labelled}
-              compact=${compact}
-              both=${both(from, to)}
-            />`,
-        )}
-      </g>
+      <g>${flows.map((one) => html`<${Flow} ...${{ ...one, labelled, compact }} />`)}</g>
       <g>
         ${names.map(
           (name) =>
             html`<${Module}
               key=${name}
-              name=${name}
-              module=${modules[name]}
-              at=${at(name)}
-              geo=${geo}
-              compact=${compact}
-              resources=${same(
-                name,
-                resources.filter(([, one]) => one.module === name),
-              )}
+              ...${{ name, geo, compact, module: modules[name], at: at(name) }}
+              resources=${resources.filter(([, one]) => one.module === name)}
               alarms=${alarms.filter(([, one]) => one.module === name).length}
             />`,
         )}
@@ -340,10 +264,11 @@ export function costs(lost) {
   return `${stopped}${rest}${kept}${lost.dropped ? `; ${count(lost.dropped, "message")} dropped` : ""}`;
 }
 
+const some = (names) => `${names.slice(0, 3).join(", ")}${names.length > 3 ? " …" : ""}`;
+
 // What nodes say on /diagnostics: each error, and a line for all warnings.
 function diagnosed({ errors, more, warnings = [], stale = [], problems = [] }, own, modules) {
   const to = href("diagnostics");
-  const some = (names) => `${names.slice(0, 3).join(", ")}${names.length > 3 ? " …" : ""}`;
   // What a module said whose link is lost is old, which the line of the module says already.
   const here = (module) => !module || !["lost", "away"].includes(modules[module]?.state);
   const those = (list) => list.filter(([module]) => here(module)).map(([, name]) => name);
@@ -368,83 +293,41 @@ const count = (number, one, several = `${one}s`) => `${number} ${number > 1 ? se
 
 function concerns(state) {
   const found = [];
-  for (const [id, alarm] of entries(state, "alarms"))
-    found.push({
-      id,
-      level: alarm.level,
-      text: alarm.text,
-      who: alarm.resource || alarm.module,
-      to: alarm.resource ? href("resource", alarm.resource) : href("alarms"),
-      since: alarm.at,
-    });
-  for (const [name, module] of entries(state, "modules")) {
-    if (module.state !== "up" && module.state !== "here" && module.state !== "relayed")
-      found.push({
-        id: `m${name}`,
-        level: { refused: "ERROR", lost: "ERROR", away: "STALE" }[module.state] || "WARN",
-        text: `${known(module.state).word}${module.error ? `: ${module.error}` : ""}${costs(module.lost)}`,
-        who: name,
-        to: href("module", name),
-        since: module.since,
-      });
-    else if (module.error)
-      found.push({ id: `m${name}`, level: "WARN", text: module.error, who: name, to: href("module", name) });
+  const say = (id, level, who, text, to, since) => found.push({ id, level, who, text, to, since });
+  for (const [id, { level, text, resource, module, at }] of entries(state, "alarms"))
+    say(id, level, resource || module, text, resource ? href("resource", resource) : href("alarms"), at);
+  for (const [name, { state: link, error, lost, since }] of entries(state, "modules")) {
+    const to = href("module", name);
+    if (["up", "here", "relayed"].includes(link)) {
+      if (error) say(`m${name}`, "WARN", name, error, to);
+      continue;
+    }
+    const level = { refused: "ERROR", lost: "ERROR", away: "STALE" }[link] || "WARN";
+    say(`m${name}`, level, name, `${known(link).word}${error ? `: ${error}` : ""}${costs(lost)}`, to, since);
   }
   found.push(...diagnosed(section(state, "diagnostics"), section(state, "agent").name, section(state, "modules")));
   const troubled = new Map(); // many topics have one trouble when a module is lost: that is one line
   for (const [name, topic] of entries(state, "topics"))
     if (topic.problem) troubled.set(topic.problem, [...(troubled.get(topic.problem) || []), name]);
-  for (const [text, names] of troubled) {
-    const several = names.length > 1;
-    found.push({
-      id: `t${text}`,
-      level: "WARN",
-      text: several ? `${text}: ${names.slice(0, 3).join(", ")}${names.length > 3 ? " …" : ""}` : text,
-      who: several ? `${names.length} topics` : names[0],
-      to: several ? href("topics") : href("topic", names[0]),
-    });
-  }
+  for (const [text, names] of troubled)
+    if (names.length > 1) say(`t${text}`, "WARN", `${names.length} topics`, `${text}: ${some(names)}`, href("topics"));
+    else say(`t${text}`, "WARN", names[0], text, href("topic", names[0]));
   const pending = entries(state, "outside").filter(([, one]) => one.state === "pending");
-  if (pending.length)
-    found.push({
-      id: "pending",
-      level: "WARN",
-      text: "pending: an invitation is needed for a link; see Not in this mesh",
-      who: pending.map(([, one]) => one.name).join(", "),
-      to: href(""),
-    });
+  const invite = "pending: an invitation is needed for a link; see Not in this mesh";
+  if (pending.length) say("pending", "WARN", pending.map(([, one]) => one.name).join(", "), invite, href(""));
   for (const note of state.notes || [])
-    found.push({
-      id: `n${note}`,
-      level: "WARN",
-      text: note,
-      who: "the agent",
-      to: href("module", section(state, "agent").name),
-    });
+    say(`n${note}`, "WARN", "the agent", note, href("module", section(state, "agent").name));
   return found.sort((a, b) => LEVELS.indexOf(a.level) - LEVELS.indexOf(b.level)); // of one level: causes first
 }
 
 export function Concerns({ state, connection }) {
   const found = concerns(state);
   const reach = section(state, "reach");
+  const first = (id, who, text, since) =>
+    found.unshift({ id, level: "ERROR", who, text, to: location.hash || "#/", since });
   if (connection.phase === "lost")
-    found.unshift({
-      id: "lost",
-      level: "ERROR",
-      who: "rmpa web",
-      text: "no connection: the page shows what was last known",
-      to: location.hash || "#/",
-      since: connection.lostAt / 1000,
-    });
-  else if (reach.ok === false)
-    found.unshift({
-      id: "mute",
-      level: "ERROR",
-      who: "the agent",
-      text: `does not answer: ${reach.error}`,
-      to: location.hash || "#/",
-      since: reach.since,
-    });
+    first("lost", "rmpa web", "no connection: the page shows what was last known", connection.lostAt / 1000);
+  else if (reach.ok === false) first("mute", "the agent", `does not answer: ${reach.error}`, reach.since);
   if (!found.length) return html`<p class="well"><${Mark} state="OK" word="Nothing is wrong." /></p>`;
   return html`<ul class="concerns">
     ${found.slice(0, 50).map(
@@ -459,34 +342,32 @@ export function Concerns({ state, connection }) {
   </ul>`;
 }
 
-const Row = memo(
-  ({ name, module, resources }) =>
-    html`<tr>
-      <th scope="row"><${Link} page="module" name=${name} /></th>
-      <td><${Mark} state=${module.state} /></td>
-      <td class="number">${seconds(module.rtt)}</td>
-      <td class="number">${bandwidth(module.bytes_in)}</td>
-      <td class="number">${bandwidth(module.bytes_out)}</td>
-      <td>
-        ${resources.map(
-          ([key, one]) =>
-            html`<div key=${key}>
-              <a href=${href("resource", key)}><${Mark} state=${one.level} word=${one.profile || "no profile"} /></a>
-            </div>`,
-        )}
-      </td>
-    </tr>`,
-);
-
-const FlowRow = memo(
-  ({ from, to, flow }) =>
-    html`<tr>
-      <th scope="row">${from} → ${to}</th>
-      <td class="number">${hertz(flow.rate)}</td>
-      <td class="number">${bandwidth(flow.bandwidth)}</td>
-      <td>${flow.topics.map((topic, at) => html`${at > 0 && ", "}<a href=${href("topic", topic)}>${topic}</a>`)}</td>
-    </tr>`,
-);
+const MODULES = [
+  ["Module", ([name]) => html`<${Link} page="module" name=${name} />`],
+  ["Link", ([, module]) => html`<${Mark} state=${module.state} />`],
+  ["#Round trip", ([, module]) => seconds(module.rtt)],
+  ["#In", ([, module]) => bandwidth(module.bytes_in)],
+  ["#Out", ([, module]) => bandwidth(module.bytes_out)],
+  [
+    "Profile",
+    ([, , resources]) =>
+      resources.map(
+        ([key, one]) =>
+          html`<div key=${key}>
+            <a href=${href("resource", key)}><${Mark} state=${one.level} word=${one.profile || "no profile"} /></a>
+          </div>`,
+      ),
+  ],
+];
+const FLOWS = [
+  ["From → to", ([key]) => key.replace(">", " → ")],
+  ["#Messages", ([, flow]) => hertz(flow.rate)],
+  ["#Bytes", ([, flow]) => bandwidth(flow.bandwidth)],
+  [
+    "Topics",
+    ([, flow]) => flow.topics.map((topic, at) => html`${at > 0 && ", "}<a href=${href("topic", topic)}>${topic}</a>`),
+  ],
+];
 
 export function Mandala({ state, connection }) {
   const current = connection.phase !== "lost" && section(state, "reach").ok !== false;
@@ -499,7 +380,9 @@ export function Mandala({ state, connection }) {
     (each) => !["relayed", "lost"].includes(each) || modules.some(([, one]) => one.state === each),
   );
   const { places } = arranged(state);
-  const ordered = modules.sort(([a], [b]) => (places[a] ?? 1e9) - (places[b] ?? 1e9));
+  const ordered = modules
+    .sort(([a], [b]) => (places[a] ?? 1e9) - (places[b] ?? 1e9))
+    .map(([name, module]) => [name, module, resources.filter(([, one]) => one.module === name)]);
   return html`<${Page}
     title="Mesh"
     kind=${`Domain ${domain} · ${up} of ${total} modules up${current ? "" : " when last heard of"}`}
@@ -517,39 +400,16 @@ export function Mandala({ state, connection }) {
         <${Panel} title="What is wrong"><${Concerns} state=${state} connection=${connection} /><//>
         <${Outside} state=${state} connection=${connection} />
         <${Panel} title="Modules"
-          ><${Table}
-            caption="Modules"
-            columns=${["Module", "Link", "#Round trip", "#In", "#Out", "Profile"]}
-            list=${ordered}
-          >
-            ${([name, module]) =>
-              html`<${Row}
-                key=${name}
-                name=${name}
-                module=${module}
-                resources=${same(
-                  `row ${name}`,
-                  resources.filter(([, one]) => one.module === name),
-                )}
-              />`}<//
-          >
-          ${total > modules.length &&
+          ><${Table} caption="Modules" columns=${MODULES} list=${ordered} /> ${total > modules.length &&
           html`<p class="empty">The server leaves out ${total - modules.length} further modules.</p>`}<//
         >
         <${Panel} title="Flows"
           ><${Table}
             caption="Flows between modules"
-            columns=${["From → to", "#Messages", "#Bytes", "Topics"]}
+            columns=${FLOWS}
             empty="No messages cross at present."
             list=${entries(state, "flows")}
-          >
-            ${([key, flow]) => {
-              const [from, to] = key.split(">");
-              return html`<${FlowRow} key=${key} from=${from} to=${to} flow=${flow} />`;
-            }}<//
-          ><//
-        >
-      </div>
-    </div><//
-  >`;
+        /><//>
+      </div></div
+  ><//>`;
 }

@@ -1,19 +1,11 @@
 // What all pages are written with: Preact, and templates whose texts can be read. Names and values come from other
 // programs: a character that is not seen, or that turns the reading direction, is drawn as its code.
 
-import { html as template } from "./vendor/htm-preact.js";
+import { Component, html as template } from "./vendor/htm-preact.js";
 import { plain } from "./format.js";
 
-export {
-  Component,
-  createContext,
-  render,
-  useContext,
-  useEffect,
-  useLayoutEffect,
-  useRef,
-  useState,
-} from "./vendor/htm-preact.js";
+export { Component, createContext, render, useContext } from "./vendor/htm-preact.js";
+export { useEffect, useLayoutEffect, useRef, useState } from "./vendor/htm-preact.js";
 
 const TEXTS = ["aria-label", "title", "placeholder"];
 const done = new WeakSet(); // a part of a template is often a template of its own
@@ -31,3 +23,21 @@ function legible(node) {
 }
 
 export const html = (...parts) => legible(template(...parts));
+
+// Lists with the same elements are the same.
+const same = (a, b) =>
+  a === b ||
+  (Array.isArray(a) && Array.isArray(b) && a.length === b.length && a.every((each, at) => same(each, b[at])));
+
+// Draws again only when one of its properties is another object.
+export function memo(draw) {
+  return class extends Component {
+    shouldComponentUpdate(next) {
+      const keys = Object.keys({ ...next, ...this.props });
+      return keys.some((key) => key !== "children" && !same(next[key], this.props[key]));
+    }
+    render(props) {
+      return draw(props);
+    }
+  };
+}

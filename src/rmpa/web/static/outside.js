@@ -1,6 +1,7 @@
 // Modules that are heard and are not of this mesh: why, and the line or the button that lets one in.
 
 import { html, useState } from "./markup.js";
+import { useAsk } from "./asking.js";
 import { entries } from "./state.js";
 import { Failure, Mark, Panel, Since } from "./parts.js";
 
@@ -17,14 +18,8 @@ export function Outside({ state, connection }) {
 }
 
 function Knocking({ one, connection }) {
-  const [state, set] = useState({});
-  const invite = () => {
-    set({ waits: true });
-    connection.ask("invite", { name: one.name }).then(
-      (value) => set({ value }),
-      (failure) => set({ failure }),
-    );
-  };
+  const [state, ask] = useAsk(connection);
+  const invite = () => ask("invite", { name: one.name });
   const [fact, ...remedy] = one.text.replace(`${one.state}: `, "").split("; ");
   const [before, after] = remedy.join("; ").split(one.invite || "\n");
   return html`<li>

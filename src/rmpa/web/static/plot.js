@@ -2,7 +2,9 @@
 // newest figures as text.
 
 import { html, useEffect, useRef, useState } from "./markup.js";
+import { ink, onTheme } from "./theme.js";
 
+const LINES = 8; // of a plot
 const KEPT = 600; // samples of each line
 const DASHES = [[], [7, 4], [2, 3], [10, 3, 2, 3]];
 
@@ -24,16 +26,15 @@ function library() {
   return loading;
 }
 
-const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const COLOURS = ["--accent", "--good", "--warn", "--bad", "--idle", "--text"];
 
 const time = (value) => new Date(value * 1000).toLocaleTimeString("en-GB");
 
 function options(labels, format, width, zero) {
   const axis = {
-    stroke: colour("--muted"),
-    grid: { stroke: colour("--line"), width: 1 },
-    ticks: { stroke: colour("--line"), width: 1 },
+    stroke: ink("--muted"),
+    grid: { stroke: ink("--line"), width: 1 },
+    ticks: { stroke: ink("--line"), width: 1 },
     font: "12px system-ui",
   };
   return {
@@ -49,7 +50,7 @@ function options(labels, format, width, zero) {
       { value: (_, value) => (value ? time(value) : "–") },
       ...labels.map((label, at) => ({
         label,
-        stroke: colour(COLOURS[at % COLOURS.length]),
+        stroke: ink(COLOURS[at % COLOURS.length]),
         width: 1.6,
         dash: DASHES[Math.floor(at / COLOURS.length) % DASHES.length],
         points: { show: false },
@@ -59,6 +60,11 @@ function options(labels, format, width, zero) {
   };
 }
 
+export const figure = (value) => (value === null || value === undefined ? "–" : String(Number(value.toPrecision(5))));
+// The lines of a plot with another one, or without one that was there.
+export const toggled = (lines, one) =>
+  lines.includes(one) ? lines.filter((each) => each !== one) : [...lines, one].slice(-LINES);
+
 // `data` is a list of columns that grows in place; `version` says when it did. `zero`: whether the scale begins at 0.
 export function Plot({ labels, data, version, format, label, zero }) {
   const box = useRef(),
@@ -66,7 +72,8 @@ export function Plot({ labels, data, version, format, label, zero }) {
   const [failure, setFailure] = useState("");
   useEffect(() => {
     let ended = false,
-      observer;
+      observer,
+      themes;
     library().then(
       (uPlot) => {
         if (ended) return;
@@ -77,16 +84,14 @@ export function Plot({ labels, data, version, format, label, zero }) {
         make();
         observer = new ResizeObserver(() => plot.current.setSize({ width: box.current.clientWidth, height: 240 }));
         observer.observe(box.current);
-        const themes = new MutationObserver(make);
-        themes.observe(document.documentElement, { attributeFilter: ["data-theme"] });
-        observer.themes = themes;
+        themes = onTheme(make);
       },
       (error) => setFailure(String(error.message)),
     );
     return () => {
       ended = true;
       observer?.disconnect();
-      observer?.themes.disconnect();
+      themes?.();
       plot.current?.destroy();
       plot.current = undefined;
     };
@@ -133,12 +138,5 @@ export function Lines({ series, format, label }) {
     return () => clearInterval(timer);
   }, [labels.join("\n")]);
   if (data.current.length !== labels.length + 1) data.current = [[], ...labels.map(() => [])];
-  return html`<${Plot}
-    labels=${labels}
-    data=${data.current}
-    version=${version}
-    format=${format}
-    label=${label}
-    zero=${true}
-  />`;
+  return html`<${Plot} ...${{ labels, version, format, label }} data=${data.current} zero=${true} />`;
 }

@@ -3,7 +3,8 @@
 import { html, useEffect, useRef, useState } from "./markup.js";
 import { count } from "./format.js";
 import { section } from "./state.js";
-import { Failure, Mark, Panel, Question } from "./parts.js";
+import { Failure, Mark, Panel, Pick, Text } from "./parts.js";
+import { Question } from "./asking.js";
 import { number, primitive } from "./typed.js";
 
 const FASTEST = 50; // messages a second
@@ -67,12 +68,13 @@ export function PublishPanel({ connection, state, topic, type }) {
   const name = known ? type : typed;
   return html`<${Panel} title="Publish" wide
     >${!known &&
-    html`<label class="filter"
-      >Type, which no node says<input
-        class="mono"
-        value=${typed}
-        onInput=${(event) => setTyped(event.target.value.trim())}
-    /></label>`}
+    html`<${Text}
+      look="filter"
+      label="Type, which no node says"
+      class="mono"
+      value=${typed}
+      onInput=${(text) => setTyped(text.trim())}
+    />`}
     <${Question}
       connection=${connection}
       what="message"
@@ -124,14 +126,7 @@ function Form({ connection, state, topic, about }) {
   };
   const to = section(state, "topics")[topic]?.to || [];
   const drawn = { types, errors, disabled: !allowed };
-  return html`<form
-    class="form"
-    ref=${form}
-    onSubmit=${(event) => {
-      event.preventDefault();
-      publish(false);
-    }}
-  >
+  return html`<form class="form" ref=${form} onSubmit=${(event) => (event.preventDefault(), publish(false))}>
     <${Struct} ...${drawn} type=${type} path="" value=${values} change=${setValues} depth=${0} />
     <details>
       <summary>${type}</summary>
@@ -185,6 +180,7 @@ function Struct({ types, type, path, value, change, depth, ...more }) {
 }
 
 function Items({ types, type, path, value, change, size, ...more }) {
+  const add = () => change([...value, draft(types, type)]);
   const set = (at) => (next) => change(value.map((each, index) => (index === at ? next : each)));
   return html`<div class="form">
     ${value.map(
@@ -201,11 +197,7 @@ function Items({ types, type, path, value, change, size, ...more }) {
     )}
     ${size < 0 &&
     html`<p>
-      <button
-        type="button"
-        disabled=${more.disabled || value.length >= MOST_ITEMS}
-        onClick=${() => change([...value, draft(types, type)])}
-      >
+      <button type="button" disabled=${more.disabled || value.length >= MOST_ITEMS} onClick=${add}>
         Add to ${path}
       </button>
     </p>`}
@@ -219,16 +211,13 @@ function Entry({ label, path, value, change, errors, disabled, kind, hint }) {
     disabled,
     "aria-invalid": error ? "true" : undefined,
     "aria-describedby": error ? `wrong-${path}` : undefined,
-    onInput: (event) => change(event.target.value),
   };
+  const typed = (event) => change(event.target.value);
   return html`<div class=${hint ? "wide" : ""}>
     <label
       ><span class="mono">${label}</span>${kind === "bool"
-        ? html`<select ...${about}>
-            <option value="false">false</option>
-            <option value="true">true</option>
-          </select>`
-        : html`<input class="mono" placeholder=${hint} spellcheck="false" ...${about} />`}</label
+        ? html`<${Pick} ...${about} names=${["false", "true"]} onChange=${change} />`
+        : html`<input class="mono" placeholder=${hint} spellcheck="false" ...${about} onInput=${typed} />`}</label
     >${error && html`<p class="wrong" id=${`wrong-${path}`}><${Mark} state="ERROR" word=${error} /></p>`}
   </div>`;
 }

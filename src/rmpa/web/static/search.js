@@ -2,63 +2,36 @@
 
 import { html, useEffect, useLayoutEffect, useRef, useState } from "./markup.js";
 import { entries } from "./state.js";
-import { href, nodeName } from "./parts.js";
+import { href, nodeName } from "./links.js";
 
 const MOST = 40;
 const KINDS = [
-  ["modules", "module", "module"],
-  ["topics", "topic", "topic"],
-  ["services", "service", "service"],
-  ["nodes", "node", "node"],
-  ["resources", "resource", "resource"],
+  ["modules", "module"],
+  ["topics", "topic"],
+  ["services", "service"],
+  ["nodes", "node"],
+  ["resources", "resource"],
 ];
 
 export function find(state, text, parameters = []) {
   const words = text.toLowerCase().split(/\s+/).filter(Boolean);
+  const last = words.at(-1) || "";
   const found = [];
-  for (const [part, kind, page] of KINDS)
+  const look = (kind, page, name, shown, said, about) => {
+    const lower = name.toLowerCase();
+    if (!words.every((word) => said.filter(Boolean).join(" ").toLowerCase().includes(word))) return;
+    const rank = lower === last ? 0 : lower.split("/").some((step) => step.startsWith(last)) ? 1 : 2;
+    found.push({ kind, name: shown, to: href(page, name), about, rank });
+  };
+  for (const [part, kind] of KINDS)
     for (const [name, value] of entries(state, part)) {
       const called = kind === "resource" ? "smart resource" : kind;
       const shown = kind === "node" ? nodeName(name) : name;
-      const parts = [called, name, shown, value.type, value.module, value.description];
-      const about = parts.filter(Boolean).join(" ").toLowerCase();
-      if (!words.every((word) => about.includes(word))) continue;
-      const last = words[words.length - 1] || "";
-      const rank =
-        name.toLowerCase() === last
-          ? 0
-          : name
-                .toLowerCase()
-                .split("/")
-                .some((step) => step.startsWith(last))
-            ? 1
-            : 2;
-      found.push({
-        kind,
-        name: shown,
-        to: href(page, name),
-        about: value.type || value.description || value.state || (kind === "node" && value.module) || "",
-        rank,
-      });
+      const about = value.type || value.description || value.state || (kind === "node" && value.module) || "";
+      look(kind, kind, name, shown, [called, name, shown, value.type, value.module, value.description], about);
     }
-  if (words.length)
-    // of many hundred parameters none is meant before a word is typed
-    for (const name of parameters) {
-      if (!words.every((word) => `parameter ${name}`.toLowerCase().includes(word))) continue;
-      const last = words[words.length - 1];
-      found.push({
-        kind: "parameter",
-        name,
-        to: href("params", name),
-        about: "",
-        rank: name
-          .toLowerCase()
-          .split("/")
-          .some((step) => step.startsWith(last))
-          ? 1
-          : 2,
-      });
-    }
+  // Of many hundred parameters none is meant before a word is typed.
+  if (words.length) for (const name of parameters) look("parameter", "params", name, name, ["parameter", name], "");
   return found
     .sort((a, b) => a.rank - b.rank || a.name.length - b.name.length || a.name.localeCompare(b.name))
     .slice(0, MOST);

@@ -26,3 +26,13 @@ export function nextTheme() {
     /* a private window: the choice lasts as long as the page */
   }
 }
+
+// The value of a colour, or of another property of the style.
+export const ink = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+
+// Calls `changed` when the user chooses other colours, until the function that it returns is called.
+export function onTheme(changed) {
+  const themes = new MutationObserver(changed);
+  themes.observe(document.documentElement, { attributeFilter: ["data-theme"] });
+  return () => themes.disconnect();
+}

@@ -37,17 +37,15 @@ function Fold({ name, about, first, draw }) {
   </details>`;
 }
 
+const Plotted = ({ on, path, onClick, children }) =>
+  html`<button type="button" class="field" aria-pressed=${String(on)} title=${`Plot ${path}`} onClick=${onClick}>
+    ${on ? "● " : ""}${children}
+  </button>`;
 const Leaf = ({ value, path, text, plots }) =>
   isScalar(value) || text !== undefined
-    ? html`<button
-        type="button"
-        class="field"
-        aria-pressed=${String(plots.chosen.includes(path))}
-        title=${`Plot ${path}`}
-        onClick=${() => plots.choose(path)}
-      >
-        ${plots.chosen.includes(path) ? "● " : ""}${text ?? written(value)}
-      </button>`
+    ? html`<${Plotted} on=${plots.chosen.includes(path)} path=${path} onClick=${() => plots.choose(path)}
+        >${text ?? written(value)}<//
+      >`
     : html`<span>${typeof value === "string" ? JSON.stringify(value) : String(value)}</span>`;
 
 const Line = ({ values, path, plots, length }) =>
@@ -55,7 +53,7 @@ const Line = ({ values, path, plots, length }) =>
     >${values.map(
       ([key, value]) =>
         html`<span key=${key}
-          ><span class="key">${key}</span> <${Leaf} value=${value} path=${`${path}.${key}`} plots=${plots}
+          ><span class="key">${key}</span> <${Leaf} ...${{ value, plots }} path=${`${path}.${key}`}
         /></span>`,
     )}${length > values.length && html`<span class="muted">… ${count(length - values.length)} more</span>`}</span
   >`;
@@ -124,14 +122,7 @@ const Rows = ({ rows, path, depth, plots, length }) =>
   html`<ul>
     ${rows.map(
       ([key, value]) =>
-        html`<${Row}
-          key=${key}
-          name=${key}
-          value=${value}
-          path=${path ? `${path}.${key}` : key}
-          depth=${depth}
-          plots=${plots}
-        />`,
+        html`<${Row} key=${key} name=${key} ...${{ value, depth, plots }} path=${path ? `${path}.${key}` : key} />`,
     )}${length > rows.length && html`<li class="muted">… ${count(length - rows.length)} more</li>`}
   </ul>`;
 

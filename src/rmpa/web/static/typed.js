@@ -68,18 +68,8 @@ export function fresh(text) {
   return typed.error?.startsWith("That is not JSON") ? { value: text } : typed;
 }
 
-const BITS = {
-  int8: 8,
-  byte: 8,
-  uint8: 8,
-  char: 8,
-  int16: 16,
-  uint16: 16,
-  int32: 32,
-  uint32: 32,
-  int64: 64,
-  uint64: 64,
-};
+const BITS = { byte: 8, char: 8 };
+for (const bits of [8, 16, 32, 64]) BITS[`int${bits}`] = BITS[`uint${bits}`] = bits;
 const BEYOND = /^[+-]?(nan|inf(inity)?)$/i;
 const NANO = 1e9;
 
@@ -98,13 +88,8 @@ export function primitive(type, text) {
     return { value: { secs, nsecs: Math.min(NANO - 1, Math.round((value - secs) * NANO)) } };
   }
   if (type.startsWith("float")) {
-    if (BEYOND.test(typed))
-      return {
-        value: typed
-          .toLowerCase()
-          .replace("infinity", "inf")
-          .replace(/^[+-]nan$/, "nan"),
-      };
+    const short = typed.toLowerCase().replace("infinity", "inf");
+    if (BEYOND.test(typed)) return { value: short.replace(/^[+-]nan$/, "nan") };
     if (!NUMBER.test(typed)) return number(typed);
     if (Math.abs(Number(typed)) > (type === "float32" ? 3.4028235677973366e38 : Number.MAX_VALUE))
       return { error: `${typed} does not fit ${type}.` };

@@ -2,8 +2,17 @@
 
 import { html } from "../markup.js";
 import { entries } from "../state.js";
-import { Link, Mark, Page, Panel, Since, Table } from "../parts.js";
+import { Mark, Page, Panel, Since } from "../parts.js";
+import { Table } from "../lists.js";
+import { Link } from "../links.js";
 import { Concerns } from "../mandala.js";
+
+const COLUMNS = [
+  ["Resource", ([, alarm]) => html`<${Link} page="resource" name=${alarm.resource} />`],
+  ["Level", ([, alarm]) => html`<${Mark} state=${alarm.level} />`],
+  ["Says", ([, alarm]) => alarm.text],
+  ["Stands for", ([, alarm]) => html`<${Since} moment=${alarm.at} />`],
+];
 
 export function Alarms({ state, connection }) {
   const alarms = entries(state, "alarms");
@@ -13,21 +22,8 @@ export function Alarms({ state, connection }) {
   >
     <div class="grid">
       <${Panel} title="Alarms of Smart Resources" wide
-        ><${Table}
-          caption="Alarms"
-          columns=${["Resource", "Level", "Says", "Stands for"]}
-          empty="There is no alarm."
-          list=${alarms}
-        >
-          ${([id, alarm]) =>
-            html`<tr key=${id}>
-              <th scope="row"><${Link} page="resource" name=${alarm.resource} /></th>
-              <td><${Mark} state=${alarm.level} /></td>
-              <td>${alarm.text}</td>
-              <td><${Since} moment=${alarm.at} /></td>
-            </tr>`}<//
-        ><//
-      >
+        ><${Table} caption="Alarms" columns=${COLUMNS} empty="There is no alarm." list=${alarms}
+      /><//>
       <${Panel} title="All that is wrong"><${Concerns} state=${state} connection=${connection} /><//></div
   ><//>`;
 }

@@ -1,33 +1,18 @@
 // What nodes of all modules say on /diagnostics: a tree by module, hardware and name, and one status with its past.
 
-import { html, useEffect, useRef, useState } from "../markup.js";
+import { html, memo, useEffect, useRef, useState } from "../markup.js";
 import { count, plain } from "../format.js";
 import { adopt, entries, section } from "../state.js";
-import {
-  Choice,
-  Facts,
-  Mark,
-  ModuleLink,
-  NodeLink,
-  Page,
-  Panel,
-  Since,
-  Table,
-  href,
-  known,
-  memo,
-  nodeKey,
-  useFilter,
-  useFirst,
-} from "../parts.js";
-import { Plot } from "../plot.js";
+import { Choice, Facts, Mark, Page, Panel, Since, known } from "../parts.js";
+import { Table, useFilter, useFirst } from "../lists.js";
+import { ModuleLink, NodeLink, href, nodeKey } from "../links.js";
+import { Plot, figure, toggled } from "../plot.js";
 
 const LEVELS = ["OK", "WARN", "STALE", "ERROR"]; // the best first, as in observe/diagnostics.py
 const rank = (level) => LEVELS.indexOf(level);
 const SPAN = 600; // seconds of a strip
 const WIDTH = 120;
 const HEIGHTS = { OK: 3, STALE: 6, WARN: 9, ERROR: 14 }; // by its height a level is seen without its colour
-const LINES = 8; // of a plot
 const KEPT = 600; // moments of it
 const NUMBER = /^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?:[^\d\s.:/-][^\d:/]*)?$/; // with a unit or without
 const numberOf = (text) => {
@@ -119,24 +104,19 @@ function Group({ node, chosen, wide, level }) {
       <summary>
         <${Mark} state=${node.worst} word="" /> <strong>${node.label}</strong> <span class="muted">${node.total}</span>
       </summary>
-      ${open && html`<${Branch} nodes=${node.children} chosen=${chosen} wide=${wide} level=${level + 1} />`}
+      ${open && html`<${Branch} nodes=${node.children} ...${{ chosen, wide }} level=${level + 1} />`}
     </details>
   </li>`;
 }
 
+const leafOf = ({ label, leaf: [name, one] }, chosen) => ({ label, name, one, chosen: name === chosen });
 function Branch({ nodes, chosen, wide, level = 0 }) {
   const [shown, more] = useFirst(nodes);
   return html`<ul class=${level ? "" : "diagnostics"}>
       ${shown.map((node) =>
         node.leaf
-          ? html`<${Leaf}
-              key=${`${node.label} ${node.leaf[0]}`}
-              label=${node.label}
-              name=${node.leaf[0]}
-              one=${node.leaf[1]}
-              chosen=${node.leaf[0] === chosen}
-            />`
-          : html`<${Group} key=${node.label} node=${node} chosen=${chosen} wide=${wide} level=${level} />`,
+          ? html`<${Leaf} key=${`${node.label} ${node.leaf[0]}`} ...${leafOf(node, chosen)} />`
+          : html`<${Group} key=${node.label} ...${{ node, chosen, wide, level }} />`,
       )}
     </ul>
     ${more}`;
@@ -188,17 +168,29 @@ export function Diagnostics({ name, state, connection }) {
         >
       </div>
       ${name &&
-      html`<${Chosen}
-        key=${name}
-        name=${name}
-        one=${section(told, "statuses")[name]}
-        own=${own}
-        state=${state}
-        connection=${connection}
-      />`}
+      html`<${Chosen} key=${name} ...${{ name, own, state, connection }} one=${section(told, "statuses")[name]} />`}
     </div><//
   >`;
 }
+
+const VALUES = [
+  ["Key", ([key]) => key],
+  ["Value", ([, text]) => text],
+  [
+    "",
+    ([key, text], { fields, toggle, past }) =>
+      (past[key] || numberOf(text) !== null) &&
+      html`<button
+        type="button"
+        class="plotted"
+        aria-pressed=${String(fields.includes(key))}
+        aria-label=${`Plot ${plain(key)}`}
+        onClick=${() => toggle(key)}
+      >
+        Plot
+      </button>`,
+  ],
+];
 
 function Chosen({ name, one, own, state, connection }) {
   const detail = section(section(state, "detail"), `diagnostic:${name}`);
@@ -226,8 +218,7 @@ function Chosen({ name, one, own, state, connection }) {
   }, [detail.heard]);
   if (!one) return html`<${Panel} title="Status"><p class="empty">There is no such status at present.</p><//>`;
   const module = one.module || own;
-  const toggle = (key) =>
-    setFields(fields.includes(key) ? fields.filter((each) => each !== key) : [...fields, key].slice(-LINES));
+  const toggle = (key) => setFields(toggled(fields, key));
   const plotted = fields.filter((key) => past.current[key]);
   const data = ["", ...plotted].map((key) => past.current[key] || []);
   return html`<${Panel} title=${one.name}>
@@ -244,33 +235,15 @@ function Chosen({ name, one, own, state, connection }) {
         ["Last news", detail.heard && html`<${Since} moment=${detail.heard} text=${(ago) => `${ago} ago`} />`],
       ]}
     />
-    <${Table} caption="Values" columns=${["Key", "Value", ""]} empty="It has no values." list=${values}>
-      ${([key, text]) =>
-        html`<tr key=${key}>
-          <th scope="row">${key}</th>
-          <td>${text}</td>
-          <td>
-            ${(past.current[key] || numberOf(text) !== null) &&
-            html`<button
-              type="button"
-              class="plotted"
-              aria-pressed=${String(fields.includes(key))}
-              aria-label=${`Plot ${plain(key)}`}
-              onClick=${() => toggle(key)}
-            >
-              Plot
-            </button>`}
-          </td>
-        </tr>`}<//
-    >
+    <${Table}
+      caption="Values"
+      columns=${VALUES}
+      about=${{ fields, toggle, past: past.current, version }}
+      empty="It has no values."
+      list=${values}
+    />
     ${plotted.length > 0 &&
-    html`<${Plot}
-      labels=${plotted}
-      data=${data}
-      version=${version}
-      format=${(value) => (value === null || value === undefined ? "–" : String(Number(value.toPrecision(5))))}
-      label=${`Values of ${one.name}`}
-    />`}
+    html`<${Plot} labels=${plotted} ...${{ data, version }} format=${figure} label=${`Values of ${one.name}`} />`}
     <p class="row"><a class="button" href="#/diagnostics">Close</a></p><//
   >`;
 }

@@ -4,7 +4,9 @@
 import { html, useEffect, useRef, useState } from "../markup.js";
 import { sentence } from "../format.js";
 import { section } from "../state.js";
-import { Link, ModuleLink, NodeLink, Page, Panel, Since, useAnswer } from "../parts.js";
+import { Page, Panel, Select, Since, Text } from "../parts.js";
+import { Link, ModuleLink, NodeLink } from "../links.js";
+import { useAnswer } from "../asking.js";
 import { Gamepad } from "./gamepad.js";
 
 const PERIOD = 100; // milliseconds between two commands
@@ -114,9 +116,7 @@ export function DrivePage({ state, connection }) {
     ><div class="grid">
       <${Panel} title="Who drives what" wide
         ><${Chain}
-          stick=${stick}
-          topic=${topic}
-          type=${type}
+          ...${{ stick, topic, type }}
           nodes=${known.topics[topic]?.nodes || []}
           takers=${section(state, "topics")[topic]?.to || []}
           own=${section(state, "agent").name || connection.hello.agent}
@@ -134,23 +134,13 @@ export function DrivePage({ state, connection }) {
           >${stick.holder &&
           !stick.mine &&
           html`<button type="button" disabled=${!allowed} onClick=${() => order("over")}>Take over</button>`}
-          <button
-            type="button"
-            class="stop"
-            disabled=${connection.phase !== "open"}
-            title="Escape"
-            onClick=${() => stop.current()}
-          >
-            Stop the robot
-          </button>
+          <${Stop} disabled=${connection.phase !== "open"} onClick=${() => stop.current()} />
         </div>
         ${stick.problem && html`<p class="muted">${sentence(stick.problem)}</p>`}<//
       >
       <${Panel} title="Joystick"
         ><${Stick} on=${on} hold=${hold} at=${at} /><${Commanded}
-          at=${at}
-          type=${type}
-          fastest=${fastest}
+          ...${{ at, type, fastest }}
           sent=${hold.by() && connection.commanded}
         />
         <p class="muted">${allowed ? HELD : DENIED}</p><//
@@ -159,9 +149,7 @@ export function DrivePage({ state, connection }) {
         <${Panel} title="What is driven, and how fast"
           ><div class="form">
             <${Target}
-              known=${known}
-              topic=${topic}
-              type=${type}
+              ...${{ known, topic, type }}
               fixed=${Boolean(known.topics[topic])}
               onTopic=${choose}
               onType=${setType}
@@ -171,6 +159,8 @@ export function DrivePage({ state, connection }) {
       </div></div
   ><//>`;
 }
+
+const Stop = (more) => html`<button type="button" class="stop" title="Escape" ...${more}>Stop the robot</button>`;
 
 // From the page that drives, by the topic, to the nodes that obey.
 function Chain({ stick, topic, type, nodes, takers, own }) {
@@ -212,24 +202,21 @@ function Chain({ stick, topic, type, nodes, takers, own }) {
 }
 
 const Target = ({ known, topic, type, fixed, onTopic, onType }) =>
-  html`<label
-      >Topic<input class="mono" list="driven" value=${topic} onInput=${(event) => onTopic(event.target.value)} /></label
-    ><datalist id="driven">
+  html`<${Text} label="Topic" class="mono" list="driven" value=${topic} onInput=${onTopic} />
+    <datalist id="driven">
       ${Object.entries(known.topics).map(
         ([name, each]) =>
           html`<option key=${name} value=${name}>${each.type}${each.nodes.map((node) => ` · ${node}`)}</option>`,
       )}
     </datalist>
-    <label
-      >Type${fixed ? ", which the topic has" : ""}<select
-        class="mono"
-        value=${type}
-        disabled=${fixed}
-        onChange=${(event) => onType(event.target.value)}
-      >
-        ${known.types.map((each) => html`<option key=${each} value=${each}>${each}</option>`)}
-      </select></label
-    >`;
+    <${Select}
+      label=${`Type${fixed ? ", which the topic has" : ""}`}
+      class="mono"
+      value=${type}
+      disabled=${fixed}
+      names=${known.types}
+      onChange=${onType}
+    />`;
 
 const degrees = (angle) => `${((angle * 180) / Math.PI).toFixed(0)}°`;
 
@@ -287,6 +274,19 @@ function Stick({ on, hold, at }) {
     const box = pad.current.getBoundingClientRect();
     go(((event.clientX - box.left) / box.width - 0.5) * 2.6, -((event.clientY - box.top) / box.height - 0.5) * 2.6);
   };
+  const press = (event) => {
+    event.preventDefault();
+    pad.current.focus();
+    pad.current.setPointerCapture(event.pointerId);
+    point(event);
+  };
+  const hit = (event) => {
+    if (!KEYS[event.key]) return;
+    event.preventDefault();
+    if (event.repeat) return;
+    pressed.current.add(event.key);
+    go(...keys());
+  };
   const keys = () =>
     [...pressed.current].reduce(([x, y], key) => [x + KEYS[key][0] * TILT, y + KEYS[key][1] * TILT], [0, 0]);
   return html`<svg
@@ -297,34 +297,14 @@ function Stick({ on, hold, at }) {
     role="application"
     aria-label=${on ? "Joystick: hold, or press the arrow keys" : "Joystick, off"}
     aria-disabled=${String(!on)}
-    onPointerDown=${(event) => {
-      if (on) {
-        event.preventDefault();
-        pad.current.focus();
-        pad.current.setPointerCapture(event.pointerId);
-        point(event);
-      }
-    }}
+    onPointerDown=${on && press}
     onPointerMove=${(event) => hold.by() === "stick" && event.buttons && point(event)}
     onPointerUp=${stop}
     onPointerCancel=${stop}
     onLostPointerCapture=${stop}
     onBlur=${stop}
-    onKeyDown=${(event) => {
-      if (on && KEYS[event.key]) {
-        event.preventDefault();
-        if (!event.repeat) {
-          pressed.current.add(event.key);
-          go(...keys());
-        }
-      }
-    }}
-    onKeyUp=${(event) => {
-      if (pressed.current.delete(event.key)) {
-        if (pressed.current.size) go(...keys());
-        else stop();
-      }
-    }}
+    onKeyDown=${on && hit}
+    onKeyUp=${(event) => pressed.current.delete(event.key) && (pressed.current.size ? go(...keys()) : stop())}
   >
     <circle class="base" r="100" />
     <path class="cross" d="M-100 0H100M0-100V100" />

@@ -2,6 +2,8 @@
 // must be held. What the user chooses is kept in this browser, for each kind of gamepad.
 
 import { html, useEffect, useRef, useState } from "../markup.js";
+import { toggled } from "../plot.js";
+import { store, stored } from "../storage.js";
 
 const POLL = 50; // milliseconds between two looks at the gamepad; 500 while there is none
 const ASLEEP = 10; // seconds without any change, after which a gamepad whose button is held may be out of reach
@@ -17,31 +19,18 @@ const AXES = [
   ["side", "Sideways"],
 ];
 
-function kept() {
-  try {
-    const found = JSON.parse(localStorage.getItem(KEPT));
-    return found && typeof found === "object" && !Array.isArray(found) ? found : {};
-  } catch {
-    return {};
-  }
-}
-
 const whole = (value, least) => Number.isInteger(value) && value >= least && value < 64;
 
 // The mapping of a kind of gamepad: what is kept, as far as it can be one.
-export function mappingOf(id, all = kept()) {
+export function mappingOf(id, all = stored(KEPT)) {
   const found = { ...FIRST, ...(Object.hasOwn(all, id) ? all[id] : {}) };
   const fits = whole(found.hold, 0) && AXES.every(([name]) => whole(found[name], -1)) && Array.isArray(found.reversed);
   return fits ? found : FIRST;
 }
 
 function keep(id, mapping) {
-  const others = Object.entries(kept()).filter(([each]) => each !== id);
-  try {
-    localStorage.setItem(KEPT, JSON.stringify(Object.fromEntries([...others.slice(1 - MOST), [id, mapping]])));
-  } catch {
-    // A browser that keeps nothing has the mapping until the page is left.
-  }
+  const others = Object.entries(stored(KEPT)).filter(([each]) => each !== id);
+  store(KEPT, Object.fromEntries([...others.slice(1 - MOST), [id, mapping]]));
 }
 
 const isDown = (button) => Boolean(button) && (button.pressed || button.value > 0.5);
@@ -176,8 +165,8 @@ export function Gamepad({ on, hold, raw }) {
       <summary>Choose the button and the axes</summary>
       <div class="form">
         <div class="row">
-          <span class="grow">Dead man's button: ${mapping.hold}</span
-          ><button type="button" onClick=${() => setLearns("hold")}>
+          <span class="grow">Dead man's button: ${mapping.hold}</span>
+          <button type="button" onClick=${() => setLearns("hold")}>
             ${learns === "hold" ? "Press it now …" : "Choose"}
           </button>
         </div>
@@ -190,13 +179,7 @@ export function Gamepad({ on, hold, raw }) {
                   ><input
                     type="checkbox"
                     checked=${mapping.reversed.includes(name)}
-                    onChange=${(event) =>
-                      change({
-                        ...mapping,
-                        reversed: [...mapping.reversed.filter((each) => each !== name)].concat(
-                          event.target.checked ? name : [],
-                        ),
-                      })}
+                    onChange=${() => change({ ...mapping, reversed: toggled(mapping.reversed, name) })}
                   />${" "}reverse<span class="unseen"> ${title}</span></span
                 ></label
               >

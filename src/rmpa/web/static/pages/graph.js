@@ -1,13 +1,18 @@
 // The graph of nodes and topics as rqt_graph draws it: nodes in a lane for each module, topics between them.
 
-import { html, useEffect, useLayoutEffect, useRef, useState } from "../markup.js";
+import { html, memo, useEffect, useLayoutEffect, useRef, useState } from "../markup.js";
 import { count, hertz } from "../format.js";
 import { section } from "../state.js";
+import { useAgain } from "../asking.js";
+import { download } from "../storage.js";
+import { gestures } from "../viewport.js";
 import { curve, layout } from "../layout.js";
-import { Choice, Failure, Link, Mark, NodeLink, Page, Panel, Table, href, memo, useFilter } from "../parts.js";
+import { Check, Choice, Failure, Mark, Page, Panel, Select } from "../parts.js";
+import { Table, useFilter } from "../lists.js";
+import { Link, NodeLink, href } from "../links.js";
 import { isData } from "./topics.js";
 
-const PERIOD = 2000; // milliseconds between two questions for a graph that may have changed
+const PERIOD = 2; // seconds between two questions for a graph that may have changed
 const LETTERS = 26;
 const NAMED = 170; // between columns, where edges have names
 const STACK = 4; // topics of the same nodes that are named in one box; the others are counted
@@ -130,30 +135,17 @@ function flow(names, topics) {
 
 function useGraph(connection) {
   const [graph, set] = useState({});
-  const open = connection.phase === "open";
-  useEffect(() => {
-    if (!open) return undefined;
-    let ended = false,
-      timer,
-      has = "";
-    const ask = async () => {
-      if (!document.hidden || !has)
-        await connection.ask("graph", { has }).then(
-          (found) => {
-            if (ended) return;
-            has = found.digest;
-            if (found.topics) set(found);
-          },
-          (failure) => !ended && set((before) => ({ ...before, failure })),
-        );
-      if (!ended) timer = setTimeout(ask, PERIOD);
-    };
-    ask();
-    return () => {
-      ended = true;
-      clearTimeout(timer);
-    };
-  }, [open]);
+  const has = useRef("");
+  useAgain(connection.phase === "open", PERIOD, "", (wanted) =>
+    connection.ask("graph", { has: has.current }).then(
+      (found) => {
+        if (!wanted()) return;
+        has.current = found.digest;
+        set((before) => (found.topics ? found : before.failure ? { ...before, failure: undefined } : before));
+      },
+      (failure) => wanted() && set((before) => ({ ...before, failure })),
+    ),
+  );
   return graph;
 }
 
@@ -161,16 +153,6 @@ const VIEWS = [
   ["both", "Nodes and topics"],
   ["nodes", "Nodes only"],
 ];
-const Check = ({ label, checked, onChange }) =>
-  html`<label class="check"><input type="checkbox" checked=${checked} onChange=${onChange} /> ${label}</label>`;
-const Select = ({ label, value, names, all, onChange }) =>
-  html`<label class="pick"
-    >${label}<select value=${value} onChange=${(event) => onChange(event.target.value)}>
-      <option value="">${all}</option>
-      ${names.map((name) => html`<option key=${name} value=${name}>${name}</option>`)}
-    </select></label
-  >`;
-
 // First parts of names that several nodes and topics have in common.
 function namespaces(topics, own) {
   const counts = new Map();
@@ -183,73 +165,60 @@ function namespaces(topics, own) {
 }
 
 export function GraphPage({ name, state, connection }) {
-  const [view, setView] = useState("both");
-  const [debug, setDebug] = useState(false);
-  const [leaves, setLeaves] = useState(true);
-  const [module, setModule] = useState("");
-  const [namespace, setNamespace] = useState("");
+  const [options, set] = useState({ view: "both", debug: false, leaves: true, module: "", namespace: "" });
+  const choice = (option) => (value) => set({ ...options, [option]: value });
   const [focused, focus] = useState(false);
   const filter = useFilter("name");
   const memory = useRef({});
   const graph = useGraph(connection);
   const own = section(state, "agent").name;
   const topics = graph.topics || {};
-  const key = JSON.stringify([
-    graph.digest,
-    view,
-    debug,
-    leaves,
-    module,
-    namespace,
-    filter.typed,
-    focused && name,
-    own,
-  ]);
+  const wanted = { ...options, text: filter.typed, only: focused && name, own };
+  const key = JSON.stringify([graph.digest, wanted]);
   if (memory.current.key !== key && graph.topics) {
-    const only = focused && name;
-    const chosen = choose(topics, { text: filter.typed, module, namespace, debug, leaves, only, own, state });
-    const { vertices, edges } = shapes(chosen, own, view === "nodes");
-    const lanes = [...new Set([own, ...vertices.map((each) => each.lane).sort()])];
-    memory.current = {
-      key,
-      chosen,
-      vertices,
-      edges,
-      drawn: layout(vertices, edges, lanes, memory.current.drawn, view === "nodes" ? NAMED : undefined),
-    };
+    const merged = options.view === "nodes";
+    const found = choose(topics, { ...wanted, state });
+    const made = shapes(found, own, merged);
+    const lanes = [...new Set([own, ...made.vertices.map((each) => each.lane).sort()])];
+    const placed = layout(made.vertices, made.edges, lanes, memory.current.drawn, merged ? NAMED : undefined);
+    memory.current = { key, chosen: found, ...made, drawn: placed };
   }
   const { chosen, vertices = [], edges = [], drawn } = memory.current;
-  const modules = [...new Set(Object.values(topics).flatMap(([, from, to]) => [...from, ...to]))]
-    .map((node) => nodeOf(node, own).module)
-    .filter((each, at, list) => list.indexOf(each) === at)
-    .sort();
+  const ends = Object.values(topics).flatMap(([, from, to]) => [...from, ...to]);
+  const modules = [...new Set(ends.map((node) => nodeOf(node, own).module))].sort();
+  const filters = [
+    ["module", "Module", modules],
+    ["namespace", "Namespace", namespaces(topics, own)],
+  ];
   return html`<${Page}
     title="Graph"
     kind=${chosen
       ? `${count(chosen.nodes.size)} nodes and ${count(chosen.topics.size)} topics of all modules`
       : "Asking …"}
-    aside=${html`<${Choice} label="What is drawn" value=${view} onChoose=${setView} options=${VIEWS} />`}
+    aside=${html`<${Choice} label="What is drawn" value=${options.view} onChoose=${choice("view")} options=${VIEWS} />`}
   >
     <div class="row filter-row">
-      ${filter.field}<${Select} label="Module" value=${module} names=${modules} all="all" onChange=${setModule} />
-      <${Select}
-        label="Namespace"
-        value=${namespace}
-        names=${namespaces(topics, own)}
-        all="all"
-        onChange=${setNamespace}
-      />
-      <${Check} label="Debug topics" checked=${debug} onChange=${() => setDebug(!debug)} />
-      <${Check} label="Topics with one end" checked=${leaves} onChange=${() => setLeaves(!leaves)} />
+      ${filter.field}
+      ${filters.map(
+        ([option, label, names]) =>
+          html`<${Select}
+            key=${option}
+            look="pick"
+            label=${label}
+            value=${options[option]}
+            names=${[["", "all"], ...names]}
+            onChange=${choice(option)}
+          />`,
+      )}
+      <${Check} label="Debug topics" checked=${options.debug} onChange=${choice("debug")} />
+      <${Check} label="Topics with one end" checked=${options.leaves} onChange=${choice("leaves")} />
     </div>
     <${Failure} failure=${graph.failure} />
     ${graph.hidden > 0 && html`<p class="empty">The server leaves out ${count(graph.hidden)} further topics.</p>`}
     ${chosen &&
     (vertices.length
       ? html`<div class="beside-graph">
-          <${Panel}
-            ><${Drawing} drawn=${drawn} vertices=${vertices} edges=${edges} name=${name} state=${state} own=${own}
-          /><//>
+          <${Panel}><${Drawing} ...${{ drawn, vertices, edges, name, state, own }} /><//>
           ${name
             ? html`<${About} name=${name} chosen=${chosen} vertices=${vertices} own=${own} state=${state}>
                 <button type="button" aria-pressed=${String(focused)} onClick=${() => focus(!focused)}>
@@ -268,7 +237,6 @@ export function GraphPage({ name, state, connection }) {
 
 const FACTOR = 1.25;
 const LEGIBLE = 1.5; // units of the drawing a pixel: smaller letters are not read
-const NEXT = { ArrowRight: [1, 0], ArrowLeft: [-1, 0], ArrowDown: [0, 1], ArrowUp: [0, -1] };
 
 // Where one looks: the upper left corner, and how many units of the drawing a pixel has; all of it until it is moved.
 function useView(box, drawn) {
@@ -291,7 +259,7 @@ function useView(box, drawn) {
   const change = (next) => set((before) => next(before || now));
   const zoom = (factor, px = w / 2, py = h / 2) =>
     change((at) => {
-      const next = Math.max(0.2, Math.min(8, at.scale * factor));
+      const next = Math.max(0.2, Math.min(8, at.scale / factor));
       return { scale: next, x: at.x + px * (at.scale - next), y: at.y + py * (at.scale - next) };
     });
   const pan = (dx, dy) => change((at) => ({ ...at, x: at.x - dx * at.scale, y: at.y - dy * at.scale }));
@@ -301,55 +269,8 @@ function useView(box, drawn) {
         Math.min(Math.max(low, spot + (60 - length) * at.scale), spot - 60 * at.scale);
       return { ...at, x: inside(x, at.x, w), y: inside(y, at.y, h) };
     });
-  return {
-    viewBox: `${now.x} ${now.y} ${w * now.scale} ${h * now.scale}`,
-    left: now.x,
-    zoom,
-    pan,
-    fit: () => set(null),
-    show,
-  };
-}
-
-// One pointer pans, two zoom; the wheel zooms where it points.
-function usePointers(box, latest) {
-  const pointers = useRef(new Map());
-  useEffect(() => {
-    const wheel = (event) => {
-      event.preventDefault();
-      const { left, top } = box.current.getBoundingClientRect();
-      latest.current.zoom(event.deltaY > 0 ? FACTOR ** 0.5 : FACTOR ** -0.5, event.clientX - left, event.clientY - top);
-    };
-    box.current.addEventListener("wheel", wheel, { passive: false });
-    return () => box.current?.removeEventListener("wheel", wheel);
-  }, []);
-  const move = (event) => {
-    const known = pointers.current.get(event.pointerId);
-    if (!known) return;
-    const others = [...pointers.current.entries()].filter(([id]) => id !== event.pointerId);
-    const at = { x: event.clientX, y: event.clientY };
-    if (others.length) {
-      const [[, other]] = others;
-      const far = (one) => Math.hypot(one.x - other.x, one.y - other.y) || 1;
-      const { left, top } = box.current.getBoundingClientRect();
-      latest.current.zoom(far(known) / far(at), (at.x + other.x) / 2 - left, (at.y + other.y) / 2 - top);
-    } else {
-      latest.current.pan(at.x - known.x, at.y - known.y);
-      const moved = Math.abs(at.x - known.x) + Math.abs(at.y - known.y);
-      known.far = (known.far || 0) + moved;
-      if (known.far > 6 && !box.current.hasPointerCapture(event.pointerId))
-        box.current.setPointerCapture(event.pointerId);
-    }
-    pointers.current.set(event.pointerId, { ...known, ...at });
-  };
-  const up = (event) => pointers.current.delete(event.pointerId);
-  return {
-    onPointerDown: (event) => pointers.current.set(event.pointerId, { x: event.clientX, y: event.clientY }),
-    onPointerMove: move,
-    onPointerUp: up,
-    onPointerCancel: up,
-    onPointerLeave: (event) => !box.current.hasPointerCapture(event.pointerId) && up(event),
-  };
+  const viewBox = `${now.x} ${now.y} ${w * now.scale} ${h * now.scale}`;
+  return { viewBox, left: now.x, zoom, pan, show, fit: () => set(null) };
 }
 
 const MARKER = { viewBox: "0 0 8 8", refX: 7, refY: 4, markerWidth: 9, markerHeight: 9 };
@@ -357,27 +278,21 @@ const MARKER = { viewBox: "0 0 8 8", refX: 7, refY: 4, markerWidth: 9, markerHei
 function Drawing({ drawn, vertices, edges, name, state, own }) {
   const box = useRef();
   const view = useView(box, drawn);
+  const step = ({ target }, ...way) => {
+    const here = target.closest("[data-id]")?.dataset.id;
+    if (here) neighbour(drawn, vertices, here, way, box.current);
+    return here;
+  };
   const latest = useRef(view);
-  latest.current = view;
-  const pointers = usePointers(box, latest);
+  latest.current = { ...view, step };
+  useEffect(() => gestures(box.current, () => latest.current), []);
   const topics = section(state, "topics");
   useEffect(() => drawn.at.has(name) && view.show(drawn.at.get(name)), [name, drawn]);
   const selected = (edge) => edge.from === name || edge.to === name;
   const lit = new Set([name, ...edges.filter(selected).flatMap((edge) => [edge.from, edge.to])]);
-  const key = (event) => {
-    const here = event.target.closest("[data-id]")?.dataset.id;
-    const step = NEXT[event.key];
-    const larger = () => view.zoom(1 / FACTOR);
-    const act = { "+": larger, "=": larger, "-": () => view.zoom(FACTOR), 0: view.fit }[event.key];
-    if (act) act();
-    else if (step && here) neighbour(drawn, vertices, here, step, box.current);
-    else if (step) view.pan(-60 * step[0], -60 * step[1]);
-    else return;
-    event.preventDefault();
-  };
   return html`<div class="row tools-row">
-      <button type="button" onClick=${() => view.zoom(1 / FACTOR)} aria-label="Larger (+)">+</button>
-      <button type="button" onClick=${() => view.zoom(FACTOR)} aria-label="Smaller (−)">−</button>
+      <button type="button" onClick=${() => view.zoom(FACTOR)} aria-label="Larger (+)">+</button>
+      <button type="button" onClick=${() => view.zoom(1 / FACTOR)} aria-label="Smaller (−)">−</button>
       <button type="button" onClick=${view.fit}>Whole</button>
       <button type="button" onClick=${() => save(box.current, drawn)}>Save as SVG</button>
       ${["flows", "bad"].map(
@@ -395,8 +310,6 @@ function Drawing({ drawn, vertices, edges, name, state, own }) {
       tabindex="0"
       role="group"
       aria-label="The graph; the table below says the same"
-      onKeyDown=${key}
-      ...${pointers}
     >
       <defs>
         <marker id="tip" markerUnits="userSpaceOnUse" orient="auto" ...${MARKER}>
@@ -423,11 +336,10 @@ function Drawing({ drawn, vertices, edges, name, state, own }) {
         (one) =>
           html`<${Vertex}
             key=${one.id}
-            one=${one}
+            ...${{ one, own }}
             at=${drawn.at.get(one.id)}
             lit=${lit.has(one.id)}
             chosen=${one.id === name}
-            own=${own}
             ...${flow(one.topics || [], topics)}
             view=${latest}
           />`,
@@ -503,11 +415,7 @@ function save(svg, drawn) {
   const ground = document.createElementNS("http://www.w3.org/2000/svg", "rect");
   give(ground, { x: -10, y: -10, width, height, fill: getComputedStyle(svg).backgroundColor });
   copy.prepend(ground);
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(new Blob([new XMLSerializer().serializeToString(copy)], { type: "image/svg+xml" }));
-  link.download = "graph.svg";
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+  download("graph.svg", "image/svg+xml", new XMLSerializer().serializeToString(copy));
 }
 
 const Names = ({ names, page }) =>
@@ -548,20 +456,18 @@ function About({ name, chosen, vertices, own, state, children }) {
   >`;
 }
 
+const COLUMNS = [
+  ["Topic", (one) => html`<${Link} page="topic" name=${one.name} />`],
+  ["~Type", (one) => one.type],
+  ["#Rate", (one, { topics }) => hertz(topics[one.name]?.rate)],
+  ["Publishers", (one) => html`<${Names} names=${one.from} />`],
+  ["Subscribers", (one) => html`<${Names} names=${one.to} />`],
+];
 const AsTable = ({ chosen, state }) =>
   html`<${Panel} title="As a table"
     ><${Table}
       caption="Topics of the graph"
-      columns=${["Topic", "Type", "#Rate", "Publishers", "Subscribers"]}
+      columns=${COLUMNS}
+      about=${{ topics: section(state, "topics") }}
       list=${[...chosen.topics.values()].sort((a, b) => (a.name < b.name ? -1 : 1))}
-    >
-      ${(one) =>
-        html`<tr key=${one.name}>
-          <th scope="row"><${Link} page="topic" name=${one.name} /></th>
-          <td class="muted">${one.type}</td>
-          <td class="number">${hertz(section(state, "topics")[one.name]?.rate)}</td>
-          <td><${Names} names=${one.from} /></td>
-          <td><${Names} names=${one.to} /></td>
-        </tr>`}<//
-    ><//
-  >`;
+  /><//>`;

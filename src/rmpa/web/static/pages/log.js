@@ -2,7 +2,8 @@
 
 import { html, useState } from "../markup.js";
 import { entries, section } from "../state.js";
-import { Choice, Page, Panel, useFilter, useKept } from "../parts.js";
+import { Choice, Page, Panel, Pick } from "../parts.js";
+import { useFilter, useKept } from "../lists.js";
 import { Lines, Missing, useLog } from "../loglines.js";
 
 export const LEVELS = [
@@ -19,7 +20,9 @@ export function Log({ state, connection }) {
   const [node, setNode] = useKept("node", "");
   const [held, hold] = useState(false);
   const filter = useFilter("text");
-  const modules = entries(state, "modules").filter(([, one]) => ["here", "up", "silent"].includes(one.state));
+  const modules = entries(state, "modules")
+    .filter(([, one]) => ["here", "up", "silent"].includes(one.state))
+    .map(([name]) => [name]);
   const nodes = new Set(
     entries(state, "nodes")
       .filter(([, one]) => !module || (one.module || own) === module)
@@ -37,10 +40,7 @@ export function Log({ state, connection }) {
   >
     <div class="row filter-row">
       <${Choice} label="Least level" value=${level} onChoose=${setLevel} options=${LEVELS} />
-      <select aria-label="Module" value=${module} onChange=${(event) => setModule(event.target.value)}>
-        <option value="">All modules</option>
-        ${modules.map(([name]) => html`<option key=${name} value=${name}>${name}</option>`)}
-      </select>
+      <${Pick} aria-label="Module" value=${module} names=${[["", "All modules"], ...modules]} onChange=${setModule} />
       <input
         class="filter"
         type="search"

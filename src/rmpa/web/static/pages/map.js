@@ -3,52 +3,34 @@
 import { html, useContext, useEffect, useRef, useState } from "../markup.js";
 import { duration, hertz } from "../format.js";
 import { entries, section } from "../state.js";
-import { AsPanel, Failure, Mark, Page, Panel } from "../parts.js";
-import { Frames } from "../frames.js";
-import {
-  LAYERS,
-  Layer,
-  View,
-  bounds,
-  drawFrames,
-  drawGround,
-  drawLayer,
-  drawScale,
-  ink,
-  moduleColour,
-} from "../layers.js";
-import { now, transformTopics, useFrames, useTick } from "./tf.js";
+import { AsPanel, Check, Failure, IconButton, Mark, Page, Panel, Select, useTick } from "../parts.js";
+import { isOld } from "../fresh.js";
+import { ink, onTheme } from "../theme.js";
+import { store, stored } from "../storage.js";
+import { gestures } from "../viewport.js";
+import { Frames, isLate } from "../frames.js";
+import { LAYERS, Layer, View, bounds, drawFrames, drawGround, drawLayer, drawScale, moduleColour } from "../layers.js";
+import { now, transformTopics, useFrames } from "./tf.js";
 
 const MOST = 12; // layers: a page may watch 16 topics, of which some are tf's
 const KEPT = "rmpa.map"; // in the browser: { fixed, follow, frames, on: { topic: true or false } }
 const PREFERRED = ["map", "world", "odom"];
 const GATHER = 100; // milliseconds in which messages are drawn together
-const OLD = 2; // seconds after which a transform on the way to a layer is old
+const OLD = 2; // seconds after which the age of what came once is told
 const SETTLED = 1; // seconds in which transforms come that belong to a message
 const LASTING = ["grid", "path"];
-const STEP = 40; // pixels of an arrow key
-const WORDS = { grid: "grid", cloud: "cloud", poses: "poses", path: "path", scan: "scan", pose: "pose" };
 const NO_FRAMES = new Frames();
 const HELP = "Drag or arrow keys move it, the wheel, two fingers or + and − zoom, 0 shows all.";
 
 // What is shown at first: what is small, and the map itself.
 const byDefault = (topic, kind) => (kind === "grid" ? /(^|\/)map$/.test(topic) : kind !== "cloud" && kind !== "poses");
 
-function restored() {
-  try {
-    const kept = JSON.parse(localStorage.getItem(KEPT));
-    return kept && typeof kept === "object" ? kept : {};
-  } catch {
-    return {};
-  }
-}
-
 // As a panel it is given what is kept of it.
 export function MapPage(props) {
-  const [kept, set] = useState(restored);
+  const [kept, set] = useState(() => stored(KEPT));
   const keep = (news) => {
     const next = { ...kept, ...news };
-    localStorage.setItem(KEPT, JSON.stringify(next));
+    store(KEPT, next);
     set(next);
   };
   return html`<${Page} title="Map" kind="From above: x to the right, y up"
@@ -76,12 +58,17 @@ function MapView({ state, connection, kept, keep }) {
   const list = html`<div class="form">
     <${Failure} failure=${failure} />
     <div class="row">
-      <${Choose} label="Fixed frame" value=${fixed} names=${names} choose=${(name) => keep({ fixed: name })} />
-      <${Choose}
+      <${Select}
+        label="Fixed frame"
+        value=${fixed}
+        names=${names.length ? names : [["", "no frame is known"]]}
+        onChange=${(name) => keep({ fixed: name })}
+      />
+      <${Select}
         label="Keep in the middle"
         value=${kept.follow ?? ""}
-        names=${["", ...names]}
-        choose=${(name) => keep({ follow: name })}
+        names=${[["", "–"], ...names]}
+        onChange=${(name) => keep({ follow: name })}
       />
     </div>
     <ul class="layers">
@@ -89,30 +76,19 @@ function MapView({ state, connection, kept, keep }) {
         ([name, one]) =>
           html`<${Row}
             key=${name}
-            ...${{
-              name,
-              connection,
-              own,
-              live,
-              map: map.current,
-              type: one.type,
-              isThere,
-              off: !shown.includes(name),
-            }}
+            ...${{ name, connection, own, live, map: map.current, type: one.type, isThere }}
+            off=${!shown.includes(name)}
             checked=${wanted.includes(name)}
             toggle=${(value) => toggle(name, value)}
           />`,
       )}
       <li>
-        <label class="check"
-          ><input
-            type="checkbox"
-            checked=${kept.frames !== false}
-            onChange=${(event) => keep({ frames: event.target.checked })}
-          /><span
-            >Frames of tf <span class="muted">${transformTopics(state).join(", ") || "no topic has them"}</span></span
-          ></label
-        >
+        <${Check}
+          label=${html`Frames of tf
+            <span class="muted">${transformTopics(state).join(", ") || "no topic has them"}</span>`}
+          checked=${kept.frames !== false}
+          onChange=${(value) => keep({ frames: value })}
+        />
       </li>
     </ul>
     ${!topics.length &&
@@ -156,14 +132,6 @@ function chosen(frames, names, inUse) {
   return known ?? frames.roots[0] ?? [...inUse][0] ?? "";
 }
 
-const Choose = ({ label, value, names, choose }) =>
-  html`<label
-    >${label}<select value=${value} onChange=${(event) => choose(event.target.value)}>
-      ${names.map((name) => html`<option key=${name} value=${name}>${name || "–"}</option>`)}
-      ${!names.length && html`<option value="">no frame is known</option>`}
-    </select></label
-  >`;
-
 // One topic: its switch, and what is said of the layers of its nodes. It watches the topic while it is on.
 function Row({ name, type, connection, own, live, map, checked, off, toggle, isThere }) {
   const [failure, setFailure] = useState(null);
@@ -175,6 +143,7 @@ function Row({ name, type, connection, own, live, map, checked, off, toggle, isT
     const end = connection.watch({ topic: name, how: "map", rate }, (message) => {
       if (message.op === "failed") setFailure(message);
       else if (message.op === "layer") map.take(name, message);
+      else if (message.op === "beat") map.beats.set(name, message.after);
     });
     return () => {
       end();
@@ -184,11 +153,11 @@ function Row({ name, type, connection, own, live, map, checked, off, toggle, isT
   const layers = map.of(name);
   return html`<li>
     ${toggle &&
-    html`<label class="check"
-      ><input type="checkbox" checked=${checked} onChange=${(event) => toggle(event.target.checked)} /><span
-        ><span class="mono">${name}</span> <span class="muted">${WORDS[kind]}</span></span
-      ></label
-    >`}
+    html`<${Check}
+      label=${html`<span class="mono">${name}</span> <span class="muted">${kind}</span>`}
+      checked=${checked}
+      onChange=${toggle}
+    />`}
     ${!off && !layers.length && !failure && html`<p class="muted about">Waiting for a message …</p>`}
     ${layers.map((layer) => html`<${About} key=${layer.source} ...${{ layer, own, live, map, isThere }} />`)}
     <${Failure} failure=${failure} />
@@ -197,7 +166,7 @@ function Row({ name, type, connection, own, live, map, checked, off, toggle, isT
 
 function About({ layer, own, live, map, isThere }) {
   const { head } = layer;
-  const old = layer.isOld(now(), isThere(layer)),
+  const old = map.isOld(layer),
     age = now() - layer.heard;
   const thinned = head.every > 1 && (head.cells ? `${head.every} × ${head.every} as one` : `1 of ${head.every} drawn`);
   const rate = !old && layer.rate && hertz(layer.rate);
@@ -223,11 +192,11 @@ function Surface({ map, fixed, layers }) {
   const label = `Map from above in the frame ${fixed || "that is not known"}, ${layers} layers. ${HELP}`;
   return html`<canvas class="ground" ref=${canvas} tabindex="0" role="application" aria-label=${label}></canvas>
     <div class="over">
-      <button type="button" class="icon" aria-label="Zoom in (+)" onClick=${() => map.zoom(1.5)}>+</button>
-      <button type="button" class="icon" aria-label="Zoom out (−)" onClick=${() => map.zoom(1 / 1.5)}>−</button>
-      <button type="button" class="icon" aria-label="Show all (0)" onClick=${() => map.fit(true)}>
-        <svg viewBox="0 0 20 20" aria-hidden="true"><path d="M3 7V3h4M13 3h4v4M17 13v4h-4M7 17H3v-4" /></svg>
-      </button>
+      <${IconButton} label="Zoom in (+)" press=${() => map.zoom(1.5)}>+<//>
+      <${IconButton} label="Zoom out (−)" press=${() => map.zoom(1 / 1.5)}>−<//>
+      <${IconButton} label="Show all (0)" press=${() => map.fit(true)}>
+        <svg viewBox="0 0 20 20" aria-hidden="true"><path d="M3 7V3h4M13 3h4v4M17 13v4h-4M7 17H3v-4" /></svg
+      ><//>
     </div>
     <span class="place mono" ref=${place}></span>`;
 }
@@ -237,16 +206,19 @@ class MapCanvas {
   constructor() {
     this.view = new View();
     this.layers = new Map();
+    this.beats = new Map(); // of each topic, the seconds after which it is old
     this.modules = []; // in the order in which they came: a module keeps its colour
     this.shown = { shown: [], fixed: "", isThere: () => true, own: "" };
     this.moved = false;
-    this.pointers = new Map();
   }
 
   get all() {
     return [...this.layers.values()];
   }
   of = (topic) => this.all.filter((layer) => layer.topic === topic);
+  // What came once, as a latched map, is old when its publisher has gone.
+  isOld = ({ topic, source, heard }) =>
+    !this.shown.isThere({ topic, source }) || isOld(heard * 1000, this.beats.get(topic));
   forget(topic) {
     for (const [key, layer] of this.layers) if (layer.topic === topic) this.layers.delete(key);
     this.draw();
@@ -278,69 +250,31 @@ class MapCanvas {
   attach(canvas, place) {
     Object.assign(this, { canvas, place });
     canvas.view = this.view; // for the console and for tests
-    const on = (name, what, more) => canvas.addEventListener(name, what, more);
-    on("wheel", (event) => this.wheel(event), { passive: false });
-    on("keydown", (event) => this.key(event));
-    on("pointerdown", (event) => {
-      canvas.setPointerCapture(event.pointerId);
-      this.pointers.set(event.pointerId, [event.offsetX, event.offsetY]);
-    });
-    on("pointermove", (event) => this.move(event));
-    for (const name of ["pointerup", "pointercancel"]) on(name, (event) => this.pointers.delete(event.pointerId));
+    const gone = gestures(canvas, () => this);
     const sizes = new ResizeObserver(() => this.draw(true));
     sizes.observe(canvas);
-    const themes = new MutationObserver(() => this.draw());
-    themes.observe(document.documentElement, { attributeFilter: ["data-theme"] });
+    const themes = onTheme(() => this.draw());
     this.old = setInterval(() => this.draw(), 1000); // what is old becomes grey
     this.draw(true);
     return () => {
+      gone();
       sizes.disconnect();
-      themes.disconnect();
+      themes();
       clearInterval(this.old);
       this.canvas = null;
     };
   }
 
-  touched() {
+  zoom = (...how) => this.move("zoom", how);
+  pan = (...how) => this.move("pan", how);
+  move(what, how) {
+    this.view[what](...how);
     this.moved = true;
     this.draw(true);
   }
-  zoom(factor, ...at) {
-    this.view.zoom(factor, ...at);
-    this.touched();
-  }
-  wheel(event) {
-    event.preventDefault();
-    this.zoom(Math.exp(-Math.max(-60, Math.min(60, event.deltaY)) / 250), event.offsetX, event.offsetY);
-  }
-  key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const step = { ArrowLeft: [STEP, 0], ArrowRight: [-STEP, 0], ArrowUp: [0, STEP], ArrowDown: [0, -STEP] }[event.key];
-    if (step) this.view.pan(...step);
-    else if (event.key === "+" || event.key === "=") this.view.zoom(1.25);
-    else if (event.key === "-") this.view.zoom(0.8);
-    else if (event.key === "0") return this.fit(true);
-    else return;
-    event.preventDefault();
-    this.touched();
-  }
-
-  // One finger or the mouse moves the map; of two fingers, their distance zooms.
-  move(event) {
-    const at = [event.offsetX, event.offsetY],
-      before = this.pointers.get(event.pointerId);
-    const [x, y] = this.view.from(...at);
+  point(px, py) {
+    const [x, y] = this.view.from(px, py);
     this.place.textContent = `${x.toFixed(2)}, ${y.toFixed(2)} m`;
-    if (!before) return;
-    const other = [...this.pointers].find(([id]) => id !== event.pointerId)?.[1];
-    if (!other) this.view.pan(at[0] - before[0], at[1] - before[1]);
-    else {
-      const apart = (one) => Math.max(1, Math.hypot(one[0] - other[0], one[1] - other[1]));
-      this.view.pan((at[0] - before[0]) / 2, (at[1] - before[1]) / 2);
-      this.view.zoom(apart(at) / apart(before), (at[0] + other[0]) / 2, (at[1] + other[1]) / 2);
-    }
-    this.pointers.set(event.pointerId, at);
-    this.touched();
   }
 
   // A measurement stays where its frame was at its stamp, as soon as the transforms around it have come. A grid or
@@ -357,14 +291,14 @@ class MapCanvas {
 
   // What is shown now, each layer with its pose in the fixed frame, or why there is none.
   placed() {
-    const { frames, fixed, isThere } = this.shown,
+    const { frames, fixed } = this.shown,
       found = [];
     for (const layer of this.all) {
       if (!layer.head) continue;
       const { pose, problem, edges } = this.poseOf(layer, frames, fixed);
-      const late = (edges || []).find((edge) => !edge.fixed && now() - edge.heard > OLD);
+      const late = (edges || []).find((edge) => isLate(edge, now()));
       layer.problem = problem ?? (late && `the transform of ${late.child} is ${duration(now() - late.heard)} old`);
-      if (pose) found.push({ layer, pose, old: Boolean(late) || layer.isOld(now(), isThere(layer)) });
+      if (pose) found.push({ layer, pose, old: Boolean(late) || this.isOld(layer) });
     }
     const order = Object.values(LAYERS);
     return found.sort((a, b) => order.indexOf(a.layer.kind) - order.indexOf(b.layer.kind));
@@ -419,7 +353,7 @@ class MapCanvas {
     return frames.names.flatMap((name) => {
       const { pose, edges } = frames.lookup(fixed, name);
       if (!pose) return [];
-      const old = !live || edges.some((edge) => !edge.fixed && now() - edge.heard > OLD);
+      const old = !live || edges.some((edge) => isLate(edge, now()));
       const sender = frames.edge(name)?.source ?? "";
       return [{ name, pose, old, colour: this.colourOf(Frames.module(sender) || own) }];
     });

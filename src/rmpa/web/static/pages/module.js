@@ -3,9 +3,12 @@
 import { html } from "../markup.js";
 import { bandwidth, bounded, bytes, count, duration, percent, seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import { Facts, Gone, Link, Mark, Page, Panel, Since, Table, Uptime, Why, useAnswer } from "../parts.js";
-import { NODE_COLUMNS, NodeRow } from "./nodes.js";
-import { TOPIC_COLUMNS, TopicRow, isData } from "./topics.js";
+import { Facts, Gone, Mark, Page, Panel, Since, under } from "../parts.js";
+import { Table } from "../lists.js";
+import { Link } from "../links.js";
+import { Why, useAnswer } from "../asking.js";
+import { NODE_COLUMNS } from "./nodes.js";
+import { TopicTable, isData } from "./topics.js";
 import { costs } from "../mandala.js";
 import { Lines } from "../plot.js";
 import { Lines as LogLines, Missing, useLog } from "../loglines.js";
@@ -13,6 +16,13 @@ import { Lines as LogLines, Missing, useLog } from "../loglines.js";
 const DIRECTIONS = [
   ["bytes_in", "received"],
   ["bytes_out", "sent"],
+];
+
+const RESOURCES = [
+  ["Resource", ([key, one]) => html`<${Link} page="resource" name=${key}>${one.name}<//>`],
+  ["Quality", ([, one]) => html`<${Mark} state=${one.level} />`],
+  ["Profile", ([, one]) => one.profile || "none"],
+  ["Says", ([, one]) => one.message],
 ];
 
 export function ModulePage({ name, state, connection }) {
@@ -31,9 +41,8 @@ export function ModulePage({ name, state, connection }) {
         : html`<${LinkPanel} module=${module} detail=${detail} />`}
       ${!own &&
       html`<${PeerAgent}
-          name=${name}
+          ...${{ name, connection }}
           up=${module.state === "up" || module.state === "silent"}
-          connection=${connection}
           version=${section(state, "agent").version}
         />
         <${Panel} title="Lanes"><${Lanes} lanes=${section(detail, "link").lanes} linked=${Boolean(detail.link)} /><//>
@@ -53,24 +62,12 @@ export function ModulePage({ name, state, connection }) {
       /><//>`}
       ${resources.length > 0 &&
       html`<${Panel} title="Smart Resources"
-        ><${Table} caption="Smart Resources" columns=${["Resource", "Quality", "Profile", "Says"]}
-          >${resources.map(
-            ([key, one]) =>
-              html`<tr key=${key}>
-                <th scope="row"><${Link} page="resource" name=${key}>${one.name}<//></th>
-                <td><${Mark} state=${one.level} /></td>
-                <td>${one.profile || "none"}</td>
-                <td>${one.message}</td>
-              </tr>`,
-          )}<//
-        ><//
-      >`}
+        ><${Table} caption="Smart Resources" columns=${RESOURCES} list=${resources}
+      /><//>`}
       ${nodes.length > 0 &&
       html`<${Panel} title=${`Nodes of ${name}`}
-        ><${Table} caption="Nodes" columns=${NODE_COLUMNS} list=${nodes}>
-          ${([key, one]) => html`<${NodeRow} key=${key} name=${key} node=${one} />`}<//
-        ><//
-      >`}
+        ><${Table} caption="Nodes" columns=${NODE_COLUMNS} list=${nodes}
+      /><//>`}
       ${own && html`<${Counters} state=${state} connection=${connection} />`}
       <${Panel} title=${`Topics of ${name}`} wide
         ><${TopicTable} list=${topics} empty=${all.length ? "It publishes no data." : "It publishes no topic."} />
@@ -83,11 +80,6 @@ export function ModulePage({ name, state, connection }) {
       <${ModuleLog} name=${name} own=${section(state, "agent").name} connection=${connection} /></div
   ><//>`;
 }
-
-const TopicTable = ({ list, empty }) =>
-  html`<${Table} caption="Topics" columns=${TOPIC_COLUMNS} empty=${empty} list=${list}>
-    ${([topic, one]) => html`<${TopicRow} key=${topic} name=${topic} topic=${one} />`}<//
-  >`;
 
 function ModuleLog({ name, own, connection }) {
   const log = useLog(connection, { modules: [name], level: "info" });
@@ -105,7 +97,7 @@ const LinkPanel = ({ module, detail }) => {
     ><${Facts}
       rows=${[
         ["State", html`<${Mark} state=${module.state} />`],
-        ["For", module.since && html`<${Uptime} since=${module.since} />`],
+        ["For", module.since && html`<${Since} moment=${module.since} />`],
         ["Address", module.remote],
         ["Round trip", seconds(module.rtt)],
         ["Clock offset", bounded(module.offset, module.offset_error)],
@@ -168,33 +160,20 @@ function PeerAgent({ name, up, connection, version }) {
 }
 
 const PURPOSE = { express: "control, small messages", bulk: "large messages" };
-const Lanes = ({ lanes, linked }) =>
-  linked && !(lanes || []).length
+const laneState = (lane) =>
+  lane.connected ? ["up", "connected"] : lane.unneeded ? ["away", "not needed now"] : ["linking", "no connection"];
+const LANES = [
+  ["Lane", (lane) => under(lane.name, PURPOSE[lane.name])],
+  ["State", (lane) => html`<${Mark} state=${laneState(lane)[0]} word=${laneState(lane)[1]} />`],
+  ["#In", (lane) => bytes(lane.bytes_in)],
+  ["#Out", (lane) => bytes(lane.bytes_out)],
+  ["#Waiting", (lane) => bytes(lane.queued || undefined)],
+  ["#Dropped", (lane) => count(lane.dropped)],
+];
+const Lanes = ({ lanes = [], linked }) =>
+  linked && !lanes.length
     ? html`<p class="empty">The agent does not report lanes.</p>`
-    : html`<${Table}
-        caption="Lanes"
-        columns=${["Lane", "State", "#In", "#Out", "#Waiting", "#Dropped"]}
-        empty="It has no link."
-        >${(lanes || []).map(
-          (lane) =>
-            html`<tr key=${lane.name}>
-              <th scope="row">
-                ${lane.name}
-                <div class="muted">${PURPOSE[lane.name] || ""}</div>
-              </th>
-              <td>
-                <${Mark}
-                  state=${lane.connected ? "up" : lane.unneeded ? "away" : "linking"}
-                  word=${lane.connected ? "connected" : lane.unneeded ? "not needed now" : "no connection"}
-                />
-              </td>
-              <td class="number">${bytes(lane.bytes_in)}</td>
-              <td class="number">${bytes(lane.bytes_out)}</td>
-              <td class="number">${lane.queued ? bytes(lane.queued) : "–"}</td>
-              <td class="number">${count(lane.dropped)}</td>
-            </tr>`,
-        )}<//
-      >`;
+    : html`<${Table} caption="Lanes" columns=${LANES} empty="It has no link." list=${lanes} />`;
 
 const Agent = ({ agent, detail }) =>
   html`<${Panel} title="Agent"
@@ -216,16 +195,14 @@ const Agent = ({ agent, detail }) =>
     ${agent.files_problem && html`<p class="failure">${agent.files_problem}</p>`}<//
   >`;
 
+const COUNTERS = [
+  ["Reason", ([name]) => html`<code>${name}</code>`],
+  ["#Count", ([, value]) => count(value)],
+];
 const Counters = ({ state, connection }) => {
   const counters = entries(section(state, "detail"), "counters:");
   connection.look([...new Map([...connection.looks, ["counters", ""]].map((each) => [each.join(), each])).values()]);
   return html`<${Panel} title="Counted by the agent"
-    ><${Table} caption="Counters" columns=${["Reason", "#Count"]} list=${counters}>
-      ${([name, value]) =>
-        html`<tr key=${name}>
-          <th scope="row"><code>${name}</code></th>
-          <td class="number">${count(value)}</td>
-        </tr>`}<//
-    ><//
-  >`;
+    ><${Table} caption="Counters" columns=${COUNTERS} list=${counters}
+  /><//>`;
 };

@@ -3,43 +3,29 @@
 import { html, useState } from "../markup.js";
 import { count, hertz } from "../format.js";
 import { entries, section } from "../state.js";
-import {
-  Facts,
-  Failure,
-  Gone,
-  Link,
-  Mark,
-  ModuleLink,
-  NodeLink,
-  nodeName,
-  Page,
-  Panel,
-  Question,
-  Table,
-  memo,
-  useAnswer,
-  useFilter,
-} from "../parts.js";
+import { Facts, Failure, Gone, Mark, Page, Panel, Select, Text } from "../parts.js";
+import { Table, useFilter } from "../lists.js";
+import { Link, ModuleLink, NodeLink, nodeName } from "../links.js";
+import { Question, useAnswer, useAsk } from "../asking.js";
 import { Lines, Missing, useLog } from "../loglines.js";
 import { useTypes } from "./services.js";
 
 const NODE_PERIOD = 5; // seconds after which the node that is shown is asked again
 
-export const NodeRow = memo(
-  ({ name, node, own }) =>
-    html`<tr>
-      <th scope="row">
-        <${NodeLink} name=${name} />${node.problem &&
-        html`<div class="muted"><${Mark} state="WARN" word="" />${node.problem}</div>`}
-      </th>
-      ${own && html`<td><${ModuleLink} name=${node.module || own} /></td>`}
-      <td class="number">${node.publishes || 0}</td>
-      <td class="number">${node.module ? "–" : node.subscribes || 0}</td>
-      <td class="number">${node.serves || 0}</td>
-    </tr>`,
-);
-// Where the module is clear; `own` is left out then.
-export const NODE_COLUMNS = ["Node", "#Publishes", "#Subscribes", "#Services"];
+// Where the module is clear it is left out.
+const COLUMNS = [
+  [
+    "Node",
+    ([name, node]) =>
+      html`<${NodeLink} name=${name} />${node.problem &&
+        html`<div class="muted"><${Mark} state="WARN" word="" />${node.problem}</div>`}`,
+  ],
+  ["Module", ([, node], { own }) => html`<${ModuleLink} name=${node.module || own} />`],
+  ["#Publishes", ([, node]) => node.publishes || 0],
+  ["#Subscribes", ([, node]) => (node.module ? "–" : node.subscribes || 0)],
+  ["#Services", ([, node]) => node.serves || 0],
+];
+export const NODE_COLUMNS = COLUMNS.filter(([heading]) => heading !== "Module");
 
 export function Nodes({ state }) {
   const filter = useFilter("name or module");
@@ -50,14 +36,7 @@ export function Nodes({ state }) {
   return html`<${Page} title="Nodes" kind=${`${all.length} in all modules`}>
     ${filter.field}
     <${Panel}
-      ><${Table}
-        caption="Nodes"
-        columns=${["Node", "Module", ...NODE_COLUMNS.slice(1)]}
-        empty="No node matches."
-        list=${shown}
-      >
-        ${([name, one]) => html`<${NodeRow} key=${name} name=${name} node=${one} own=${own} />`}<//
-      >
+      ><${Table} caption="Nodes" columns=${COLUMNS} about=${{ own }} empty="No node matches." list=${shown} />
       <p class="empty">
         ${hidden ? `The server leaves out ${hidden} further nodes. ` : ""}Of peers, the nodes that offer something to
         this module.
@@ -107,20 +86,21 @@ export function NodePage({ name, state, connection }) {
         ${failure && html`<p class="empty">The node cannot be asked: ${failure.error}. ${failure.remedy}</p>`}<//
       >
       <${Panel} title="Services"
-        ><${Table} caption="Services" columns=${["Service", "Type"]} empty="It offers no service." list=${services}
-          >${(each) => {
-            const service = section(state, "services")[each];
-            return html`<tr key=${each}>
-              <th scope="row">
-                ${service
+        ><${Table}
+          caption="Services"
+          columns=${[
+            [
+              "Service",
+              ([each, service]) =>
+                service
                   ? html`<${Link} page="service" name=${each}>${service.name}<//>`
-                  : html`<span class="mono">${each.slice(each.indexOf(":") + 1)}</span>`}
-              </th>
-              <td class="muted">${service ? typeOf(service) : "not known here"}</td>
-            </tr>`;
-          }}<//
-        ><//
-      >
+                  : html`<span class="mono">${each.slice(each.indexOf(":") + 1)}</span>`,
+            ],
+            ["~Type", ([, service]) => (service ? typeOf(service) : "not known here")],
+          ]}
+          empty="It offers no service."
+          list=${services.map((each) => [each, section(state, "services")[each]])}
+      /><//>
       ${[
         ["Publishes", publishes, facts?.publications, "It publishes nothing."],
         [
@@ -132,21 +112,25 @@ export function NodePage({ name, state, connection }) {
       ].map(
         ([title, names, types, empty]) =>
           html`<${Panel} key=${title} title=${title}>
-            <${Table} caption=${title} columns=${["Topic", "Type", "#Rate"]} empty=${empty} list=${names}
-              >${(each) =>
-                html`<tr key=${each}>
-                  <th scope="row">
-                    ${topics[each]
+            <${Table}
+              caption=${title}
+              columns=${[
+                [
+                  "Topic",
+                  (each) =>
+                    topics[each]
                       ? html`<${Link} page="topic" name=${each} />`
-                      : html`<span class="mono">${each}</span>`}
-                  </th>
-                  <td class="muted">${topics[each]?.type || types?.[each] || ""}</td>
-                  <td class="number">
-                    ${topics[each] ? hertz(topics[each].rate) : html`<span class="muted">not known here</span>`}
-                  </td>
-                </tr>`}<//
-            ><//
-          >`,
+                      : html`<span class="mono">${each}</span>`,
+                ],
+                ["~Type", (each) => topics[each]?.type || types?.[each] || ""],
+                [
+                  "#Rate",
+                  (each) => (topics[each] ? hertz(topics[each].rate) : html`<span class="muted">not known here</span>`),
+                ],
+              ]}
+              empty=${empty}
+              list=${names}
+          /><//>`,
       )}
       <${Connections} facts=${facts} failure=${failure} module=${peer || own} own=${own} />
       <${Levels} node=${node} peer=${peer} connection=${connection} />
@@ -162,6 +146,16 @@ const OtherEnd = ({ name, module, own }) =>
       ? html`<code>${name}</code>`
       : html`<${NodeLink} name=${name.startsWith(`${own}:`) ? name.slice(own.length + 1) : name} />`;
 
+const CONNECTIONS = [
+  ["Topic", (one) => html`<${Link} page="topic" name=${one.topic} />`],
+  ["~Way", (one) => (one.inbound ? "← from" : "→ to")],
+  ["Other end", (one, about) => html`<${OtherEnd} name=${one.other} ...${about} />`],
+  [
+    "State",
+    ({ connected }) =>
+      html`<${Mark} state=${connected ? "up" : "silent"} word=${connected ? "connected" : "not connected"} />`,
+  ],
+];
 const Connections = ({ facts, failure, module, own }) =>
   html`<${Panel} title="Connections" wide
     >${facts && !facts.connections
@@ -172,52 +166,34 @@ const Connections = ({ facts, failure, module, own }) =>
         </p>`
       : html`<${Table}
           caption="Connections"
-          columns=${["Topic", "Way", "Other end", "State"]}
+          columns=${CONNECTIONS}
+          about=${{ module, own }}
           empty=${facts ? "It has no connection." : failure ? "Not known: the node cannot be asked." : "Asking …"}
           list=${facts?.connections || []}
-          >${(one, at) =>
-            html`<tr key=${at}>
-              <th scope="row"><${Link} page="topic" name=${one.topic} /></th>
-              <td class="muted">${one.inbound ? "← from" : "→ to"}</td>
-              <td><${OtherEnd} name=${one.other} module=${module} own=${own} /></td>
-              <td>
-                <${Mark}
-                  state=${one.connected ? "up" : "silent"}
-                  word=${one.connected ? "connected" : "not connected"}
-                />
-              </td>
-            </tr>`}<//
-        >`}<//
+        />`}<//
   >`;
 
 const LOG_LEVELS = ["debug", "info", "warn", "error", "fatal"];
+
+const LOGGERS = [
+  ["Logger", ([name]) => html`<span class="mono">${name}</span>`],
+  ["Level", ([, level]) => level],
+];
 
 // The loggers of a node are asked for by a button: the roscpp of some systems does not bear the question.
 function Levels({ node, peer, connection }) {
   const [logger, setLogger] = useState("");
   const [level, setLevel] = useState("info");
-  const [state, set] = useState({});
+  const [state, ask] = useAsk(connection, (told) => ({ said: `${Object.keys(told).join(" and ")}: ${level}` }));
   const submit = (event) => {
     event.preventDefault();
-    set({ waits: true });
-    connection.ask("set_log_level", { name: node, peer, logger: logger.trim(), level }).then(
-      (told) => set({ said: `${Object.keys(told).join(" and ")}: ${level}` }),
-      (failure) => set({ failure }),
-    );
+    ask("set_log_level", { name: node, peer, logger: logger.trim(), level });
   };
   return html`<${Panel} title="Log levels"
     >${connection.hello.may.includes("control") &&
     html`<form class="row" onSubmit=${submit}>
-      <label
-        ><span>Logger</span
-        ><input value=${logger} placeholder="of its own code" onInput=${(event) => setLogger(event.target.value)}
-      /></label>
-      <label
-        ><span>Level</span
-        ><select value=${level} onChange=${(event) => setLevel(event.target.value)}>
-          ${LOG_LEVELS.map((each) => html`<option key=${each} value=${each}>${each}</option>`)}
-        </select></label
-      >
+      <${Text} label="Logger" value=${logger} placeholder="of its own code" onInput=${setLogger} />
+      <${Select} label="Level" value=${level} names=${LOG_LEVELS} onChange=${setLevel} />
       <button class="primary" disabled=${state.waits}>Set</button>
       <span role="status" class="muted said">${state.said}</span><${Failure} failure=${state.failure} />
     </form>`}
@@ -227,17 +203,7 @@ function Levels({ node, peer, connection }) {
       args=${{ name: node, peer }}
       label="Show its loggers"
       show=${(levels) =>
-        html`<${Table}
-          caption="Loggers"
-          columns=${["Logger", "Level"]}
-          empty="None."
-          list=${Object.entries(levels).sort()}
-          >${([name, each]) =>
-            html`<tr key=${name}>
-              <th scope="row" class="mono">${name}</th>
-              <td>${each}</td>
-            </tr>`}<//
-        >`}
+        html`<${Table} caption="Loggers" columns=${LOGGERS} empty="None." list=${Object.entries(levels).sort()} />`}
   /><//>`;
 }
 

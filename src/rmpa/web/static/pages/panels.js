@@ -2,7 +2,9 @@
 
 import { html, useEffect, useRef, useState } from "../markup.js";
 import { entries, section } from "../state.js";
-import { AsPanel, Failure, Page, Panel } from "../parts.js";
+import { AsPanel, Failure, IconButton, Page, Panel, Select, Text } from "../parts.js";
+import { download, store, stored } from "../storage.js";
+import { toggled } from "../plot.js";
 import { Fields, IMAGES, Image, Value } from "../live.js";
 
 const STORE = "rmpa.panels"; // in the browser: { current, layouts: { name: panels } }
@@ -53,17 +55,12 @@ export function checked(list) {
 }
 
 function restored() {
-  try {
-    const kept = JSON.parse(localStorage.getItem(STORE));
-    const layouts = Object.entries(kept.layouts)
-      .slice(0, MOST_LAYOUTS)
-      .map(([name, list]) => [name, checked(list).panels])
-      .filter(([name, panels]) => isText(name) && panels);
-    if (layouts.length) return { current: kept.current, layouts: Object.fromEntries(layouts) };
-  } catch {
-    // nothing was kept, or something else
-  }
-  return { current: "Panels", layouts: { Panels: [] } };
+  const kept = stored(STORE);
+  const layouts = Object.entries(kept.layouts || {})
+    .slice(0, MOST_LAYOUTS)
+    .map(([name, list]) => [name, checked(list).panels])
+    .filter(([name, panels]) => isText(name) && panels);
+  return { current: kept.current, layouts: layouts.length ? Object.fromEntries(layouts) : { Panels: [] } };
 }
 
 export function Panels({ state, connection, pages }) {
@@ -75,7 +72,7 @@ export function Panels({ state, connection, pages }) {
   const panels = kept.layouts[current];
   const open = arranging ?? panels.length === 0;
   const keep = (next) => {
-    localStorage.setItem(STORE, JSON.stringify(next));
+    store(STORE, next);
     set(next);
     fail(null);
   };
@@ -90,9 +87,7 @@ export function Panels({ state, connection, pages }) {
   const plot = (topic, path) => {
     const at = panels.findIndex((one) => one.kind === "plot" && one.topic === topic);
     if (at < 0) return add({ kind: "plot", topic, fields: [path], wide: 2 });
-    const fields = panels[at].fields.includes(path)
-      ? panels[at].fields.filter((each) => each !== path)
-      : [...panels[at].fields, path].slice(-MOST_FIELDS);
+    const fields = toggled(panels[at].fields, path);
     return fields.length ? replace(at, { fields }) : change(panels.filter((_, each) => each !== at));
   };
   const plotted = (topic) =>
@@ -170,25 +165,22 @@ function Controls({ one, at, panels, change, replace }) {
     [list[at], list[to]] = [list[to], list[at]];
     change(list);
   };
-  const button = (label, sign, disabled, act) =>
-    html`<button
-      type="button"
-      class="icon"
-      aria-label=${`${label}: ${titleOf(one)}`}
-      title=${label}
-      disabled=${disabled}
-      onClick=${act}
-    >
-      ${sign}
-    </button>`;
+  const controls = [
+    ["Earlier", "↑", at === 0, () => swap(at - 1)],
+    ["Later", "↓", at === panels.length - 1, () => swap(at + 1)],
+    ["Wider", "↔", one.wide >= WIDEST, () => replace(at, { wide: one.wide + 1 })],
+    ["Narrower", "→←", one.wide <= 1, () => replace(at, { wide: one.wide - 1 })],
+    ["Taller", "↕", one.tall >= TALLEST, () => replace(at, { tall: one.tall + 1 })],
+    ["Shorter", "⇕", one.tall <= 1, () => replace(at, { tall: one.tall - 1 })],
+    ["Remove", "×", false, () => change(panels.filter((_, each) => each !== at))],
+  ];
   return html`<div class="tools">
-    ${button("Earlier", "↑", at === 0, () => swap(at - 1))}
-    ${button("Later", "↓", at === panels.length - 1, () => swap(at + 1))}
-    ${button("Wider", "↔", one.wide >= WIDEST, () => replace(at, { wide: one.wide + 1 }))}
-    ${button("Narrower", "→←", one.wide <= 1, () => replace(at, { wide: one.wide - 1 }))}
-    ${button("Taller", "↕", one.tall >= TALLEST, () => replace(at, { tall: one.tall + 1 }))}
-    ${button("Shorter", "⇕", one.tall <= 1, () => replace(at, { tall: one.tall - 1 }))}
-    ${button("Remove", "×", false, () => change(panels.filter((_, each) => each !== at)))}
+    ${controls.map(
+      ([label, sign, disabled, press]) =>
+        html`<${IconButton} key=${label} label=${`${label}: ${titleOf(one)}`} title=${label} ...${{ disabled, press }}
+          >${sign}<//
+        >`,
+    )}
   </div>`;
 }
 
@@ -211,11 +203,7 @@ function Layouts({ kept, keep, current, panels, change, fail }) {
   };
   const write = () => {
     const text = JSON.stringify({ format: FORMAT, name: current, panels }, null, 2);
-    const link = document.createElement("a");
-    link.href = URL.createObjectURL(new Blob([text], { type: "application/json" }));
-    link.download = `${current.replace(/[^\w-]+/g, "_")}.json`;
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+    download(`${current.replace(/[^\w-]+/g, "_")}.json`, "application/json", text);
   };
   const read = async () => {
     const [chosen] = file.current.files;
@@ -236,12 +224,8 @@ function Layouts({ kept, keep, current, panels, change, fail }) {
     change(next.panels, isText(made.name) ? made.name : chosen.name.slice(0, LONGEST));
   };
   return html`<form class="row" onSubmit=${save}>
-    <label
-      >Layout<select value=${current} onChange=${(event) => keep({ ...kept, current: event.target.value })}>
-        ${names.map((each) => html`<option key=${each} value=${each}>${each}</option>`)}
-      </select></label
-    >
-    <label>New name<input value=${name} onInput=${(event) => setName(event.target.value)} /></label>
+    <${Select} label="Layout" value=${current} names=${names} onChange=${(each) => keep({ ...kept, current: each })} />
+    <${Text} label="New name" value=${name} onInput=${setName} />
     <button>Save as</button>
     <button type="button" onClick=${remove}>Remove layout</button>
     <button type="button" onClick=${write}>Export</button>
@@ -265,27 +249,18 @@ function Add({ state, pages, panels, add, may }) {
     add({ kind, topic: topic.trim(), fields: lines.filter(Boolean), ...large });
   };
   return html`<form class="row" onSubmit=${submit}>
-    <label
-      >Panel<select value=${kind} onChange=${(event) => setKind(event.target.value)}>
-        ${kinds.map((each) => html`<option key=${each} value=${each}>${KINDS[each][0]}</option>`)}
-      </select></label
-    >
+    <${Select} label="Panel" value=${kind} names=${kinds.map((each) => [each, KINDS[each][0]])} onChange=${setKind} />
     ${needs(kind, "topic") &&
-    html`<label
-        >Topic<input
-          class="mono"
-          list="topics"
-          value=${topic}
-          onInput=${(event) => setTopic(event.target.value)} /></label
-      ><datalist id="topics">${topics.map(([name]) => html`<option key=${name} value=${name} />`)}</datalist>`}
+    html`<${Text} label="Topic" class="mono" list="topics" value=${topic} onInput=${setTopic} />
+      <datalist id="topics">${topics.map(([each]) => html`<option key=${each} value=${each} />`)}</datalist>`}
     ${needs(kind, "fields") &&
-    html`<label
-      >Fields<input
-        class="mono"
-        placeholder="pose.pose.position.x, twist.twist.linear.x"
-        value=${fields}
-        onInput=${(event) => setFields(event.target.value)}
-    /></label>`}
+    html`<${Text}
+      label="Fields"
+      class="mono"
+      placeholder="pose.pose.position.x, twist.twist.linear.x"
+      value=${fields}
+      onInput=${setFields}
+    />`}
     <button class="primary" disabled=${panels.length >= MOST}>Add</button>
   </form>`;
 }

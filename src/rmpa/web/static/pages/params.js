@@ -2,7 +2,9 @@
 
 import { html, useEffect, useRef, useState } from "../markup.js";
 import { entries, section } from "../state.js";
-import { Choice, Editable, Failure, Page, Panel, useFilter, useFirst, useKept } from "../parts.js";
+import { Choice, Failure, Page, Panel, Text } from "../parts.js";
+import { useFilter, useFirst, useKept } from "../lists.js";
+import { Editable, useAgain } from "../asking.js";
 import { plain } from "../format.js";
 import { another, fresh, kind } from "../typed.js";
 
@@ -12,18 +14,14 @@ export function grow(values) {
   for (const [name, value] of Object.entries(values)) {
     const steps = name.split("/").filter(Boolean);
     let at = root;
-    for (const step of steps.slice(0, -1))
-      at =
-        at[step] && typeof at[step] === "object" && !Array.isArray(at[step])
-          ? at[step]
-          : (at[step] = Object.create(null));
+    for (const step of steps.slice(0, -1)) at = isTree(at[step]) ? at[step] : (at[step] = Object.create(null));
     at[steps[steps.length - 1]] = value;
   }
   return root;
 }
 
-// Milliseconds after which a peer's parameters are read again; this module's core tells its changes.
-const PEER_PERIOD = 3000;
+// Seconds after which a peer's parameters are read again; this module's core tells its changes.
+const PEER_PERIOD = 3;
 
 export function Params({ name, state, connection }) {
   const own = section(state, "agent").name;
@@ -50,21 +48,12 @@ export function Params({ name, state, connection }) {
     shown.current = { peer };
     setValues(null);
   }, [module]);
-  useEffect(() => {
-    if (open) read();
-  }, [module, open]); // what was read stays while there is no connection
+  // What was read stays while there is no connection.
+  useAgain(open, peer ? PEER_PERIOD : 0, module, () => read(shown.current.digest && { has: shown.current.digest }));
   // Changes by others: this module's core tells them, a peer is asked while the page is seen.
   useEffect(() => {
     if (open && !peer && shown.current.digest) read({ has: shown.current.digest });
   }, [state.parameters]);
-  useEffect(() => {
-    if (!peer || !open) return undefined;
-    const timer = setInterval(
-      () => document.hidden || !shown.current.digest || read({ has: shown.current.digest }),
-      PEER_PERIOD,
-    );
-    return () => clearInterval(timer);
-  }, [module, open]);
   const choices = entries(state, "modules")
     .filter(([, one]) => one.state === "up" || one.state === "here")
     .map(([each]) => [each, each]);
@@ -157,13 +146,13 @@ function Setter({ ask }) {
       (failure) => set({ failure }),
     );
   };
-  const edit = (take) => (event) => {
-    take(event.target.value);
+  const edit = (take) => (value) => {
+    take(value);
     set({});
   };
   return html`<form class="row" onSubmit=${save}>
-    <label>Name<input class="mono" value=${name} onInput=${edit(setName)} /></label>
-    <label>Value: JSON, or text<input class="mono" value=${text} onInput=${edit(setText)} /></label>
+    <${Text} label="Name" class="mono" value=${name} onInput=${edit(setName)} />
+    <${Text} label="Value: JSON, or text" class="mono" value=${text} onInput=${edit(setText)} />
     <button class="primary">Set</button>
     <p role="status" class="muted said">
       ${state.said || (text && !typed.error && `It is sent as a ${kind(typed.value)}.`)}

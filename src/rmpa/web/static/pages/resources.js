@@ -3,27 +3,21 @@
 import { html, useState } from "../markup.js";
 import { seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import { Editable, Facts, Failure, Gone, Link, Mark, ModuleLink, Page, Panel, Table, memo } from "../parts.js";
+import { Facts, Failure, Gone, Mark, Page, Panel, under } from "../parts.js";
+import { Table } from "../lists.js";
+import { Link, ModuleLink } from "../links.js";
+import { Editable } from "../asking.js";
 import { setting } from "../typed.js";
 
-const Row = memo(
-  ({ name, one }) =>
-    html`<tr>
-      <th scope="row">
-        <${Link} page="resource" name=${name}>${one.name}<//>
-        <div class="muted">${one.description}</div>
-      </th>
-      <td><${ModuleLink} name=${one.module} /></td>
-      <td>${one.role}${one.physical ? "" : html` <span class="muted">simulated</span>`}</td>
-      <td>
-        <${Mark} state=${one.level} />
-        <div class="muted">${one.message}</div>
-      </td>
-      <td>${one.profile || "none"}</td>
-      <td>${one.context || "–"}</td>
-      <td class="number">${one.clients || 0}</td>
-    </tr>`,
-);
+const RESOURCES = [
+  ["Resource", ([name, one]) => under(html`<${Link} page="resource" name=${name}>${one.name}<//>`, one.description)],
+  ["Module", ([, one]) => html`<${ModuleLink} name=${one.module} />`],
+  ["Role", ([, one]) => html`${one.role}${!one.physical && html` <span class="muted">simulated</span>`}`],
+  ["Quality", ([, one]) => under(html`<${Mark} state=${one.level} />`, one.message)],
+  ["Profile", ([, one]) => one.profile || "none"],
+  ["Context", ([, one]) => one.context || "–"],
+  ["#Clients", ([, one]) => one.clients || 0],
+];
 
 export function Resources({ state }) {
   const all = entries(state, "resources");
@@ -31,15 +25,100 @@ export function Resources({ state }) {
     ><${Panel}
       ><${Table}
         caption="Smart Resources"
-        columns=${["Resource", "Module", "Role", "Quality", "Profile", "Context", "#Clients"]}
+        columns=${RESOURCES}
         empty="No module has a Smart Resource."
-        list=${all}
-      >
-        ${([key, one]) => html`<${Row} key=${key} name=${key} one=${one} />`}<//
-      ><//
-    ><//
-  >`;
+        list=${all} /><//
+  ><//>`;
 }
+
+const said = (values) =>
+  Object.entries(values || {})
+    .map(([key, value]) => `${key} ${value}`)
+    .join(", ") || "–";
+const QUALITY = [
+  ["Attribute", (each) => each.name],
+  ["#Now", (each, { values }) => quantity(values[each.name])],
+  ["Better", ({ better }) => ({ max: "more", min: "less" })[better] ?? better],
+  ["Class", (each) => each.category],
+];
+const CLIENTS = [
+  ["Client", (client) => client.name],
+  ["Is told", (client) => html`<${Mark} state=${client.level} word=${client.message} />`],
+  [
+    "Asks",
+    (client) => Object.entries(client.values || {}).map(([key, value]) => html`<div key=${key}>${key} ${value}</div>`),
+  ],
+];
+const CONTEXTS = [
+  [
+    "Context",
+    (each, { resource }) =>
+      each.name === resource.context ? html`<${Mark} state="up" word=${each.name} />` : each.name,
+  ],
+  ["When", (each) => each.when || "by hand"],
+  ["Requires", (each) => said(each.requires)],
+  ["Profiles", (each) => (each.profiles || []).join(", ") || "all"],
+  [
+    "#",
+    (each, { resource, choose }) => {
+      const here = each.name === resource.context;
+      return (
+        choose &&
+        html`<button type="button" onClick=${() => choose("context", here ? "" : each.name)}>
+          ${here ? "Leave" : "Enter"}
+        </button>`
+      );
+    },
+  ],
+];
+const range = ({ choices, low, high, type }) =>
+  choices?.length
+    ? choices.join(" | ")
+    : low !== undefined || high !== undefined
+      ? `${low ?? ""} … ${high ?? ""}`
+      : type;
+const PARAMETERS = [
+  ["Parameter", (each) => each.name],
+  [
+    "#Value",
+    (each, { now, set }) =>
+      html`<${Setting}
+        value=${now[each.name] ?? each.default}
+        about=${each}
+        set=${set && ((value) => set(each.name, value))}
+      />`,
+  ],
+  ["Range", range],
+  ["Description", (each) => each.description],
+];
+const TOPICS = [
+  ["Topic", (each) => html`<${Link} page="topic" name=${each.topic} />`],
+  ["Way", (each) => each.way],
+  ["Type", (each) => each.type],
+  ["Contract", (each) => said(each.contract)],
+];
+const PROFILES = [
+  [
+    "Profile",
+    (each, { resource }) =>
+      each.name === resource.profile ? html`<${Mark} state="up" word=${`${each.name} runs`} />` : each.name,
+  ],
+  ["Offers", (each, { units }) => offers(each, units)],
+  ["#Cost", (each) => each.cost],
+  ["Description", (each) => each.description],
+  [
+    "#",
+    (each, { decision, choose }) => {
+      const chosen = decision.chosen === each.name;
+      return (
+        choose &&
+        html`<button type="button" onClick=${() => choose("profile", chosen ? "" : each.name)}>
+          ${chosen ? "Let it decide" : "Choose"}
+        </button>`
+      );
+    },
+  ],
+];
 
 export function ResourcePage({ name, state, connection }) {
   const one = section(state, "resources")[name];
@@ -50,7 +129,28 @@ export function ResourcePage({ name, state, connection }) {
     decision = section(detail, "decision"),
     values = section(section(detail, "health"), "values");
   const whose = { resource: one.name, peer: one.module === section(state, "agent").name ? "" : one.module };
-  const choose = (what, choice) => connection.ask(what, { ...whose, choice }).then(() => setFailure(null), setFailure);
+  const may = connection.may("control");
+  const choose =
+    may && ((what, choice) => connection.ask(what, { ...whose, choice }).then(() => setFailure(null), setFailure));
+  const set = may && ((parameter, value) => connection.ask("configure", { ...whose, name: parameter, value }));
+  const { attributes = [] } = descriptor;
+  const units = Object.fromEntries(attributes.map((each) => [each.name, each.unit]));
+  const lists = [
+    ["Quality", QUALITY, attributes.filter((each) => each.name in values), "It has measured nothing yet.", "Quality"],
+    ["Who asked what", CLIENTS, detail.clients, "No client asks for anything.", "Clients"],
+    ["Contexts", CONTEXTS, detail.contexts || descriptor.contexts, "It has no contexts.", "Contexts"],
+    ["Configuration", PARAMETERS, descriptor.parameters, "It has no parameters.", "Parameters"],
+    [
+      "Topics",
+      TOPICS,
+      ["out", "in"].flatMap((way) =>
+        (descriptor[`${way}puts`] || []).map((each) => ({ ...each, way, name: way + each.topic })),
+      ),
+      "",
+      "Topics",
+    ],
+  ];
+  const about = { resource: one, values, decision, units, choose, set, now: section(detail, "parameters") };
   return html`<${Page}
     title=${one.name}
     kind=${`Smart Resource of ${one.module} · ${one.role || ""}${one.physical ? "" : ", simulated"}`}
@@ -77,130 +177,18 @@ export function ResourcePage({ name, state, connection }) {
         ><${Distances} scores=${decision.scores || []} profile=${one.profile}
       /><//>
       <${Panel} title="Profiles" wide
-        ><${Profiles}
-          descriptor=${descriptor}
-          decision=${decision}
-          one=${one}
-          choose=${connection.may("control") ? (choice) => choose("profile", choice) : null}
+        ><${Table}
+          caption="Profiles"
+          columns=${PROFILES}
+          ...${{ about }}
+          list=${descriptor.profiles || []}
+          empty="It has no profiles."
       /><//>
       <${Panel} title="Why: each term of the decision" wide><${Terms} scores=${decision.scores || []} /><//>
-      <${Panel} title="Quality"
-        ><${Table}
-          caption="Quality"
-          columns=${["Attribute", "#Now", "Better", "Class"]}
-          empty="It has measured nothing yet."
-          >${(descriptor.attributes || [])
-            .filter((each) => each.name in values)
-            .map(
-              (each) =>
-                html`<tr key=${each.name}>
-                  <th scope="row">${each.name}</th>
-                  <td class="number">${quantity(values[each.name])}</td>
-                  <td>${each.better === "max" ? "more" : each.better === "min" ? "less" : each.better}</td>
-                  <td>${each.category}</td>
-                </tr>`,
-            )}<//
-        ><//
-      >
-      <${Panel} title="Who asked what"
-        ><${Table} caption="Clients" columns=${["Client", "Is told", "Asks"]} empty="No client asks for anything."
-          >${(detail.clients || []).map(
-            (client) =>
-              html`<tr key=${client.name}>
-                <th scope="row">${client.name}</th>
-                <td><${Mark} state=${client.level} word=${client.message} /></td>
-                <td>
-                  ${Object.entries(client.values || {}).map(
-                    ([key, value]) => html`<div key=${key}>${key} ${value}</div>`,
-                  )}
-                </td>
-              </tr>`,
-          )}<//
-        ><//
-      >
-      <${Panel} title="Contexts"
-        ><${Table}
-          caption="Contexts"
-          columns=${["Context", "When", "Requires", "Profiles", ""]}
-          empty="It has no contexts."
-          >${(detail.contexts || descriptor.contexts || []).map(
-            (each) =>
-              html`<tr key=${each.name}>
-                <th scope="row">
-                  ${each.name === one.context ? html`<${Mark} state="up" word=${each.name} />` : each.name}
-                </th>
-                <td>${each.when || "by hand"}</td>
-                <td>
-                  ${Object.entries(each.requires || {})
-                    .map(([key, value]) => `${key} ${value}`)
-                    .join(", ") || "–"}
-                </td>
-                <td>${(each.profiles || []).join(", ") || "all"}</td>
-                <td class="number">
-                  ${connection.may("control") &&
-                  html`<button
-                    type="button"
-                    onClick=${() => choose("context", each.name === one.context ? "" : each.name)}
-                  >
-                    ${each.name === one.context ? "Leave" : "Enter"}
-                  </button>`}
-                </td>
-              </tr>`,
-          )}<//
-        ><//
-      >
-      <${Panel} title="Configuration"
-        ><${Table}
-          caption="Parameters"
-          columns=${["Parameter", "#Value", "Range", "Description"]}
-          empty="It has no parameters."
-          >${(descriptor.parameters || []).map(
-            (each) =>
-              html`<tr key=${each.name}>
-                <th scope="row">${each.name}</th>
-                <td class="number">
-                  <${Setting}
-                    value=${section(detail, "parameters")[each.name] ?? each.default}
-                    about=${each}
-                    set=${connection.may("control")
-                      ? (value) => connection.ask("configure", { ...whose, name: each.name, value })
-                      : null}
-                  />
-                </td>
-                <td>
-                  ${each.choices?.length
-                    ? each.choices.join(" | ")
-                    : each.low !== undefined || each.high !== undefined
-                      ? `${each.low ?? ""} … ${each.high ?? ""}`
-                      : each.type}
-                </td>
-                <td>${each.description}</td>
-              </tr>`,
-          )}<//
-        ><//
-      >
-      <${Panel} title="Topics"
-        ><${Table} caption="Topics" columns=${["Topic", "Way", "Type", "Contract"]}
-          >${[
-            ["outputs", "out"],
-            ["inputs", "in"],
-          ].flatMap(([list, way]) =>
-            (descriptor[list] || []).map(
-              (each) =>
-                html`<tr key=${way + each.topic}>
-                  <th scope="row"><${Link} page="topic" name=${each.topic} /></th>
-                  <td>${way}</td>
-                  <td>${each.type}</td>
-                  <td>
-                    ${Object.entries(each.contract || {})
-                      .map(([key, value]) => `${key} ${value}`)
-                      .join(", ") || "–"}
-                  </td>
-                </tr>`,
-            ),
-          )}<//
-        ><//
-      >
+      ${lists.map(
+        ([title, columns, list = [], empty, caption]) =>
+          html`<${Panel} key=${title} title=${title}><${Table} ...${{ caption, columns, list, about, empty }} /><//>`,
+      )}
     </div><//
   >`;
 }
@@ -219,13 +207,7 @@ function Setting({ value, about, set }) {
     );
   };
   const choices = about.choices?.length ? about.choices.map(String) : about.type === "bool" ? ["true", "false"] : null;
-  return html`<${Editable}
-    label=${about.name}
-    shown=${shown}
-    begin=${written ?? ""}
-    save=${save}
-    choices=${choices}
-  />`;
+  return html`<${Editable} label=${about.name} ...${{ shown, save, choices }} begin=${written ?? ""} />`;
 }
 
 // "0.000797688 m/s²" with four digits.
@@ -240,32 +222,6 @@ const offers = (profile, units) =>
   Object.entries(profile.offers || {})
     .map(([key, value]) => `${key} ${value}${units[key] ? `\u2009${units[key]}` : ""}`)
     .join(", ") || "–";
-
-function Profiles({ descriptor, decision, one, choose }) {
-  const units = Object.fromEntries((descriptor.attributes || []).map((each) => [each.name, each.unit]));
-  return html`<${Table}
-    caption="Profiles"
-    columns=${["Profile", "Offers", "#Cost", "Description", ""]}
-    empty="It has no profiles."
-    >${(descriptor.profiles || []).map(
-      (each) =>
-        html`<tr key=${each.name}>
-          <th scope="row">
-            ${each.name === one.profile ? html`<${Mark} state="up" word=${`${each.name} runs`} />` : each.name}
-          </th>
-          <td>${offers(each, units)}</td>
-          <td class="number">${each.cost}</td>
-          <td>${each.description}</td>
-          <td class="number">
-            ${choose &&
-            html`<button type="button" onClick=${() => choose(decision.chosen === each.name ? "" : each.name)}>
-              ${decision.chosen === each.name ? "Let it decide" : "Choose"}
-            </button>`}
-          </td>
-        </tr>`,
-    )}<//
-  >`;
-}
 
 // A bar for each profile: how far it is from what is asked. The nearest feasible one runs.
 function Distances({ scores, profile }) {
@@ -320,16 +276,8 @@ function Terms({ scores }) {
   const terms = scores.flatMap((score) => (score.terms || []).map((term) => [score, term]));
   const keys = [...new Set(terms.flatMap(([, term]) => Object.keys(term)))];
   const rest = scores.filter((each) => !(each.terms || []).length);
-  return html`${terms.length > 0 &&
-  html`<${Table} caption="Terms" columns=${["Profile", ...keys]}
-    >${terms.map(
-      ([score, term], at) =>
-        html`<tr key=${at}>
-          <th scope="row">${score.profile}</th>
-          ${keys.map((key) => html`<td key=${key}>${cell(term[key])}</td>`)}
-        </tr>`,
-    )}<//
-  >`}
+  const columns = [["Profile", ([score]) => score.profile], ...keys.map((key) => [key, ([, term]) => cell(term[key])])];
+  return html`${terms.length > 0 && html`<${Table} caption="Terms" columns=${columns} list=${terms} />`}
   ${rest.map(
     (each) =>
       html`<p key=${each.profile} class="empty">

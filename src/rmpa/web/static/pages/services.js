@@ -3,23 +3,10 @@
 import { html, useState } from "../markup.js";
 import { count, seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import {
-  Facts,
-  Failure,
-  Gone,
-  Link,
-  ModuleLink,
-  NodeLink,
-  Page,
-  Panel,
-  Question,
-  Table,
-  Why,
-  memo,
-  nodeKey,
-  useAnswer,
-  useFilter,
-} from "../parts.js";
+import { Facts, Failure, Gone, Page, Panel, under } from "../parts.js";
+import { Table, useFilter } from "../lists.js";
+import { Link, ModuleLink, NodeLink, nodeKey } from "../links.js";
+import { Question, Why, useAnswer, useAsk } from "../asking.js";
 import { json } from "../typed.js";
 
 const STATES = { home: "stays in its module", hidden: "hidden here", idle: "not in use", open: "in use" };
@@ -34,48 +21,34 @@ export function useTypes(connection, state) {
   return (one) => one.type || (one.state === "hidden" ? "" : value?.[one.name] || missing);
 }
 
-const Row = memo(
-  ({ name, service, own, type }) =>
-    html`<tr>
-      <th scope="row">
-        <${Link} page="service" name=${name}>${service.name}<//>${service.problem &&
-        html`<div class="muted">${service.problem}</div>`}
-      </th>
-      <td><${ModuleLink} name=${service.module || own} /></td>
-      <td><${NodeLink} name=${nodeKey(service.module, service.node)} /></td>
-      <td>${type}</td>
-      <td>${STATES[service.state] || service.state}</td>
-      <td class="number">${count(service.calls || 0)}</td>
-      <td class="number">${count(service.failed || 0)}</td>
-    </tr>`,
-);
+const COLUMNS = [
+  ["Service", ([name, one]) => under(html`<${Link} page="service" name=${name}>${one.name}<//>`, one.problem)],
+  ["Module", ([, service], { own }) => html`<${ModuleLink} name=${service.module || own} />`],
+  ["Node", ([, service]) => html`<${NodeLink} name=${nodeKey(service.module, service.node)} />`],
+  ["Type", ([, , type]) => type],
+  ["State", ([, service]) => STATES[service.state] || service.state],
+  ["#Calls", ([, service]) => count(service.calls || 0)],
+  ["#Failed", ([, service]) => count(service.failed || 0)],
+];
 
 export function Services({ state, connection }) {
   const typeOf = useTypes(connection, state);
   const filter = useFilter("name or type");
   const all = entries(state, "services");
   const hidden = section(state, "hidden").services;
-  const shown = all.filter(([name, one]) =>
-    filter.matches(`${name} ${[typeOf(one)].filter((each) => typeof each === "string")}`),
-  );
+  const shown = all
+    .map(([name, one]) => [name, one, typeOf(one)])
+    .filter(([name, , type]) => filter.matches(`${name} ${typeof type === "string" ? type : ""}`));
   return html`<${Page} title="Services" kind=${`${all.length} in all modules`}>
     ${filter.field}
     <${Panel}
       ><${Table}
         caption="Services"
-        columns=${["Service", "Module", "Node", "Type", "State", "#Calls", "#Failed"]}
+        columns=${COLUMNS}
+        about=${{ own: section(state, "agent").name }}
         empty="No service matches."
         list=${shown}
-      >
-        ${([key, one]) =>
-          html`<${Row}
-            key=${key}
-            name=${key}
-            service=${one}
-            own=${section(state, "agent").name}
-            type=${typeOf(one)}
-          />`}<//
-      >
+      />
       ${hidden &&
       html`<p class="empty">
         ${count(hidden)} more services are not listed: <code>rmpa service list</code> has them.
@@ -130,17 +103,14 @@ export function ServicePage({ name, state, connection }) {
 
 function Call({ connection, service, about }) {
   const [text, setText] = useState(JSON.stringify(about.request ?? {}, null, 2));
-  const [state, set] = useState({});
+  const [state, ask, set] = useAsk(connection, (answer) => ({ answer }));
   const allowed = connection.may("control");
+  const field = { value: text, onInput: (event) => setText(event.target.value), disabled: !allowed };
   const call = (event) => {
     event.preventDefault();
     const { value: request, error } = json(text.trim() || "{}");
     if (error) return set({ failure: { error } });
-    set({ waits: true });
-    connection.ask("call", { service: service.name, peer: service.module || "", request }).then(
-      (answer) => set({ answer }),
-      (failure) => set({ failure }),
-    );
+    return ask("call", { service: service.name, peer: service.module || "", request });
   };
   return html`<div class="grid">
     <div>
@@ -148,14 +118,7 @@ function Call({ connection, service, about }) {
       <pre class="tree" tabindex="0">${about.text}</pre>
     </div>
     <form class="form" onSubmit=${call}>
-      <label
-        >Request as JSON<textarea
-          spellcheck="false"
-          value=${text}
-          onInput=${(event) => setText(event.target.value)}
-          disabled=${!allowed}
-        ></textarea>
-      </label>
+      <label>Request as JSON<textarea spellcheck="false" ...${field}></textarea></label>
       <div class="row">
         <button class="primary" disabled=${!allowed || state.waits}>
           ${state.waits ? "Waiting for the response …" : "Call it"}</button

@@ -3,14 +3,15 @@
 import { html, useEffect, useRef, useState } from "../markup.js";
 import { count, duration, hertz } from "../format.js";
 import { entries, section } from "../state.js";
-import { Failure, Facts, Mark, ModuleLink, NodeLink, Page, Panel, Table, useFilter } from "../parts.js";
-import { Frames, SILENT, angles } from "../frames.js";
+import { Facts, Failure, Mark, Page, Panel, Select, useTick } from "../parts.js";
+import { Table, useFilter } from "../lists.js";
+import { ModuleLink, NodeLink } from "../links.js";
+import { Frames, SILENT, angles, isLate } from "../frames.js";
 
 const TYPES = ["tf2_msgs/TFMessage", "tf/tfMessage"];
 const MOST = 4; // topics: a page may watch 16
 const BEHIND = 1; // seconds between stamp and receipt
 const SIMULATED = 1e8; // stamps below it are of a simulated clock
-const STALE = 2; // seconds; a transform that moves is sent more often
 
 export const now = () => performance.now() / 1000;
 export const transformTopics = (state) =>
@@ -42,15 +43,6 @@ export function useFrames(connection, state, changed) {
   return { frames: frames.current, failure, topics };
 }
 
-// Draws anew so many times a second.
-export function useTick(seconds) {
-  const [, tick] = useState(0);
-  useEffect(() => {
-    const timer = setInterval(() => tick((n) => n + 1), seconds * 1000);
-    return () => clearInterval(timer);
-  }, [seconds]);
-}
-
 // Whether a node is in the graph; true of all where not all are known.
 export function presence(state) {
   const nodes = section(state, "nodes");
@@ -77,48 +69,46 @@ function rowsOf(frames) {
   return rows;
 }
 
-function Row({ row: { name, depth }, frames, own, there }) {
-  const senders = [...(frames.edges.get(name)?.values() ?? [])];
-  const holds = frames.edge(name);
-  const head = html`<th scope="row">
-    <span class="frame" style=${`padding-left:${Math.min(depth, 12) * 1.3}rem`}
-      >${depth > 0 && html`<span class="branch" aria-hidden="true" />`}<span class="mono">${name}</span></span
-    >
-    <span class="unseen">, level ${depth + 1}</span>
-  </th>`;
-  if (!holds)
-    return html`<tr>
-      ${head}
-      <td class="muted">a root</td>
-      <td class="number">–</td>
-      <td class="number">–</td>
-      <td></td>
-      <td></td>
-    </tr>`;
-  return html`<tr>
-    ${head}
-    <td class="mono">${holds.parent}</td>
-    <td class="number">${holds.fixed ? html`<span class="muted">static</span>` : hertz(Frames.rate(holds, now()))}</td>
-    <td class="number">${age(holds)}</td>
-    <td>
-      ${senders.map(
+const COLUMNS = [
+  [
+    "Frame",
+    ({ name, depth }) =>
+      html`<span class="frame" style=${`padding-left:${Math.min(depth, 12) * 1.3}rem`}
+          >${depth > 0 && html`<span class="branch" aria-hidden="true" />`}<span class="mono">${name}</span></span
+        >
+        <span class="unseen">, level ${depth + 1}</span>`,
+  ],
+  [
+    "Parent",
+    ({ holds }) => (holds ? html`<span class="mono">${holds.parent}</span>` : html`<span class="muted">a root</span>`),
+  ],
+  [
+    "#Rate",
+    ({ holds }) => (holds?.fixed ? html`<span class="muted">static</span>` : hertz(holds && Frames.rate(holds, now()))),
+  ],
+  ["#Age", ({ holds }) => (holds ? age(holds) : "–")],
+  [
+    "Sent by",
+    ({ name, holds }, { frames, there }) =>
+      [...(frames.edges.get(name)?.values() ?? [])].map(
         (edge) =>
           html`<div key=${edge.source} class=${there(edge.source) ? "" : "muted"}>
             <${NodeLink} name=${edge.source} />${!there(edge.source) && " has gone"}
             ${edge.parent !== holds.parent && html` <span class="muted">with the parent ${edge.parent}</span>`}
           </div>`,
-      )}
-    </td>
-    <td><${ModuleLink} name=${Frames.module(holds.source) || own} /></td>
-  </tr>`;
-}
+      ),
+  ],
+  ["Module", ({ holds }, { own }) => holds && html`<${ModuleLink} name=${Frames.module(holds.source) || own} />`],
+];
 
 function age(edge) {
   if (edge.fixed) return html`<span class="muted">–</span>`;
   const old = ageOf(edge);
-  if (old > STALE) return html`<${Mark} state="STALE" word=${duration(old)} />`;
-  return `${ageOf(edge).toFixed(1)} s`;
+  if (isLate(edge, now())) return html`<${Mark} state="STALE" word=${duration(old)} />`;
+  return `${old.toFixed(1)} s`;
 }
+
+const late = (behind) => `${duration(Math.abs(behind))} ${behind > 0 ? "behind" : "ahead of"}`;
 
 export function FramesPage({ state, connection }) {
   const { frames, failure, topics } = useFrames(connection, state, () => {});
@@ -136,14 +126,12 @@ export function FramesPage({ state, connection }) {
       problems.push({
         frame: name,
         level: "WARN",
-        text:
-          `has stamps ${duration(Math.abs(behind))} ${behind > 0 ? "behind" : "ahead of"} the clock here, ` +
-          `sent by ${edge.source}`,
+        text: `has stamps ${late(behind)} the clock here, sent by ${edge.source}`,
       });
   }
-  const rows = rowsOf(frames).filter(({ name }) =>
-    filter.matches([name, ...(frames.edges.get(name)?.keys() ?? [])].join(" ")),
-  );
+  const rows = rowsOf(frames)
+    .filter(({ name }) => filter.matches([name, ...(frames.edges.get(name)?.keys() ?? [])].join(" ")))
+    .map((row) => ({ ...row, holds: frames.edge(row.name) }));
   return html`<${Page} title="Frames" kind=${topics.length ? `Transforms of ${topics.join(", ")}` : "Transforms"}>
     <${Failure} failure=${failure} />
     ${problems.length > 0 &&
@@ -163,13 +151,11 @@ export function FramesPage({ state, connection }) {
     <${Panel} title=${`${count(frames.names.length)} frames`} aside=${filter.field}
       ><${Table}
         caption="Frames"
-        columns=${["Frame", "Parent", "#Rate", "#Age", "Sent by", "Module"]}
+        columns=${COLUMNS}
+        about=${{ frames, own, there }}
         empty=${topics.length ? "No transform has come." : "No topic has the type tf2_msgs/TFMessage."}
         list=${rows}
-      >
-        ${(row) => html`<${Row} key=${row.name} row=${row} frames=${frames} own=${own} there=${there} />`}<//
-      ><//
-    >
+    /><//>
     ${frames.names.length > 1 && html`<${Between} frames=${frames} />`}<//
   >`;
 }
@@ -180,30 +166,22 @@ function Between({ frames }) {
   const [target, setTarget] = useState(frames.roots[0] ?? names[0]);
   const [frame, setFrame] = useState(names.find((name) => name !== target));
   const found = frames.lookup(target, frame);
-  const choice = (label, value, choose) =>
-    html`<label
-      >${label}<select value=${value} onChange=${(event) => choose(event.target.value)}>
-        ${names.map((name) => html`<option key=${name} value=${name}>${name}</option>`)}
-      </select></label
-    >`;
+  const digits = (value) => value.toFixed(4);
   const metres = (value) => `${value.toFixed(3)} m`;
   const pose = found.pose;
   return html`<${Panel} title="One frame in another">
     <div class="form">
-      <div class="row">${choice("Frame", frame, setFrame)}${choice("in", target, setTarget)}</div>
+      <div class="row">
+        <${Select} label="Frame" value=${frame} names=${names} onChange=${setFrame} />
+        <${Select} label="in" value=${target} names=${names} onChange=${setTarget} />
+      </div>
       ${found.problem
         ? html`<p><${Mark} state="WARN" word=${found.problem} /></p>`
         : html`<${Facts}
             rows=${[
               ["x, y, z", pose.slice(0, 3).map(metres).join(", ")],
               ["Roll, pitch, yaw", angles(pose).map(degrees).join(", ")],
-              [
-                "Quaternion x, y, z, w",
-                pose
-                  .slice(3)
-                  .map((each) => each.toFixed(4))
-                  .join(", "),
-              ],
+              ["Quaternion x, y, z, w", pose.slice(3).map(digits).join(", ")],
               ["Distance", metres(Math.hypot(...pose.slice(0, 3)))],
               ["By way of", found.edges.map((edge) => edge.child).join(", ")],
             ]}

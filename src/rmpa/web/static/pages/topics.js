@@ -3,41 +3,15 @@
 import { html, useState } from "../markup.js";
 import { bandwidth, clock, count, hertz, seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import {
-  Choice,
-  Facts,
-  Failure,
-  Gone,
-  Link,
-  Mark,
-  NodeLink,
-  NodeLinks,
-  Page,
-  Panel,
-  Since,
-  Table,
-  Why,
-  memo,
-  nodeKey,
-  useAnswer,
-  useFilter,
-  useKept,
-} from "../parts.js";
+import { Choice, Facts, Failure, Gone, Mark, Page, Panel, Since, under } from "../parts.js";
+import { Table, useFilter, useKept } from "../lists.js";
+import { Link, NodeLink, NodeLinks, nodeKey } from "../links.js";
+import { Why, useAnswer } from "../asking.js";
 import { Lines } from "../plot.js";
 import { Live } from "../live.js";
 import { PublishPanel } from "../publish.js";
 
-export const TOPIC_COLUMNS = ["Topic", "#Rate", "#Bytes", "Type", "#Latency", "#Lost", "From → to"];
 const lostOf = (topic) => (topic.lost || 0) + (topic.dropped || 0);
-const KEYS = {
-  Topic: ([name]) => name,
-  Type: ([, topic]) => topic.type,
-  "#Rate": ([, topic, measured]) => measured?.rate ?? topic.rate,
-  "#Bytes": ([, topic, measured]) => measured?.bandwidth ?? topic.bandwidth,
-  "#Latency": ([, topic]) => topic.latency,
-  "#Lost": ([, topic]) => lostOf(topic) || undefined,
-  "From → to": ([, topic]) => (topic.from || []).join(", "),
-};
 
 // How a rate was measured where the topic is published; what is not measured says why.
 const WAYS = {
@@ -45,37 +19,55 @@ const WAYS = {
   sampled: "measured by a short subscription where it is published",
   "no subscriber": "its publisher may work for subscribers only, and is not woken: Live on its page measures it",
 };
+const Ago = ({ moment }) => html`<${Since} moment=${moment} text=${(shown) => `${shown} ago`} />`;
 function Rate({ topic, measured }) {
   if (topic.stopped)
     return html`<span class="muted">${hertz(topic.rate)}</span>
-      <div class="muted">stopped <${Since} moment=${topic.stopped} text=${(shown) => `${shown} ago`} /></div>`;
+      <div class="muted">stopped <${Ago} moment=${topic.stopped} /></div>`;
   if (!measured) return hertz(topic.rate);
   if (measured.rate === undefined)
     return html`–${" "}<span class="muted" title=${WAYS[measured.how]}>${measured.how}</span>`;
   return html`<span title=${WAYS[measured.how]}>${measured.rate ? hertz(measured.rate) : "none in 2 s"}</span>`;
 }
 
-export const TopicRow = memo(
-  ({ name, topic, measured }) =>
-    html`<tr class=${topic.stopped ? "old" : ""}>
-      <th scope="row">
-        <${Link} page="topic" name=${name} />${topic.problem &&
-        html`<div class="muted"><${Mark} state="WARN" word=${""} />${topic.problem}</div>`}
-      </th>
-      <td class="number"><${Rate} topic=${topic} measured=${measured} /></td>
-      <td class="number">${bandwidth(measured?.bandwidth || topic.bandwidth)}</td>
-      <td><span class="muted">${topic.type}</span></td>
-      <td class="number">${seconds(topic.latency)}</td>
-      <td class="number">${lostOf(topic) ? count(lostOf(topic)) : "–"}</td>
-      <td>
-        ${(topic.from || []).join(", ") || html`<span class="muted">no publisher</span>`}
-        ${" "}→${" "}${(topic.to || []).join(", ") ||
-        html`<span class="muted">no subscriber here</span>`}${topic.crosses
-          ? ""
-          : html` <span class="muted">does not cross</span>`}
-      </td>
-    </tr>`,
-);
+const muted = (text) => html`<span class="muted">${text}</span>`;
+// Of entries [name, topic, what was measured].
+const TOPIC_COLUMNS = [
+  [
+    "Topic",
+    ([name, topic]) =>
+      html`<${Link} page="topic" name=${name} />${topic.problem &&
+        html`<div class="muted"><${Mark} state="WARN" word="" />${topic.problem}</div>`}`,
+    ([name]) => name,
+  ],
+  [
+    "#Rate",
+    ([, topic, measured]) => html`<${Rate} ...${{ topic, measured }} />`,
+    ([, topic, measured]) => measured?.rate ?? topic.rate,
+  ],
+  [
+    "#Bytes",
+    ([, topic, measured]) => bandwidth(measured?.bandwidth || topic.bandwidth),
+    ([, topic, measured]) => measured?.bandwidth ?? topic.bandwidth,
+  ],
+  ["~Type", ([, topic]) => topic.type, ([, topic]) => topic.type],
+  ["#Latency", ([, topic]) => seconds(topic.latency), ([, topic]) => topic.latency],
+  ["#Lost", ([, topic]) => count(lostOf(topic) || undefined), ([, topic]) => lostOf(topic) || undefined],
+  [
+    "From → to",
+    ([, { from = [], to = [], crosses }]) =>
+      html`${from.join(", ") || muted("no publisher")}${" → "}${to.join(", ") ||
+      muted("no subscriber here")}${!crosses && html` ${muted("does not cross")}`}`,
+    ([, topic]) => (topic.from || []).join(", "),
+  ],
+];
+export const TopicTable = ({ list, empty }) =>
+  html`<${Table}
+    caption="Topics"
+    columns=${TOPIC_COLUMNS}
+    tone=${([, topic]) => (topic.stopped ? "old" : "")}
+    ...${{ list, empty }}
+  />`;
 
 // What Smart Resources and the log publish about themselves, next to the topics that carry data.
 const ABOUT = new RegExp(
@@ -120,10 +112,7 @@ export function Topics({ state }) {
   >
     ${filter.field}
     <${Panel}
-      ><${Table} caption="Topics" columns=${TOPIC_COLUMNS} keys=${KEYS} empty="No topic matches." list=${shown}>
-        ${([name, one, rate]) => html`<${TopicRow} key=${name} name=${name} topic=${one} measured=${rate} />`}<//
-      >
-      ${which === "data" &&
+      ><${TopicTable} empty="No topic matches." list=${shown} /> ${which === "data" &&
       all.length > shown.length &&
       !filter.typed &&
       html`<p class="empty">
@@ -160,7 +149,7 @@ export function TopicPage({ name, state, connection }) {
     return html`<${Page} title=${name} kind="Topic"
       ><${Gone} kind="topic" name=${name} /><${Panel} title="Why?"
         ><${Why} connection=${connection} kind="topic" name=${name} /><//
-      ><${PublishPanel} connection=${connection} state=${state} topic=${name}
+      ><${PublishPanel} ...${{ connection, state }} topic=${name}
     /><//>`;
   const routes = entries(detail, "routes");
   const own = section(state, "agent").name;
@@ -176,13 +165,16 @@ export function TopicPage({ name, state, connection }) {
             ["Subscribed in", (topic.to || []).join(", ")],
             [
               `Publishers in ${own}`,
-              (detail.publishers || []).length > 0 ? html`<${NodeLinks} names=${detail.publishers} />` : "",
+              detail.publishers?.length > 0 && html`<${NodeLinks} names=${detail.publishers} />`,
             ],
             [
               `Subscribers in ${own}`,
-              (detail.subscribers || []).length > 0 ? html`<${NodeLinks} names=${detail.subscribers} />` : "",
+              detail.subscribers?.length > 0 && html`<${NodeLinks} names=${detail.subscribers} />`,
             ],
-            ["Elsewhere", detail.remote_subscribers && html`<${NodeLinks} names=${detail.remote_subscribers} />`],
+            [
+              "Elsewhere",
+              detail.remote_subscribers?.length > 0 && html`<${NodeLinks} names=${detail.remote_subscribers} />`,
+            ],
             ["Crosses", topic.crosses ? "yes" : "no"],
             ["Because", detail.policy],
             ["MD5 sum", detail.md5 && html`<code>${detail.md5}</code>`],
@@ -211,97 +203,85 @@ export function TopicPage({ name, state, connection }) {
       <${Panel} title="Routes" wide
         ><${Table}
           caption="Routes"
-          columns=${[
-            "Source",
-            "State",
-            "#Rate",
-            "#Jitter p99",
-            "#Latency p50, p99",
-            "#Lost",
-            "#Dropped",
-            "Transport",
-            "Contract",
-          ]}
+          columns=${ROUTES}
+          about=${{ own }}
           empty="It has no route to or from a peer."
-          list=${routes}
-        >
-          ${([key, route]) => html`<${Route} key=${key} route=${route} own=${own} />`}<//
-        ><//
-      >
+          list=${routes.flatMap(withSubscribers)}
+      /><//>
       <${ContractPanel} connection=${connection} topic=${name} type=${topic.type} own=${own} routes=${routes.length} />
       <${Events} routes=${routes} /></div
   ><//>`;
 }
 
-const Route = memo(({ route, own }) => {
-  const latency = section(route, "latency");
-  const contract = Object.entries(route.contract || {})
+const contract = (route) =>
+  Object.entries(route.contract || {})
     .map(([key, value]) => `${key} ${value}`)
     .join(", ");
-  return html`<tr>
-      <th scope="row">
-        <${NodeLink} name=${nodeKey(route.direction === "in" ? route.peer : "", route.node)} />
-        <div class="muted">${route.direction === "in" ? `${route.peer} → ${own}` : `${own} → ${route.peer}`}</div>
-      </th>
-      <td>
-        ${route.state}${route.stopped &&
-        html`<div>
-          <${Mark} state="STALE" word="stopped" />${" "}<${Since}
-            moment=${route.stopped}
-            text=${(shown) => `${shown} ago`}
-          />
-        </div>`}${route.problem && html`<div class="muted">${route.problem}</div>`}
-      </td>
-      <td class=${route.stopped ? "number muted" : "number"}>
-        ${hertz(route.rate)}
-        <div class="muted">${bandwidth(route.bandwidth)}</div>
-      </td>
-      <td class="number">${seconds(route.jitter)}</td>
-      <td class="number">
-        ${seconds(latency.p50)}, ${seconds(latency.p99)}
-        <div class="muted">± ${seconds(latency.error)}</div>
-      </td>
-      <td class="number">
-        ${(route.events || {}).loss_unknown ? "unknown, ≥ " : ""}${count((route.lost || 0) + (route.expired || 0))}
-      </td>
-      <td class="number">${count((route.dropped || 0) + (route.oversized || 0))}</td>
-      <td>
-        ${route.transport || "–"}${route.lane &&
-        html`<div class="muted">${route.lane} lane</div>`}${route.condition_text &&
-        html`<div class="muted">${route.condition_text}</div>`}
-      </td>
-      <td>
-        ${contract || "default"}${Object.entries(route.events || {}).map(
-          ([kind, times]) => html`<div class="muted" key=${kind}>${kind.replaceAll("_", " ")}: ${count(times)}</div>`,
-        )}
-      </td>
-    </tr>
-    ${(route.subscribers || []).map((one) => html`<${Subscriber} key=${one.node} one=${one} />`)}`;
-});
+const eventsOf = (route) =>
+  Object.entries(route.events || {}).map(([kind, times]) => `${kind.replaceAll("_", " ")}: ${count(times)}`);
+const ROUTES = [
+  [
+    "Source",
+    (one, { own }) => {
+      if (one.inner) return html`<span class="inner mono">→ ${one.node}</span>`;
+      const [peer, way] = one.direction === "in" ? [one.peer, [one.peer, own]] : ["", [own, one.peer]];
+      return under(html`<${NodeLink} name=${nodeKey(peer, one.node)} />`, way.join(" → "));
+    },
+  ],
+  [
+    "State",
+    (one) =>
+      under(
+        one.state,
+        one.stopped && html`<${Mark} state="STALE" word="stopped" />${" "}<${Ago} moment=${one.stopped} />`,
+        one.problem,
+      ),
+  ],
+  [
+    "#Rate",
+    (one) =>
+      under(
+        html`<span class=${one.stopped ? "muted" : ""}>${hertz(one.rate)}</span>`,
+        !one.inner && bandwidth(one.bandwidth),
+      ),
+  ],
+  ["#Jitter p99", (one) => seconds(one.jitter)],
+  [
+    "#Latency p50, p99",
+    ({ inner, latency = {} }) =>
+      inner ? "–" : under(`${seconds(latency.p50)}, ${seconds(latency.p99)}`, `± ${seconds(latency.error)}`),
+  ],
+  [
+    "#Lost",
+    (one) =>
+      one.inner
+        ? "–"
+        : `${one.events?.loss_unknown ? "unknown, ≥ " : ""}${count((one.lost || 0) + (one.expired || 0))}`,
+  ],
+  ["#Dropped", (one) => (one.inner ? "–" : count((one.dropped || 0) + (one.oversized || 0)))],
+  ["Transport", (one) => under(one.transport || "–", one.lane && `${one.lane} lane`, one.condition_text, one.endpoint)],
+  ["Contract", (one) => (one.inner ? one.wanted || "" : under(contract(one) || "default", ...eventsOf(one)))],
+];
 
-// A subscriber of a route where its transport is known: the agents see no message of direct ones.
-const Subscriber = ({ one }) => {
-  const said = [
+// The subscribers of a route stand below it where their transport is known: the agents see no message of direct ones.
+const withSubscribers = ([key, route]) => [
+  { ...route, name: key },
+  ...(route.subscribers || []).map((one) => ({
+    ...one,
+    inner: true,
+    name: `${key} ${one.node}`,
+    problem: troubleOf(one),
+  })),
+];
+function troubleOf(one) {
+  const gap = `interrupted ${count(one.interruptions)} times, the last for ${seconds(one.interrupted)}`;
+  const parts = [
     one.condition && one.text,
     one.transport === "direct" && "not measured: the nodes are connected directly",
-    one.interruptions &&
-      `interrupted ${count(one.interruptions)} times, the last for ${seconds(one.interrupted)}: ` +
-        "what is lost of that time is not counted",
-  ]
-    .filter(Boolean)
-    .join("; ");
-  return html`<tr>
-    <th scope="row" class="inner"><span class="mono">→ ${one.node}</span></th>
-    <td>${one.state}${said && html`<div class="muted">${said}</div>`}</td>
-    <td class="number">–</td>
-    <td class="number">–</td>
-    <td class="number">–</td>
-    <td class="number">–</td>
-    <td class="number">–</td>
-    <td>${one.transport || "–"}${one.endpoint && html`<div class="muted">${one.endpoint}</div>`}</td>
-    <td>${one.wanted || ""}</td>
-  </tr>`;
-};
+    one.interruptions && `${gap}: what is lost of that time is not counted`,
+  ];
+  return parts.filter(Boolean).join("; ");
+}
 
 const MEANINGS = {
   reliability: "whether messages survive the loss of a link",
@@ -318,34 +298,23 @@ const MEANINGS = {
   transport: "through the agents, or from node to node",
 };
 const SECONDS = ["deadline", "lifespan", "liveliness_lease", "outage"];
-const term = (key, value) =>
-  value === null || value === undefined
-    ? "none"
-    : SECONDS.includes(key)
-      ? seconds(value)
-      : key === "max_rate"
-        ? hertz(value)
-        : String(value).replaceAll("_", " ");
+function term(key, value) {
+  if (value === null || value === undefined) return "none";
+  if (SECONDS.includes(key)) return seconds(value);
+  return key === "max_rate" ? hertz(value) : String(value).replaceAll("_", " ");
+}
+const TERMS = [
+  ["Term", ([key]) => under(key.replaceAll("_", " "), MEANINGS[key])],
+  ["Value", ([key, one]) => term(key, one.value)],
+  ["~Set by", ([, one]) => one.rule],
+];
 
 // What the settings of this module ask for the topic, whether a route is open or not.
 function ContractPanel({ connection, topic, type, own, routes }) {
   const { value, failure } = useAnswer(connection, "contract", { topic, type: type === "*" ? "" : type || "" });
   const rows = Object.entries(value || {});
   const set = rows.filter(([, one]) => one.rule !== "default");
-  const table = (shown) =>
-    html`<${Table} caption="Contract" columns=${["Term", "Value", "Set by"]}
-      >${shown.map(
-        ([key, one]) =>
-          html`<tr key=${key}>
-            <th scope="row">
-              ${key.replaceAll("_", " ")}
-              <div class="muted">${MEANINGS[key] || ""}</div>
-            </th>
-            <td>${term(key, one.value)}</td>
-            <td class="muted">${one.rule}</td>
-          </tr>`,
-      )}<//
-    >`;
+  const table = (list) => html`<${Table} caption="Contract" columns=${TERMS} list=${list} />`;
   return html`<${Panel} title=${`Contract, by the settings of ${own}`} wide
     ><${Failure} failure=${failure} /> ${value &&
     (set.length
@@ -362,26 +331,19 @@ function ContractPanel({ connection, topic, type, own, routes }) {
   >`;
 }
 
+const EVENTS = [
+  ["Time", (event) => clock(event.at)],
+  ["Event", (event) => event.kind.replaceAll("_", " ")],
+  ["Source", (event) => event.from],
+  ["Text", (event) => event.text],
+];
 const Events = ({ routes }) => {
   const events = routes.flatMap(([, route]) =>
     (route.recent || []).map((event) => ({ ...event, from: `${route.peer} ${route.node}` })),
   );
+  const list = events.sort((a, b) => b.at - a.at);
   return (
-    events.length > 0 &&
-    html`<${Panel} title="Events of its contract" wide
-      ><${Table} caption="Events" columns=${["Time", "Event", "Source", "Text"]}
-        >${events
-          .sort((a, b) => b.at - a.at)
-          .map(
-            (event) =>
-              html`<tr key=${event.from + event.kind + event.at}>
-                <th scope="row">${clock(event.at)}</th>
-                <td>${event.kind.replaceAll("_", " ")}</td>
-                <td>${event.from}</td>
-                <td>${event.text}</td>
-              </tr>`,
-          )}<//
-      ><//
-    >`
+    list.length > 0 &&
+    html`<${Panel} title="Events of its contract" wide><${Table} caption="Events" columns=${EVENTS} list=${list} /><//>`
   );
 };
