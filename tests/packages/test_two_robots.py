@@ -147,7 +147,7 @@ class Reader:
         """Open the page from the laptop."""
         host, _, path = self.page.removeprefix("https://").partition("/")
         name, _, port = host.partition(":")
-        address = self.robots[name].host.address
+        address = self.robots[name].host.address if name in self.robots else name
         wire = self.laptop.open_socket()
         wire.settimeout(20.0)
         wire.connect((address, int(port)))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 ROOT: Final = Path(__file__).parents[2]
-NUMBERS: Final = tuple(sorted([*map(str, range(1, 43)), "16a"], key=lambda n: (int(n.rstrip("a")), n)))
+NUMBERS: Final = tuple(sorted([*map(str, range(1, 44)), "16a"], key=lambda n: (int(n.rstrip("a")), n)))
 # Traps without a test, and why.
 NOT_YET: Final[dict[str, str]] = {}
 

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 from weakref import WeakValueDictionary
 
 from rmpa.core.errors import RmpaError, StartError
-from rmpa.core.identity import Guid, Identity, proxy_name, proxy_prefix
+from rmpa.core.identity import Guid, Identity, proxied_node, proxy_name, proxy_prefix
 from rmpa.ros.environment import is_loopback
 from rmpa.ros.node.listeners import SharedListener
 from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.wire.slave_api import OUTBOUND, BusConnection
 from rmpa.ros.wire.xmlrpc import RosReply
 from rmpa.runtime.accept import DESCRIPTORS, Use, is_shortage, open_files_advice
 from rmpa.runtime.loop import yielding_to_data
@@ -156,8 +157,15 @@ class ProxyNodes:
             listener=self._listener,
             counters=self._counters,
             on_kill=on_kill,
+            elsewhere=lambda topic: self._elsewhere(name, topic),
         )
         return node
+
+    def _elsewhere(self, name: str, topic: str) -> Iterable[BusConnection]:
+        """The subscribers of other modules to a proxy's topic, which are connected to its node."""
+        for number, node in enumerate(self._core.subscribers(topic), 1):
+            if proxied_node(node) is not None and node != name:
+                yield BusConnection(number, node, OUTBOUND, topic, True, f"by the agents, to {node}", 0, 0)
 
     def publication(self, name: str, uri: str, topic: str) -> Publication | None:
         """The topic of a proxy of this process, for subscribers of this process; ``None`` if there is none.

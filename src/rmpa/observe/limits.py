@@ -67,11 +67,17 @@ DIAGNOSTIC_FORGET: Final = 600.0
 # At it: further ones are left out
 # Told in: `rmpa diagnostics`, the page of diagnostics
 DIAGNOSTIC_RATE: Final = 20.0
-# Their bytes a second, likewise: reading them takes a tenth of a core.
+# [Agent] Bytes of its messages a second, in the long run
+# At it: further ones are left out
+# Told in: `rmpa diagnostics`, the page of diagnostics
+# Why: Reading them takes a tenth of a core.
 DIAGNOSTIC_FLOW: Final = MIB
 # How long it is said that a publisher of ``/diagnostics`` is heard in part.
 DIAGNOSTIC_PROBLEM: Final = 30.0
-# Bytes of a message on ``/diagnostics`` that is decoded: 2,000 statuses of an agent are some 1.5 MB.
+# [Agent] Bytes of one message on `/diagnostics`
+# At it: it is left out
+# Told in: `rmpa diagnostics`, the page of diagnostics
+# Why: 2,000 statuses of an agent are some 1.5 MB.
 DIAGNOSTIC_BYTES: Final = 4 * MIB
 # Values of a status; further ones are left out.
 DIAGNOSTIC_VALUES: Final = 256

@@ -260,7 +260,7 @@ FOXGLOVE: Final[dict[str, tuple[str, dict[str, Any], bool]]] = {
 # The ops of the pages; what "ask" asks says itself what it needs, and every page may stop what "stick" drives.
 MONITOR: Final = {
     "ack": "", "look": "", "watch": "subscribe", "unwatch": "", "seen": "", "ask": "",
-    "drive": "drive", "release": "", "stick": "drive",
+    "drive": "drive", "release": "", "stick": "drive", "publish": "control", "publishing": "", "unpublish": "",
 }  # fmt: skip
 
 

@@ -14,14 +14,13 @@ from rmpa.bridge.data.reception import ImportFlow
 from rmpa.bridge.messages import Source
 from rmpa.bridge.peer_offers import Remote
 from rmpa.core.contract import Contract, Durability, Reliability
-from rmpa.core.identity import OWN_NODE, proxied_node, serial_add
+from rmpa.core.identity import OWN_NODE, serial_add
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.node.publication import Publication, PublicationEvents
-from rmpa.ros.wire.slave_api import OUTBOUND, BusConnection
 from rmpa.ros.wire.tcpros import TopicDescription, printable
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Mapping
+    from collections.abc import Awaitable, Callable, Mapping
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.quality import QosEvent, QosWatch
@@ -190,14 +189,6 @@ class ImportRoute(PublicationEvents):
             self._bridge.core.call("unregisterPublisher", node.name, self.topic, node.uri)
             # rospy does not leave a publisher when the master removes it, so its connection is closed.
             node.remove_publication(self.topic)
-
-    def elsewhere(self) -> Iterable[BusConnection]:
-        """As of ``PublicationEvents``: ``bridge.subscriptions`` shows the subscribers of other modules."""
-        return (
-            BusConnection(number, node, OUTBOUND, self.topic, True, f"by the agents, to {node}", 0, 0)
-            for number, node in enumerate(self._bridge.core.subscribers(self.topic), 1)
-            if proxied_node(node) is not None and self.node is not None and node != self.node.name
-        )
 
     def register(self) -> None:
         """Register the proxy as a publisher; without effect once the topic has left."""

@@ -30,7 +30,7 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.stream import Stream
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Mapping, Sequence
 
     from rmpa.core.outbox import QueuedMessage
     from rmpa.ros.node.subscription import InProcessConnection
@@ -172,10 +172,6 @@ class PublicationEvents:
     def join(self, connection: SubscriberConnection) -> Receiver | None:  # noqa: ARG002 - of those who override it
         """A subscriber connects to a topic that is served; return what takes the messages in its place."""
         return None
-
-    def elsewhere(self) -> Iterable[BusConnection]:
-        """The connections that a remote node has to its other subscribers, for the ``getBusInfo`` of its proxy."""
-        return ()
 
     def request(self, caller: str) -> Awaitable[RosReply | None] | None:  # noqa: ARG002 - of those who override it
         """Answer the ``requestTopic`` of a subscriber with this caller id.

@@ -87,6 +87,7 @@ class SlaveNode:
         on_param_update: ``(key, value) -> whether the node subscribed to that key``.
         on_kill: ``(caller id, reason) -> reply``: awaited after ``on_shutdown`` for the answer to ``shutdown``.
         taps: The owner's own connections to publishers, for ``getBusInfo`` and ``getBusStats``.
+        elsewhere: ``(topic)``: the connections to further subscribers of the remote node that this one stands for.
 
     Attributes:
         uri: The slave API's URI, ``http://host:port/``; empty before ``start()``.
@@ -107,6 +108,7 @@ class SlaveNode:
         on_param_update: Callable[[str, XmlRpcValue], bool] = _not_followed,
         on_kill: Callable[[str, str], Awaitable[RosReply]] | None = None,
         taps: Callable[[], Iterable[TopicConnection]] = tuple,
+        elsewhere: Callable[[str], Iterable[BusConnection]] = lambda _: (),
     ) -> None:
         self.name = name
         self.master_uri = master_uri
@@ -123,6 +125,7 @@ class SlaveNode:
         self._on_kill = on_kill
         self._on_param_update = on_param_update
         self._taps = taps
+        self._elsewhere = elsewhere
         self._http = XmlRpcServer(self._call, host, port, counters=self.counters, name=f"node {name}")
         self._tcpros = TcprosServer(
             name, self._publications, services=self._services, counters=self.counters, numbers=self._numbers
@@ -234,7 +237,9 @@ class SlaveNode:
 
     def connections(self) -> list[BusConnection]:
         """All topic connections."""
-        found = [c for each in self._publications.values() for c in (*each.connections(), *each.events.elsewhere())]
+        found = [
+            c for topic, each in self._publications.items() for c in (*each.connections(), *self._elsewhere(topic))
+        ]
         found += [c for subscription in self._subscriptions for c in subscription.connections()]
         return found + [tap.connection() for tap in self._taps()]
 
