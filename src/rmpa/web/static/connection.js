@@ -155,6 +155,7 @@ export class Connection {
         this.settle(message.id)?.resolve(message.value);
         break;
       case "stick":
+        if (message.mine && !this.stick?.mine) this.notice = null; // of how this page lost it before
         this.stick = message;
         this.changed();
         break;

@@ -34,7 +34,7 @@ export const NodeRow = memo(
       </th>
       ${own && html`<td><${ModuleLink} name=${node.module || own} /></td>`}
       <td class="number">${node.publishes || 0}</td>
-      <td class="number">${node.module ? "–" : node.subscribes || 0}</td>
+      <td class="number">${node.subscribes || 0}</td>
       <td class="number">${node.serves || 0}</td>
     </tr>`,
 );

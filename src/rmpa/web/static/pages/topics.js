@@ -67,7 +67,7 @@ export const TopicRow = memo(
       <td><span class="muted">${topic.type}</span></td>
       <td class="number">${seconds(topic.latency)}</td>
       <td class="number">${lostOf(topic) ? count(lostOf(topic)) : "–"}</td>
-      <td>
+      <td class="ends">
         ${(topic.from || []).join(", ") || html`<span class="muted">no publisher</span>`}
         ${" "}→${" "}${(topic.to || []).join(", ") ||
         html`<span class="muted">no subscriber here</span>`}${topic.crosses
@@ -182,7 +182,7 @@ export function TopicPage({ name, state, connection }) {
               `Subscribers in ${own}`,
               (detail.subscribers || []).length > 0 ? html`<${NodeLinks} names=${detail.subscribers} />` : "",
             ],
-            ["Elsewhere", detail.remote_subscribers && html`<${NodeLinks} names=${detail.remote_subscribers} />`],
+            ["Elsewhere", detail.remote_subscribers?.length ? html`<${NodeLinks} names=${detail.remote_subscribers} />` : ""],
             ["Crosses", topic.crosses ? "yes" : "no"],
             ["Because", detail.policy],
             ["MD5 sum", detail.md5 && html`<code>${detail.md5}</code>`],
