@@ -123,7 +123,7 @@ const LinkPanel = ({ module, detail }) => {
         ["Found by", module.source],
         ["Dialled by", link.dialled === undefined ? undefined : link.dialled ? "this module" : "the peer"],
         ["Next attempt in", detail.next_attempt !== undefined ? seconds(detail.next_attempt) : undefined],
-        ["GUID", html`<code>${module.guid}</code>`],
+        ["GUID", module.guid ? html`<code>${module.guid}</code>` : ""],
       ]}
   /><//>`;
 };
