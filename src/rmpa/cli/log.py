@@ -79,7 +79,8 @@ class _Log:
     def _say(self, one: ModuleLog) -> None:
         if one.problem != self._problems.get(one.module, ""):
             problem = self._unlinked.get(one.module) if one.code == "unknown-name" else one.problem
-            warn(f"{one.module}: {problem or one.problem or 'it answers again'}", one.code)
+            hint = "; a [[permission]] there may allow it: log" if one.code == "not-permitted" else ""
+            warn(f"{one.module}: {problem or one.problem or 'it answers again'}{hint}", one.code)
             self._problems[one.module] = one.problem
         now = time.monotonic()
         for node in one.lost:
