@@ -25,6 +25,7 @@ import { Plot } from "../plot.js";
 const LEVELS = ["OK", "WARN", "STALE", "ERROR"]; // the best first, as in observe/diagnostics.py
 const rank = (level) => LEVELS.indexOf(level);
 const SPAN = 600; // seconds of a strip
+const REDRAWN = 5000; // milliseconds after which a strip has moved
 const WIDTH = 120;
 const HEIGHTS = { OK: 3, STALE: 6, WARN: 9, ERROR: 14 }; // by its height a level is seen without its colour
 const LINES = 8; // of a plot
@@ -135,6 +136,7 @@ function Branch({ nodes, chosen, wide, level = 0 }) {
               name=${node.leaf[0]}
               one=${node.leaf[1]}
               chosen=${node.leaf[0] === chosen}
+              drawn=${Math.floor(Date.now() / REDRAWN)}
             />`
           : html`<${Group} key=${node.label} node=${node} chosen=${chosen} wide=${wide} level=${level} />`,
       )}

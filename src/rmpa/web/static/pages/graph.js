@@ -288,8 +288,8 @@ function useView(box, drawn) {
     box.current.style.height = `min(72vh, ${Math.max(240, Math.ceil(drawn.height / wide))}px)`; // no higher than it is
   }, [drawn.height, wide]);
   const middle = (low, all) => Math.min(0, (all - low) / 2);
-  const at = (one) => ({ scale: one, x: middle(w * one, drawn.width), y: middle(h * one, drawn.height) });
-  const now = moved === ALL ? at(Math.max(scale, drawn.width / w, drawn.height / h)) : moved || at(scale);
+  const seen = (one) => ({ scale: one, x: middle(w * one, drawn.width), y: middle(h * one, drawn.height) });
+  const now = moved === ALL ? seen(Math.max(scale, drawn.width / w, drawn.height / h)) : moved || seen(scale);
   const change = (next) => set((before) => next(before && before !== ALL ? before : now));
   const zoom = (factor, px = w / 2, py = h / 2) =>
     change((at) => {

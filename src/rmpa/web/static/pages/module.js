@@ -20,9 +20,7 @@ export function ModulePage({ name, state, connection }) {
   if (!module) return html`<${Page} title=${name} kind="Module"><${Gone} kind="module" name=${name} /><//>`;
   const own = section(state, "agent").name === name;
   const detail = section(section(state, "detail"), `module:${name}`);
-  const all = entries(state, "topics").filter(([, one]) =>
-    [...(one.from || []), ...(one.to || [])].includes(name),
-  );
+  const all = entries(state, "topics").filter(([, one]) => [...(one.from || []), ...(one.to || [])].includes(name));
   const topics = all.filter(([topic]) => isData(topic, state));
   const resources = entries(state, "resources").filter(([, one]) => one.module === name);
   const nodes = entries(state, "nodes").filter(([, one]) => (one.module || section(state, "agent").name) === name);
@@ -75,8 +73,7 @@ export function ModulePage({ name, state, connection }) {
       >`}
       ${own && html`<${Counters} state=${state} connection=${connection} />`}
       <${Panel} title=${`Topics of ${name}`} wide
-        ><${TopicTable} list=${topics} empty="It has no topic." />
-        ${all.length > topics.length &&
+        ><${TopicTable} list=${topics} empty="It has no topic." /> ${all.length > topics.length &&
         html`<details>
           <summary>${all.length - topics.length} of its Smart Resources, about themselves, and of the log</summary>
           <${TopicTable} list=${all.filter(([topic]) => !isData(topic, state))} />

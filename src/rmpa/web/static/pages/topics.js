@@ -182,7 +182,10 @@ export function TopicPage({ name, state, connection }) {
               `Subscribers in ${own}`,
               (detail.subscribers || []).length > 0 ? html`<${NodeLinks} names=${detail.subscribers} />` : "",
             ],
-            ["Elsewhere", detail.remote_subscribers?.length ? html`<${NodeLinks} names=${detail.remote_subscribers} />` : ""],
+            [
+              "Elsewhere",
+              detail.remote_subscribers?.length ? html`<${NodeLinks} names=${detail.remote_subscribers} />` : "",
+            ],
             ["Crosses", topic.crosses ? "yes" : "no"],
             ["Because", detail.policy],
             ["MD5 sum", detail.md5 && html`<code>${detail.md5}</code>`],
