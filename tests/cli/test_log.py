@@ -74,4 +74,6 @@ def test_all_modules_are_asked_and_what_cannot_be_read_is_named(place: Place, ag
     assert "base:/loud writes more than is kept" in errors
     assert asked[0] == {"after": {}, "most": 100, "level": "warn", "node": "/hand", "since": 300.0}
     assert place.run("log", "arm", "old")[0] == 1
+    place.run("log", "--node", "arm:/hand")  # as a line has it
+    assert (asked[-1]["modules"], asked[-1]["node"]) == (["arm"], "/hand")
     assert [each["text"] for each in place.json("log", "--json", "-n", "2")] == ["second", "third"]

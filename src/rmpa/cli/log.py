@@ -15,7 +15,7 @@ import click
 
 from rmpa.bridge.limits import LOG_LINES_ASKED
 from rmpa.bridge.log_ring import LEVELS, ModuleLog
-from rmpa.cli.completion import peers
+from rmpa.cli.completion import completes, nodes, peers
 from rmpa.cli.options import LINES, Options, agent_verb, argument, flag
 from rmpa.cli.output import Painted, paint, print_json, print_text, printable, warn
 from rmpa.core.errors import ConfigError
@@ -79,7 +79,8 @@ class _Log:
     def _say(self, one: ModuleLog) -> None:
         if one.problem != self._problems.get(one.module, ""):
             problem = self._unlinked.get(one.module) if one.code == "unknown-name" else one.problem
-            warn(f"{one.module}: {problem or one.problem or 'it answers again'}", one.code)
+            hint = "; a [[permission]] there may allow it: log" if one.code == "not-permitted" else ""
+            warn(f"{one.module}: {problem or one.problem or 'it answers again'}{hint}", one.code)
             self._problems[one.module] = one.problem
         now = time.monotonic()
         for node in one.lost:
@@ -95,7 +96,13 @@ class _Log:
     click.option(
         "--level", type=click.Choice([*LEVELS.values()]), default="info", show_default=True, help="At least."
     ),
-    click.option("--node", default="", metavar="GLOB", help="Only of nodes like this: '/arm/*'; /rmpa is the agent."),
+    click.option(
+        "--node",
+        default="",
+        metavar="GLOB",
+        shell_complete=completes(nodes),
+        help="Only of nodes like this: '/arm/*', arm:/hand; /rmpa is the agent.",
+    ),
     click.option("--since", default="", metavar="TIME", help="Only of the last so long: 30s, 5m, 2h."),
     click.option(
         "-n",
@@ -121,7 +128,9 @@ def log(
       rmpa log arm --node '/arm/*' --since 5m
       rmpa log --json | jq -r 'select(.agent | not) | .text'
     """
-    glob = node if not node or node.startswith(("/", "*")) else f"/{node}"
+    module, _, name = node.rpartition(":")
+    modules = (module,) if module else modules
+    glob = name if not name or name.startswith(("/", "*")) else f"/{name}"
     query: dict[str, object] = {"level": level, "node": glob, "since": _read_since(since) if since else 0.0}
     with options.client(timeout=60.0) as client:
         asked = _Log(client, modules, query)

@@ -208,8 +208,8 @@ def _verbose(title: str, what: str, graph: Graph, ends: dict[str, list[str]], na
     for name in names:
         if name in ends:
             kind, count = printable(graph.types.get(name, "unknown type")), len(ends[name])
-            mark = peers_mark(ends[name]) if what == "publisher" else ""
-            yield Painted(f" * {printable(name)} [{kind}] {count} {what}{'s' if count != 1 else ''}{mark}")
+            text = f" * {printable(name)} [{kind}] {count} {what}{'s' if count != 1 else ''}"
+            yield Painted(text + peers_mark(ends[name]))
 
 
 def _find(text: str, options: Options) -> tuple[GraphName, Master, Graph]:

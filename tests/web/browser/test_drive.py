@@ -181,6 +181,11 @@ async def test_the_page_shows_who_drives_what_and_each_page_may_stop_it(site: Si
     await page.click("Take over")
     await page.wait_text("This page")
     assert stick.holder != "other"
+    stick.stop("10.0.0.99")
+    await page.wait_text("does not obey this page any more")
+    await page.run(f"{TICK}.click()")
+    await page.wait_text("This page")
+    await page.wait("!document.querySelector('.banner')")  # it obeys again
 
 
 async def test_a_topic_is_driven_with_the_type_that_it_has(site: Site) -> None:

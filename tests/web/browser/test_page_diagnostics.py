@@ -47,6 +47,10 @@ async def test_the_tree_is_of_module_hardware_and_name_and_keeps_filter_and_grou
     assert await page.run("document.querySelectorAll('.status').length") == 3
     assert await page.run("document.querySelector('.status').ariaCurrent") == "true"
     await page.wait_text("<b>late</b>")
+    strip = "document.querySelector('.status .strip').innerHTML"
+    before = await page.run(strip)
+    await page.run("Date.now = ((now) => () => now() + 60000)(Date.now); true")
+    await page.wait(f"{strip} !== {before!r}")  # time passes, and no status changes
 
 
 async def test_what_nodes_report_no_more_is_stale(site: Site) -> None:

@@ -89,6 +89,17 @@ async def test_a_small_screen_shows_the_tables_of_the_first_page_whole(site: Sit
     assert await page.run(f"{cut}.map((each) => each.ariaLabel)") == []
 
 
+async def test_the_links_of_all_pages_fit_a_notebook_and_a_phone_shows_that_of_the_page(site: Site) -> None:
+    await site.page.look(1280, 800)
+    page = await site.open("drive")
+    row = "document.querySelector('.top nav')"
+    await page.wait(f"{row}.scrollWidth === {row}.clientWidth")
+    await page.look(390, 844)
+    await page.run("location.hash = '#/log'")
+    link = "document.querySelector('.top nav [aria-current]')"
+    await page.wait(f"{link}.textContent === 'Log' && {link}.getBoundingClientRect().right <= innerWidth")
+
+
 async def test_the_keyboard_reaches_everything(site: Site) -> None:
     page = await site.open()
     await page.press("/")

@@ -178,7 +178,8 @@ def test_noise_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rate", "age", "stopped"), [(50.0, 1.9, None), (50.0, 12.0, -12.0), (0.5, 9.0, None), (0.5, 11.0, -11.0)]
+    ("rate", "age", "stopped"),
+    [(50.0, 1.9, None), (50.0, 12.0, -12.0), (0.5, 9.0, None), (0.5, 11.0, -11.0)],
 )
 def test_what_stopped_is_old_after_some_of_its_own_periods(rate: float, age: float, stopped: float | None) -> None:
     (flowing, *_) = (each for each in snapshots()[0].topics if each.name == "/odom")
@@ -192,6 +193,13 @@ def test_what_stopped_is_old_after_some_of_its_own_periods(rate: float, age: flo
     assert bool(state["flows"]) == (moment is None)
     detail: Any = details(snapshot, {}, "topic", "/odom")
     assert {route.get("stopped") for route in detail["routes"].values()} == {moment}
+
+
+def test_one_latched_message_has_not_stopped() -> None:
+    (topic, *_) = (each for each in snapshots()[0].topics if each.name == "/odom")
+    routes = tuple(replace(each, rate=None, age=60.0, period=None) for each in topic.routes)
+    detail: Any = details(replace(FULL, topics=(replace(topic, routes=routes),)), {}, "topic", "/odom")
+    assert {route.get("stopped") for route in detail["routes"].values()} == {None}
 
 
 async def test_rates_are_asked_while_a_page_looks_and_joined_with_the_topics_here() -> None:

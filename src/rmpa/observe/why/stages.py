@@ -244,7 +244,9 @@ def _published(ends: Ends, peer: str) -> Check:
         others = {source.topic for source in there.sources} - {"", wire}
         return Check("publisher", OK, f"{text} ({', '.join(sorted(others))} there)" if others else text)
     text = f"no node of {peer} publishes {wire}"
-    text += f"; {', '.join(there.subscribers)} there only subscribe to it" if there.subscribers else ""
+    if there.subscribers:
+        one = len(there.subscribers) == 1
+        text += f"; {', '.join(there.subscribers)} there only subscribe{'s' if one else ''} to it"
     remedy = f"start its publisher there, or see `rmpa topic list {peer}:/`"
     return Check("publisher", FAIL, text, f"did you mean {there.similar}?" if there.similar else remedy)
 

@@ -310,9 +310,12 @@ class StateBuilder:
 
 
 def is_stopped(route: RouteInfo) -> bool:
-    """Whether the last message of a route is old by the route's own period: its figures say what was."""
+    """Whether the last message of a route is old by the route's own period: its figures say what was.
+
+    One message alone has no period, as a latched one.
+    """
     period = route.period.p50 if route.period is not None else 1 / route.rate if route.rate else 0.0
-    return route.age is not None and route.age > old_after(period)
+    return period > 0 and route.age is not None and route.age > old_after(period)
 
 
 def module_facts(module: ModuleFacts) -> Tree:

@@ -81,11 +81,21 @@ class App extends Component {
 
   // The heading of another page gets the focus as soon as there is one: the page may have to be loaded first.
   componentDidUpdate() {
+    this.showPage();
     const heading = this.arrives && document.querySelector("main h1");
     if (!heading) return;
     this.arrives = false;
     heading.focus({ preventScroll: true });
     scrollTo(0, kept().scroll || 0);
+  }
+
+  // Where the row of pages is longer than the screen, the present one is scrolled to.
+  showPage() {
+    const link = document.querySelector(".top nav [aria-current]");
+    if (!link || link === this.shown) return;
+    this.shown = link;
+    const row = link.parentElement;
+    row.scrollLeft = link.offsetLeft + link.offsetWidth / 2 - row.clientWidth / 2;
   }
 
   // Many messages, one drawing: in the next frame, or soon where none comes, as in a tab that is or becomes hidden.

@@ -30,7 +30,10 @@ const RECEIVE = {
   beat: toWatch,
   published: (to, message) => to.publishing.get(message.id)?.(message),
   answer: (to, { id, value }) => to.settle(id)?.resolve(value),
-  stick: shown("stick"),
+  stick(to, message) {
+    if (message.mine && !to.stick?.mine) to.notice = null; // of how this page lost it before
+    shown("stick")(to, message);
+  },
   driven: shown("commanded"),
   failed: (to, message) => to.failed(message),
 };

@@ -4,7 +4,7 @@
 // of which the order with the fewest crossings stays, and then each column as near to its neighbours as its order
 // allows. Vertices that were there before keep their order, so that a graph that grows does not jump.
 
-const GAP = { column: 70, row: 12, lane: 18, title: 24 };
+const GAP = { column: 48, row: 12, lane: 18, title: 24 };
 const COLUMNS = 17; // more are not read at one look
 const SHAPE = 8; // rows to a column: boxes are wide, and so are screens
 const SWEEPS = 8;

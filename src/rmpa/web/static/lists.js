@@ -69,9 +69,9 @@ export function sorted(list, of, down) {
     .map(([, each]) => each);
 }
 
-// A heading says how its column is drawn: "#" as numbers, "~" muted.
-const KINDS = { "#": "number", "~": "muted" };
-const text = (heading) => heading.replace(/^[#~]/, "");
+// A heading says how its column is drawn: "#" as numbers, "~" muted, "^" never narrow.
+const KINDS = { "#": "number", "~": "muted", "^": "ends" };
+const text = (heading) => heading.replace(/^[#~^]/, "");
 
 function Heading({ column, sort, onSort }) {
   const kind = KINDS[column[0]],

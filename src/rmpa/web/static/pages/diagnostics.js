@@ -11,6 +11,7 @@ import { Plot, figure, toggled } from "../plot.js";
 const LEVELS = ["OK", "WARN", "STALE", "ERROR"]; // the best first, as in observe/diagnostics.py
 const rank = (level) => LEVELS.indexOf(level);
 const SPAN = 600; // seconds of a strip
+const REDRAWN = 5000; // milliseconds after which a strip has moved
 const WIDTH = 120;
 const HEIGHTS = { OK: 3, STALE: 6, WARN: 9, ERROR: 14 }; // by its height a level is seen without its colour
 const KEPT = 600; // moments of it
@@ -109,7 +110,9 @@ function Group({ node, chosen, wide, level }) {
   </li>`;
 }
 
-const leafOf = ({ label, leaf: [name, one] }, chosen) => ({ label, name, one, chosen: name === chosen });
+const leafOf = ({ label, leaf: [name, one] }, chosen) => {
+  return { label, name, one, chosen: name === chosen, drawn: Math.floor(Date.now() / REDRAWN) };
+};
 function Branch({ nodes, chosen, wide, level = 0 }) {
   const [shown, more] = useFirst(nodes);
   return html`<ul class=${level ? "" : "diagnostics"}>

@@ -237,6 +237,7 @@ export function GraphPage({ name, state, connection }) {
 
 const FACTOR = 1.25;
 const LEGIBLE = 1.5; // units of the drawing a pixel: smaller letters are not read
+const ALL = "all"; // is shown, however small
 
 // Where one looks: the upper left corner, and how many units of the drawing a pixel has; all of it until it is moved.
 function useView(box, drawn) {
@@ -254,9 +255,10 @@ function useView(box, drawn) {
   useLayoutEffect(() => {
     box.current.style.height = `min(72vh, ${Math.max(240, Math.ceil(drawn.height / wide))}px)`; // no higher than it is
   }, [drawn.height, wide]);
-  const whole = { scale, x: (drawn.width - w * scale) / 2, y: Math.min(0, (drawn.height - h * scale) / 2) };
-  const now = moved || { ...whole, x: Math.min(0, whole.x) };
-  const change = (next) => set((before) => next(before || now));
+  const middle = (low, all) => Math.min(0, (all - low) / 2);
+  const seen = (one) => ({ scale: one, x: middle(w * one, drawn.width), y: middle(h * one, drawn.height) });
+  const now = moved === ALL ? seen(Math.max(scale, drawn.width / w, drawn.height / h)) : moved || seen(scale);
+  const change = (next) => set((before) => next(before && before !== ALL ? before : now));
   const zoom = (factor, px = w / 2, py = h / 2) =>
     change((at) => {
       const next = Math.max(0.2, Math.min(8, at.scale / factor));
@@ -270,7 +272,7 @@ function useView(box, drawn) {
       return { ...at, x: inside(x, at.x, w), y: inside(y, at.y, h) };
     });
   const viewBox = `${now.x} ${now.y} ${w * now.scale} ${h * now.scale}`;
-  return { viewBox, left: now.x, zoom, pan, show, fit: () => set(null) };
+  return { viewBox, left: now.x, zoom, pan, show, fit: () => set(ALL) };
 }
 
 const MARKER = { viewBox: "0 0 8 8", refX: 7, refY: 4, markerWidth: 9, markerHeight: 9 };

@@ -30,7 +30,7 @@ export function ModulePage({ name, state, connection }) {
   if (!module) return html`<${Page} title=${name} kind="Module"><${Gone} kind="module" name=${name} /><//>`;
   const own = section(state, "agent").name === name;
   const detail = section(section(state, "detail"), `module:${name}`);
-  const all = entries(state, "topics").filter(([, one]) => (one.from || []).includes(name));
+  const all = entries(state, "topics").filter(([, one]) => [...(one.from || []), ...(one.to || [])].includes(name));
   const topics = all.filter(([topic]) => isData(topic, state));
   const resources = entries(state, "resources").filter(([, one]) => one.module === name);
   const nodes = entries(state, "nodes").filter(([, one]) => (one.module || section(state, "agent").name) === name);
@@ -70,8 +70,7 @@ export function ModulePage({ name, state, connection }) {
       /><//>`}
       ${own && html`<${Counters} state=${state} connection=${connection} />`}
       <${Panel} title=${`Topics of ${name}`} wide
-        ><${TopicTable} list=${topics} empty=${all.length ? "It publishes no data." : "It publishes no topic."} />
-        ${all.length > topics.length &&
+        ><${TopicTable} list=${topics} empty="It has no topic." /> ${all.length > topics.length &&
         html`<details>
           <summary>${all.length - topics.length} of its Smart Resources, about themselves, and of the log</summary>
           <${TopicTable} list=${all.filter(([topic]) => !isData(topic, state))} />
@@ -113,7 +112,7 @@ const LinkPanel = ({ module, detail }) => {
         ["Found by", module.source],
         ["Dialled by", link.dialled === undefined ? undefined : link.dialled ? "this module" : "the peer"],
         ["Next attempt in", detail.next_attempt !== undefined ? seconds(detail.next_attempt) : undefined],
-        ["GUID", html`<code>${module.guid}</code>`],
+        ["GUID", module.guid ? html`<code>${module.guid}</code>` : ""],
       ]}
   /><//>`;
 };

@@ -22,7 +22,7 @@ const COLUMNS = [
   ],
   ["Module", ([, node], { own }) => html`<${ModuleLink} name=${node.module || own} />`],
   ["#Publishes", ([, node]) => node.publishes || 0],
-  ["#Subscribes", ([, node]) => (node.module ? "–" : node.subscribes || 0)],
+  ["#Subscribes", ([, node]) => node.subscribes || 0],
   ["#Services", ([, node]) => node.serves || 0],
 ];
 export const NODE_COLUMNS = COLUMNS.filter(([heading]) => heading !== "Module");

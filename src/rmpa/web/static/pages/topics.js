@@ -54,7 +54,7 @@ const TOPIC_COLUMNS = [
   ["#Latency", ([, topic]) => seconds(topic.latency), ([, topic]) => topic.latency],
   ["#Lost", ([, topic]) => count(lostOf(topic) || undefined), ([, topic]) => lostOf(topic) || undefined],
   [
-    "From → to",
+    "^From → to",
     ([, { from = [], to = [], crosses }]) =>
       html`${from.join(", ") || muted("no publisher")}${" → "}${to.join(", ") ||
       muted("no subscriber here")}${!crosses && html` ${muted("does not cross")}`}`,
