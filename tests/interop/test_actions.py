@@ -74,7 +74,9 @@ def client_in(module: Module, kind: str, name: str = "client") -> Process:
     return module.ros.node(kind, "action_client", name=name, commands=True)
 
 
-@pytest.mark.parametrize(("server_kind", "client_kind"), [("rospy", "roscpp"), ("roscpp", "rospy")])
+@pytest.mark.parametrize(
+    ("server_kind", "client_kind"), [("rospy", "roscpp"), pytest.param("roscpp", "rospy", marks=pytest.mark.long)]
+)
 def test_goals_of_one_module_are_done_in_another(modules: ModuleFactory, client_kind: str, server_kind: str) -> None:
     a, b = modules("a", "b")
     client = client_in(a, client_kind)

@@ -167,7 +167,7 @@ def _listening(process: Process) -> list[str]:
     return [line.split()[3].rpartition(":")[2] for line in table.splitlines() if f"pid={process.pid}," in line]
 
 
-@pytest.mark.parametrize("client", ["roscpp", "rospy"])
+@pytest.mark.parametrize("client", ["roscpp", pytest.param("rospy", marks=pytest.mark.long)])
 def test_one_caller_id_is_direct_once(modules: ModuleFactory, client: str) -> None:
     """Nodes of one name subscribe in two modules: the second is relayed until the first has gone."""
     a, b, c = modules("a", "b", "c", config=AUTO)

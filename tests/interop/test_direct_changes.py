@@ -29,7 +29,7 @@ from tests.interop.transports import (
 )
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
-CLIENTS: Final = [("roscpp", "rospy"), ("rospy", "roscpp")]
+CLIENTS: Final = [("roscpp", "rospy"), pytest.param("rospy", "roscpp", marks=pytest.mark.long)]
 RATE: Final = 100
 # Messages that may pass while a subscriber is moved: a tenth of a second in general, much more on a busy machine.
 MOVE_GAP: Final = RATE * 2
@@ -138,7 +138,7 @@ def test_a_restarted_publisher_is_direct_again(modules: ModuleFactory, subscribe
     assert gaps(flows(listener, 50)) == settled
 
 
-@pytest.mark.parametrize("client", ["roscpp", "rospy"])
+@pytest.mark.parametrize("client", ["roscpp", pytest.param("rospy", marks=pytest.mark.long)])
 def test_an_ended_subscriber_leaves_nothing_behind(modules: ModuleFactory, client: str) -> None:
     a, b = modules("a", "b", config=AUTO)
     on_the_network(a, b)
@@ -352,7 +352,9 @@ def two_on_one(host: Host, agent: AgentFactory, shell: ShellFactory) -> tuple[Mo
     return first, second
 
 
-@pytest.mark.parametrize(("client", "bound"), [("roscpp", True), ("rospy", False)])
+@pytest.mark.parametrize(
+    ("client", "bound"), [("roscpp", True), pytest.param("rospy", False, marks=pytest.mark.long)]
+)
 def test_modules_of_one_machine_are_direct_over_loopback(
     lab: Lab, agent: AgentFactory, shell: ShellFactory, client: str, *, bound: bool
 ) -> None:

@@ -72,7 +72,7 @@ def wait_subscribers(module: Module, topic: str, *nodes: str) -> None:
     eventually(lambda: subscribers(module, topic) == set(nodes), what=what)
 
 
-@pytest.mark.parametrize("client", ["rospy", "roscpp"])
+@pytest.mark.parametrize("client", ["rospy", pytest.param("roscpp", marks=pytest.mark.long)])
 def test_a_topic_that_is_only_subscribed_to_is_known_everywhere(modules: ModuleFactory, client: str) -> None:
     base, pc = modules("a", "b")
     motors = base.ros.node(client, "listener", "__name:=motors", topic="/test/cmd_vel", count=50)
@@ -145,6 +145,7 @@ def test_rqt_graph_draws_in_each_module_what_it_draws_of_one_roscore(
         eventually(partial(is_drawn, module.ros, expected), what=f"the whole graph at {module.name}")
 
 
+@pytest.mark.long
 def test_a_lazy_relay_is_still_lazy(modules: ModuleFactory) -> None:
     """topic_tools' relay subscribes while its own topic has a subscriber; a shown one elsewhere is none."""
     pc, base, other = modules("a", "b", "c")

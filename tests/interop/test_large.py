@@ -104,7 +104,7 @@ def test_each_byte_arrives(modules: ModuleFactory, tmp_path: Path, sending: str)
         assert len(md5s(folder)) == 2
 
 
-@pytest.mark.parametrize("dies", ["publisher", "agent"])
+@pytest.mark.parametrize("dies", ["publisher", pytest.param("agent", marks=pytest.mark.long)])
 def test_what_dies_in_the_middle_leaves_no_half_message(modules: ModuleFactory, tmp_path: Path, dies: str) -> None:
     a, b = modules("a", "b")
     heard = listeners_at(b, tmp_path)
@@ -173,6 +173,7 @@ def all_have(sender: Process, heard: dict[Path, Process]) -> bool:
     return all(md5s(folder) for folder in heard)
 
 
+@pytest.mark.long
 def test_two_publishers_of_large_messages_are_not_mixed(modules: ModuleFactory, tmp_path: Path) -> None:
     # Without a depth, what waits for half a second on a busy machine is dropped.
     a, b = modules("a", "b", config='[[contract]]\ntopics = ["/large"]\ndepth = 10\n')

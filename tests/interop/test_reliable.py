@@ -43,7 +43,11 @@ def route(module: Module) -> dict[str, object]:
     return dict(msgspec.to_builtins(found))
 
 
-@pytest.mark.parametrize(("outage", "cuts", "pause"), [(0.3, 5, 1.4), (2.5, 2, 2.0)], ids=["short", "long"])
+@pytest.mark.parametrize(
+    ("outage", "cuts", "pause"),
+    [(0.3, 5, 1.4), pytest.param(2.5, 2, 2.0, marks=pytest.mark.long)],
+    ids=["short", "long"],
+)
 def test_nothing_is_lost_doubled_or_moved(
     modules: ModuleFactory, tmp_path: Path, outage: float, cuts: int, pause: float
 ) -> None:

@@ -87,7 +87,9 @@ def reaches(end: OtherEnd, topic: str, listeners: list[Process], text: str) -> N
     eventually(told, FORGOTTEN, what=f"{text} at each listener", every=0.2)
 
 
-@pytest.mark.parametrize(("size", "rate", "count"), [(64, 100, 100), (1 << 20, 10, 20)])
+@pytest.mark.parametrize(
+    ("size", "rate", "count"), [(64, 100, 100), pytest.param(1 << 20, 10, 20, marks=pytest.mark.long)]
+)
 def test_bytes_of_roscpp_go_to_ros2_and_back_to_three_modules(hall: Hall, size: int, rate: int, count: int) -> None:
     """#352, #218: each message once at each module, whichever library is there, and each byte right."""
     there, back = f"/there{size}", f"/back{size}"
@@ -171,7 +173,7 @@ def test_services_of_a_far_module_and_of_ros2(hall: Hall, node: OtherEnd) -> Non
     node.do("unserve", service="/gate2")
 
 
-@pytest.mark.parametrize("victim", ["gateway", "agent"])
+@pytest.mark.parametrize("victim", ["gateway", pytest.param("agent", marks=pytest.mark.long)])
 def test_both_ways_flow_again_after_a_kill(hall: Hall, node: OtherEnd, victim: str) -> None:
     """kill -9: of the gateway, whose half ends with it and stays in ROS 2's graph for a while, and of an agent."""
     on, back = f"/on_{victim}", f"/back_{victim}"

@@ -60,7 +60,9 @@ def wait_address(module: Module, *, other_than: object) -> None:
     eventually(seen, what=f"another address than {other_than}")
 
 
-@pytest.mark.parametrize(("client", "server"), [("rospy", "roscpp"), ("roscpp", "rospy")])
+@pytest.mark.parametrize(
+    ("client", "server"), [("rospy", "roscpp"), pytest.param("roscpp", "rospy", marks=pytest.mark.long)]
+)
 def test_calls_go_from_node_to_node(modules: ModuleFactory, server: str, client: str) -> None:
     a, b = modules("a", "b", config=AUTO)
     on_the_network(a, b)

@@ -208,7 +208,7 @@ MEGABYTE = 1024 * 1024
     [
         ("roscpp", "roscpp", 1000, 64),
         ("rospy", "rospy", 1000, 64),
-        ("roscpp", "rospy", 100, 3000),
+        pytest.param("roscpp", "rospy", 100, 3000, marks=pytest.mark.long),
         ("rospy", "roscpp", 10, MEGABYTE),
     ],
 )
@@ -264,7 +264,9 @@ def total(listener: Process) -> tuple[object, ...]:
     return report["gaps"], report["doubled"], report["bad"]
 
 
-@pytest.mark.parametrize(("size", "rate"), [(MB, 30), (64, 1000)], ids=["images", "commands"])
+@pytest.mark.parametrize(
+    ("size", "rate"), [pytest.param(MB, 30, marks=pytest.mark.alone), (64, 1000)], ids=["images", "commands"]
+)
 def test_a_stopped_subscriber_is_its_own_affair(modules: ModuleFactory, tmp_path: Path, size: int, rate: int) -> None:
     a, b, c = modules("a", "b", "c")
     stuck = b.ros.node("rospy" if size == 64 else "roscpp", "listener", "__name:=stuck", topic="/data")

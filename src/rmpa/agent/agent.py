@@ -398,9 +398,8 @@ def make_core(settings: Settings) -> Core:
 
 
 # The loggers that /rmpa/set_logger_level can set: the whole agent, or one room.
-_LOGGERS: Final = {
-    name: name for name in ("rmpa", "rmpa.agent", "rmpa.bridge", "rmpa.discovery", "rmpa.mesh", "rmpa.ros")
-}
+_ROOMS: Final = ("rmpa", "rmpa.agent", "rmpa.bridge", "rmpa.discovery", "rmpa.mesh", "rmpa.ros")
+_LOGGERS: Final = {name: name for name in _ROOMS}
 
 
 class Agent:
@@ -419,10 +418,7 @@ class Agent:
     """
 
     def __init__(
-        self,
-        settings: Settings,
-        realtime: tuple[str, ...] = (),
-        load: Callable[[], Loaded] | None = None,
+        self, settings: Settings, realtime: tuple[str, ...] = (), load: Callable[[], Loaded] | None = None
     ) -> None:
         self.settings = settings
         clock = SystemClock()
@@ -465,9 +461,8 @@ class Agent:
         self.bridge.rpc.on_request(INFO, lambda _asker, _args: self.snapshots.agent().for_peers(), needs)
         self.sites = SiteRequests(self.bridge)
         self.why = WhyService(settings.name, facts, self.snapshots, self.sites)
-        self.operations = ControlOperations(
-            settings.name, facts, self.params, self.snapshots, nodes, self.sites, rates
-        )
+        answers = nodes, self.sites, rates
+        self.operations = ControlOperations(settings.name, facts, self.params, self.snapshots, *answers)
         self.trust_commands = TrustCommands(settings, self.trust)
         handlers: dict[str, Handler] = {
             **self.operations.handlers(),

@@ -57,7 +57,7 @@ const TOPIC_COLUMNS = [
     "^From → to",
     ([, { from = [], to = [], crosses }]) =>
       html`${from.join(", ") || muted("no publisher")}${" → "}${to.join(", ") ||
-      muted("no subscriber here")}${!crosses && html` ${muted("does not cross")}`}`,
+      muted("no subscriber")}${!crosses && html` ${muted("does not cross")}`}`,
     ([, topic]) => (topic.from || []).join(", "),
   ],
 ];
