@@ -56,8 +56,8 @@ const TOPIC_COLUMNS = [
   [
     "^From → to",
     ([, { from = [], to = [], crosses }]) =>
-      html`${from.join(", ") || muted("no publisher")}${" → "}${to.join(", ") ||
-      muted("no subscriber")}${!crosses && html` ${muted("does not cross")}`}`,
+      html`${from.join(", ") || muted("no publisher")}${" → "}${to.join(", ") || muted("no subscriber")}${!crosses &&
+      html` ${muted("does not cross")}`}`,
     ([, topic]) => (topic.from || []).join(", "),
   ],
 ];
