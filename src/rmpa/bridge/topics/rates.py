@@ -1,4 +1,4 @@
-"""The rates of this module's topics, measured where they are published, while somebody looks at a list of them.
+"""The rates of this module's topics, measured where they are published, while a list of them is shown.
 
 Nodes count what they send over each connection and tell it (``getBusStats``), which costs no message. A topic without
 a connection, or of a node that does not tell, is subscribed to for a moment by a connection of the agent's own, which

@@ -285,7 +285,7 @@ class FramesWatch(WatchState):
                 self._counts[key] = count = self._counts.get(key, 0) + 1
                 move, turn = each["transform"]["translation"], each["transform"]["rotation"]
                 pose = [move["x"], move["y"], move["z"], turn["x"], turn["y"], turn["z"], turn["w"]]
-                # One that is not finite, or has no rotation, is null: the page says who sends it.
+                # One that is not finite, or has no rotation, is null: the page names its sender.
                 usable = all(map(math.isfinite, pose)) and any(pose[3:])
                 stamps = _seconds(each["header"]["stamp"]), message.stamp_ns / 1e9
                 self._changed[key] = [child, parent, source, is_static, *stamps, count, pose if usable else None]

@@ -151,7 +151,7 @@ class AccessPolicy:
                 return None
             return _foreign(_short(request.origin))
         elsewhere = request.fetch_site in ("cross-site", "same-site")
-        # The token in the URL says who wants a picture; a cookie would be sent along unasked.
+        # Only the token in the URL counts: a browser sends a cookie with requests of any site.
         if request.is_picture and self.token and self._fits(request.token):
             return None
         # A link on another page may lead here: the browser shows the page, and the other page cannot read it.

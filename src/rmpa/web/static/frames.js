@@ -1,4 +1,4 @@
-// The frames of tf as a page knows them: who sends each transform, what one frame is in another, and what is wrong.
+// The frames of tf as a page knows them: the sender of each transform, what one frame is in another, and what is wrong.
 // A pose is [x, y, z, qx, qy, qz, qw], in metres: that of the child in its parent.
 
 const KEPT = 30; // transforms of each frame, of the last seconds, for a stamp between two of them
