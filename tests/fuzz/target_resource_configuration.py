@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.declare import parse_rule
+from rmpa.resource.expression import parse_expression
 from rmpa.resource.reconfigure import ChoiceParameter, checked, config, entries, read_config
 from rmpa.resource.resource import Resource
 from rmpa.ros.types.descriptor import CONFIG_TYPE
@@ -55,7 +55,7 @@ def fuzz(data: bytes) -> None:
 
 def _rule(text: str) -> None:
     try:
-        rule = parse_rule(text, _ONE.parameters)
+        rule = parse_expression(text, _ONE.parameters)
     except ConfigError as error:
         str(error)
         return

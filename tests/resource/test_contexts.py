@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import ConfigError, PeerRefused
 from rmpa.resource import limits
-from rmpa.resource.declare import ContextRule, Scalar, parse_rule, split_reference
+from rmpa.resource.expression import Expression, Scalar, parse_expression, split_reference
 from rmpa.resource.node import ResourceNode
 from rmpa.resource.quality import at_least
 from rmpa.resource.reconfigure import DESCRIPTION_TYPE, read_config
@@ -277,8 +277,8 @@ async def test_a_rule_over_its_own_topics(core: RosCore, node: Node) -> None:
 PARAMETERS = ("gain", "name", "on")
 
 
-def rule(text: str) -> ContextRule:
-    return parse_rule(text, PARAMETERS, "context docked")
+def rule(text: str) -> Expression:
+    return parse_expression(text, PARAMETERS, "context docked")
 
 
 @pytest.mark.parametrize(
@@ -337,7 +337,7 @@ def test_a_text_is_no_number() -> None:
         ("~on == True", "'True' is no value; did you mean true?"),
         ("~name == docked", "'docked' is no value; texts have quotes"),
         ("~name == 'docked", "cannot be read"),
-        ("__import__('os')", "'__import__' is no value"),
+        ("__import__('os')", "there is no function __import__"),
         ("and", "'and' is no value"),
         ("(" * 50 + "~on" + ")" * 50, f"deeper than {limits.CONTEXT_RULE_DEPTH} brackets"),
         ("not " * 50 + "~on", f"deeper than {limits.CONTEXT_RULE_DEPTH} brackets"),
@@ -354,7 +354,7 @@ def test_invalid_rule_is_refused(text: str, said: str) -> None:
 @given(st.text(alphabet="~/.()<>=! andortuefls'\"0123_x-", max_size=80))
 def test_any_text_is_a_rule_or_an_error(text: str) -> None:
     with contextlib.suppress(ConfigError):
-        made = parse_rule(text, ("x", "a"))
+        made = parse_expression(text, ("x", "a"))
         assert made.holds({}) in (True, False, None)
         assert made.holds(dict.fromkeys(made.references, 1.0)) is not None
 

@@ -167,12 +167,17 @@ def prepared(path: Path, given: Sequence[str] = ()) -> list[Resource]:
 
 
 def load(path: Path) -> list[Resource]:
-    """Run a Python file and return the resources that it declares, in order.
+    """The resources that a file declares, in order: one in TOML, or those of a Python file, which is run.
 
     Raises:
         ConfigError: It cannot be run, declares none, two of one name, or one without a profile.
     """
     import runpy
+
+    if path.suffix == ".toml":
+        from rmpa.resource.description import read_description
+
+        return [read_description(path.read_bytes(), path)]
 
     from rmpa.resource.resource import Resource
 

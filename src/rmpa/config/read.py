@@ -86,6 +86,7 @@ _AT_LINE: Final = re.compile(r" \(at line (\d+), column \d+\)$")
 _TYPES: Final[dict[str, tuple[type, str]]] = {
     "string": (str, "a text in quotes"),
     "integer": (int, "a whole number"),
+    "number": (float, "a number"),
     "boolean": (bool, "true or false"),
     "array": (list, "a list"),
     "object": (dict, "a table"),
@@ -101,6 +102,25 @@ def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
 
     Returns:
         What it says, by the key of a setting; only the keys and types are checked.
+
+    Raises:
+        ConfigError: With line and key, if the text is not TOML, has an unknown key or a value of a wrong type.
+    """
+    text, table = read_toml(data, path, json_schema())
+    found = {setting.key: value_at(table, setting.key) for setting in SETTINGS if setting.key}
+    return {key: value for key, value in found.items() if value is not None}
+
+
+def read_toml(data: bytes, path: Path | None, schema: JsonSchema) -> tuple[str, dict[str, Any]]:
+    """Read the bytes of a TOML file, and check its keys and types by a schema.
+
+    Args:
+        data: UTF-8 text in TOML.
+        path: For the text of errors.
+        schema: The keys and types that it may have, as JSON Schema.
+
+    Returns:
+        The text, and what it says.
 
     Raises:
         ConfigError: With line and key, if the text is not TOML, has an unknown key or a value of a wrong type.
@@ -121,13 +141,12 @@ def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
             "the file", "not UTF-8 text", "save it as UTF-8", path, line, code="unreadable-settings"
         ) from None
     table = _parse_toml(text, path)
-    for place, problem, remedy in _mistakes((), table, json_schema()):
+    for place, problem, remedy in _mistakes((), table, schema, schema):
         raise ConfigError(dotted(place), problem, remedy, path, line_of(text, place))
-    found = {setting.key: value_at(table, setting.key) for setting in SETTINGS if setting.key}
-    return {key: value for key, value in found.items() if value is not None}
+    return text, table
 
 
-def _mistakes(place: Place, value: object, schema: JsonSchema) -> Iterator[tuple[Place, str, str]]:
+def _mistakes(place: Place, value: object, schema: JsonSchema, root: JsonSchema) -> Iterator[tuple[Place, str, str]]:
     """Each unknown key and wrong type in a value: place, problem and remedy. All else is checked by the readers."""
     expected = schema.get("type", [])
     types = [expected] if isinstance(expected, str) else expected
@@ -140,15 +159,15 @@ def _mistakes(place: Place, value: object, schema: JsonSchema) -> Iterator[tuple
         yield place, f"{shown(value)} is not {' or '.join(_TYPES[name][1] for name in types)}", remedy
     elif isinstance(value, list):
         for index, element in enumerate(value):
-            yield from _mistakes((*place, index), element, schema.get("items", {}))
+            yield from _mistakes((*place, index), element, schema.get("items", {}), root)
     elif isinstance(value, dict):
         known, other = schema.get("properties", {}), schema.get("additionalProperties") or {}
         for key, inner in value.items():
             if known and key not in known:
                 what = "an unknown table" if isinstance(inner, dict) else "an unknown key"
-                remedy = REMOVED.get(dotted((*place, key))) or _suggestion(place, key, list(known))
+                remedy = REMOVED.get(dotted((*place, key))) or _suggestion(place, key, list(known), root)
                 yield (*place, key), what, remedy
-            yield from _mistakes((*place, key), inner, known.get(key, other))
+            yield from _mistakes((*place, key), inner, known.get(key, other), root)
 
 
 def _parse_toml(text: str, path: Path | None) -> dict[str, Any]:
@@ -184,9 +203,9 @@ def dotted(place: Place) -> str:
     return ".".join(part for part in place if isinstance(part, str))
 
 
-def _suggestion(place: Place, word: str, here: list[str]) -> str:
+def _suggestion(place: Place, word: str, here: list[str], root: JsonSchema) -> str:
     """What to do about an unknown key: the key that was probably meant, or the table that it belongs in."""
-    everywhere = list(_keys(json_schema()))
+    everywhere = list(_keys(root))
     homes = [key for key in everywhere if key[-1] == word]
     near = did_you_mean(word, here)
     if near is not None and (place or not homes):
@@ -206,8 +225,11 @@ def _keys(schema: JsonSchema, table: Key = ()) -> Iterator[Key]:
     """Every key of a table and of those in it."""
     for name, inner in schema["properties"].items():
         inside = inner.get("items", inner)
+        named = inside.get("additionalProperties") or {}  # of tables that the user names
         if "properties" in inside:
             yield from _keys(inside, (*table, name))
+        elif "properties" in named:
+            yield from _keys(named, (*table, name, "NAME"))
         else:
             yield (*table, name)
 

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from rmpa.resource.quality import Attribute, Bound, Value
     from rmpa.resource.runtime import Runtime
     from rmpa.resource.tasks import Tasks
+    from rmpa.resource.values import ExpressionValues
     from rmpa.ros.node.endpoints import Publisher, Received, Subscriber
 
 _log = logging.getLogger(__name__)
@@ -213,13 +214,15 @@ class Adapter(RuntimePart):
 
     Args:
         runtime: The runtime of the resource.
+        values: The values of attributes that have an expression.
         tasks: The resource's tasks, paused while a profile is applied.
         stop: Set when a function of a profile or context has exceeded its time-out: the resource has to end.
     """
 
-    def __init__(self, runtime: Runtime, tasks: Tasks, stop: asyncio.Event) -> None:
+    def __init__(self, runtime: Runtime, values: ExpressionValues, tasks: Tasks, stop: asyncio.Event) -> None:
         resource = runtime.resource
         self._runtime = runtime
+        self._values = values
         self._tasks = tasks
         self._stop = stop
         self._name = runtime.node.name
@@ -307,7 +310,7 @@ class Adapter(RuntimePart):
     def _end_window(self, now: float) -> None:
         # Counted from the due time, not from now, so that lateness does not add up.
         self._window_end = max((self._window_end or now) + self._settings.window, now)
-        measured = self._measuring.window(now) if self._measuring is not None else {}
+        measured = self._values.derive(self._measuring.window(now) if self._measuring is not None else {})
         self._measured = self.observed.worst(measured, self.adaptation.requirements, now)
         for text, missing in count_missing(self._missing, self._runtime.problems()[0]):
             message = text if missing else f"over: {text}"

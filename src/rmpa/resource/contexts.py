@@ -11,14 +11,14 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource import limits
 from rmpa.resource.adapter import HungError, call_function
-from rmpa.resource.declare import Context, parse_rule, split_reference
-from rmpa.resource.runtime import RuntimePart, topic_of
+from rmpa.resource.declare import Context
+from rmpa.resource.runtime import RuntimePart
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.loop import MachineTimer
@@ -26,10 +26,10 @@ from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
     from rmpa.resource.adapter import Adapter
-    from rmpa.resource.declare import Input, Output, Parameter, Scalar
     from rmpa.resource.runtime import Runtime
     from rmpa.resource.tasks import Tasks
-    from rmpa.ros.node.endpoints import Received, Subscriber
+    from rmpa.resource.values import ExpressionValues
+    from rmpa.ros.node.endpoints import Received
 
 _log = logging.getLogger(__name__)
 _HOLDER: Final = "context"
@@ -44,13 +44,15 @@ class Contexts(RuntimePart):
 
     Args:
         runtime: The runtime of the resource.
+        values: The values that rules refer to.
         tasks: The resource's tasks, paused during a switch.
         adapter: Puts the requirements of contexts in force.
     """
 
-    def __init__(self, runtime: Runtime, tasks: Tasks, adapter: Adapter) -> None:
+    def __init__(self, runtime: Runtime, values: ExpressionValues, tasks: Tasks, adapter: Adapter) -> None:
         resource = runtime.resource
         self._runtime = runtime
+        self._values = values
         self._tasks = tasks
         self._adapter = adapter
         self._known = resource.contexts
@@ -61,17 +63,11 @@ class Contexts(RuntimePart):
         # When the present context began, monotonic seconds.
         self._since = -math.inf
         self._rules = {
-            name: parse_rule(context.when, resource.parameters, f"context {name} of {resource.name}")
+            name: resource.expression(context.when, f"context {name} of {resource.name}")
             for name, context in self._known.items()
             if context.when
         }
-        references = {reference for rule in self._rules.values() for reference in rule.references}
-        self._parameters = {reference for reference in references if reference.startswith("~")}
-        self._fields = {reference: _TopicField(reference) for reference in references - self._parameters}
-        self._subscribers: dict[str, Subscriber] = {}
-        # The topic of each input or output of the resource that a rule refers to, by the declared name.
-        self._taps: dict[str, str] = {}
-        self._latest: dict[str, tuple[MessageType, bytes]] = {}
+        self._references = {reference for rule in self._rules.values() for reference in rule.references}
         self._retry = 0.0
         # Held during a switch, and from a choice to its outcome: one that fails must not undo the next.
         self._lock = asyncio.Lock()
@@ -80,10 +76,6 @@ class Contexts(RuntimePart):
         self._timer = MachineTimer(lambda: self._next_evaluation, self._evaluate)
         # True before ``start`` and after ``close``.
         self._closed = True
-
-    def problems(self) -> tuple[list[str], list[str]]:
-        """Why fields that rules refer to cannot be read."""
-        return [], [f"rule over {field.problem}" for field in self._fields.values() if field.problem]
 
     async def start(self) -> None:
         """Enter the chosen context, if any, and evaluate the rules from now on."""
@@ -99,9 +91,8 @@ class Contexts(RuntimePart):
             except RmpaError as error:
                 _log.warning("! %s: %s [resource-trouble]", node.name, error)
                 self.chosen = ""
-        if self._fields:
-            self._work.start(self._find_topics(), "find topics of rules")
         if self._rules:
+            self._values.listeners.append(self._changed)
             self._evaluate(self._loop.time())
             self._timer.arm()
 
@@ -133,57 +124,6 @@ class Contexts(RuntimePart):
                 raise
             self._publish()
 
-    def received(self, item: Input, message: Received) -> None:
-        """Keep the message of an input if a rule refers to its topic."""
-        if item.name in self._taps:
-            self._update(self._taps[item.name], message.kind, message.raw)
-
-    def published(self, output: Output, raw: bytes, now_ns: int) -> None:  # noqa: ARG002
-        """Keep the message of an output if a rule refers to its topic."""
-        if output.name in self._taps:
-            self._update(self._taps[output.name], output.type, raw)
-
-    def parameter_changed(self, parameter: Parameter) -> None:
-        """Evaluate the rules soon if one of them refers to the parameter."""
-        if f"~{parameter.name}" in self._parameters:
-            self._evaluate_soon()
-
-    def _update(self, topic: str, kind: MessageType, raw: bytes) -> None:
-        self._latest[topic] = kind, raw
-        self._evaluate_soon()
-
-    def _values(self) -> dict[str, Scalar]:
-        found = {text: self._runtime.resource.parameters[text[1:]].value for text in self._parameters}
-        for text, field in self._fields.items():
-            if (subscriber := self._subscribers.get(field.topic)) is not None and not subscriber.publishers:
-                self._latest.pop(field.topic, None)  # without a publisher the value is unknown
-            if (latest := self._latest.get(field.topic)) and (value := field.read(*latest)) is not None:
-                found[text] = value
-        return found
-
-    async def _find_topics(self) -> None:
-        """Look up the topics that rules refer to, and subscribe to them, until all are found."""
-        node, delay = self._runtime.node, 0.5
-        while missing := [field for field in self._fields.values() if not field.topic]:
-            try:
-                published = {topic for topic, _ in await node.get_published_topics()}
-                for field in missing:
-                    if field.find(published):
-                        await self._subscribe(field.topic)
-            except RmpaError as error:
-                _log.debug("! %s: topics of rules: %s", node.name, error)
-            await asyncio.sleep(delay)
-            delay = min(2 * delay, limits.CONTEXT_RETRY)
-
-    async def _subscribe(self, topic: str) -> None:
-        resource, node = self._runtime.resource, self._runtime.node
-        own = [name for name in (*resource.inputs, *resource.outputs) if topic_of(name, node.name) == topic]
-        self._taps.update(dict.fromkeys(own, topic))
-        if not own and topic not in self._subscribers:  # else its messages come already
-            self._subscribers[topic] = await node.subscribe(
-                topic, callback=lambda message: self._update(topic, message.kind, message.raw)
-            )
-
     def _wanted(self, now: float) -> str:
         """The context to be in: the one chosen by hand, or else the first whose rule holds; empty: none.
 
@@ -193,11 +133,12 @@ class Contexts(RuntimePart):
             return self.chosen
         if now - self._since < limits.CONTEXT_DWELL:
             return self.current
-        values = self._values()
+        values = self._values.now()
         return next((name for name, rule in self._rules.items() if rule.holds(values)), "")
 
-    def _evaluate_soon(self) -> None:
-        if self._next_evaluation is not None:
+    def _changed(self, references: set[str]) -> None:
+        """Evaluate the rules soon if one of them refers to what has changed."""
+        if references & self._references and self._next_evaluation is not None:
             self._next_evaluation = min(self._next_evaluation, self._loop.time() + _DEBOUNCE)
             self._timer.arm()
 
@@ -260,46 +201,3 @@ class Contexts(RuntimePart):
         if not self._closed:
             self._runtime.publish_text("context", self.current)
             self._runtime.changed()
-
-
-class _TopicField:
-    """A field of a topic that rules refer to."""
-
-    def __init__(self, reference: str) -> None:
-        self._reference = reference
-        self._fields: tuple[str, ...] = ()
-        # Global name of the topic; empty until it is found.
-        self.topic = ""
-        # Why the field cannot be read from the topic's messages; empty if it can.
-        self.problem = ""
-
-    def find(self, published: set[str]) -> bool:
-        """Find the topic among the published ones; false if none of the candidates is published."""
-        for topic, fields in split_reference(self._reference):
-            if topic in published:
-                self.topic, self._fields = topic, fields
-                return True
-        return False
-
-    def read(self, kind: MessageType, raw: bytes) -> Any:
-        """The field's value in a serialized message; ``None`` if it does not exist or is no scalar."""
-        fields, problem, value = self._fields, "", None
-        if not fields and len(kind.fields) == 1:
-            fields = (kind.fields[0].name,)
-        try:
-            value = kind.deserialize(raw)
-            for name in fields:
-                value = getattr(value, name)
-            if hasattr(value, "nanosec"):
-                value = float(value.sec + value.nanosec / 1e9)
-            if not isinstance(value, bool | int | float | str):
-                problem = "it is no number, text or truth; name a field of it"
-        except AttributeError:
-            has = ", ".join(field.name for field in kind.fields)
-            problem = f"{kind.name} has no {'.'.join(fields)}; it has {has}"
-        except RmpaError as error:
-            problem = str(error)
-        before, self.problem = self.problem, f"{self._reference}: {problem}" if problem else ""
-        if problem and self.problem != before:
-            _log.warning("! the context rule with %s [resource-trouble]", self.problem)
-        return None if problem else value

@@ -1,4 +1,4 @@
-"""The parts of a declaration: parameters, topics, profiles, contexts with their rules, tasks; and their checks.
+"""The parts of a declaration: parameters, topics, nodes, profiles, contexts, alarms, tasks; and their checks.
 
 While the resource runs, ``rmpa.resource.runtime`` binds these to a node: it sets their fields ``on_…``.
 """
@@ -7,32 +7,47 @@ from __future__ import annotations
 
 import inspect
 import math
-import operator
-import re
-from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config.rules import CONTRACT_RULES, TERMS
-from rmpa.config.values import BadValue, did_you_mean, suggestion
+from rmpa.config.values import BadValue, suggestion
 from rmpa.core.contract import Contract
 from rmpa.core.errors import ConfigError, LocalProtocolError
 from rmpa.core.limits import INT32_MAX, INT32_MIN
-from rmpa.resource import limits
 from rmpa.ros.types.definitions import UnknownTypeError
 from rmpa.ros.types.find import find_message_type
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator
+    from collections.abc import Iterable
 
+    from rmpa.resource.expression import Expression
     from rmpa.resource.quality import Attribute, QoSRequest, RequirementAnswer, Value
     from rmpa.ros.types.messages import MessageType
 
 Hook = Callable[[], Awaitable[None] | None]
 ParameterValue = bool | int | float | str
 _ROS_TYPES: Final = {bool: "bool", int: "int", float: "double", str: "str"}
+
+
+class OfferSource(StrEnum):
+    """By which offers profiles are compared."""
+
+    DECLARED = "declared"
+    LEARNT = "learnt"
+
+
+class Measure(StrEnum):
+    """How a topic that another node publishes is measured."""
+
+    # By subscribing; what carries more than ``limits.MEASURED_BYTES`` a second by the node's own counters.
+    AUTO = "auto"
+    # By subscribing: every message is counted, and stamps give the latency.
+    SUBSCRIBE = "subscribe"
+    # By the node's own counters of its connections (getBusStats): rate and bandwidth, without another subscriber.
+    COUNTERS = "counters"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +65,7 @@ class AdaptationSettings:
         cool_down: Seconds for which a profile is excluded after it failed or was violated.
         cool_down_max: The longest cool-down; it doubles with each further failure.
         apply_timeout: Seconds after which a profile that is being applied counts as hung.
+        offers: Whether profiles are compared by what their author declared, or by what they have given (``learnt``).
     """
 
     violations: int = 2
@@ -61,6 +77,35 @@ class AdaptationSettings:
     cool_down: float = 10.0
     cool_down_max: float = 160.0
     apply_timeout: float = 5.0
+    offers: OfferSource = OfferSource.DECLARED
+
+
+class BindingKind(StrEnum):
+    """Where another node has the value of a parameter."""
+
+    # dynamic_reconfigure of the node; a change takes effect at once.
+    DYNAMIC = "dynamic"
+    # A parameter below the node's name on the parameter server, which most nodes read only at their start.
+    PRIVATE = "private"
+    # An argument of the launch file that the resource starts; a change restarts it.
+    ARGUMENT = "arg"
+
+
+@dataclass(frozen=True, slots=True)
+class Binding:
+    """Where the value of a parameter is, if another node has it.
+
+    Args:
+        kind: Where the value is.
+        node: The declared name of the node (``ManagedNode.key``).
+        name: The parameter's name there.
+        restart: Whether the node must be restarted to take a new value.
+    """
+
+    kind: BindingKind
+    node: str
+    name: str
+    restart: bool = False
 
 
 @dataclass(eq=False)
@@ -75,6 +120,7 @@ class Parameter:
         choices: The only valid values, if the parameter is an enumeration.
         unit: The unit, a text for people.
         description: A text for people.
+        binding: Where another node has the value; ``None``: the resource itself has it.
         on_change: Called with the parameter, in the thread that changed it; ``None`` while the resource does not run.
     """
 
@@ -85,6 +131,7 @@ class Parameter:
     choices: tuple[ParameterValue, ...] = ()
     unit: str = ""
     description: str = ""
+    binding: Binding | None = None
     on_change: Callable[[Parameter], None] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -167,13 +214,15 @@ class DeclaredTopic:
         name: The declared name, in the resource's namespace unless it is global.
         type_name: Name of the message type, ``package/Name``.
         contract: The offered or requested QoS of the messages; for outputs the agent's rules are applied on top.
+        label: The prefix of its measured attributes; empty: made of the name (``Resource.labels``).
 
     Raises:
         DefinitionError: The type's name is malformed, or rmpa comes with its package, which has no such type.
     """
 
-    def __init__(self, name: str, type_name: str, contract: Contract) -> None:
+    def __init__(self, name: str, type_name: str, contract: Contract, label: str = "") -> None:
         self.name = name
+        self.label = label
         self.type_name = type_name
         self.contract = contract
         # The type; ``None`` until it is known.
@@ -201,10 +250,14 @@ class DeclaredTopic:
 
 
 class Output(DeclaredTopic):
-    """A topic that the resource publishes."""
+    """A topic that the resource publishes, or that another node publishes for it."""
 
     # Whether a late subscriber gets the last message.
     latch = False
+    # Whether another node publishes it, so that the resource only measures it.
+    observed = False
+    # How an observed one is measured.
+    measure = Measure.AUTO
     # Called in any thread with ``(message fields, whole message)``; ``None`` while the resource does not run.
     on_publish: Callable[[Mapping[str, Any], object | None], None] | None = None
 
@@ -228,6 +281,8 @@ class Input(DeclaredTopic):
 
     # Whether the resource is stale while the topic has no publisher.
     required = True
+    # Whether another node receives it, so that the resource only looks whether it is published.
+    observed = False
 
 
 @dataclass(eq=False)
@@ -236,10 +291,12 @@ class DeclaredAttribute:
 
     Args:
         attribute: The attribute.
+        value: The expression that gives its value at the end of each window; ``None``: ``observe`` alone does.
         on_observation: Called in any thread with ``(attribute's name, value)``; ``None`` unless the resource runs.
     """
 
     attribute: Attribute
+    value: Expression | None = None
     on_observation: Callable[[str, Value], None] | None = field(default=None, repr=False)
 
     def observe(self, value: Value) -> None:
@@ -292,6 +349,9 @@ class Profile:
         description: A text for people.
         apply: The function that applies it.
         needs: The precondition: true or ``None`` while the profile may be used, else false or the reason as a text.
+        sets: The values of parameters that it sets, by name, before ``apply``.
+        nodes: The declared nodes that must run in it, besides those that always run.
+        rule: A rule that must not be false while the profile is used; empty: none.
     """
 
     name: str
@@ -301,6 +361,88 @@ class Profile:
     description: str = ""
     apply: Hook = lambda: None
     needs: Callable[[], str | bool | None] | None = None
+    sets: Mapping[str, ParameterValue] = field(default_factory=dict, hash=False)
+    nodes: tuple[str, ...] = ()
+    rule: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmRule:
+    """An alarm that a rule raises, beside those of the control loop.
+
+    Args:
+        name: Unique within the resource.
+        when: The rule over topics, parameters and attributes; the alarm stands while it is true.
+        error: Whether it is an ERROR; else a WARN.
+        text: What people read; empty: the rule.
+    """
+
+    name: str
+    when: str
+    error: bool = False
+    text: str = ""
+
+
+class RestartPolicy(StrEnum):
+    """When a started process that has ended is started again."""
+
+    ALWAYS = "always"
+    # If it ended with another exit code than 0, or by a signal.
+    ON_FAILURE = "on-failure"
+    NEVER = "never"
+
+
+@dataclass(frozen=True, slots=True)
+class ManagedNode:
+    """A ROS node that exists without the resource: it is attached to, and started if the declaration says how.
+
+    Args:
+        key: Its name in the declaration.
+        name: Global name of the node.
+        run: ``PACKAGE EXECUTABLE``, as for rosrun; empty: it is not started so.
+        launch: ``PACKAGE FILE`` or a path, as for roslaunch; ``name`` is one of its nodes.
+        command: A program with its arguments.
+        args: Further arguments: of the program, or ``name:=value`` of the launch file.
+        params: Private parameters that are set on the parameter server before it starts.
+        remap: Names of topics and services that it has otherwise, by its own name for them.
+        env: Variables of the environment.
+        restart: When it is started again.
+        stop_after: Seconds that it may take to end after SIGINT, before SIGTERM and SIGKILL follow.
+    """
+
+    key: str
+    name: str
+    run: str = ""
+    launch: str = ""
+    command: tuple[str, ...] = ()
+    args: tuple[str, ...] = ()
+    params: Mapping[str, ParameterValue] = field(default_factory=dict, hash=False)
+    remap: Mapping[str, str] = field(default_factory=dict, hash=False)
+    env: Mapping[str, str] = field(default_factory=dict, hash=False)
+    restart: RestartPolicy = RestartPolicy.ON_FAILURE
+    stop_after: float = 10.0
+
+    @property
+    def started(self) -> bool:
+        """Whether the declaration says how it is started."""
+        return bool(self.run or self.launch or self.command)
+
+
+@dataclass(frozen=True, slots=True)
+class StartRule:
+    """When the module's agent starts the resource without being asked.
+
+    Args:
+        boot: Whether it does at all.
+        delay: Seconds after the conditions below hold.
+        topics: Topics that must be published.
+        after: Resources of the module that must be active.
+    """
+
+    boot: bool = False
+    delay: float = 0.0
+    topics: tuple[str, ...] = ()
+    after: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,8 +451,7 @@ class Context:
 
     Args:
         name: Unique within the resource.
-        when: A rule over topics and parameters (``parse_rule``) that selects the context; empty: it is chosen by hand
-            only.
+        when: A rule (``resource.expression``) that selects the context; empty: it is chosen by hand only.
         requires: QoS requests on the resource itself, by attribute.
         profiles: The only profiles that may run in the context; empty: any.
         outputs: The only outputs that are published in the context, by name; ``None``: all.
@@ -411,178 +552,3 @@ def read_enum(kind: type[Any], text: str, where: str) -> Any:
 def _refuse_unknown(where: str, problem: str, text: str, known: Iterable[str], listed: str = "it is one of ") -> None:
     names = list(known)
     raise ConfigError(where, problem, suggestion(text, names, f"{listed}{', '.join(names)}"))
-
-
-# Rules that select a context by fields of topics and by the resource's parameters::
-#
-#     rule       = conjunction { "or" conjunction }
-#     conjunction= negation { "and" negation }
-#     negation   = "not" negation | "(" rule ")" | value [ ("==" | "!=" | "<" | "<=" | ">" | ">=") value ]
-#     value      = number | 'text' | "text" | true | false | ~parameter | /topic | /topic/field | /topic.field.field
-#
-# Example: ``/battery/charging == true and ~gain > 3``. In ``/battery/charging`` the longest part that is a published
-# topic is the topic, as for rostopic; ``/battery.charging`` is explicit. A topic alone means the message's only field
-# (``std_msgs/Bool``). A value that is unknown (no message yet, no publisher) makes a comparison neither true nor
-# false. A rule holds only if it is true whatever the unknown values are (Kleene's logic).
-#
-# Pure: a rule is parsed once, into a function of the values; nothing is evaluated as Python.
-
-
-# A value that rules can compare.
-Scalar = bool | int | float | str
-_Holds = Callable[[Mapping[str, Scalar]], bool | None]
-_TOKEN: Final = re.compile(
-    r"\s*(?:(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.]))"
-    r"|(?P<text>'[^']*'|\"[^\"]*\")"
-    r"|(?P<reference>/[A-Za-z]\w*(?:/\w+)*(?:\.\w+)*|~[A-Za-z]\w*)"
-    r"|(?P<word>[A-Za-z_]\w*)"
-    r"|(?P<sign>==|!=|<=|>=|<|>|\(|\)))"
-)
-_SIGNS: Final[Mapping[str, Callable[[Any, Any], bool]]] = {
-    "==": operator.eq,
-    "!=": operator.ne,
-    "<": operator.lt,
-    "<=": operator.le,
-    ">": operator.gt,
-    ">=": operator.ge,
-}
-_KEYWORDS: Final = ("and", "or", "not", "true", "false")
-
-
-@dataclass(frozen=True, slots=True)
-class ContextRule:
-    """A parsed rule.
-
-    Args:
-        holds: Whether the rule is true by the known values, which are by reference; ``None``: that depends on unknown
-            values.
-        references: Each variable of the rule once, as written there: ``/topic.field`` or ``~parameter``.
-    """
-
-    holds: _Holds
-    references: tuple[str, ...]
-
-
-def parse_rule(text: str, parameters: Collection[str], where: str = "rule") -> ContextRule:
-    """Parse a rule.
-
-    Args:
-        text: A ``rule`` of the grammar above.
-        parameters: Names of the resource's parameters.
-        where: Description of the rule, for errors.
-
-    Raises:
-        ConfigError: The rule has a syntax error or an unknown parameter, or is too long or nested too deeply.
-    """
-    if len(text) > limits.CONTEXT_RULE_MAX:
-        raise ConfigError(where, f"{len(text)} characters", f"at most {limits.CONTEXT_RULE_MAX}")
-    parser = _RuleParser(text, where)
-    holds = parser.parse()
-    for name in (reference[1:] for reference in parser.references if reference.startswith("~")):
-        if name not in parameters:
-            near = did_you_mean(name, parameters)
-            remedy = f"did you mean ~{near}?" if near else "declare it before the context"
-            raise ConfigError(where, f"there is no parameter {name}", remedy)
-    return ContextRule(holds, tuple(parser.references))
-
-
-def split_reference(text: str) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Possible splits of a reference into a topic and its fields, longest topic first; no field: the only one."""
-    topic, dot, fields = text.partition(".")
-    if dot:
-        yield topic, tuple(fields.split("."))
-        return
-    parts = topic.strip("/").split("/")
-    for count in range(len(parts), 0, -1):
-        yield "/" + "/".join(parts[:count]), tuple(parts[count:])
-
-
-class _RuleParser:
-    """A recursive-descent parser of one rule."""
-
-    def __init__(self, text: str, where: str) -> None:
-        self._text = text
-        self._where = where
-        self.references: dict[str, None] = {}
-        self._tokens: deque[tuple[str, str]] = deque()
-        at = 0
-        while rest := text[at:].strip():
-            if (match := _TOKEN.match(text, at)) is None:
-                raise self._error(f"{rest[:20]!r} cannot be read")
-            kind = match.lastgroup or ""
-            self._tokens.append((kind, match[kind]))
-            at = match.end()
-        self._tokens.append(("", ""))
-
-    def parse(self) -> _Holds:
-        holds = self._rule(0)
-        if self._tokens[0][0]:
-            raise self._error(f"{self._tokens[0][1]!r} stands where the rule must end, or go on with and/or")
-        return holds
-
-    def _take(self, *lexemes: str) -> str:
-        """Remove the next token and return it if it is one of these; else nothing."""
-        return self._tokens.popleft()[1] if self._tokens[0][1] in lexemes else ""
-
-    def _rule(self, depth: int) -> _Holds:
-        return self._chain("or", lambda: self._chain("and", lambda: self._negation(depth)))
-
-    def _chain(self, word: str, part: Callable[[], _Holds]) -> _Holds:
-        parts = [part()]
-        while self._take(word):
-            parts.append(part())
-        decisive = word == "or"  # one true decides an "or", one false an "and"
-
-        def holds(values: Mapping[str, Scalar]) -> bool | None:
-            found = [each(values) for each in parts]
-            if decisive in found:
-                return decisive
-            return None if None in found else not decisive
-
-        return holds
-
-    def _negation(self, depth: int) -> _Holds:
-        if depth > limits.CONTEXT_RULE_DEPTH:
-            raise self._error(f"deeper than {limits.CONTEXT_RULE_DEPTH} brackets")
-        if self._take("not"):
-            inner = self._negation(depth + 1)
-            return lambda values: None if (found := inner(values)) is None else not found
-        if self._take("("):
-            inner = self._rule(depth + 1)
-            if not self._take(")"):
-                raise self._error("a bracket is not closed")
-            return inner
-        left = self._value()
-        sign = self._take(*_SIGNS)
-        right = self._value() if sign else ("", True)
-        return lambda values: _compare(_SIGNS[sign or "=="], *(values.get(r) if r else v for r, v in (left, right)))
-
-    def _value(self) -> tuple[str, Scalar]:
-        """A reference, or an empty one with a constant."""
-        kind, piece = self._tokens[0]
-        if kind == "word" and piece not in ("true", "false"):
-            near = did_you_mean(piece, _KEYWORDS) if piece not in _KEYWORDS else None
-            raise self._error(f"{piece!r} is no value", f"did you mean {near}?" if near else "texts have quotes")
-        if not kind or kind == "sign":
-            raise self._error(f"a value is missing in front of {piece!r}" if piece else "a value is missing")
-        self._tokens.popleft()
-        if kind == "reference":
-            self.references[piece] = None
-            return piece, ""
-        return "", piece == "true" if kind == "word" else float(piece) if kind == "number" else piece[1:-1]
-
-    def _error(
-        self, problem: str, remedy: str = "for example /battery/charging == true and ~gain > 3"
-    ) -> ConfigError:
-        return ConfigError(self._where, f"{self._text!r}: {problem}", remedy)
-
-
-def _compare(compare: Callable[[Any, Any], bool], left: Scalar | None, right: Scalar | None) -> bool | None:
-    """Compare two values; numbers and booleans as Python does, since a ROS ``bool`` may be 0 or 1."""
-    if left is None or right is None or left != left or right != right:  # noqa: PLR0124 - NaN
-        return None
-    if isinstance(left, str) != isinstance(right, str):
-        return compare is operator.ne  # a text equals only texts
-    if isinstance(left, str) and compare not in (operator.eq, operator.ne):
-        return False  # texts have no order
-    return compare(left, right)

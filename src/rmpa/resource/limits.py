@@ -45,6 +45,10 @@ CONTEXT_RULE_MAX: Final = 1024
 CONTEXT_RULE_DEPTH: Final = 20
 # A context that a rule has selected stays at least so long: a value at a threshold must not cause oscillation.
 CONTEXT_DWELL: Final = 1.0
+# [Resources] Bytes a second up to which an observed topic is measured by subscribing (``measure = "auto"``)
+# At it: its node's own counters give rate and bandwidth
+# Why: A second subscriber of an image delays the first one.
+MEASURED_BYTES: Final = 256 * 1024
 # The function of a context may take so long; tasks are paused meanwhile.
 CONTEXT_ENTER_TIMEOUT: Final = 5.0
 # Seconds from a failed switch until the rules are evaluated again; also the longest between searches for topics.

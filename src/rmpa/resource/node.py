@@ -15,6 +15,7 @@ from rmpa.resource.reconfigure import Reconfigure
 from rmpa.resource.runtime import LifecycleState, Runtime
 from rmpa.resource.saved import Persistence, SavedCoolDown, SavedState
 from rmpa.resource.tasks import Tasks
+from rmpa.resource.values import ExpressionValues
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.fetch_type import fetch_type
 from rmpa.ros.node.node import Node
@@ -70,12 +71,20 @@ class ResourceNode:
         self.runtime = Runtime(resource, node)
         self.runtime.close_outputs()
         self.tasks = Tasks(self.runtime, self._deactivate_soon)
-        self.adapter = Adapter(self.runtime, self.tasks, stop if stop is not None else asyncio.Event())
-        self.contexts = Contexts(self.runtime, self.tasks, self.adapter)
+        self.values = ExpressionValues(self.runtime, resource.expressions())
+        self.adapter = Adapter(self.runtime, self.values, self.tasks, stop if stop is not None else asyncio.Event())
+        self.contexts = Contexts(self.runtime, self.values, self.tasks, self.adapter)
         self.configuration = Reconfigure(self.runtime, self.tasks, self.adapter, self.contexts)
         self.demands = Demands(self.runtime)
         # In the order of their start.
-        self.parts: list[RuntimePart] = [self.tasks, self.adapter, self.contexts, self.configuration, self.demands]
+        self.parts: list[RuntimePart] = [
+            self.values,
+            self.tasks,
+            self.adapter,
+            self.contexts,
+            self.configuration,
+            self.demands,
+        ]
         self._persistence: Persistence | None = None
         if state is not None:
             self._persistence = Persistence(self.runtime, self._state, state)

@@ -20,31 +20,37 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import is_legal_name
 from rmpa.resource.declare import (
     AdaptationSettings,
+    AlarmRule,
+    Binding,
     Context,
     DeclaredAttribute,
     Demand,
     Hook,
     Input,
+    ManagedNode,
+    Measure,
+    OfferSource,
     OnFailure,
     Output,
     Parameter,
     ParameterValue,
     Profile,
+    StartRule,
     Task,
     check_arity,
-    parse_rule,
     read_contract,
     read_enum,
 )
+from rmpa.resource.expression import Expression, parse_expression
 from rmpa.resource.quality import MEASURED, Attribute, Category, Direction, Scale, find_attribute, quantity
 
 if TYPE_CHECKING:
@@ -62,6 +68,19 @@ RESERVED: Final = frozenset(
 )  # fmt: skip
 # Keys of requirements and quality reports that cannot be names of attributes.
 NOT_ATTRIBUTES: Final = frozenset({"expires", "level_for", "priority", "profile", "reaction"})
+# Functions in expressions that the running resource answers, with the numbers of their arguments.
+SOURCES: Final[Mapping[str, tuple[int, ...]]] = {
+    # Processor time of a node's process as a share of one core; memory that it holds, bytes. Without a name: of the
+    # resource's only node.
+    "cpu": (0, 1),
+    "memory": (0, 1),
+    # Of the machine: the hottest thermal zone, or the zone of this type, in °C.
+    "temperature": (0, 1),
+    # The number in a value of /diagnostics: name of the status, key; or the level of the status, 0 to 3.
+    "diagnostics": (1, 2),
+    # Whether a node is registered at the core and answers.
+    "running": (1,),
+}
 # The least value in seconds of each time of the control loop.
 _LEAST: Final = {"window": 0.05, "dwell": 0.0, "settle": 0.0, "cool_down": 0.0, "apply_timeout": 0.01}
 _DAY: Final = 86400
@@ -107,11 +126,25 @@ class Resource:
         self.tasks: dict[str, Task] = {}
         self.demands: dict[str, Demand] = {}
         self.hooks: dict[str, Hook] = {}
+        # Nodes that exist without the resource, by their declared names.
+        self.nodes: dict[str, ManagedNode] = {}
+        self.alarms: dict[str, AlarmRule] = {}
+        self.start = StartRule()
         # Parameters of the control loop.
         self.settings = AdaptationSettings()
 
-    def output(self, name: str, kind: str, *, latch: bool = False, **contract: object) -> Output:
-        """Declare a topic that the resource publishes.
+    def output(
+        self,
+        name: str,
+        kind: str,
+        *,
+        latch: bool = False,
+        observed: bool = False,
+        measure: str = "auto",
+        label: str = "",
+        **contract: object,
+    ) -> Output:
+        """Declare a topic that the resource publishes, or that another node publishes for it.
 
         Args:
             name: A name in the resource's namespace, or a global one (``/cmd_vel``).
@@ -119,6 +152,9 @@ class Resource:
                 (``rmpa.ros.types.find``). A type of another package is learnt at the start from a publisher of that
                 type, here or in another module; the resource waits for one.
             latch: Whether a late subscriber gets the last message.
+            observed: Whether another node publishes it; the resource measures it, and passes nothing on.
+            measure: How an observed one is measured: ``declare.Measure``.
+            label: The prefix of its measured attributes; by default made of the name.
             contract: The keys of a ``[[contract]]``: ``deadline="100 ms"``, ``reliability="reliable"`` …
 
         Raises:
@@ -126,20 +162,31 @@ class Resource:
             DefinitionError: The type's name is malformed, or its package is known and has no such type.
         """
         where = self._check_topic("output", name, self.outputs, self.inputs)
-        made = Output(name, kind, read_contract(where, contract))
-        made.latch = latch
+        made = Output(name, kind, read_contract(where, contract), self._check_label(where, label))
+        made.latch, made.observed = latch, observed
+        made.measure = read_enum(Measure, measure, where)
         self.outputs[name] = made
         return made
 
-    def input(self, name: str, kind: str, *, required: bool = True, **contract: object) -> Input:
+    def input(
+        self,
+        name: str,
+        kind: str,
+        *,
+        required: bool = True,
+        observed: bool = False,
+        label: str = "",
+        **contract: object,
+    ) -> Input:
         """Declare a topic that the resource needs; arguments and errors as for ``output``, except ``required``.
 
         A type that is unknown on this machine is learnt from the topic's publisher; the resource starts without it.
-        ``required``: whether the resource is stale while the topic has no publisher.
+        ``required``: whether the resource is stale while the topic has no publisher. ``observed``: another node
+        receives it; the resource only looks whether it is published.
         """
         where = self._check_topic("input", name, self.inputs, self.outputs)
-        made = Input(name, kind, read_contract(where, contract))
-        made.required = required
+        made = Input(name, kind, read_contract(where, contract), self._check_label(where, label))
+        made.required, made.observed = required, observed
         self.inputs[name] = made
         return made
 
@@ -175,14 +222,19 @@ class Resource:
         choices: Sequence[ParameterValue] = (),
         unit: str = "",
         description: str = "",
+        binding: Binding | None = None,
     ) -> Parameter:
         """Declare a parameter, whose type is that of its default; ``Parameter`` explains the arguments.
 
         Raises:
-            ConfigError: The name is illegal or taken, the bounds are the wrong way round, or the default is invalid.
+            ConfigError: The name is illegal or taken, the bounds are the wrong way round, the default is invalid, or
+                the binding names no declared node.
         """
         where = self._check_name("parameter", name, self.parameters)
-        made = Parameter(name, default, low, high, tuple(choices), unit, description)
+        if binding is not None and binding.node not in self.nodes:
+            remedy = suggestion(binding.node, self.nodes, f"declared are {', '.join(self.nodes) or 'none'}")
+            raise ConfigError(where, f"there is no node {binding.node}", remedy)
+        made = Parameter(name, default, low, high, tuple(choices), unit, description, binding)
         made.check_declaration(where)
         self.parameters[name] = made
         return made
@@ -197,6 +249,7 @@ class Resource:
         category: str = "performance",
         tolerance: float | str | None = None,
         words: Sequence[str] = (),
+        value: str = "",
     ) -> DeclaredAttribute:
         """Declare a quality attribute that the user's code observes, in addition to ``quality.MEASURED``.
 
@@ -208,6 +261,8 @@ class Resource:
             category: ``temporal``, ``spatial``, ``reliability`` or ``performance``.
             tolerance: A shortfall of this size counts as 1; with a unit, or a ratio on a log scale.
             words: The values of ordinal and nominal scales.
+            value: An expression (``resource.expression``) that gives its value at the end of each window, over
+                topics, parameters, ``SOURCES`` and the attributes declared before; empty: ``observe`` gives it.
 
         Raises:
             ConfigError: The name is illegal or taken, or the arguments contradict each other.
@@ -228,7 +283,8 @@ class Resource:
             tolerance=plain,
             words=tuple(words),
         )
-        made = self.declared_attributes[name] = DeclaredAttribute(attribute)
+        made = DeclaredAttribute(attribute, self.expression(value, where) if value else None)
+        self.declared_attributes[name] = made
         return made
 
     @property
@@ -238,13 +294,14 @@ class Resource:
         The prefix is the last part of the name; if that is taken, as many last parts as make it unique, joined by
         dots; if all are taken, the whole name after ``in.`` or ``out.``.
         """
-        found: dict[str, str] = {}
-        for name in (*self.outputs, *self.inputs):
+        topics = self.outputs | self.inputs
+        found = {name: topic.label for name, topic in topics.items() if topic.label}
+        for name in (name for name in topics if name not in found):
             parts = name.strip("/").split("/")
             several = [".".join(parts[-count:]) for count in range(1, len(parts) + 1)]
             several.append(f"{'in' if name in self.inputs else 'out'}.{several[-1]}")
             found[name] = next((label for label in several if label not in found.values()), several[-1])
-        return found
+        return {name: found[name] for name in topics}
 
     @property
     def attributes(self) -> dict[str, Attribute]:
@@ -269,6 +326,9 @@ class Resource:
         needs: Callable[[], str | bool | None] | None = None,
         name: str = "",
         description: str = "",
+        sets: Mapping[str, ParameterValue] | None = None,
+        nodes: Sequence[str] = (),
+        rule: str = "",
     ) -> Callable[[_Function], _Function]:
         """Declare a System Profile; the decorated function applies it.
 
@@ -280,6 +340,9 @@ class Resource:
                 true or ``None`` while the profile may be used, else false or a text with the reason.
             name: By default the function's name.
             description: By default the first line of the function's docstring.
+            sets: Values of parameters that it sets before the function is called.
+            nodes: Declared nodes that must run in it; one that no profile names always runs.
+            rule: A rule over topics, parameters and attributes; while it is false the profile is not used.
 
         Raises:
             ConfigError: The name is taken, an attribute or unit is unknown, a value is invalid, or there is a
@@ -306,7 +369,25 @@ class Resource:
                 for key, value in offers.items()
             }
             text = description or (function.__doc__ or "").strip().partition("\n")[0]
-            self.profiles[title] = Profile(title, values, cost, best_effort, text, function, needs)  # type: ignore[arg-type] # check_arity
+            given = {key: self._parameter_value(key, value, where) for key, value in (sets or {}).items()}
+            for node in nodes:
+                if node not in self.nodes:
+                    remedy = suggestion(node, self.nodes, f"declared are {', '.join(self.nodes) or 'none'}")
+                    raise ConfigError(where, f"there is no node {node}", remedy)
+            if rule:
+                self.expression(rule, where)
+            self.profiles[title] = Profile(
+                title,
+                values,
+                cost,
+                best_effort,
+                text,
+                function,  # type: ignore[arg-type] # check_arity
+                needs,
+                given,
+                tuple(nodes),
+                rule,
+            )
             return function
 
         return declare
@@ -339,10 +420,80 @@ class Resource:
         if outputs is not None and (strange := [o.name for o in outputs if o not in self.outputs.values()]):
             raise ConfigError(where, f"{strange[0]} is no output of this resource", "name its own outputs")
         if when:
-            parse_rule(when, self.parameters, where)
+            self.expression(when, where)
         names = tuple(output.name for output in outputs) if outputs is not None else None
         made = self.contexts[name] = Context(name, when, dict(requires or {}), tuple(profiles), names, enter)
         return made
+
+    def node(self, key: str, name: str = "", **how: Any) -> ManagedNode:
+        """Declare a ROS node that exists without the resource; ``ManagedNode`` explains the arguments.
+
+        Args:
+            key: Its name in the declaration.
+            name: Global name of the node; by default ``/<key>``.
+            how: The other fields of ``ManagedNode``.
+
+        Raises:
+            ConfigError: A name is illegal or taken, or there are several ways to start it.
+        """
+        where = self._new("node", key, self.nodes)
+        made = ManagedNode(key, name or f"/{key}", **how)
+        if not key or not is_legal_name(key) or "/" in key or key.startswith("~"):
+            raise ConfigError(where, f"{key!r} is not a base name", "letters, digits and _, a letter first")
+        if not made.name.startswith("/") or not is_legal_name(made.name) or made.name == "/":
+            raise ConfigError(where, f"{made.name!r} is not a global name of a node", f"for example /{key}")
+        if any(other.name == made.name for other in self.nodes.values()) or made.name == f"/{self.name}":
+            raise ConfigError(where, f"{made.name} is declared already, or the resource itself", "name it once")
+        if sum(map(bool, (made.run, made.launch, made.command))) > 1:
+            raise ConfigError(where, "run, launch and command are three ways to start it", "keep one of them")
+        self.nodes[key] = made
+        return made
+
+    def alarm(self, name: str, when: str, *, level: str = "warn", text: str = "") -> AlarmRule:
+        """Declare an alarm that stands while a rule is true.
+
+        Args:
+            name: Unique within the resource.
+            when: The rule, over topics, parameters, ``SOURCES`` and attributes.
+            level: ``warn`` or ``error``.
+            text: What people read; by default the rule.
+
+        Raises:
+            ConfigError: The name is taken, the level is unknown or the rule is invalid.
+        """
+        where = self._new("alarm", name, self.alarms)
+        if level not in ("warn", "error"):
+            raise ConfigError(where, f"there is no level {level!r}", "it is warn or error")
+        self.expression(when, where)
+        made = self.alarms[name] = AlarmRule(name, when, level == "error", text)
+        return made
+
+    def expression(self, text: str, where: str) -> Expression:
+        """Parse an expression over the resource's topics, parameters, attributes and ``SOURCES``.
+
+        Raises:
+            ConfigError: It is invalid, or names a node that is not declared; ``where`` begins the error's text.
+        """
+        parsed = parse_expression(text, self.parameters, where, attributes=self.attributes, sources=SOURCES)
+        for source in parsed.sources.values():
+            if source.function not in ("cpu", "memory", "running"):
+                continue
+            if not source.arguments and len(self.nodes) != 1:
+                raise ConfigError(where, f"{source.function}() of which node?", f"there are {len(self.nodes)}")
+            if source.arguments and (node := source.arguments[0]) not in self.nodes:
+                remedy = suggestion(node, self.nodes, f"declared are {', '.join(self.nodes) or 'none'}")
+                raise ConfigError(where, f"there is no node {node}", remedy)
+        return parsed
+
+    def expressions(self) -> Iterator[Expression]:
+        """All expressions of the declaration: rules of contexts, alarms and profiles, and values of attributes."""
+        rules = (
+            *((f"context {one.name}", one.when) for one in self.contexts.values()),
+            *((f"alarm {one.name}", one.when) for one in self.alarms.values()),
+            *((f"profile {one.name}", one.rule) for one in self.profiles.values()),
+        )
+        yield from (self.expression(text, f"{where} of {self.name}") for where, text in rules if text)
+        yield from (one.value for one in self.declared_attributes.values() if one.value is not None)
 
     def task(
         self,
@@ -404,6 +555,7 @@ class Resource:
         cool_down: float | str = 10.0,
         cool_down_max: float | str = 160.0,
         apply_timeout: float | str = 5.0,
+        offers: str = "declared",
     ) -> None:
         """Set the parameters of the control loop: ``AdaptationSettings`` explains them; times may have a unit.
 
@@ -417,6 +569,7 @@ class Resource:
             cool_down: Time for which a profile is excluded after it failed or was violated.
             cool_down_max: The longest such time, if that happens repeatedly.
             apply_timeout: Time-out of a profile's function.
+            offers: ``declared`` or ``learnt``: by what profiles are compared.
 
         Raises:
             ConfigError: A time is out of range, or ``violations`` is greater than ``windows``.
@@ -431,7 +584,8 @@ class Resource:
             if not least <= times[name] <= _DAY:
                 raise ConfigError(where, f"{name} is {times[name]:g} s", f"at least {least:g} s, at most a day")
         times["cool_down_max"] = max(times["cool_down_max"], times["cool_down"])
-        self.settings = AdaptationSettings(violations, windows, improvement, **times)
+        source = read_enum(OfferSource, offers, where)
+        self.settings = AdaptationSettings(violations, windows, improvement, **times, offers=source)
 
     def on(self, event: str) -> Callable[[_Function], _Function]:
         """Declare the callback of a life-cycle transition.
@@ -462,6 +616,20 @@ class Resource:
         if name in known:
             raise ConfigError(where, "there are two of this name", "name one of them otherwise")
         return where
+
+    def _parameter_value(self, name: str, value: ParameterValue, where: str) -> ParameterValue:
+        if name not in self.parameters:
+            remedy = suggestion(name, self.parameters, f"declared are {', '.join(self.parameters) or 'none'}")
+            raise ConfigError(where, f"there is no parameter {name}", remedy)
+        try:
+            return self.parameters[name].check(value)
+        except ConfigError as error:
+            raise ConfigError(f"{where}, {error.source}", error.problem, error.remedy) from None
+
+    def _check_label(self, where: str, label: str) -> str:
+        if label and (not is_legal_name(label) or "/" in label or label in self.labels.values()):
+            raise ConfigError(where, f"{label!r} cannot be its label", "letters, digits and _, and none twice")
+        return label
 
     def _check_rate(self, parameter: Parameter, where: str) -> None:
         if parameter not in self.parameters.values():

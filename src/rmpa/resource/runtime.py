@@ -147,6 +147,8 @@ class Runtime:
         async with contextlib.AsyncExitStack() as undo:
             await undo.enter_async_context(self.node)
             for output in self.resource.outputs.values():
+                if output.observed:
+                    continue
                 topic = topic_of(output.name, self.node.name)
                 self._publishers[output.name] = await self.node.advertise(topic, output.type, latch=output.latch)
                 output.on_publish = functools.partial(self._publish, output, HeaderNumbers(output.type))
@@ -163,7 +165,8 @@ class Runtime:
                 self._texts[name] = publisher, None
             self.publish_descriptor()
             for item in self.resource.inputs.values():
-                await self._subscribe(item)
+                if not item.observed:
+                    await self._subscribe(item)
             for step in first:
                 await step()
             for part in self.parts:
@@ -196,7 +199,9 @@ class Runtime:
         missing = [
             f"no node publishes {name}"
             for name, item in self.resource.inputs.items()
-            if item.required and not ((subscriber := self._subscribers.get(name)) and subscriber.publishers)
+            if item.required
+            and not item.observed
+            and not ((subscriber := self._subscribers.get(name)) and subscriber.publishers)
         ]
         broken = []
         for part in self.parts:
@@ -206,6 +211,10 @@ class Runtime:
         if self.state is not LifecycleState.ACTIVE:
             broken.append(f"it is {self.state}")
         return missing, broken
+
+    def hears(self, name: str) -> bool:
+        """Whether the messages of an input or output, by its declared name, come to the resource itself."""
+        return name in self._publishers or name in self._subscribers
 
     def call_in_loop(self, function: Callable[..., object], *args: Any) -> None:
         """Call a function in the event loop: at once if called in the loop's thread, else as soon as the loop can."""
