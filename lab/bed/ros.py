@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 # The interpreter that Debian's rospy is installed for.
 PYTHON: Final = "/usr/bin/python3"
 NODES: Final = Path(__file__).parents[1] / "nodes"
+# What roscpp nodes include as <rmpa_ros/rmpa_ros.h>.
+CLIENT_HEADERS: Final = Path(__file__).parents[2] / "packaging/ros/rmpa_ros/include"
 _SYSTEM_PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 # Programs that end others, which are in sessions of their own.
 _PARENTS: Final = ("roscore", "roslaunch", "launch")
@@ -251,14 +253,17 @@ def compiled(program: str, nodes: Path = NODES, headers: Path = NODES) -> Path:
     It is kept where the XDG Base Directory Specification has a user's caches: ``~/.cache/rmpa/nodes``.
     """
     source = nodes / f"{program}.cpp"
+    text = source.read_text()
     folders = list(dict.fromkeys((headers, NODES)))
+    if "<rmpa_ros/" in text:
+        folders.append(CLIENT_HEADERS)
     flags = ["-std=c++17", "-O2", "-Wall", "-Wextra"]
-    packages = ["actionlib", "roscpp"] if "<actionlib/" in source.read_text() else ["roscpp"]
+    packages = ["actionlib", "roscpp"] if "<actionlib/" in text else ["roscpp"]
     libraries = subprocess.run(
         ["pkg-config", "--cflags", "--libs", *packages], capture_output=True, text=True, check=True
     ).stdout.split()
     digest = hashlib.sha256(" ".join([*flags, *libraries]).encode())
-    for part in [source, *(header for folder in folders for header in sorted(folder.glob("*.hpp")))]:
+    for part in [source, *(header for folder in folders for header in sorted(folder.rglob("*.h*")))]:
         digest.update(part.read_bytes())
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rmpa" / "nodes"
     binary = cache / f"{program}-{digest.hexdigest()[:12]}"

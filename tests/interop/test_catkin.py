@@ -131,3 +131,6 @@ def test_a_workspace_with_it_builds_and_installs(tmp_path: Path) -> None:
     )
     command = '. "$HOME/install_isolated/setup.sh" && roslaunch --args /rmpa rmpa_ros up.launch web:=true'
     assert f"{tmp_path}/install_isolated/lib/rmpa_ros/rmpa" in run(["sh", "-c", command], env=env)
+    assert (tmp_path / "install_isolated/include/rmpa_ros/rmpa_ros.h").exists()
+    imports = '. "$HOME/install_isolated/setup.sh" && python3 -c "import rmpa_ros; print(rmpa_ros.__file__)"'
+    assert run(["sh", "-c", imports], env=env).startswith(f"{tmp_path}/install_isolated/")

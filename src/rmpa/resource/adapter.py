@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
+from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.resource import limits
 from rmpa.resource.adaptation import Adaptation
@@ -240,6 +241,8 @@ class Adapter(RuntimePart):
         # The function for which the resource ends; ``None``: none hangs.
         self.hung: HungError | None = None
         self.observed = ObservedQualities(self._attributes, resource.name, 3 * self._settings.window)
+        # The attributes whose values the resource's own nodes say.
+        self._said = {n: one for n, one in resource.declared_attributes.items() if one.value is None}
         # ``None`` before the start.
         self._measuring: QualityMeasurement | None = None
         self._measured: dict[str, Value] = {}
@@ -280,6 +283,8 @@ class Adapter(RuntimePart):
         self.adaptation.restore(requirements, self.saved.last, cool_downs, now)
         self._requirements = await node.subscribe(f"{node.name}/requirements", kind, self._requirement_received)
         await node.subscribe(f"{node.name}/observed", kind, self._observation_received)
+        if self._runtime.resource.nodes and any(one.value is None for one in self._said.values()):
+            await node.subscribe(f"{node.name}/attributes", kind, self._attribute_received)
         self.adaptation.block(self._blocked_by_needs, now)
         if self.preset:
             self.adaptation.pin(self.preset, now, restored=True)
@@ -340,6 +345,23 @@ class Adapter(RuntimePart):
         except ConfigError as error:
             if self.clients[message.caller_id].refusal != str(error):  # reports repeat; one error is logged once
                 self.refuse(message.caller_id, str(error))
+
+    def _attribute_received(self, message: Received) -> None:
+        """Take what a node of the resource says of attributes."""
+        problem = ""
+        if message.caller_id not in {node.name for node in self._runtime.resource.nodes.values()}:
+            problem = "attributes: it is no node of this resource; declare it: [node.NAME]"
+        for name, text in _pairs(message) if not problem else ():
+            if (declared := self._said.get(name)) is None:
+                there = f"there are {', '.join(self._said)}"
+                problem = f"{name}: nodes cannot say it; {suggestion(name, self._said, there)}"
+                continue
+            try:
+                declared.observe(declared.attribute.parse(text, name))
+            except ConfigError as error:
+                problem = str(error)
+        if problem and self.clients[message.caller_id].refusal != problem:  # they repeat; one error is logged once
+            self.refuse(message.caller_id, problem)
 
     def _requirement_received(self, message: Received) -> None:
         client, stamp, now = message.caller_id, message.message.header.stamp, self._loop.time()

@@ -62,8 +62,9 @@ _Function = TypeVar("_Function", bound=Callable[..., object])
 # Names below a resource's node that are reserved for topics, services and parameters of every resource.
 RESERVED: Final = frozenset(
     {
-        "alarms", "context", "decision", "descriptor", "observed", "parameter_descriptions", "parameter_updates",
-        "profile", "quality", "requirements", "responses", "set_context", "set_parameters", "state",
+        "alarms", "attributes", "context", "decision", "descriptor", "observed", "parameter_descriptions",
+        "parameter_updates", "profile", "quality", "requirements", "responses", "set_context", "set_parameters",
+        "state",
     }
 )  # fmt: skip
 # Keys of requirements and quality reports that cannot be names of attributes.
