@@ -26,6 +26,7 @@ The file is read into the declaration of ``rmpa.resource.resource``; nothing of 
 
 from __future__ import annotations
 
+import json
 import re
 from typing import TYPE_CHECKING, Any, Final
 
@@ -35,6 +36,7 @@ from rmpa.config.schema import NEEDED, Setting
 from rmpa.config.values import BOOL, TEXT, BadValue, JsonSchema, ValueType, list_of, member_of, text_type
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import is_legal_name
+from rmpa.resource import limits
 from rmpa.resource.declare import Binding, BindingKind, Measure, OfferSource, RestartPolicy, StartRule
 from rmpa.resource.quality import Category, Direction, Scale, parse_request, quantity
 from rmpa.resource.resource import Resource, Role
@@ -236,8 +238,28 @@ def read_description(data: bytes, path: Path) -> Resource:
     Raises:
         ConfigError: With line and key, for the first mistake.
     """
+    if len(data) > limits.DESCRIPTION_MAX:
+        problem = f"{len(data)} bytes, more than {limits.DESCRIPTION_MAX}"
+        raise ConfigError("the file", problem, "is it the right file?", path, 1, code="unreadable-settings")
     text, table = read_toml(data, path, _SCHEMA)
     return _Reader(text, table, path).read()
+
+
+def description_mistakes(data: bytes, path: Path) -> list[ConfigError]:
+    """What is wrong in a description: all unknown keys and wrong types, else the first of other mistakes."""
+    found: list[ConfigError] = []
+    try:
+        read_toml(data, path, _SCHEMA, found)
+        if not found:
+            read_description(data, path)
+    except ConfigError as error:
+        found.append(error)
+    return found
+
+
+def schema_text() -> str:
+    """The JSON Schema as it is printed and stands in docs/."""
+    return json.dumps(_SCHEMA, indent=2, ensure_ascii=False) + "\n"
 
 
 class _Reader:
@@ -255,7 +277,7 @@ class _Reader:
         except BadValue as error:
             remedy = error.remedy or (f"did you mean {error.better}?" if error.better else "")
             place = (*self._place, *error.at)
-            raise self._error(place, dotted(place), error.problem, remedy) from None
+            raise self._error(place, dotted(place) or "the file", error.problem, remedy) from None
         except ConfigError as error:
             raise self._error(self._blamed(error), error.source, error.problem, error.remedy) from None
         except RmpaError as error:  # a type that there is not
@@ -272,12 +294,13 @@ class _Reader:
             table = table[part]
         source = getattr(error, "source", "")
         last = re.split(r",| of ", source)[-1]
+        words = re.findall(r"[\w.]+", f"{last} {str(error).replace(source, '', 1)}")
         found: Place = self._place
         best = 0
         for place, value in _places(self._place, table):
-            words = re.findall(r"[\w.]+", f"{last} {str(error).replace(source, '', 1)}")
             shown = not isinstance(value, dict | list | bool) and len(str(value)) > 1 and str(value) in str(error)
-            score = 2 * shown + (str(place[-1]) in words) + (str(place[-1]) in last)
+            shown |= isinstance(value, str) and repr(value) in str(error)
+            score = 2 * shown + (str(place[-1]) in words) + 2 * (str(place[-1]) in last)
             if score > best:
                 found, best = place, score
         return found

@@ -49,6 +49,11 @@ CONTEXT_DWELL: Final = 1.0
 # At it: its node's own counters give rate and bandwidth
 # Why: A second subscriber of an image delays the first one.
 MEASURED_BYTES: Final = 256 * 1024
+# [Resources] Bytes of a file that describes a resource
+# At it: it is refused
+# Told in: its error
+# Why: A large one has some 10 KB, and each mistake is searched for its line.
+DESCRIPTION_MAX: Final = 64 * 1024
 # The function of a context may take so long; tasks are paused meanwhile.
 CONTEXT_ENTER_TIMEOUT: Final = 5.0
 # Seconds from a failed switch until the rules are evaluated again; also the longest between searches for topics.
