@@ -105,7 +105,7 @@ types: $(STAMP)  ## mypy, strict
 imports: $(STAMP)  ## the rooms import one way only; pure rooms stay pure
 	$(BIN)/lint-imports
 
-reference: $(STAMP)  ## write docs/reference/commands.md, settings.md and limits.md, and docs/rmpa.schema.json, from the code
+reference: $(STAMP)  ## write docs/reference/commands.md, settings.md and limits.md, and docs/*.schema.json, from the code
 	$(BIN)/python scripts/write-reference
 
 docs: $(STAMP)  ## build the site of docs/ into site/, which is read from disk or from any web server

@@ -377,7 +377,7 @@ class _Reader:
                 raise BadValue("it names a node, and not what it is there", 'add dynamic = "NAME", private or arg')
             return None
         if len(given) > 1:
-            raise BadValue(f"{' and '.join(given)} are two places for one value", "keep one of them")
+            raise BadValue(f"{' and '.join(given)} are two places for one value", "keep one", at=(list(given)[-1],))
         kind, name = next(iter(given.items()))
         if not node and len(made.nodes) != 1:
             there = ", ".join(made.nodes) or "none"
