@@ -204,6 +204,7 @@ def load(path: Path) -> list[Resource]:
         if resource.name in seen:
             raise ConfigError(f"resource {resource.name}", "there are two of this name", "rename one of them", path)
         seen.add(resource.name)
+        resource.file = path.name
         if not resource.profiles:
             remedy = "declare one: @NAME.profile(offers={…})"
             raise ConfigError(f"resource {resource.name}", "it has no System Profile", remedy, path)

@@ -107,6 +107,10 @@ class Binding:
     name: str
     restart: bool = False
 
+    def __str__(self) -> str:
+        """``driver dynamic frame_rate``, as descriptors have it."""
+        return f"{self.node} {self.kind} {self.name}"
+
 
 @dataclass(eq=False)
 class Parameter:
@@ -426,6 +430,13 @@ class ManagedNode:
     def started(self) -> bool:
         """Whether the declaration says how it is started."""
         return bool(self.run or self.launch or self.command)
+
+    @property
+    def how(self) -> str:
+        """How it is started, as descriptors have it; a command's words are told to no other module."""
+        if self.command:
+            return "command"
+        return f"run {self.run}" if self.run else f"launch {self.launch}" if self.launch else "attached"
 
 
 @dataclass(frozen=True, slots=True)

@@ -332,6 +332,7 @@ class _Reader:
         if not is_legal_name(name) or "/" in name:
             raise ConfigError("name", f"{name!r} is not a ROS base name", 'give one: name = "camera"')
         made = Resource(name, **about)
+        made.file = self._path.name
         for key, node in self._named("node"):
             node["stop_after"] = quantity(node.get("stop_after", 10.0), "s", "stop_after")
             made.node(key, **node)

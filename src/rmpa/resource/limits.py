@@ -54,6 +54,25 @@ MEASURED_BYTES: Final = 256 * 1024
 # Told in: its error
 # Why: A large one has some 10 KB, and each mistake is searched for its line.
 DESCRIPTION_MAX: Final = 64 * 1024
+# [Resources] Windows of each profile and attribute from which its learnt offer is computed
+# At it: the oldest is dropped
+# Told in: `rmpa profile list`, which shows the median, the spread and their number
+LEARNT_WINDOWS: Final = 60
+# [Resources] Windows that a learnt offer needs before profiles are compared by it (`offers = "learnt"`)
+# At it: with fewer the declared offer counts
+# Told in: `rmpa profile explain`
+LEARNT_LEAST: Final = 10
+# [Resources] Decisions that are told with their reasons
+# At it: the oldest is dropped
+# Told in: `rmpa profile explain`
+DECISIONS_KEPT: Final = 10
+# A status of ``/diagnostics`` is known so long: nodes repeat theirs each second, an aggregator drops it after 5 s.
+DIAGNOSTICS_LIFESPAN: Final = 10.0
+# Seconds between two readings of a process's figures, at least: processor time is counted in hundredths of a second.
+FIGURES_PAUSE: Final = 0.5
+# An operator's change at a node is judged when its configuration has been quiet so long: a node may publish what the
+# resource has set only after its reply.
+KNOB_QUIET: Final = 0.3
 # The function of a context may take so long; tasks are paused meanwhile.
 CONTEXT_ENTER_TIMEOUT: Final = 5.0
 # Seconds from a failed switch until the rules are evaluated again; also the longest between searches for topics.

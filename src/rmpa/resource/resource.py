@@ -130,6 +130,8 @@ class Resource:
         self.nodes: dict[str, ManagedNode] = {}
         self.alarms: dict[str, AlarmRule] = {}
         self.start = StartRule()
+        # Base name of the file that declares it; empty: unknown.
+        self.file = ""
         # Parameters of the control loop.
         self.settings = AdaptationSettings()
 
@@ -234,6 +236,9 @@ class Resource:
         if binding is not None and binding.node not in self.nodes:
             remedy = suggestion(binding.node, self.nodes, f"declared are {', '.join(self.nodes) or 'none'}")
             raise ConfigError(where, f"there is no node {binding.node}", remedy)
+        if binding is not None and binding.kind == "private" and binding.name in self.nodes[binding.node].params:
+            remedy = "leave it out there: default is its first value"
+            raise ConfigError(where, f"{binding.name} is among the params of node {binding.node} too", remedy)
         made = Parameter(name, default, low, high, tuple(choices), unit, description, binding)
         made.check_declaration(where)
         self.parameters[name] = made

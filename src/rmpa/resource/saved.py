@@ -126,6 +126,8 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
         context: The context chosen by hand, or empty.
         requirements: Requirements of clients, which may come back.
         cool_downs: Cool-downs by profile.
+        by_hand: Values of other nodes that people have set, by parameter.
+        learnt: The values of each profile's last windows, by attribute.
     """
 
     format: int = FORMAT
@@ -135,6 +137,8 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
     context: str = ""
     requirements: tuple[SavedRequirement, ...] = ()
     cool_downs: dict[str, SavedCoolDown] = {}
+    by_hand: dict[str, bool | int | float | str] = {}
+    learnt: dict[str, dict[str, list[float]]] = {}
 
     def checked(self, resource: Resource, now_ns: int) -> tuple[SavedState, list[str]]:
         """What still fits the declaration of the resource, and a text about each part that does not.
@@ -151,13 +155,18 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
                 return ""
             return name
 
-        parameters, requirements = {}, []
-        for name, value in self.parameters.items():
-            try:
-                if declared("parameter", name, resource.parameters):
-                    parameters[name] = resource.parameters[name].check(value)
-            except ConfigError as error:
-                lost.append(str(error))
+        requirements = []
+
+        def valid(values: Mapping[str, bool | int | float | str]) -> dict[str, bool | int | float | str]:
+            found = {}
+            for name, value in values.items():
+                try:
+                    if declared("parameter", name, resource.parameters):
+                        found[name] = resource.parameters[name].check(value)
+                except ConfigError as error:
+                    lost.append(str(error))
+            return found
+
         for one in self.requirements:
             try:
                 if one.requirement(resource.attributes, resource.name, 0.0, now_ns) is not None:
@@ -165,12 +174,14 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
             except ConfigError as error:
                 lost.append(f"requirement of {one.client}: {error}")
         found = SavedState(
-            parameters=parameters,
+            parameters=valid(self.parameters),
             chosen=declared("profile", self.chosen, resource.profiles),
             last=declared("profile", self.last, resource.profiles),
             context=declared("context", self.context, resource.contexts),
             requirements=tuple(requirements),
             cool_downs={n: c for n, c in self.cool_downs.items() if declared("profile", n, resource.profiles)},
+            by_hand={n: v for n, v in valid(self.by_hand).items() if resource.parameters[n].binding is not None},
+            learnt=self.learnt,
         )
         return found, lost
 
