@@ -39,7 +39,8 @@ if TYPE_CHECKING:
 
     from rmpa.resource.actuation import Actuation
     from rmpa.resource.decision import Alarm
-    from rmpa.resource.declare import Context, Hook, Input, Output, Profile
+    from rmpa.resource.declare import Context, Hook, Input, ManagedNode, Output, Profile
+    from rmpa.resource.processes import Processes
     from rmpa.resource.quality import Attribute, Bound, Value
     from rmpa.resource.runtime import Runtime
     from rmpa.resource.tasks import Tasks
@@ -280,6 +281,8 @@ class Adapter(RuntimePart):
             MachineTimer(lambda: self._clients_check, self._check_clients),
         )
         self._closed = False
+        # The part that runs the nodes that profiles name; ``None``: there are none.
+        self.processes: Processes | None = None
 
     async def start(self) -> None:
         """Begin to measure, choose the first profile, and serve clients."""
@@ -368,8 +371,19 @@ class Adapter(RuntimePart):
 
     def _update_blocked(self) -> None:
         """Block the profiles whose preconditions or rules do not hold, and those that the context excludes."""
-        blocked = self._rules.blocked() | self._blocked_by_needs | self._blocked_by_context
+        by_nodes = self.processes.blocked() if self.processes is not None else {}
+        blocked = by_nodes | self._rules.blocked() | self._blocked_by_needs | self._blocked_by_context
         self.adaptation.block(blocked, self._loop.time())
+
+    def node_changed(self, node: ManagedNode, text: str, ended: bool) -> None:
+        """Report that a node has ended, or runs again; the running profile has failed if it names one that ended."""
+        self._log_change(text, over=not ended)
+        level, profile = DiagnosticLevel.WARN if ended else DiagnosticLevel.OK, self.adaptation.profile
+        values = {"node": node.name, "cleared": str(not ended).lower()}
+        self._report("alarms", level, text if ended else f"over: {text}", values)
+        if ended and profile and node.key in self._runtime.resource.profiles[profile].nodes:
+            self.adaptation.broken(profile, text, self._loop.time())
+        self._tell()
 
     def _observation_received(self, message: Received) -> None:
         try:

@@ -74,12 +74,14 @@ class ResourceNode:
         node = Node(resource.name, master_uri=master_uri, on_shutdown=lambda _reason: self.ended.set())
         self.runtime = Runtime(resource, node)
         self.runtime.close_outputs()
-        self.processes = Processes(self.runtime)
+        self.processes = Processes(self.runtime, state.parent if state is not None else None)
         self.tasks = Tasks(self.runtime, self._deactivate_soon)
         self.values = ExpressionValues(self.runtime, resource.expressions())
         self.actuation = Actuation(self.runtime, self.processes)
         stop = stop if stop is not None else asyncio.Event()
         self.adapter = Adapter(self.runtime, self.values, self.tasks, self.actuation, stop)
+        self.adapter.processes = self.processes
+        self.processes.on_change = self.adapter.node_changed
         self.contexts = Contexts(self.runtime, self.values, self.tasks, self.adapter)
         self.configuration = Reconfigure(self.runtime, self.tasks, self.actuation, self.adapter, self.contexts)
         self.demands = Demands(self.runtime)
@@ -258,6 +260,7 @@ class ResourceNode:
         elif not refused:
             self.tasks.activate()
         runtime.publish_text("state", runtime.state)
+        self.processes.note_soon()
         if refused:
             raise PeerRefused(f"resource {self.resource.name}", f"{transition}: {why}")
 

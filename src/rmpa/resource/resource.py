@@ -54,6 +54,8 @@ from rmpa.resource.expression import Expression, parse_expression
 from rmpa.resource.quality import MEASURED, Attribute, Category, Direction, Scale, find_attribute, quantity
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rmpa.resource.quality import QoSRequest
 
 # The highest rate of a periodic task, in Hz.
@@ -132,6 +134,8 @@ class Resource:
         self.start = StartRule()
         # Base name of the file that declares it; empty: unknown.
         self.file = ""
+        # The folder of the file that declares it, in which its nodes are started; ``None``: that of the process.
+        self.folder: Path | None = None
         # Parameters of the control loop.
         self.settings = AdaptationSettings()
 
