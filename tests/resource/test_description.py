@@ -34,7 +34,7 @@ def test_a_file_declares_all_that_it_says() -> None:
     assert (driver.name, driver.run, driver.stop_after, driver.restart) == (
         "/usb_cam", "usb_cam usb_cam_node", 2.0, RestartPolicy.ALWAYS,
     )  # fmt: skip
-    assert driver.params == {"video_device": "/dev/video0", "width": 640, "mirror": True, "gain": 0.5}
+    assert driver.params == {"width": 640, "mirror": True, "sharpness": 0.5}
     assert (lamp.name, lamp.command) == ("/lamp", ("/usr/bin/env", "lamp"))
     assert {name: one.binding for name, one in robot.parameters.items()} == {
         "fps": Binding(BindingKind.DYNAMIC, "driver", "frame_rate"),

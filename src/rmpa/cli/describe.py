@@ -136,13 +136,14 @@ async def _misfits(options: Options, resource: Resource, text: str, file: Path, 
     master = options.master()
     graph = await read_graph(master)
     names = {node.name for node in resource.nodes.values()} & set(graph.nodes)
+    servers = {node.server or node.name for node in resource.nodes.values()}
     sources = [source for each in resource.expressions() for source in each.sources.values()]
 
     async def body(node: Node) -> live.LiveGraph:
         return await live.look(
             node,
             topics=[topic for topic in resource.outputs if topic in graph.publishers],
-            servers=[name for name in names if f"{name}{live.DESCRIPTIONS}" in graph.publishers],
+            servers=[name for name in servers if f"{name}{live.DESCRIPTIONS}" in graph.publishers],
             owners=sorted(names),
             diagnostics=any(source.function == "diagnostics" for source in sources),
             seconds=seconds,

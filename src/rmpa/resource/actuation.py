@@ -100,7 +100,7 @@ class Actuation(RuntimePart):
             self._service = await asyncio.to_thread(ServiceType, SERVICE_TYPE)
         for key in self._heard:
             await node.subscribe(
-                f"{nodes[key].name}/parameter_updates",
+                f"{nodes[key].server or nodes[key].name}/parameter_updates",
                 MessageType(CONFIG_TYPE),
                 functools.partial(self._configured, key),
             )
@@ -276,7 +276,8 @@ class Actuation(RuntimePart):
                 remedy = suggestion(there, present, f"it has {', '.join(present)}")
                 raise PeerRefused(self._where(key), f"{name}: it has no dynamic parameter {there}", remedy)
             asked[there] = _fit(value, present[there])
-        service = f"{self._runtime.resource.nodes[key].name}/set_parameters"
+        node = self._runtime.resource.nodes[key]
+        service = f"{node.server or node.name}/set_parameters"
         self._touch(key)
         try:
             async with asyncio.timeout(limit):

@@ -11,22 +11,23 @@ import os
 import re
 import shutil
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from xml.etree import ElementTree as ET
 
 from rmpa.config.read import line_of
 from rmpa.config.values import suggestion
-from rmpa.core.errors import RmpaError
+from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.resource.declare import BindingKind
 from rmpa.resource.expression import split_reference
 from rmpa.resource.live import DESCRIPTIONS
+from rmpa.resource.processes import command_of
 from rmpa.ros.types.descriptor import TOPIC
 from rmpa.ros.types.find import find_message_type
-from rmpa.ros.types.installed import SearchPath
+from rmpa.ros.types.installed import SearchPath, package_folders
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
+    from pathlib import Path
 
     from rmpa.config.values import Place
     from rmpa.resource.declare import ManagedNode, Parameter, ParameterValue, Profile
@@ -91,6 +92,10 @@ class Check:
     def _up(self, node: ManagedNode) -> bool:
         return node.name in self.running
 
+    def _knobs(self, key: str) -> Mapping[str, Knob]:
+        node = self.resource.nodes[key]
+        return self.seen.knobs.get(node.server or node.name, {})
+
     def _nodes(self) -> Iterator[Misfit]:
         for key, node in self.resource.nodes.items():
             place = ("node", key)
@@ -99,9 +104,9 @@ class Check:
                     node.name, self.running, "start it, or say how it is started: run, launch, command"
                 )
                 yield self._misfit((*place, "name"), f"no node {node.name} runs", remedy)
-            for how in ("run", "launch", "command"):
-                if (given := getattr(node, how)) and (problem := _missing(how, given, self.path.parent)):
-                    yield self._misfit((*place, how), problem, "is its workspace sourced here?")
+            if node.started and (problem := _missing(node, self.path.parent)):
+                how = next(each for each in ("run", "launch", "command") if getattr(node, each))
+                yield self._misfit((*place, how), problem, "is its workspace sourced here?")
 
     def _topics(self) -> Iterator[Misfit]:
         resource, names = self.resource, {node.name for node in self.resource.nodes.values()}
@@ -254,7 +259,7 @@ class Check:
             binding = self.resource.parameters[name].binding
             if binding is None or binding.kind is not BindingKind.DYNAMIC:
                 return False
-            knob = self.seen.knobs.get(self.resource.nodes[binding.node].name, {}).get(binding.name)
+            knob = self._knobs(binding.node).get(binding.name)
             if knob is None or knob.value != value:
                 return False
         return True
@@ -284,37 +289,27 @@ def _fits(value: object, kind: str) -> bool:
     return isinstance(value, types) and (kind == "bool" or not isinstance(value, bool))
 
 
-def _missing(how: str, given: str | tuple[str, ...], folder: Path) -> str:
+def _missing(node: ManagedNode, folder: Path) -> str:
     """Why what starts a node is not found on this machine; empty if it is."""
-    if how == "command":
-        program = given[0]
+    if node.command:
+        program = node.command[0]
         found = shutil.which(program) or ("/" in program and os.access(folder / program, os.X_OK))
         return "" if found else f"there is no program {program} on this machine"
-    words = str(given).split()
-    if how == "launch":
-        return "" if _launch_file(words, folder) else f"there is no launch file {given} on this machine"
-    if len(words) != 2:
-        return f"{given!r} is not PACKAGE EXECUTABLE"
-    return "" if any(_package_files(*words, executable=True)) else f"there is no executable {given} on this machine"
-
-
-def _package_files(package: str, name: str, *, executable: bool) -> Iterator[Path]:
-    """The files of that name in a package: where catkin and Debian put its programs, and below its ``share``."""
-    path = SearchPath.read(os.environ)
-    prefixes = [Path(prefix) for prefix in (*path.prefixes, *path.system)]
-    folders = [prefix / part / package for prefix in prefixes for part in ("lib", "libexec", "share")]
-    folders += [Path(root) / package for root in path.packages]
-    folders += [child for root in path.packages for child in Path(root).glob(f"*/{package}")]
-    for folder in folders:
-        for found in (folder / name, *folder.glob(f"*/{name}")):
-            if found.is_file() and (not executable or os.access(found, os.X_OK)):
-                yield found
+    try:
+        command_of(node, {}, os.environ)
+    except PeerRefused as error:
+        return f"{error.peer}: {error.reason}"
+    lost = node.launch and _launch_file(node.launch.split(), folder) is None
+    return f"there is no launch file {node.launch} on this machine" if lost else ""
 
 
 def _launch_file(words: list[str], folder: Path) -> Path | None:
     if len(words) == 1:
-        return path if (path := folder / words[0]).is_file() else None
-    return next(_package_files(words[0], words[1], executable=False), None)
+        return beside if (beside := folder / words[0]).is_file() else None
+    path = SearchPath.read(os.environ)
+    roots = (*path.packages, *(f"{prefix}/share" for prefix in (*path.prefixes, *path.system)))
+    places = (place for root in roots for place in package_folders(words[0], root))
+    return next((found for place in places for found in sorted(place.rglob(words[1]))), None)
 
 
 def _no_argument(launch: str, folder: Path, name: str) -> str:

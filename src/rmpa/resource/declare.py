@@ -412,6 +412,7 @@ class ManagedNode:
         env: Variables of the environment.
         restart: When it is started again.
         stop_after: Seconds that it may take to end after SIGINT, before SIGTERM and SIGKILL follow.
+        server: Global name of its dynamic_reconfigure server, such as that of a nodelet in it; empty: the node's own.
     """
 
     key: str
@@ -425,6 +426,7 @@ class ManagedNode:
     env: Mapping[str, str] = field(default_factory=dict, hash=False)
     restart: RestartPolicy = RestartPolicy.ON_FAILURE
     stop_after: float = 10.0
+    server: str = ""
 
     @property
     def started(self) -> bool:

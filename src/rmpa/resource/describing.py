@@ -155,7 +155,8 @@ def _table(kind: str, key: str, values: Mapping[str, object], *notes: str, activ
 
 
 def _node(found: Found) -> list[str]:
-    lines = _table("node", "driver", {"name": found.facts.name})
+    server = {"server": found.server} if found.server and found.server != found.facts.name else {}
+    lines = _table("node", "driver", {"name": found.facts.name} | server)
     if found.started:
         return [*lines, "# Start it too: (what is set here is guessed from its process)", *_commented(found.started)]
     return [*lines, '# run = "PACKAGE EXECUTABLE", launch = "PACKAGE FILE" or command = ["PROGRAM"] would start it.']

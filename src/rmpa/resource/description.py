@@ -87,6 +87,7 @@ _NODE: Final = {
     "env": Setting(_table_of({"type": "string"}), "Variables of its environment."),
     "restart": Setting(member_of(RestartPolicy, "a policy"), "When it is started again after its end.", "on-failure"),
     "stop_after": Setting(_QUANTITY, "How long it may take to end before it is killed.", "10 s"),
+    "server": Setting(_NAME, "Its dynamic_reconfigure server, where that has another name, as of a nodelet."),
 }
 _TOPIC: Final = {
     "topic": Setting(_NAME, "The topic's name in the graph.", NEEDED),

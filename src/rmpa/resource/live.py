@@ -189,11 +189,11 @@ def _knobs(description: Any, updates: Any) -> Iterable[Knob]:
     for one in (each for group in description.groups for each in group.parameters):
         name, kind = str(one.name), str(one.type)
         choices = _choices(str(one.edit_method))
-        bounds: list[float | None] = [None, None]
-        if kind in ("int", "double") and not choices:
-            bounds = [_bound(low.get(name)), _bound(high.get(name))]
+        least, most = _bound(low.get(name)), _bound(high.get(name))
+        if kind not in ("int", "double") or choices:
+            least = most = None
         if name in values:
-            yield Knob(name, kind, values[name], *bounds, choices, str(one.description).strip())
+            yield Knob(name, kind, values[name], least, most, choices, str(one.description).strip())
 
 
 def _bound(value: ParameterValue | None) -> float | None:

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -455,6 +456,15 @@ class Resource:
             raise ConfigError(where, f"{made.name} is declared already, or the resource itself", "name it once")
         if sum(map(bool, (made.run, made.launch, made.command))) > 1:
             raise ConfigError(where, "run, launch and command are three ways to start it", "keep one of them")
+        if made.server and (not made.server.startswith("/") or not is_legal_name(made.server)):
+            raise ConfigError(where, f"{made.server!r} is not a global name", f"for example {made.name}/debayer")
+        for text, least in ((made.run, 2), (made.launch, 1)):
+            try:
+                enough = not text or len(shlex.split(text)) >= least
+            except ValueError:  # a quote is not closed
+                enough = False
+            if not enough:
+                raise ConfigError(where, f"{text!r} does not name a program", "write PACKAGE NAME, as for rosrun")
         self.nodes[key] = made
         return made
 
