@@ -140,13 +140,11 @@ class Check:
                 continue
             elif binding.kind is BindingKind.PRIVATE:
                 yield from self._private(node, parameter, binding.name, place)
-            elif (knobs := self.seen.knobs.get(node.name)) is None:
-                problem = f"{node.name} has no dynamic_reconfigure"
-                served = [t.removesuffix(DESCRIPTIONS) for t in self.publishers if t.startswith(f"{node.name}/")]
-                others = ", ".join(
-                    one for one in served if one.startswith(f"{node.name}/") and one in self.seen.knobs
-                )
-                yield self._misfit(place, problem, f"there is {others}" if others else "is it a private parameter?")
+            elif not (knobs := self._knobs(binding.node)):
+                ends = [t for t, nodes in self.publishers.items() if t.endswith(DESCRIPTIONS) and node.name in nodes]
+                others = " or ".join(f'server = "{topic.removesuffix(DESCRIPTIONS)}"' for topic in ends)
+                problem = f"there is no dynamic_reconfigure {node.server or node.name}"
+                yield self._misfit(place, problem, f"the node has {others}" if others else "is it private?")
             elif (knob := knobs.get(binding.name)) is None:
                 remedy = suggestion(binding.name, knobs, f"it has {', '.join(knobs)}")
                 yield self._misfit(place, f"{node.name} has no parameter {binding.name}", remedy)

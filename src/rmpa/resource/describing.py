@@ -96,7 +96,8 @@ class Found:
         if any(_COMMANDS.search(f"{kind} {topic}") for topic, kind in self._kinds(self.outputs)):
             return Role.CONTROLLING
         sensing = any(kind in _NAMES for _, kind in self._kinds(self.outputs))
-        return Role.CONTROLLING if self.inputs and not sensing else Role.SENSING
+        processing = any(kind in _NAMES for _, kind in self._kinds(self.inputs))
+        return Role.CONTROLLING if processing or (self.inputs and not sensing) else Role.SENSING
 
     def _kinds(self, topics: Iterable[str]) -> Iterator[tuple[str, str]]:
         yield from ((t, self.facts.publications.get(t) or self.facts.subscriptions.get(t, "*")) for t in topics)
@@ -105,7 +106,7 @@ class Found:
     def title(self) -> str:
         """A name for the resource, which must not be the node's own."""
         base = self.name.rpartition("/")[2]
-        kinds = [kind for _, kind in self._kinds(self.outputs)]
+        kinds = [kind for _, kind in self._kinds(self.outputs)] if self.role is not Role.CONTROLLING else []
         name = next((_NAMES[kind] for kind in kinds if kind in _NAMES), base)
         return f"{name}_resource" if self.name.rpartition(":")[2] == f"/{name}" else name
 

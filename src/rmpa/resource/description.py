@@ -66,6 +66,8 @@ _VALUE: Final = _any(_SCALAR["type"])
 _NUMBER: Final = _any(["number", "integer"])
 _QUANTITY: Final = _any(["string", "number", "integer"])
 _TEXTS: Final = list_of(TEXT)
+# Arguments may be repeated; the schema has checked that they are texts.
+_WORDS: Final[ValueType[tuple[str, ...]]] = ValueType(tuple, {"type": "array", "items": TEXT.json_schema})
 _NAME: Final = text_type(lambda raw: raw, "/camera/image_raw")
 _CONTRACT: Final = CONTRACT_RULES.json_schema["items"]["properties"]
 
@@ -80,8 +82,8 @@ _NODE: Final = {
     "name": Setting(_NAME, "The node's name in the graph; by default /NAME of the table."),
     "run": Setting(TEXT, "Started as by rosrun: PACKAGE EXECUTABLE."),
     "launch": Setting(TEXT, "Started by roslaunch: PACKAGE FILE, or a path beside this file."),
-    "command": Setting(_TEXTS, "Started as this program with its arguments."),
-    "args": Setting(_TEXTS, "Further arguments, or NAME:=VALUE of the launch file."),
+    "command": Setting(_WORDS, "Started as this program with its arguments."),
+    "args": Setting(_WORDS, "Further arguments, or NAME:=VALUE of the launch file."),
     "params": Setting(_table_of(_SCALAR), "Private parameters that are set before it starts."),
     "remap": Setting(_table_of({"type": "string"}), "Names of topics and services, by the node's own name for them."),
     "env": Setting(_table_of({"type": "string"}), "Variables of its environment."),

@@ -153,8 +153,7 @@ async def look(
             status_of[str(status.name)] = received.caller_id
 
     subscribers: list[Subscriber] = []
-    # What comes first may have waited: in the publisher's queue, or for the imports of this process.
-    begin = time.monotonic() + _WARM_UP
+    begin = math.inf
     for topic in topics:
         counted = await node.subscribe(topic, None, on_bytes=lambda data, header, t=topic: count(t, data, header))  # type: ignore[misc]
         subscribers.append(counted)
@@ -162,6 +161,8 @@ async def look(
         subscribers.append(await node.subscribe(topic, kind, lambda received, t=topic: tell(t, received)))  # type: ignore[misc]
     if diagnostics:
         subscribers.append(await node.subscribe(DIAGNOSTICS, ARRAY_TYPE, diagnose))
+    # What comes first may have waited: in the publisher's queue, or for the imports of this process.
+    begin = time.monotonic() + _WARM_UP
     try:
         await asyncio.sleep(seconds + _WARM_UP)
     finally:
