@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from xml.etree import ElementTree as ET
 
 from rmpa.config.read import line_of
-from rmpa.config.values import suggestion
+from rmpa.config.values import did_you_mean, suggestion
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.resource.declare import BindingKind
 from rmpa.resource.expression import split_reference
@@ -165,8 +165,8 @@ class Check:
     def _dynamic(self, parameter: Parameter, knob: Knob) -> Iterator[Misfit]:
         place = ("parameter", parameter.name)
         if knob.type != parameter.type:
-            remedy = f"write a {knob.type}, such as {_example(knob)}"
-            yield self._misfit((*place, "default"), f"{knob.name} is a {knob.type}, not a {parameter.type}", remedy)
+            problem = f"{knob.name} is of type {knob.type}, not {parameter.type}"
+            yield self._misfit((*place, "default"), problem, f"write it like {_example(knob)}")
             return
         low, high = parameter.bounds
         takes = f"the node takes {_range(knob)}"
