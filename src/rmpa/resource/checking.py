@@ -220,9 +220,9 @@ class Check:
                         return f"{topic} is {kind.name}, which has no {'.'.join(fields)}", f"it has {has}"
                     value = getattr(value, name)
             return None
-        return f"no node publishes {reference}", suggestion(
-            reference, self.publishers, "it is unknown until one does"
-        )
+        nearest = (did_you_mean(topic, self.publishers) for topic, _ in split_reference(reference))
+        near = next(filter(None, nearest), "")
+        return f"no node publishes {reference}", f"did you mean {near}?" if near else "it is unknown until one does"
 
     def _status(self, name: str, key: str | None = None) -> tuple[str, str] | None:
         found = self.seen.diagnostics.get(name)
