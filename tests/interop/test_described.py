@@ -109,7 +109,7 @@ async def test_an_example_fits_its_node_and_adapts_it(
             code, said = await fits()
             assert code == 0, said
             async with ResourceClient(guest, name) as client:
-                await client.require(**asked)
+                await client.require(**asked)  # type: ignore[arg-type] # by attribute
                 await until(lambda: loop.profile == then)
                 async with asyncio.timeout(40):
                     async for answer in client.answers():

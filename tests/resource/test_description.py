@@ -95,7 +95,7 @@ def test_a_mistake_is_told_with_its_line(right: str, wrong: str, words: str) -> 
 
 def test_all_misspelt_keys_are_told_at_once() -> None:
     text = TEXT.replace("dynamic =", "dynamc =").replace("better =", "beter =").replace("[alarm.hot]", "[alrm.hot]")
-    lines = [one.line for one in description_mistakes(text.encode(), FULL)]
+    lines = [one.line or 0 for one in description_mistakes(text.encode(), FULL)]
     misspelt = re.compile(r"dynamc|beter|\[alrm")
     assert sorted(lines) == [n for n, line in enumerate(text.split("\n"), 1) if misspelt.match(line)]
     assert description_mistakes(TEXT.encode(), FULL) == []
