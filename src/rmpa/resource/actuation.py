@@ -69,7 +69,7 @@ class Actuation(RuntimePart):
         self._runtime = runtime
         self._processes = processes
         parameters, nodes = runtime.resource.parameters, runtime.resource.nodes
-        self._bound: dict[str, Binding] = {name: one.binding for name, one in parameters.items() if one.binding}
+        self._bound = runtime.resource.bound
         # Values that people set, by parameter; may be set before ``start``.
         self.by_hand: dict[str, ParameterValue] = {}
         # Called after a value by hand has come or gone.
@@ -309,16 +309,21 @@ class Actuation(RuntimePart):
         self._touched[key] = asyncio.get_running_loop().time()
 
     def _configured(self, key: str, message: Received) -> None:
-        """A node has said its configuration: judge it when it is quiet."""
+        """A node has said its configuration: judge it when it is quiet, that of a new connection at once."""
         self._configs[key] = read_config(message.message)
+        self._heard[key].set()
+        self._touch(key)
         if self._headers.get(key) is not message.header:
             self._headers[key] = message.header
             self._fresh.add(key)
-        self._heard[key].set()
-        self._touch(key)
-        if key not in self._judging:
+            self._work.start(self._greet(key), f"first configuration of {key}")
+        elif key not in self._judging:
             self._judging.add(key)
             self._work.start(self._judge(key), f"configuration of {key}")
+
+    async def _greet(self, key: str) -> None:
+        async with self._lock:
+            await self._take(key)
 
     async def _judge(self, key: str) -> None:
         loop = asyncio.get_running_loop()
@@ -374,7 +379,7 @@ class Actuation(RuntimePart):
         profiles = self._runtime.resource.profiles.values()
         kept = here or before is not None or any(name in one.sets for one in profiles)
         if kept and not same(self._wanted.get(name), value):
-            self.by_hand[name] = value
+            self.by_hand[name] = _fit(value, self._runtime.resource.parameters[name].default)
         if not same(before, self.by_hand.get(name)):
             text = f"{value} by hand; profiles leave it alone" if name in self.by_hand else "no longer by hand"
             _log.info("= %s: parameter %s: %s", self._runtime.node.name, name, text)
