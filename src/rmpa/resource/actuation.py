@@ -117,6 +117,21 @@ class Actuation(RuntimePart):
         """Follow nothing any more; the nodes keep their values."""
         await self._work.close()
 
+    def blocked(self) -> dict[str, str]:
+        """The profiles that cannot run, with the reason: a node does not run that nothing here starts."""
+        nodes = self._runtime.resource.nodes
+        absent = {key for key, one in nodes.items() if not one.started and self._processes.pid(key) is None}
+        return {
+            one.name: f"node {nodes[missing[0]].name} does not run"
+            for one in self._runtime.resource.profiles.values()
+            if (missing := sorted(absent & self._needed(one)))
+        }
+
+    def _needed(self, profile: Profile) -> set[str]:
+        """The nodes that run in a profile: its own, and those that no profile names."""
+        named = {key for one in self._runtime.resource.profiles.values() for key in one.nodes}
+        return (self._runtime.resource.nodes.keys() - named) | set(profile.nodes)
+
     async def apply(self, profile: Profile) -> None:
         """Have the profile's nodes run, then set its values, except those by hand.
 
@@ -167,9 +182,8 @@ class Actuation(RuntimePart):
 
     async def _run_nodes(self, profile: Profile, values: Mapping[str, ParameterValue]) -> None:
         """Have exactly the profile's nodes run. One that is started here is started with its values at once."""
-        named = {key for one in self._runtime.resource.profiles.values() for key in one.nodes}
-        needed = (self._runtime.resource.nodes.keys() - named) | set(profile.nodes)
-        absent = {key for key in needed if self._processes.pid(key) is None}
+        named = set(profile.nodes)
+        absent = {key for key in self._needed(profile) if self._processes.pid(key) is None}
         for name, value in values.items():
             binding = self._bound[name]
             if binding.kind is _PRIVATE and binding.node in absent:
@@ -177,7 +191,7 @@ class Actuation(RuntimePart):
         late = {key for key in absent if self._differing(key, values, _ARGUMENT)}
         await _all(self._restart(key, values) for key in late - named)
         if late & named:
-            await self._processes.require(set(profile.nodes) - late)  # ends those that may have the same device
+            await self._processes.require(named - late)  # ends those that may have the same device
             await _all(self._restart(key, values) for key in late & named)
         await self._processes.require(profile.nodes)
 

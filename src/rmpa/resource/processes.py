@@ -28,6 +28,8 @@ class Processes(RuntimePart):
 
     async def start(self) -> None:
         """Look for the nodes."""
+        for key in self._runtime.resource.nodes:
+            await self._ask(key)
         if self._runtime.resource.nodes:
             self._work.add(keep_task(self._watch, "watch nodes"))
 
@@ -50,6 +52,11 @@ class Processes(RuntimePart):
     def pid(self, key: str) -> int | None:
         """The process of a node."""
         return self._pids.get(key)
+
+    def problems(self) -> tuple[list[str], list[str]]:
+        """Nodes that do not run."""
+        nodes = self._runtime.resource.nodes
+        return [f"node {nodes[key].name} does not run" for key, pid in self._pids.items() if pid is None], []
 
     async def _watch(self) -> None:
         while True:
