@@ -62,7 +62,8 @@ async def running(core: RosCore, resource: Resource, state: Path | None = None) 
 
 
 def decision(one: ResourceNode) -> dict[str, Any]:
-    return json.loads(json.dumps(one.adapter.decision(), default=str))
+    said: dict[str, Any] = json.loads(json.dumps(one.adapter.decision(), default=str))
+    return said
 
 
 async def choose(one: ResourceNode, **values: Any) -> None:

@@ -74,6 +74,8 @@ class Actuation(RuntimePart):
         self.by_hand: dict[str, ParameterValue] = {}
         # Called after a value by hand has come or gone.
         self.on_change: Callable[[], None] = lambda: None
+        # The parameters that some profile sets.
+        self._profiled = {name for one in runtime.resource.profiles.values() for name in one.sets}
         # What the profile that runs sets.
         self._wanted: dict[str, ParameterValue] = {}
         # What the nodes have, by parameter, as it was read last.
@@ -357,13 +359,12 @@ class Actuation(RuntimePart):
         wanted = {name: value for name, value in (self._wanted | self.by_hand).items() if name in dynamic}
         for name, binding in dynamic.items():
             value = config.get(binding.name)
-            if value is not None and not same(self._known.get(name), value):
-                self._known[name] = value
-                if not (fresh and name in wanted):
-                    self._show(name)
-                    if not fresh:
-                        self._turned(name, value)
-            elif fresh and name not in wanted:
+            if value is None or (not fresh and same(self._known.get(name), value)):
+                continue
+            self._known[name] = value
+            if not fresh:
+                self._turned(name, value)
+            if not fresh or name not in self._profiled | wanted.keys():
                 self._show(name)
         if fresh and wanted:
             try:
@@ -390,8 +391,7 @@ class Actuation(RuntimePart):
     def _turned(self, name: str, value: ParameterValue, *, here: bool = False) -> None:
         """Note what a person has set; ``here``: at the resource, so that a restarted node gets it again."""
         before = self.by_hand.pop(name, None)
-        profiles = self._runtime.resource.profiles.values()
-        kept = here or before is not None or any(name in one.sets for one in profiles)
+        kept = here or before is not None or name in self._profiled
         if kept and not same(self._wanted.get(name), value):
             self.by_hand[name] = _fit(value, self._runtime.resource.parameters[name].default)
         if not same(before, self.by_hand.get(name)):
