@@ -69,11 +69,13 @@ class Actuation(RuntimePart):
         self._runtime = runtime
         self._processes = processes
         parameters, nodes = runtime.resource.parameters, runtime.resource.nodes
-        self._bound: dict[str, Binding] = {name: one.binding for name, one in parameters.items() if one.binding}
+        self._bound = runtime.resource.bound
         # Values that people set, by parameter; may be set before ``start``.
         self.by_hand: dict[str, ParameterValue] = {}
         # Called after a value by hand has come or gone.
         self.on_change: Callable[[], None] = lambda: None
+        # The parameters that some profile sets.
+        self._profiled = {name for one in runtime.resource.profiles.values() for name in one.sets}
         # What the profile that runs sets.
         self._wanted: dict[str, ParameterValue] = {}
         # What the nodes have, by parameter, as it was read last.
@@ -116,6 +118,21 @@ class Actuation(RuntimePart):
     async def close(self) -> None:
         """Follow nothing any more; the nodes keep their values."""
         await self._work.close()
+
+    def blocked(self) -> dict[str, str]:
+        """The profiles that cannot run, with the reason: a node does not run that nothing here starts."""
+        nodes = self._runtime.resource.nodes
+        absent = {key for key, one in nodes.items() if not one.started and self._processes.pid(key) is None}
+        return {
+            one.name: f"node {nodes[missing[0]].name} does not run"
+            for one in self._runtime.resource.profiles.values()
+            if (missing := sorted(absent & self._needed(one)))
+        }
+
+    def _needed(self, profile: Profile) -> set[str]:
+        """The nodes that run in a profile: its own, and those that no profile names."""
+        named = {key for one in self._runtime.resource.profiles.values() for key in one.nodes}
+        return (self._runtime.resource.nodes.keys() - named) | set(profile.nodes)
 
     async def apply(self, profile: Profile) -> None:
         """Have the profile's nodes run, then set its values, except those by hand.
@@ -167,9 +184,8 @@ class Actuation(RuntimePart):
 
     async def _run_nodes(self, profile: Profile, values: Mapping[str, ParameterValue]) -> None:
         """Have exactly the profile's nodes run. One that is started here is started with its values at once."""
-        named = {key for one in self._runtime.resource.profiles.values() for key in one.nodes}
-        needed = (self._runtime.resource.nodes.keys() - named) | set(profile.nodes)
-        absent = {key for key in needed if self._processes.pid(key) is None}
+        named = set(profile.nodes)
+        absent = {key for key in self._needed(profile) if self._processes.pid(key) is None}
         for name, value in values.items():
             binding = self._bound[name]
             if binding.kind is _PRIVATE and binding.node in absent:
@@ -177,7 +193,7 @@ class Actuation(RuntimePart):
         late = {key for key in absent if self._differing(key, values, _ARGUMENT)}
         await _all(self._restart(key, values) for key in late - named)
         if late & named:
-            await self._processes.require(set(profile.nodes) - late)  # ends those that may have the same device
+            await self._processes.require(named - late)  # ends those that may have the same device
             await _all(self._restart(key, values) for key in late & named)
         await self._processes.require(profile.nodes)
 
@@ -310,16 +326,21 @@ class Actuation(RuntimePart):
         self._touched[key] = asyncio.get_running_loop().time()
 
     def _configured(self, key: str, message: Received) -> None:
-        """A node has said its configuration: judge it when it is quiet."""
+        """A node has said its configuration: judge it when it is quiet, that of a new connection at once."""
         self._configs[key] = read_config(message.message)
+        self._heard[key].set()
+        self._touch(key)
         if self._headers.get(key) is not message.header:
             self._headers[key] = message.header
             self._fresh.add(key)
-        self._heard[key].set()
-        self._touch(key)
-        if key not in self._judging:
+            self._work.start(self._greet(key), f"first configuration of {key}")
+        elif key not in self._judging:
             self._judging.add(key)
             self._work.start(self._judge(key), f"configuration of {key}")
+
+    async def _greet(self, key: str) -> None:
+        async with self._lock:
+            await self._take(key)
 
     async def _judge(self, key: str) -> None:
         loop = asyncio.get_running_loop()
@@ -339,13 +360,12 @@ class Actuation(RuntimePart):
         wanted = {name: value for name, value in (self._wanted | self.by_hand).items() if name in dynamic}
         for name, binding in dynamic.items():
             value = config.get(binding.name)
-            if value is not None and not same(self._known.get(name), value):
-                self._known[name] = value
-                if not (fresh and name in wanted):
-                    self._show(name)
-                    if not fresh:
-                        self._turned(name, value)
-            elif fresh and name not in wanted:
+            if value is None or (not fresh and same(self._known.get(name), value)):
+                continue
+            self._known[name] = value
+            if not fresh:
+                self._turned(name, value)
+            if not fresh or name not in self._profiled | wanted.keys():
                 self._show(name)
         if fresh and wanted:
             try:
@@ -372,10 +392,9 @@ class Actuation(RuntimePart):
     def _turned(self, name: str, value: ParameterValue, *, here: bool = False) -> None:
         """Note what a person has set; ``here``: at the resource, so that a restarted node gets it again."""
         before = self.by_hand.pop(name, None)
-        profiles = self._runtime.resource.profiles.values()
-        kept = here or before is not None or any(name in one.sets for one in profiles)
+        kept = here or before is not None or name in self._profiled
         if kept and not same(self._wanted.get(name), value):
-            self.by_hand[name] = value
+            self.by_hand[name] = _fit(value, self._runtime.resource.parameters[name].default)
         if not same(before, self.by_hand.get(name)):
             text = f"{value} by hand; profiles leave it alone" if name in self.by_hand else "no longer by hand"
             _log.info("= %s: parameter %s: %s", self._runtime.node.name, name, text)

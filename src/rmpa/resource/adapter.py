@@ -302,7 +302,7 @@ class Adapter(RuntimePart):
         self.adaptation.restore(requirements, self.saved.last, cool_downs, now)
         self._requirements = await node.subscribe(f"{node.name}/requirements", kind, self._requirement_received)
         await node.subscribe(f"{node.name}/observed", kind, self._observation_received)
-        self.adaptation.block(self._blocked_by_needs | self._rules.blocked(), now)
+        self._update_blocked()
         if self.preset:
             self.adaptation.pin(self.preset, now, restored=True)
         else:
@@ -370,8 +370,8 @@ class Adapter(RuntimePart):
         self._tell()
 
     def _update_blocked(self) -> None:
-        """Block the profiles whose preconditions or rules do not hold, and those that the context excludes."""
-        by_nodes = self.processes.blocked() if self.processes is not None else {}
+        """Block profiles whose preconditions, rules or nodes are not as they need, and those out of the context."""
+        by_nodes = self._actuation.blocked() | (self.processes.blocked() if self.processes is not None else {})
         blocked = by_nodes | self._rules.blocked() | self._blocked_by_needs | self._blocked_by_context
         self.adaptation.block(blocked, self._loop.time())
 

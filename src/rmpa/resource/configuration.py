@@ -188,6 +188,7 @@ class Reconfigure(RuntimePart):
         scores = loop.explain(asyncio.get_running_loop().time())
         why = next((s.excluded for s in scores if s.profile == profile), "") or "another was taken"
         self._adapter.pin(before)
+        await self._adapter.settled()
         raise ConfigError(f"profile {profile}", f"it could not be applied: {why}", "what was chosen before stays")
 
     async def _to_server(self) -> None:

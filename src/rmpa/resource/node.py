@@ -153,8 +153,8 @@ class ResourceNode:
             saved = self.adapter.saved = await self._persistence.restore()
             self.adapter.preset, self.contexts.chosen, self._last = saved.chosen, saved.context, saved.last
             self.actuation.by_hand |= saved.by_hand
-        given = (one for one in self.resource.parameters.values() if one.given and one.binding is not None)
-        self.actuation.by_hand |= {one.name: one.value for one in given}
+        given = {name: self.resource.parameters[name] for name in self.resource.bound}
+        self.actuation.by_hand |= {name: one.value for name, one in given.items() if one.given}
         try:
             # Parameters are loaded before ``configure``, which opens the device before a profile sets it.
             await self.runtime.start(self.parts, self.configuration.load, self._configure)
@@ -277,7 +277,7 @@ class ResourceNode:
         cooling = loop.cooling(asyncio.get_running_loop().time())
         if self.runtime.state is _FINALIZED:
             self.adapter.learnt.update()
-        own = {n: p for n, p in self.resource.parameters.items() if p.binding is None}
+        own = {n: p for n, p in self.resource.parameters.items() if n not in self.resource.bound}
         return SavedState(
             parameters={n: p.value for n, p in own.items() if p.value != p.default},
             chosen=loop.pinned,

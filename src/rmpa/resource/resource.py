@@ -298,6 +298,11 @@ class Resource:
         return made
 
     @property
+    def bound(self) -> dict[str, Binding]:
+        """Where other nodes have the values of parameters, by parameter."""
+        return {name: one.binding for name, one in self.parameters.items() if one.binding is not None}
+
+    @property
     def labels(self) -> dict[str, str]:
         """The prefix of the measured attributes of each output and input, by name, outputs first.
 

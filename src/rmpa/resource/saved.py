@@ -155,18 +155,13 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
                 return ""
             return name
 
-        requirements = []
-
-        def valid(values: Mapping[str, bool | int | float | str]) -> dict[str, bool | int | float | str]:
-            found = {}
-            for name, value in values.items():
-                try:
-                    if declared("parameter", name, resource.parameters):
-                        found[name] = resource.parameters[name].check(value)
-                except ConfigError as error:
-                    lost.append(str(error))
-            return found
-
+        parameters, requirements = {}, []
+        for name, value in self.parameters.items():
+            try:
+                if declared("parameter", name, resource.parameters):
+                    parameters[name] = resource.parameters[name].check(value)
+            except ConfigError as error:
+                lost.append(str(error))
         for one in self.requirements:
             try:
                 if one.requirement(resource.attributes, resource.name, 0.0, now_ns) is not None:
@@ -174,13 +169,13 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
             except ConfigError as error:
                 lost.append(f"requirement of {one.client}: {error}")
         found = SavedState(
-            parameters=valid(self.parameters),
+            parameters=parameters,
             chosen=declared("profile", self.chosen, resource.profiles),
             last=declared("profile", self.last, resource.profiles),
             context=declared("context", self.context, resource.contexts),
             requirements=tuple(requirements),
             cool_downs={n: c for n, c in self.cool_downs.items() if declared("profile", n, resource.profiles)},
-            by_hand={n: v for n, v in valid(self.by_hand).items() if resource.parameters[n].binding is not None},
+            by_hand={n: v for n, v in self.by_hand.items() if declared("parameter", n, resource.bound)},
             learnt=self.learnt,
         )
         return found, lost

@@ -133,8 +133,7 @@ class Sources(RuntimePart):
         for status in message.message.status:
             if (name := str(status.name)) in self._statuses:
                 values = {str(pair.key): str(pair.value) for pair in status.values}
-                level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
-                self._diagnostics[name] = time.monotonic(), level, values
+                self._diagnostics[name] = time.monotonic(), int(status.level), values
 
     def _diagnosed(self, name: str, key: str = "") -> Scalar | None:
         """The number at the beginning of a value, or its text where there is none; without a key the level."""
