@@ -17,9 +17,10 @@ from rmpa.core.errors import PeerRefused
 from rmpa.resource import limits
 from rmpa.resource.declare import ManagedNode
 from rmpa.resource.node import ResourceNode
-from rmpa.resource.processes import NodeState, command_of, find_executable
+from rmpa.resource.processes import NodeState, command_of
 from rmpa.resource.resource import Resource
 from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.executables import find_executable
 from rmpa.ros.node.node import Node
 from rmpa.runtime.programs import ProgramMark, ResourceRun, end_program, figures
 from tests.resource.rig import ARRAY, OK, WARN, status
