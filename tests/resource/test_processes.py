@@ -1,4 +1,4 @@
-"""The nodes of a resource: started, attached to, restarted, taken over after a crash, ended; and what is said of it."""
+"""The nodes of a resource: started, attached to, restarted, taken over after a crash, ended; what is said of it."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ async def test_a_node_that_fails_again_and_again_blocks_its_profiles(
     one = make(described(("laser",), (), laser=()))
     await one.start()
     os.kill(await runs(one, "laser"), signal.SIGKILL)
-    await until(lambda: one.processes.blocked())
+    await until(one.processes.blocked)
     assert "is not started again (1 times in a row)" in one.processes.blocked()["p0"]
     monkeypatch.setattr(limits, "NODE_BLOCKED", 0.0)
     assert not one.processes.blocked()
