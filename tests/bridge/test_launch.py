@@ -192,7 +192,10 @@ async def test_at_boot_resources_start_in_their_order_and_a_circle_is_said(make:
     waits = await module.wait("plan", "waiting")
     assert waits.boot
     for name, why in (("plan", "waits for cam"), ("cam", "waits for /scan")):
-        await until(lambda name=name, why=why: module.part._launched[name].why == why)
+        one = module.part._launched[name]
+        async with asyncio.timeout(30):
+            while one.why != why:
+                await asyncio.sleep(0.01)
     assert "a after b after a" in (await module.one("a")).why
     assert "waits for nothing, which is not in the folder" in (await module.one("lone")).why
     module.published["/scan"] = {"/laser": "http://127.0.0.1:2/"}

@@ -94,8 +94,8 @@ class Launcher(Part):
         """End all that runs."""
         await end_tasks(self._main)
         self._waiting.clear()
-        await asyncio.gather(*(one.stop() for one in self._launched.values()))
         await self._work.close()
+        await asyncio.gather(*(one.stop() for one in self._launched.values()))
 
     @property
     def _folder(self) -> Path:
@@ -336,12 +336,10 @@ class Launcher(Part):
         """Start, stop or restart a resource; return when that is done, or has failed, or takes long."""
         file = files.get(name) or LaunchFile(name, self._launched[name].path, "its file is gone")
         one = self._of(name, file.path)
-        if what != "start":
-            self._waiting.pop(name, None)
-            await one.stop()
-        if what != "stop":
-            await self._start(one)
-            await self._settle(one)
+        change = self._work.start(self._change(what, one), f"{what} {name}", raises=(RmpaError,))
+        await asyncio.wait([change], timeout=limits.LAUNCH_WAIT)  # it goes on where the asking program gives up
+        if change.done():
+            change.result()
         told = one.told(file, await asyncio.to_thread(load_runs, self._state), self.shares)
         module, problem = self._bridge.context.settings.name, ""
         if what != "stop" and told.state == "failed":
@@ -349,6 +347,14 @@ class Launcher(Part):
             problem = f"{name} {told.why}; its log ends: {' '.join(logs[0].lines)}"
         code = "resource-stopped" if problem else ""
         return ModuleResources(module=module, resources=(told,), problem=problem, code=code)
+
+    async def _change(self, what: str, one: ResourceProgram) -> None:
+        if what != "start":
+            self._waiting.pop(one.name, None)
+            await one.stop()
+        if what != "stop":
+            await self._start(one)
+            await self._settle(one)
 
     async def _settle(self, one: ResourceProgram) -> None:
         """Wait until a resource is active, has failed, or takes longer than the answer may."""

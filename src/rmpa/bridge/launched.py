@@ -70,7 +70,7 @@ class LaunchedResource(msgspec.Struct, frozen=True, kw_only=True):
         name: Its name: that of its file without the ending.
         file: The base name of its file.
         state: ``stopped``, ``waiting`` (for what its start depends on), ``starting``, ``failed``, ``refused``, or
-            while it runs that of its life cycle: ``active``, ``inactive``.
+            while it runs ``stopping`` or that of its life cycle: ``active``, ``inactive``.
         pid: The process of ``rmpa run``.
         since: Since when that runs, in Unix seconds; 0: it does not.
         restarts: How often the agent has started it again after a failure.
@@ -134,7 +134,7 @@ class ResourceProgram:
 
     Attributes:
         mark: Its process, or the last one.
-        state: ``stopped``, ``waiting``, ``starting`` or ``failed``; what it says of itself while it runs comes first.
+        state: ``stopped``, ``waiting``, ``starting``, ``stopping``, ``failed``; what it tells itself goes first.
         why: The reason, as a text.
     """
 
@@ -185,7 +185,7 @@ class ResourceProgram:
         """End it with its nodes, and wait until it has ended."""
         async with self._one:
             await end_tasks(self._keeper)
-            self._keeper = None
+            self._keeper, self.state, self.why = None, "stopping", ""
             if self.mark is not None and self.runs:
                 await end_program(self.mark, limits.LAUNCH_END)
             if self._child is not None:
@@ -257,6 +257,7 @@ class ResourceProgram:
             states = [run.state for run in its] or ["unconfigured"]
             state = next((each for each in states if each != "active"), "active")
             state = "starting" if state == "unconfigured" else state
+            state = self.state if self.state == "stopping" and self.runs else state
         elif file.problem:
             state, why = "refused", file.problem
         return LaunchedResource(

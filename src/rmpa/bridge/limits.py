@@ -299,9 +299,10 @@ LAUNCH_RESTART_MAX: Final = 60.0
 LAUNCH_STEADY: Final = 60.0
 # Seconds that a resource has to end, with its nodes, before it is killed; a node has 10 s by default.
 LAUNCH_END: Final = 20.0
-# Seconds that an answer to a start waits until the resource is active, and that the asking agent waits for it.
-LAUNCH_WAIT: Final = 15.0
-LAUNCH_ASK_TIMEOUT: Final = 45.0
+# Seconds that an answer waits until the resource is active or has ended, and that the asking agent waits for it: a
+# command has 30 s (``observe.limits.CONTROL_HANDLER_TIMEOUT``).
+LAUNCH_WAIT: Final = 20.0
+LAUNCH_ASK_TIMEOUT: Final = 25.0
 # Lines of each log in one answer, and logs of one resource.
 LAUNCH_LOG_LINES: Final = 500
 LAUNCH_LOGS_MAX: Final = 16
