@@ -1,4 +1,4 @@
-"""The nodes of a resource: started, attached to, restarted, taken over after a crash, ended; and what is said of it."""
+"""The nodes of a resource: started, attached to, restarted, taken over after a crash, ended; what is said of it."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from rmpa.core.errors import PeerRefused
 from rmpa.resource import limits
 from rmpa.resource.declare import ManagedNode
 from rmpa.resource.node import ResourceNode
-from rmpa.resource.processes import NodeState, command_of, find_executable
+from rmpa.resource.processes import NodeState, command_of
 from rmpa.resource.resource import Resource
 from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.executables import find_executable
 from rmpa.ros.node.node import Node
 from rmpa.runtime.programs import ProgramMark, ResourceRun, end_program, figures
 from tests.resource.rig import ARRAY, OK, WARN, status
@@ -172,7 +173,7 @@ async def test_a_node_that_fails_again_and_again_blocks_its_profiles(
     one = make(described(("laser",), (), laser=()))
     await one.start()
     os.kill(await runs(one, "laser"), signal.SIGKILL)
-    await until(lambda: one.processes.blocked())
+    await until(one.processes.blocked)
     assert "is not started again (1 times in a row)" in one.processes.blocked()["p0"]
     monkeypatch.setattr(limits, "NODE_BLOCKED", 0.0)
     assert not one.processes.blocked()

@@ -13,11 +13,9 @@ import logging
 import os
 import random
 import shlex
-import shutil
 import signal
 import time
 from enum import StrEnum
-from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from rmpa.core.errors import PeerRefused, RmpaError
@@ -26,9 +24,9 @@ from rmpa.resource import limits
 from rmpa.resource.declare import RestartPolicy
 from rmpa.resource.runtime import LifecycleState, RuntimePart
 from rmpa.ros.environment import host_of, is_loopback
+from rmpa.ros.executables import find_executable, find_program
 from rmpa.ros.http.rpc import call_api, is_own_name
 from rmpa.ros.node.listeners import local_addresses
-from rmpa.ros.types.installed import SearchPath, package_folders
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.programs import (
     LOGS,
@@ -49,6 +47,7 @@ from rmpa.runtime.tasks import OwnedTasks, end_tasks, start_task
 if TYPE_CHECKING:
     import subprocess
     from collections.abc import Callable, Collection, Mapping
+    from pathlib import Path
 
     from rmpa.resource.declare import ManagedNode
     from rmpa.resource.quality import Value
@@ -564,60 +563,10 @@ def command_of(node: ManagedNode, arguments: Mapping[str, str], environ: Mapping
         given = dict(word.split(":=", 1) for word in node.args if ":=" in word) | dict(arguments)
         words = [word for word in node.args if ":=" not in word]
         words += [f"{name}:={value}" for name, value in given.items()]
-        return [*_program("roslaunch", environ), "--screen", *shlex.split(node.launch), *words]
+        return [*find_program("roslaunch", environ), "--screen", *shlex.split(node.launch), *words]
     if node.command:
         return [*node.command, *node.args, *remap]
     package, executable, *more = shlex.split(node.run)
     namespace, _, base = node.name.rpartition("/")
     own = [f"__name:={base}", f"__ns:={namespace or '/'}"]
     return [*find_executable(package, executable, environ), *more, *node.args, *remap, *own]
-
-
-def find_executable(package: str, name: str, environ: Mapping[str, str]) -> list[str]:
-    """The begin of the command line of a package's executable, which is found as ``rosrun`` finds it.
-
-    It is searched in ``lib/PACKAGE`` of each prefix of CMAKE_PREFIX_PATH, in the package's folder below
-    ROS_PACKAGE_PATH, then in ``lib/PACKAGE`` of the installations, sourced or not.
-
-    Raises:
-        PeerRefused: There is none.
-    """
-    path = SearchPath.read(environ)
-    for prefix in path.prefixes:
-        if _is_executable(found := Path(prefix, "lib", package, name)):
-            return [str(found)]
-    for root in path.packages:
-        for folder in package_folders(package, root):
-            for found in sorted(folder.rglob(name)):
-                if _is_executable(found):
-                    return [str(found)]
-    for prefix in path.system:
-        if _is_executable(found := Path(prefix, "lib", package, name)):
-            return _sourced(prefix, [str(found)])
-    raise PeerRefused(
-        f"{package} {name}", "there is no such executable", f"it was searched in {path}", code="unknown-name"
-    )
-
-
-def _program(name: str, environ: Mapping[str, str]) -> list[str]:
-    """The begin of the command line of a program of ROS.
-
-    Raises:
-        PeerRefused: It is not installed.
-    """
-    if found := shutil.which(name, path=environ.get("PATH")):
-        return [found]
-    for prefix in SearchPath.read(environ).system:
-        if _is_executable(found_at := Path(prefix, "bin", name)):
-            return _sourced(prefix, [str(found_at)])
-    raise PeerRefused(name, "it is not installed here", "install ROS's package of that name", code="unknown-name")
-
-
-def _sourced(prefix: str, command: list[str]) -> list[str]:
-    """A command with the environment of an installation that is not sourced, as a service at boot has it."""
-    script = Path(prefix, "env.sh")
-    return [str(script), *command] if _is_executable(script) else command
-
-
-def _is_executable(path: Path) -> bool:
-    return path.is_file() and os.access(path, os.X_OK)

@@ -8,11 +8,12 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 from xmlrpc.client import ServerProxy
 from xmlrpc.server import SimpleXMLRPCServer
 
 name = sys.argv[1]
-print(f"begins: {sys.argv[2:]} in {os.getcwd()} with {os.environ.get('COLOUR', '')}", flush=True)
+print(f"begins: {sys.argv[2:]} in {Path.cwd()} with {os.environ.get('COLOUR', '')}", flush=True)
 if "--refuse" in sys.argv:
     print("no device /dev/none", file=sys.stderr)
     sys.exit(3)
@@ -26,7 +27,7 @@ if "--child" in sys.argv:
     print(f"child {child.pid}", flush=True)
 
 
-def end(*_):
+def end(*_: object) -> None:
     os._exit(0)
 
 
