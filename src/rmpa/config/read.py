@@ -165,10 +165,10 @@ def read_toml(
         ) from None
     table = _parse_toml(text, path)
     for place, problem, remedy in _mistakes((), table, schema, schema):
-        error = ConfigError(dotted(place), problem, remedy, path, line_of(text, place))
+        wrong = ConfigError(dotted(place), problem, remedy, path, line_of(text, place))
         if found is None:
-            raise error
-        found.append(error)
+            raise wrong
+        found.append(wrong)
     return text, table
 
 

@@ -436,4 +436,5 @@ def _topic(topic: DeclaredTopic, node: str, *, required: bool = True) -> TopicDe
     values = {key: getattr(topic.contract, key) for key in KEYS}
     contract = {key: value for key, value in values.items() if value != getattr(DEFAULT_CONTRACT, key)}
     observed = getattr(topic, "observed", False)
-    return TopicDescriptor(topic.name, topic_of(topic.name, node), topic.type_name, contract, required, observed)
+    full = topic_of(topic.name, node)
+    return TopicDescriptor(topic.name, full, topic.type_name, contract, required, observed, topic.label)

@@ -32,6 +32,7 @@ class TopicDescriptor(msgspec.Struct, frozen=True):
         contract: The contract's values that differ from the defaults, by key.
         required: For inputs only: whether the resource is stale without a publisher.
         observed: Whether another node has the topic, and the resource only measures it.
+        label: The prefix of its measured attributes, where that is not made of its name.
     """
 
     name: str
@@ -40,6 +41,7 @@ class TopicDescriptor(msgspec.Struct, frozen=True):
     contract: dict[str, str | int | float | None] = {}
     required: bool = True
     observed: bool = False
+    label: str = ""
 
 
 class ParameterDescriptor(msgspec.Struct, frozen=True, kw_only=True):
