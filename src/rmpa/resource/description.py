@@ -96,7 +96,7 @@ _TOPIC: Final = {
     "type": Setting(TEXT, "The message type, package/Name.", NEEDED),
 }
 _TERMS: Final = {
-    term: Setting(_any(_CONTRACT[term].get("type", [])), _CONTRACT[term]["description"]) for term in TERMS
+    term: Setting(ValueType(lambda raw: raw, _CONTRACT[term]), _CONTRACT[term]["description"]) for term in TERMS
 }
 _OUTPUT: Final = {
     **_TOPIC,

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import math
 import re
+import struct
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,25 +36,31 @@ DIAGNOSTICS: Final = "/diagnostics"
 _FEW: Final = 3
 # Above it a bound is the largest number of its type.
 _BOUNDLESS: Final = 1e300
+# The begin of a definition whose first field is a header, behind comments, and of such a message.
+_STAMPED: Final = re.compile(r"(\s*(#.*)?\n)*\s*(std_msgs/)?Header\s")
+_STAMP: Final = struct.Struct("<III")
 # Seconds before the measurement begins.
 _WARM_UP: Final = 0.5
 
 
 @dataclass(slots=True)
 class Flow:
-    """What came on one topic from one node while it was measured; times in monotonic seconds."""
+    """What came on one topic from one node while it was measured; times in seconds."""
 
     count: int = 0
     size: int = 0
     first: float = 0.0
     last: float = 0.0
 
-    def add(self, size: int, now: float) -> None:
-        """Count a message."""
+    def add(self, data: memoryview, now: float, *, stamped: bool) -> None:
+        """Count a message, by its stamp where it has one: what waited for this process comes all at once."""
+        if stamped and len(data) >= _STAMP.size:
+            _, seconds, nanoseconds = _STAMP.unpack_from(data)
+            now = seconds + nanoseconds / 1e9 or now
         self.first = self.first or now
         self.last = now
         self.count += 1
-        self.size += size
+        self.size += len(data)
 
     @property
     def rate(self) -> float:
@@ -142,7 +149,8 @@ async def look(
     def count(topic: str, data: memoryview, header: Mapping[str, str]) -> None:
         now = time.monotonic()
         if now >= begin:
-            flows[topic].setdefault(header.get("callerid", ""), Flow()).add(len(data), now)
+            stamped = _STAMPED.match(header.get("message_definition", "")) is not None
+            flows[topic].setdefault(header.get("callerid", ""), Flow()).add(data, now, stamped=stamped)
 
     def tell(topic: str, received: Received) -> None:
         told[topic] = received.message

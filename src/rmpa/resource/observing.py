@@ -93,7 +93,7 @@ class Observing(RuntimePart):
             subscriber = self._runtime.subscriber(output.name)
             if subscriber is None and (self._publishers is None or self._publishers.get(topic)):
                 continue
-            if subscriber is None or not subscriber.publishers:
+            if (subscriber is None or not subscriber.publishers) and not self._is_off(output):
                 missing.append(f"no node publishes {output.name}")
                 refusals = [*subscriber.refusals.values()][-1:] if subscriber is not None else []
                 broken += [f"{output.name}: {printable(text)}" for text in refusals]
@@ -102,6 +102,16 @@ class Observing(RuntimePart):
                 f"no node publishes {name}" for topic, name in self._inputs.items() if not self._publishers.get(topic)
             ]
         return missing, broken
+
+    def _is_off(self, output: Output) -> bool:
+        """Whether the present profile offers no messages of an output: its node need not run."""
+        resource = self._runtime.resource
+        profile = resource.profiles.get(self._adapter.adaptation.profile)
+        keys = [
+            f"{resource.labels[output.name]}.rate",
+            *(["rate"] if output.name == next(iter(resource.outputs)) else []),
+        ]
+        return profile is not None and any(profile.offers.get(key) == 0 for key in keys)
 
     def _received(self, output: Output, message: Received) -> None:
         """Change to counters if the topic carries much."""

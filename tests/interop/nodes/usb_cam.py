@@ -9,7 +9,6 @@ from dynamic_reconfigure.server import Server
 from payload import parser, say
 from sensor_msgs.msg import Image
 
-
 # What generate_dynamic_reconfigure_options makes of a .cfg file.
 CONFIG = SimpleNamespace(
     min={"frame_rate": 1, "gain": 0.0},
