@@ -65,6 +65,7 @@ tests: $(STAMP)  ## all tests, several files at a time; some of them: make tests
 
 test-long: $(STAMP)  ## more seeds of the simulated networks and fuzz targets than `make tests` has, and tests marked `long`
 	RMPA_SIMULATION_SEEDS=8 FUZZ_MUTATIONS=20000 $(BIN)/python -m pytest -n auto --timeout 3600 tests/simulation tests/bridge/io tests/fuzz
+	$(APT) scripts/install-ros --images
 	$(BIN)/python -m pytest -m long --timeout 3600
 
 test-packages: $(STAMP) ros  ## install by each way on machines of Debian 11, 12 and 13 (chroots), arm64 too, and let their nodes speak, and boot it with systemd; in half an hour
@@ -105,7 +106,7 @@ types: $(STAMP)  ## mypy, strict
 imports: $(STAMP)  ## the rooms import one way only; pure rooms stay pure
 	$(BIN)/lint-imports
 
-reference: $(STAMP)  ## write docs/reference/commands.md, settings.md and limits.md, and docs/rmpa.schema.json, from the code
+reference: $(STAMP)  ## write docs/reference/commands.md, settings.md and limits.md, and docs/*.schema.json, from the code
 	$(BIN)/python scripts/write-reference
 
 docs: $(STAMP)  ## build the site of docs/ into site/, which is read from disk or from any web server

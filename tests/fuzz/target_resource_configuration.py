@@ -21,7 +21,7 @@ _CONFIG = MessageType(CONFIG_TYPE)
 
 
 def _message(**values: bool | float | str) -> bytes:
-    return b"C" + _CONFIG.serialize(_CONFIG.make(config(values, _KNOWN)))
+    return b"C" + _CONFIG.serialize(_CONFIG.make(config(values)))
 
 
 SEEDS: list[bytes] = [

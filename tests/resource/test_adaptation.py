@@ -78,7 +78,7 @@ class Loop:
         def call(*args: Any, **named: Any) -> Any:
             self.out.told = []
             result = found(*args, **named)
-            return self.out.told if result is None and name != "next_timer" else result
+            return self.out.told if name == "window" or (result is None and name != "next_timer") else result
 
         return call
 

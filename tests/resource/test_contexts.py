@@ -356,7 +356,8 @@ def test_any_text_is_a_rule_or_an_error(text: str) -> None:
     with contextlib.suppress(ConfigError):
         made = parse_expression(text, ("x", "a"))
         assert made.holds({}) in (True, False, None)
-        assert made.holds(dict.fromkeys(made.references, 1.0)) is not None
+        known = made.holds(dict.fromkeys(made.references, 1.0))
+        assert known is not None or "/" in text  # a division by zero
 
 
 def test_the_graph_tells_which_part_is_the_topic() -> None:

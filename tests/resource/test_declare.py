@@ -314,7 +314,7 @@ def test_without_contexts_there_is_none_to_choose() -> None:
 
 def test_a_config_comes_back() -> None:
     values: dict[str, Any] = {"gain": 2.5, "echoes": 4, "beam": "narrow", "on": False, "profile": "slow"}
-    message = sent(CONFIG_TYPE, config(values, KNOWN))
+    message = sent(CONFIG_TYPE, config(values))
     assert read_config(message) == values
     assert [(g.name, g.state, g.id, g.parent) for g in message.groups] == [("Default", True, 0, 0)]
 

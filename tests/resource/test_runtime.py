@@ -47,7 +47,7 @@ class Ear(RuntimePart):
                 self.change.clear()
                 await self.change.wait()
 
-    def published(self, output: Output, raw: bytes, now_ns: int) -> None:
+    def published(self, output: Output, raw: bytes, now_ns: int, caller: str = "") -> None:
         self.note("published", output.name)
 
     def received(self, item: Input, message: Received) -> None:
@@ -134,7 +134,7 @@ async def test_messages_are_numbered_so_that_losses_are_seen(core: RosCore) -> N
     sent: list[int] = []
 
     class Eye(RuntimePart):
-        def published(self, output: Output, raw: bytes, now_ns: int) -> None:
+        def published(self, output: Output, raw: bytes, now_ns: int, caller: str = "") -> None:
             sent.append(int.from_bytes(raw[:4], "little"))
 
     await runtime.start([Eye()])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import time
 from typing import TYPE_CHECKING, Any, Final
 
 import click
@@ -39,6 +41,16 @@ def _offers(descriptor: Descriptor, values: dict[str, float | str]) -> str:
     return ", ".join(f"{name} {_shown(value, units.get(name, ''))}" for name, value in values.items()) or "-"
 
 
+def _learnt(descriptor: Descriptor, figures: dict[str, dict[str, Any]]) -> str:
+    """What a profile has given, in one line: the median, the spread between the quartiles, the number of windows."""
+    units = {attribute.name: attribute.unit for attribute in descriptor.attributes}
+    return ", ".join(f"{name} {_measured(one, units.get(name, ''))}" for name, one in figures.items()) or "-"
+
+
+def _measured(one: dict[str, Any] | None, unit: str) -> str:
+    return f"{_shown(one['median'], unit)} (spread {one['spread']:.3g}, n {one['n']})" if one else "-"
+
+
 async def _decision(graph: ResourceGraph, one: SeenResource) -> dict[str, Any]:
     """A resource's account of its last decision.
 
@@ -56,9 +68,12 @@ async def _decision(graph: ResourceGraph, one: SeenResource) -> dict[str, Any]:
 
 @resource_verb()
 async def profile_list(graph: ResourceGraph, one: SeenResource, options: Options) -> None:
-    """List a RESOURCE's profiles and what they offer.
+    """List a RESOURCE's profiles, what they offer, and what they have given.
 
     ---
+    OFFERS is what its author declared. LEARNT is the median of the last windows that were judged while it ran, with
+    the spread from the first to the third quartile and the number of windows; it is kept over restarts. With
+    adaptation.offers = "learnt" profiles are compared by it once there are ten windows.
 
     Examples:
       rmpa profile list
@@ -68,6 +83,7 @@ async def profile_list(graph: ResourceGraph, one: SeenResource, options: Options
     said, runs, chosen = one.descriptor, decision.get("profile", ""), decision.get("chosen", "")
     scores = ((str(s.get("profile")), str(s.get("excluded", ""))) for s in decision.get("scores", ()))
     left_out = {name: why for name, why in scores if why}
+    learnt: dict[str, Any] = decision.get("learnt", {})
     rows, colours = [], []
     for each in said.profiles:
         why = left_out.get(each.name, "")
@@ -75,9 +91,19 @@ async def profile_list(graph: ResourceGraph, one: SeenResource, options: Options
         colours.append("green" if state else "yellow" if why else "")
         notes = "; ".join(filter(None, ("best effort" if each.best_effort else "", each.description)))
         state = state or ("left out" if why else "-")
-        rows.append((each.name, state, _offers(said, each.offers), f"{each.cost:g}", why or notes))
+        given = (_learnt(said, learnt.get(each.name, {})),) if learnt else ()
+        rows.append((each.name, state, _offers(said, each.offers), *given, f"{each.cost:g}", why or notes))
     about = {**one.named, "profile": runs, "chosen": chosen, "profiles": said.profiles, "left_out": left_out}
-    options.show(about, Table("PROFILE, STATE, OFFERS, >COST, NOTES", rows, colours))
+    about |= {"learnt": learnt, "by_hand": decision.get("by_hand", {})}
+    table = Table(f"PROFILE, STATE, OFFERS, {'LEARNT, ' if learnt else ''}>COST, NOTES", rows, colours)
+    options.show(about, table, *_by_hand(one, decision))
+
+
+def _by_hand(one: SeenResource, decision: dict[str, Any]) -> Iterator[Text]:
+    """What people have set at nodes, which profiles leave alone."""
+    if by_hand := decision.get("by_hand"):
+        values = ", ".join(f"{name} = {value}" for name, value in by_hand.items())
+        yield f"by hand: {values}; `rmpa profile set {one} --auto` gives it back"
 
 
 @resource_verb()
@@ -132,7 +158,8 @@ def _set(what: str, resource: str, name: str | None, *, auto: bool, options: Opt
 def profile_set(resource: str, name: str | None, auto: bool, options: Options) -> None:
     """Choose the PROFILE of a RESOURCE by hand; returns when it runs.
 
-    It runs until --auto, whatever clients ask for. If it cannot be applied, the earlier choice stays.
+    It runs until --auto, whatever clients ask for. If it cannot be applied, the earlier choice stays. Either gives
+    parameters of nodes that people have set back to the profiles.
 
     ---
 
@@ -150,7 +177,8 @@ async def profile_explain(graph: ResourceGraph, one: SeenResource, options: Opti
     ---
     D is the distance of a profile from what is asked: sqrt(sum(weight * shortfall^2) / sum(weight)) over its terms,
     and a little for its cost. A shortfall of 1 is the tolerance of the attribute, or the range over all profiles. The
-    smallest D that falls short of nothing hard is taken.
+    smallest D that falls short of nothing hard is taken. Below are the last ten decisions, the newest last, with
+    their reasons, and how long each took from its cause until it was in force.
 
     Examples:
       rmpa profile explain /sonar
@@ -169,21 +197,37 @@ def _explained(one: SeenResource, decision: dict[str, Any]) -> Iterator[Text]:
         yield f"alarm: {str(decision['alarm']).replace('_', '-')}"
     if decision.get("reaction") is not None:
         yield f"last reconfiguration took {decision['reaction']:.3g} s"
+    yield from _by_hand(one, decision)
     yield ""
     units = {attribute.name: attribute.unit for attribute in one.descriptor.attributes}
+    scores = decision.get("scores", ())
+    learnt = any(term.get("learnt") for score in scores for term in score.get("terms", ()))
     rows, colours = [], []
-    for score in decision.get("scores", ()):
+    for score in scores:
         name = str(score.get("profile"))
         head = (name, _verdict(score, runs, chosen), f"{score.get('distance', 0.0):.4g}")
         for term in score.get("terms") or [{}]:
             attribute, shortfall = str(term.get("attribute", "-")), term.get("delta")
             wanted = f"{term.get('wanted', '-')}" + (" hard" if term.get("hard") else "")
-            cells = (attribute, wanted, _shown(term.get("offered"), units.get(attribute, "")))
+            unit = units.get(attribute, "")
+            given = (_measured(term.get("learnt"), unit),) if learnt else ()
+            cells = (attribute, wanted, _shown(term.get("offered"), unit), *given)
             weight = f"{term['weight']:g}" if "weight" in term else "-"
             rows.append((*head, *cells, f"{shortfall:.4g}" if shortfall is not None else "-", weight))
             colours.append("green" if name == runs else "yellow" if score.get("excluded") else "")
             head = ("", "", "")
-    yield Table("PROFILE, VERDICT, >D, ATTRIBUTE, WANTED, OFFERED, >SHORTFALL, >WEIGHT", rows, colours)
+    titles = f"PROFILE, VERDICT, >D, ATTRIBUTE, WANTED, OFFERED, {'LEARNT, ' if learnt else ''}>SHORTFALL, >WEIGHT"
+    yield Table(titles, rows, colours)
+    if history := [_decided(each) for each in decision.get("history", ())]:
+        yield ""
+        yield Table("AT, FROM, TO, >TOOK, WHY", history)
+
+
+def _decided(one: dict[str, Any]) -> Sequence[str]:
+    """One of the last decisions."""
+    why = f"{one.get('why', '')}; failed: {one['failed']}" if "failed" in one else str(one.get("why", ""))
+    at = time.strftime("%H:%M:%S", time.localtime(one.get("at", 0)))
+    return at, str(one.get("from") or "-"), str(one.get("to")), f"{one.get('took', 0):.3g} s", why
 
 
 def _verdict(score: dict[str, Any], runs: str, chosen: str) -> str:
@@ -265,16 +309,18 @@ async def resource_info(graph: ResourceGraph, one: SeenResource, options: Option
       rmpa resource info base:/arm --json
     """
     texts, values, quality, responses = await asyncio.gather(
-        graph.texts([one], "state", "profile", "context"),
+        graph.texts([one], "state", "profile", "context", "decision"),
         graph.configuration(one),
         graph.hear([one], "quality", ARRAY_TYPE),
         graph.hear([one], "responses", ARRAY_TYPE),
     )
-    state, profile, context = (said.get(one, "") for said in texts)
+    state, profile, context, decision = (said.get(one, "") for said in texts)
     about: dict[str, Any] = {"name": one.path, "peer": one.peer, "node": one.caller}
     about |= {"state": state, "profile": profile, "context": context}
     about |= {"health": next(_statuses(quality.get(one)), None), "parameters": values}
     about |= {"clients": [*_statuses(responses.get(one))]}
+    with contextlib.suppress(msgspec.DecodeError):  # it has decided nothing yet
+        about["by_hand"] = msgspec.json.decode(decision, type=dict[str, Any]).get("by_hand", {})
     options.show(about | {"descriptor": one.descriptor}, _info(one, about))
 
 
@@ -303,7 +349,8 @@ def _info(one: SeenResource, about: dict[str, Any]) -> Iterator[Text]:
     tables: dict[str, Iterable[Sequence[str]]] = {
         "OUTPUT, TYPE, CONTRACT": ((t.topic, t.type, _terms(t.contract)) for t in said.outputs),
         "INPUT, TYPE, CONTRACT": ((t.topic, t.type, _terms(t.contract)) for t in said.inputs),
-        "PARAMETER, VALUE, RANGE, DESCRIPTION": (_parameter(p, values) for p in said.parameters),
+        "NODE, NAME, HOW": ((n.key, n.name, n.how) for n in said.nodes),
+        "PARAMETER, VALUE, RANGE, DESCRIPTION": (_parameter(p, values, about) for p in said.parameters),
         "QUALITY, NOW, BETTER, CLASS": _qualities(said, health["values"] if health else {}),
         "PROFILE, COST, OFFERS, DESCRIPTION": (
             (p.name, f"{p.cost:g}", _offers(said, p.offers), p.description) for p in said.profiles
@@ -334,12 +381,14 @@ def _runs(task: TaskDescriptor, values: dict[str, Any]) -> str:
     return f"{task.rate:g} Hz" if task.rate else f"on {task.on}"
 
 
-def _parameter(one: ParameterDescriptor, values: dict[str, Any]) -> Sequence[str]:
+def _parameter(one: ParameterDescriptor, values: dict[str, Any], about: dict[str, Any]) -> Sequence[str]:
     low, high = ("" if bound is None else f"{bound:g}" for bound in (one.low, one.high))
     within = " | ".join(map(str, one.choices)) or (f"{low} .. {high}" if low or high else one.type)
     value = values.get(one.name, one.default)
     text = str(value).lower() if isinstance(value, bool) else _shown(value, one.unit)
-    return one.name, text, within, one.description
+    by_hand = " by hand" if one.name in about.get("by_hand", {}) else ""
+    where = f"{one.description} [{one.binding}]".lstrip() if one.binding else one.description
+    return one.name, text + by_hand, within, where
 
 
 def _qualities(said: Descriptor, values: dict[str, str]) -> Iterator[Sequence[str]]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from bisect import bisect_left
 from dataclasses import dataclass, field, replace
 from ipaddress import AddressValueError, IPv4Address
 from pathlib import Path
@@ -41,44 +42,63 @@ def value_at(table: object, place: Place) -> object:
     return table
 
 
+# What counts in a valid TOML text: strings, comments, brackets and the ends of lines.
+_PIECE: Final = re.compile(
+    r"""\"{3}(?:\\.|[^\\])*?\"{3,5}|'{3}.*?'{3,5}|"(?:\\.|[^"\\\n])*"|'[^'\n]*'|\#[^\n]*|[\[{\]}]|\n""", re.DOTALL
+)
+
+
+def _line_ends(text: str) -> Iterator[tuple[int, int]]:
+    """Each end of a line outside strings in a valid TOML text: the line's number, from 1, and the open brackets."""
+    line = depth = 0
+    for match in _PIECE.finditer(text):
+        piece = match[0]
+        depth += (piece in "[{") - (piece in "]}")
+        line += piece.count("\n")
+        if piece == "\n":
+            yield line, depth
+
+
 def line_of(text: str, place: Place) -> int | None:
     """The line, from 1, on which the key or element at a place begins in a valid TOML text; ``None`` if it has none.
 
-    A prefix of whole lines is valid TOML only if no statement is left open. So the first valid prefix that contains
-    the place ends with its statement, and the last valid prefix before that ends where the statement begins. An
-    element of a list is searched within its statement.
+    A prefix that ends with a statement is valid TOML. The first of these that contains the place ends with its
+    statement, which begins where the one before ends. An element of a list is searched within its statement.
     """
     lines = text.split("\n")
-    begin = 0
-    for end in range(1, len(lines) + 1):
-        try:
-            table = tomllib.loads("\n".join(lines[:end]))
-        except (ValueError, RecursionError):
-            continue
-        if value_at(table, place) is not None:
-            return _element_line(lines, begin, end, place)
-        begin = end
-    return None
+    ends = [0, *(line for line, depth in _line_ends(text) if not depth), len(lines)]
+
+    def has_place(end: int) -> bool:
+        return value_at(tomllib.loads("\n".join(lines[:end])), place) is not None
+
+    if not has_place(len(lines)):
+        return None
+    at = bisect_left(ends, True, key=has_place)
+    return _element_line(lines, ends[at - 1], ends[at], place)
 
 
 def _element_line(lines: list[str], begin: int, end: int, place: Place) -> int:
     """The line of a place in the statement between two lines: not its first only for an element of a list."""
     if begin + 1 == end:
         return end
-    inline = value_at(tomllib.loads("\n".join(lines[begin:end])), place) is not None
+    text = "\n".join(lines[begin:end])
+    inline = value_at(tomllib.loads(text), place) is not None
     indices = [part for part in (place if inline else place[-1:]) if isinstance(part, int)]
     if not indices:
         return begin + 1
-    for stop in range(begin + 1, end):
+
+    def has_element(line: int) -> bool:
         try:
-            value: object = tomllib.loads("\n".join(lines[begin:stop]) + "\n]")
+            value: object = tomllib.loads("\n".join(lines[begin : begin + line]) + "\n]")
         except ValueError:
-            continue
+            return False
         while isinstance(value, dict) and value:
             value = next(iter(value.values()))
-        if isinstance(value, list) and len(value) > indices[0]:
-            return stop
-    return end
+        return isinstance(value, list) and len(value) > indices[0]
+
+    stops = [line for line, depth in _line_ends(text) if depth == 1]
+    at = bisect_left(stops, True, key=has_element)
+    return begin + stops[at] if at < len(stops) else end
 
 
 _AT_LINE: Final = re.compile(r" \(at line (\d+), column \d+\)$")
@@ -111,13 +131,16 @@ def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
     return {key: value for key, value in found.items() if value is not None}
 
 
-def read_toml(data: bytes, path: Path | None, schema: JsonSchema) -> tuple[str, dict[str, Any]]:
+def read_toml(
+    data: bytes, path: Path | None, schema: JsonSchema, found: list[ConfigError] | None = None
+) -> tuple[str, dict[str, Any]]:
     """Read the bytes of a TOML file, and check its keys and types by a schema.
 
     Args:
         data: UTF-8 text in TOML.
         path: For the text of errors.
         schema: The keys and types that it may have, as JSON Schema.
+        found: Gets all unknown keys and wrong types; without it the first is raised.
 
     Returns:
         The text, and what it says.
@@ -142,7 +165,10 @@ def read_toml(data: bytes, path: Path | None, schema: JsonSchema) -> tuple[str, 
         ) from None
     table = _parse_toml(text, path)
     for place, problem, remedy in _mistakes((), table, schema, schema):
-        raise ConfigError(dotted(place), problem, remedy, path, line_of(text, place))
+        wrong = ConfigError(dotted(place), problem, remedy, path, line_of(text, place))
+        if found is None:
+            raise wrong
+        found.append(wrong)
     return text, table
 
 
@@ -163,20 +189,23 @@ def _mistakes(place: Place, value: object, schema: JsonSchema, root: JsonSchema)
     elif isinstance(value, dict):
         known, other = schema.get("properties", {}), schema.get("additionalProperties") or {}
         for key, inner in value.items():
-            if known and key not in known:
+            if known and key not in known and not other:
                 what = "an unknown table" if isinstance(inner, dict) else "an unknown key"
                 remedy = REMOVED.get(dotted((*place, key))) or _suggestion(place, key, list(known), root)
                 yield (*place, key), what, remedy
             yield from _mistakes((*place, key), inner, known.get(key, other), root)
 
 
+# Lists, tables or parts of a key within each other: nothing has so many, and tomllib takes minutes for very many.
+_NESTED: Final = re.compile(r"""(?<![\w"'-])(?:[\w"'-]+\s*\.\s*){64}|(?:[\[{][^\[\]{}]*){64}""")
+
+
 def _parse_toml(text: str, path: Path | None) -> dict[str, Any]:
+    nested = _NESTED.search(text)
     try:
-        return tomllib.loads(text)
+        table = tomllib.loads(text) if nested is None else None
     except RecursionError:
-        raise ConfigError(
-            "the file", "lists or tables nested too deeply", "", path, code="unreadable-settings"
-        ) from None
+        table = None
     except ValueError as error:  # TOMLDecodeError, and int() on thousands of digits
         message = str(error)
         match = _AT_LINE.search(message)
@@ -185,6 +214,10 @@ def _parse_toml(text: str, path: Path | None) -> dict[str, Any]:
         raise ConfigError(
             "the file", problem, _toml_remedy(text, line), path, line, code="unreadable-settings"
         ) from None
+    if table is None:
+        line = text.count("\n", 0, nested.start()) + 1 if nested is not None else 1
+        raise ConfigError("the file", "lists or tables nested too deeply", "", path, line, code="unreadable-settings")
+    return table
 
 
 def _toml_remedy(text: str, line: int) -> str:

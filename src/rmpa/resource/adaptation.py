@@ -154,12 +154,13 @@ class Adaptation:
             self._blocked = dict(blocked)
             self._plan(now, "the preconditions of profiles have changed")
 
-    def pin(self, profile: str, now: float, *, restored: bool = False) -> None:
+    def pin(self, profile: str, now: float, *, restored: bool = False, again: bool = False) -> None:
         """Run this profile whatever is requested; an empty name lets the loop decide again.
 
         Args:
             profile: Name of the profile, or empty.
             now: The time of the call.
+            again: Whether to apply the decided profile even if it runs already.
             restored: Whether the choice was made before a restart; the profile's cool-down continues then. A new
                 choice ends the cool-down, since its cause may have been removed.
 
@@ -172,22 +173,24 @@ class Adaptation:
                 self._cooling.pop(profile, None)
                 self._cool_down_lengths.pop(profile, None)
         self.pinned = profile
-        self._plan(now, f"{profile} was chosen by hand" if profile else "the choice by hand is over", at_once=True)
+        why = f"{profile} was chosen by hand" if profile else "the choice by hand is over"
+        self._plan(now, why, at_once=True, again=again)
 
     def reconsider(self, why: str, now: float) -> None:
         """Choose the best profile without hysteresis and dwell time: at the start, or in another context."""
         self._plan(now, why, at_once=True)
 
-    def window(self, measured: Mapping[str, Value], now: float) -> None:
+    def window(self, measured: Mapping[str, Value], now: float) -> bool:
         """Judge a window of measured quality that ends now.
 
-        The window is ignored unless it began at least ``settle`` seconds after the active profile was applied.
+        Returns:
+            Whether it was: not unless it began at least ``settle`` seconds after the active profile was applied.
         """
         began = max(self._window_end, self._active_since) if self._window_end is not None else now
         self._window_end = now
         if self.applying or not self.profile or began < self._active_since + self._settings.settle:
-            return
-        offers = self._decider.profile(self.profile).offers
+            return False
+        offers = self._decider.offers(self.profile)
         self._windows.append((began, find_shortfalls(self._attributes, measured, self.bounds, offers)))
         violated = self._violated()
         if len(violated) >= self._settings.violations and not self.pinned:
@@ -197,6 +200,7 @@ class Adaptation:
             best = self._pinned_or_best(now)
             if best is not None and best.feasible:  # otherwise an attribute that was not measured may fall short
                 self._set_alarm(None)
+        return True
 
     def _violated(self) -> list[tuple[float, tuple[Shortfall, ...]]]:
         return [window for window in self._windows if window[1]]
@@ -245,6 +249,12 @@ class Adaptation:
         self.applying = ""
         # The failed profile may be partly in force, so even the profile that ran before is applied again.
         self._plan(now, f"{profile} failed: {why}", again=True)
+
+    def broken(self, profile: str, why: str, now: float) -> None:
+        """Report that the running profile does not work any more; the next best profile is applied instead."""
+        if profile and profile == self.profile and not self.applying:
+            self.begin_cool_down(profile, why, now)
+            self._plan(now, f"{profile} does not work any more: {why}", at_once=True)
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due; ``None``: no timer runs."""
@@ -344,7 +354,7 @@ class Adaptation:
     def _apply(self, profile: str, why: str, cause: float) -> None:
         self.applying = profile
         self._cause = min(self._cause, cause)
-        self._out.apply(profile, why)
+        self._out.apply(profile, why + self._decider.learnt_text(self.bounds, self.profile, profile))
 
     def begin_cool_down(self, profile: str, why: str, now: float) -> None:
         """Exclude a profile; the driver calls it for one that hangs: the restarted resource tries another one."""

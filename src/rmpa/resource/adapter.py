@@ -10,6 +10,7 @@ import asyncio
 import inspect
 import logging
 import time
+from collections import deque
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -19,10 +20,13 @@ from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.resource import limits
 from rmpa.resource.adaptation import Adaptation
 from rmpa.resource.decision import AlarmKind, Decider
+from rmpa.resource.declare import OfferSource
+from rmpa.resource.learnt import LearntOffers
 from rmpa.resource.measuring import ObservedQualities, QualityMeasurement, count_missing
 from rmpa.resource.quality import Requirement
 from rmpa.resource.runtime import CALLER, RuntimePart
 from rmpa.resource.saved import Clients, SavedState
+from rmpa.resource.values import Rules
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
 from rmpa.ros.types.descriptor import LEVEL_FOR
 from rmpa.ros.types.messages import MessageType
@@ -34,13 +38,16 @@ from rmpa.runtime.tasks import end_tasks, start_task
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from rmpa.resource.actuation import Actuation
     from rmpa.resource.decision import Alarm
-    from rmpa.resource.declare import Context, Hook, Input, Output, Profile
+    from rmpa.resource.declare import Context, Hook, Input, ManagedNode, Output, Profile
+    from rmpa.resource.processes import Processes
     from rmpa.resource.quality import Attribute, Bound, Value
     from rmpa.resource.runtime import Runtime
     from rmpa.resource.tasks import Tasks
     from rmpa.resource.values import ExpressionValues
     from rmpa.ros.node.endpoints import Publisher, Received, Subscriber
+    from rmpa.ros.wire.slave_api import Sent
 
 _log = logging.getLogger(__name__)
 # The value of ``quality`` that has how long its level has stood: an age, since the clocks of modules differ.
@@ -217,19 +224,27 @@ class Adapter(RuntimePart):
         runtime: The runtime of the resource.
         values: The values of attributes that have an expression.
         tasks: The resource's tasks, paused while a profile is applied.
+        actuation: Applies a profile to other nodes.
         stop: Set when a function of a profile or context has exceeded its time-out: the resource has to end.
     """
 
-    def __init__(self, runtime: Runtime, values: ExpressionValues, tasks: Tasks, stop: asyncio.Event) -> None:
+    def __init__(
+        self, runtime: Runtime, values: ExpressionValues, tasks: Tasks, actuation: Actuation, stop: asyncio.Event
+    ) -> None:
         resource = runtime.resource
         self._runtime = runtime
         self._values = values
         self._tasks = tasks
+        self._actuation = actuation
+        actuation.on_change = self._tell
         self._stop = stop
         self._name = runtime.node.name
         self._attributes = resource.attributes
         self._settings = resource.settings
-        decider = Decider(resource.name, self._attributes, list(resource.profiles.values()))
+        profiles = list(resource.profiles.values())
+        by_learnt = self._settings.offers is OfferSource.LEARNT
+        self.learnt = LearntOffers(profiles)
+        decider = Decider(resource.name, self._attributes, profiles, self.learnt, by_learnt=by_learnt)
         self.adaptation = Adaptation(self._attributes, decider, self._settings, self)
         self.clients = Clients(resource.name, self._attributes)
         # The state that was saved before a restart.
@@ -247,6 +262,10 @@ class Adapter(RuntimePart):
         self._measuring: QualityMeasurement | None = None
         self._measured: dict[str, Value] = {}
         self._missing: dict[str, int] = {}
+        self._rules = Rules(resource, values)
+        # The last decisions, the newest last, as they are told; and the one that is being applied.
+        self._history: deque[dict[str, Any]] = deque(maxlen=limits.DECISIONS_KEPT)
+        self._deciding: dict[str, Any] = {}
         self._preconditions = Preconditions(resource.profiles)
         self._blocked_by_needs: dict[str, str] = {}
         self._blocked_by_context: dict[str, str] = {}
@@ -265,6 +284,8 @@ class Adapter(RuntimePart):
             MachineTimer(lambda: self._clients_check, self._check_clients),
         )
         self._closed = False
+        # The part that runs the nodes that profiles name; ``None``: there are none.
+        self.processes: Processes | None = None
 
     async def start(self) -> None:
         """Begin to measure, choose the first profile, and serve clients."""
@@ -280,12 +301,13 @@ class Adapter(RuntimePart):
         requirements = self.clients.restore(self.saved.requirements, now, now_ns)
         left = {name: one.left(now, now_ns) for name, one in self.saved.cool_downs.items()}
         cool_downs = {name: one for name, one in left.items() if one is not None}
+        self.learnt.restore(self.saved.learnt)
         self.adaptation.restore(requirements, self.saved.last, cool_downs, now)
         self._requirements = await node.subscribe(f"{node.name}/requirements", kind, self._requirement_received)
         await node.subscribe(f"{node.name}/observed", kind, self._observation_received)
         if self._runtime.resource.nodes and any(one.value is None for one in self._said.values()):
             await node.subscribe(f"{node.name}/attributes", kind, self._attribute_received)
-        self.adaptation.block(self._blocked_by_needs, now)
+        self._update_blocked()
         if self.preset:
             self.adaptation.pin(self.preset, now, restored=True)
         else:
@@ -302,10 +324,15 @@ class Adapter(RuntimePart):
         await end_tasks(self._checking, self._applying)
         await self._preconditions.close()
 
-    def published(self, output: Output, raw: bytes, now_ns: int) -> None:
+    def published(self, output: Output, raw: bytes, now_ns: int, caller: str = "") -> None:
         """Measure a message that an output has sent."""
         if self._measuring is not None:
-            self._measuring.message(output.name, raw, self._loop.time(), now_ns)
+            self._measuring.message(output.name, raw, self._loop.time(), now_ns, caller)
+
+    def counted(self, output: str, sent: Mapping[str, Sent], now: float) -> None:
+        """Measure an observed output by the counts of its publishers, from now on."""
+        if self._measuring is not None:
+            self._measuring.counted(output, sent, now)
 
     def received(self, item: Input, message: Received) -> None:
         """Measure a message that an input has received."""
@@ -322,13 +349,25 @@ class Adapter(RuntimePart):
             self._log_change(message, over=not missing)
             level = DiagnosticLevel.STALE if missing else DiagnosticLevel.OK
             self._report("alarms", level, message, {"cleared": str(not missing).lower()})
+        self._judge_alarms()
         if self._checking is None or self._checking.done():
             self._checking = start_task(self._check_preconditions(), "check preconditions")
-        self.adaptation.window(self._measured, now)
+        profile = self.adaptation.profile
+        if self.adaptation.window(self._measured, now):
+            self.learnt.window(profile, self._measured)
         for part in self._runtime.parts:
             part.window_ended(self._measured)
         self._report_quality(now)
         self._tell()
+
+    def _judge_alarms(self) -> None:
+        for alarm, raised in self._rules.judge():
+            text = alarm.text or f"alarm {alarm.name}: {alarm.when}"
+            level = DiagnosticLevel.ERROR if alarm.error else DiagnosticLevel.WARN
+            message = text if raised else f"over: {text}"
+            self._log_change(message, over=not raised)
+            values = {"alarm": alarm.name, "rule": alarm.when, "cleared": str(not raised).lower()}
+            self._report("alarms", level if raised else DiagnosticLevel.OK, message, values)
 
     async def _check_preconditions(self) -> None:
         self._blocked_by_needs = await self._preconditions.check()
@@ -336,8 +375,20 @@ class Adapter(RuntimePart):
         self._tell()
 
     def _update_blocked(self) -> None:
-        """Block the profiles whose preconditions do not hold, and those that the context excludes."""
-        self.adaptation.block(self._blocked_by_needs | self._blocked_by_context, self._loop.time())
+        """Block profiles whose preconditions, rules or nodes are not as they need, and those out of the context."""
+        by_nodes = self._actuation.blocked() | (self.processes.blocked() if self.processes is not None else {})
+        blocked = by_nodes | self._rules.blocked() | self._blocked_by_needs | self._blocked_by_context
+        self.adaptation.block(blocked, self._loop.time())
+
+    def node_changed(self, node: ManagedNode, text: str, ended: bool) -> None:
+        """Report that a node has ended, or runs again; the running profile has failed if it names one that ended."""
+        self._log_change(text, over=not ended)
+        level, profile = DiagnosticLevel.WARN if ended else DiagnosticLevel.OK, self.adaptation.profile
+        values = {"node": node.name, "cleared": str(not ended).lower()}
+        self._report("alarms", level, text if ended else f"over: {text}", values)
+        if ended and profile and node.key in self._runtime.resource.profiles[profile].nodes:
+            self.adaptation.broken(profile, text, self._loop.time())
+        self._tell()
 
     def _observation_received(self, message: Received) -> None:
         try:
@@ -412,13 +463,13 @@ class Adapter(RuntimePart):
         self.adaptation.reconsider(f"context {context.name}" if context.name else "no context any more", now)
         self._tell()
 
-    def pin(self, profile: str) -> None:
-        """Choose a profile by hand; an empty name lets the loop decide.
+    def pin(self, profile: str, *, again: bool = False) -> None:
+        """Choose a profile by hand; an empty name lets the loop decide. ``again``: apply it even if it runs already.
 
         Raises:
             ConfigError: The resource has no profile of this name.
         """
-        self.adaptation.pin(profile, self._loop.time())
+        self.adaptation.pin(profile, self._loop.time(), again=again)
         self._tell()
 
     async def settled(self) -> None:
@@ -429,30 +480,37 @@ class Adapter(RuntimePart):
     def apply(self, profile: str, why: str) -> None:
         """Begin to apply a profile; the loop decides on the next one only after the outcome of this one."""
         _log.info("= %s: profile %s: %s", self._name, profile, why)
+        self._deciding = {"at": time.time(), "from": self.adaptation.profile, "to": profile, "why": why}
         self._applying = start_task(self._apply(profile), f"apply {profile}")
 
-    async def _apply(self, profile: str) -> None:
-        function, limit, why = self._runtime.resource.profiles[profile].apply, self._settings.apply_timeout, ""
+    async def _apply(self, name: str) -> None:
+        profile, limit, why = self._runtime.resource.profiles[name], self._settings.apply_timeout, ""
+        began = self._loop.time()
         try:
+            await self._actuation.apply(profile)
             await self._tasks.pause()
             self._runtime.hold()
+            for key, value in profile.sets.items():
+                if (parameter := self._runtime.resource.parameters[key]).binding is None:
+                    parameter.value = value
             remedy = "mend it, or allow it longer: adaptation(apply_timeout=…)"
-            await call_function(function, "profile", profile, limit, remedy)
+            await call_function(profile.apply, "profile", name, limit, remedy)
         except HungError as error:
             self._runtime.release(drop=True)
-            self.adaptation.begin_cool_down(profile, f"not applied within {limit:g} s", self._loop.time())
+            self.adaptation.begin_cool_down(name, f"not applied within {limit:g} s", self._loop.time())
             self.end(error)
             return
         except Exception as error:  # noqa: BLE001 - the top of the user's code
-            why = f"{type(error).__name__}: {error}"
-            _log.warning("! %s: profile %s: %s [resource-trouble]", self._name, profile, why)
+            why = str(error) if isinstance(error, RmpaError) else f"{type(error).__name__}: {error}"
+            _log.warning("! %s: profile %s: %s [resource-trouble]", self._name, name, why)
         self._runtime.release(drop=bool(why))
         self._tasks.resume()
         self.observed.clear()
         if why:
-            self.adaptation.failed(profile, why, self._loop.time())
+            self._history.append(self._deciding | {"took": self._loop.time() - began, "failed": why})
+            self.adaptation.failed(name, why, self._loop.time())
         else:
-            self.adaptation.applied(profile, self._loop.time())
+            self.adaptation.applied(name, self._loop.time())
         self._tell()
 
     def alarm(self, alarm: Alarm, *, cleared: bool) -> None:
@@ -470,6 +528,8 @@ class Adapter(RuntimePart):
     def reacted(self, profile: str, reaction: float) -> None:
         """Begin a new window, so that a profile is not judged by values measured under the previous one."""
         self.reaction = reaction
+        self._history.append(self._deciding | {"took": reaction})
+        self.learnt.update()
         now = self._loop.time()
         if self._measuring is not None:
             self._measuring.restart(now)
@@ -528,6 +588,9 @@ class Adapter(RuntimePart):
             "alarm": loop.alarm.kind.value if loop.alarm is not None else "",
             "conflicts": [text for _, text in loop.conflicts],
             "clients": sorted(loop.requirements),
+            "by_hand": dict(self._actuation.by_hand),
+            "history": list(self._history),
+            "learnt": msgspec.to_builtins(self.learnt.offers),
             "scores": [
                 msgspec.to_builtins(score) | {"feasible": score.feasible} for score in loop.explain(self._loop.time())
             ],
@@ -535,7 +598,12 @@ class Adapter(RuntimePart):
 
     def health(self) -> tuple[DiagnosticLevel, str]:
         """The present level and message of the resource's ``quality`` topic."""
-        return health(self.adaptation, *self._runtime.problems())
+        missing, broken = self._runtime.problems()
+        standing = self._rules.standing.values()
+        broken += [alarm.text or f"alarm {alarm.name}: {alarm.when}" for alarm in standing]
+        level, message = health(self.adaptation, missing, broken)
+        serious = any(alarm.error for alarm in standing) and level < DiagnosticLevel.ERROR
+        return DiagnosticLevel.ERROR if serious else level, message
 
     def _report_quality(self, now: float) -> None:
         """Publish the quality of a window, also on ``/diagnostics``, with how long it has had this level."""

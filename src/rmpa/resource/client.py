@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.resource.quality import EXPIRES, PRIORITY, RequirementAnswer
-from rmpa.resource.runtime import RuntimePart
+from rmpa.resource.runtime import RuntimePart, topic_of
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.descriptor import TOPIC, Descriptor
 from rmpa.ros.types.messages import MessageType
@@ -210,8 +210,9 @@ class Demands(RuntimePart):
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._clients: dict[str, ResourceClient] = {}
-        # Name of the first output of each resource whose descriptor has been received, by resource.
-        self._first: dict[str, str] = {}
+        # The topics of each resource whose descriptor has been received, in this graph: by the prefix that the
+        # attributes of the output have; without one by an empty text.
+        self._topics: dict[str, dict[str, str]] = {}
         self._undo = contextlib.AsyncExitStack()
 
     async def start(self) -> None:
@@ -227,7 +228,7 @@ class Demands(RuntimePart):
                 undo.push_async_callback(end_tasks, following)
                 if demand.requests:
                     self._request(demand)
-                if any(name.startswith(f"{demand.resource}/") for name in self._runtime.resource.inputs):
+                if self._runtime.resource.inputs:
                     await self._observe(demand.resource, client)
             self._undo = undo.pop_all()
 
@@ -250,14 +251,14 @@ class Demands(RuntimePart):
 
     def window_ended(self, measured: Mapping[str, Value]) -> None:
         """Report the measured values of inputs to the resources that send them, for the requested attributes."""
-        resource = self._runtime.resource
-        labels = resource.labels
+        resource, labels = self._runtime.resource, self._runtime.resource.labels
+        inputs = {topic_of(name, self._runtime.node.name): labels[name] for name in resource.inputs}
         for name, client in self._clients.items():
             found: dict[str, Any] = {}
-            for request in resource.demands[name].requests if name in self._first else ():
+            topics = self._topics.get(name, {})
+            for request in resource.demands[name].requests if topics else ():
                 output, _, attribute = request.replace("__", ".").rpartition(".")
-                item = f"{name}/{output or self._first[name]}"
-                value = measured.get(f"{labels[item]}.{attribute}") if item in resource.inputs else None
+                value = measured.get(f"{inputs.get(topics.get(output, ''), '')}.{attribute}")
                 if value is not None:
                     found[request] = value
             if found and client.connected:
@@ -280,11 +281,13 @@ class Demands(RuntimePart):
 
         def descriptor_received(received: Received) -> None:
             try:
-                outputs = Descriptor.parse(str(received.message.data)).outputs
+                said = Descriptor.parse(str(received.message.data))
             except RmpaError as error:
                 _log.warning("! %s: %s: %s [resource-trouble]", self._runtime.node.name, name, error)
-            else:
-                self._first[name] = outputs[0].name if outputs else ""
+                return
+            prefix = name.removesuffix(said.node)  # of what that module offers here
+            topics = {one.label or one.name: f"{prefix}{one.topic}" for one in said.outputs}
+            self._topics[name] = {"": next(iter(topics.values()), ""), **topics}
 
         await client.observe()
         await self._runtime.node.subscribe(f"{name}/{TOPIC}", MessageType("std_msgs/String"), descriptor_received)

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError
+from rmpa.resource.learnt import LearntOffer, LearntOffers
 from rmpa.resource.quality import Scale
 
 if TYPE_CHECKING:
@@ -35,6 +36,8 @@ EPSILON: Final = 1e-3
 _MISSING: Final = 1.0
 # Factor by which a soft bound may be missed further than the profile declares, before it counts as violated.
 EXPECTED: Final = 1.25
+# A learnt value that differs from the declared one by more than this part of it is told in reasons.
+_NOTABLE: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +47,11 @@ class Term:
     Args:
         attribute: Name of the attribute.
         wanted: The requested bound, as a text for people.
-        offered: The profile's value; ``None`` if it offers none.
+        offered: The profile's value by which it is compared; ``None`` if it offers none.
         delta: The relative shortfall; 0 if the request is met.
         weight: Weight of the attribute, above 0.
         hard: Whether a shortfall makes the profile infeasible.
+        learnt: What the profile has given of it; ``None``: it has not run yet.
     """
 
     attribute: str
@@ -56,6 +60,7 @@ class Term:
     delta: float
     weight: float
     hard: bool
+    learnt: LearntOffer | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,10 +94,22 @@ class Decider:
         resource: Name of the resource, for errors.
         attributes: The attributes that clients may request, by name.
         profiles: The declared profiles, in order of declaration.
+        learnt: What profiles have given.
+        by_learnt: Whether profiles are compared by that, where there are enough windows.
     """
 
-    def __init__(self, resource: str, attributes: Mapping[str, Attribute], profiles: Sequence[Profile]) -> None:
+    def __init__(
+        self,
+        resource: str,
+        attributes: Mapping[str, Attribute],
+        profiles: Sequence[Profile],
+        learnt: LearntOffers | None = None,
+        *,
+        by_learnt: bool = False,
+    ) -> None:
         self._resource = resource
+        self._learnt = learnt if learnt is not None else LearntOffers(profiles)
+        self._by_learnt = by_learnt
         self._attributes = attributes
         self.profiles = {profile.name: profile for profile in profiles}
         # What a shortfall of 1 is on the scale of each attribute that a profile offers.
@@ -118,6 +135,25 @@ class Decider:
             raise ConfigError(f"profile {name}", f"{self._resource} has no such profile", remedy)
         return found
 
+    def offers(self, name: str) -> Mapping[str, Value]:
+        """The offers by which a profile is compared: those declared, or learnt."""
+        offers = self.profiles[name].offers
+        if not self._by_learnt or not (learnt := self._learnt.offers.get(name)):
+            return offers
+        return {**offers, **{key: one.median for key, one in learnt.items() if one.enough}}
+
+    def learnt_text(self, bounds: Mapping[str, Bound], *profiles: str) -> str:
+        """What was learnt of profiles, and differs from their declarations, as an addition to a reason; or empty."""
+        found = []
+        for name in profiles if self._by_learnt else ():
+            offers = self.offers(name) if name else {}
+            for key in bounds.keys() & offers.keys():
+                declared, value = self.profiles[name].offers[key], offers[key]
+                if not isinstance(value, str) and abs(value - float(declared)) > _NOTABLE * abs(float(declared)):
+                    show = self._attributes[key].format
+                    found.append(f"{name} has given {key} {show(value)}, declared {show(declared)}")
+        return f" (learnt: {'; '.join(sorted(found))})" if found else ""
+
     def decide(self, bounds: Mapping[str, Bound], excluded: Mapping[str, str] | None = None) -> ProfileScore | None:
         """The profile that serves the requirements best; ``None`` if all are excluded.
 
@@ -142,10 +178,13 @@ class Decider:
         scale = sum(bound.weight for bound in bounds.values())
         found = []
         for name, profile in self.profiles.items():
+            offers, learnt = self.offers(name), self._learnt.offers.get(name, {})
             terms = tuple(
-                Term(key, texts[key], offer, self._delta(key, bound, offer), bound.weight, bound.hard)
+                Term(
+                    key, texts[key], offer, self._delta(key, bound, offer), bound.weight, bound.hard, learnt.get(key)
+                )
                 for key, bound in bounds.items()
-                for offer in (profile.offers.get(key),)
+                for offer in (offers.get(key),)
             )
             total = sum(term.weight * term.delta * term.delta for term in terms)
             distance = (math.sqrt(total / scale) if terms else 0.0) + EPSILON * profile.cost

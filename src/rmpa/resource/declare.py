@@ -107,6 +107,10 @@ class Binding:
     name: str
     restart: bool = False
 
+    def __str__(self) -> str:
+        """``driver dynamic frame_rate``, as descriptors have it."""
+        return f"{self.node} {self.kind} {self.name}"
+
 
 @dataclass(eq=False)
 class Parameter:
@@ -408,6 +412,7 @@ class ManagedNode:
         env: Variables of the environment.
         restart: When it is started again.
         stop_after: Seconds that it may take to end after SIGINT, before SIGTERM and SIGKILL follow.
+        server: Global name of its dynamic_reconfigure server, such as that of a nodelet in it; empty: the node's own.
     """
 
     key: str
@@ -421,11 +426,19 @@ class ManagedNode:
     env: Mapping[str, str] = field(default_factory=dict, hash=False)
     restart: RestartPolicy = RestartPolicy.ON_FAILURE
     stop_after: float = 10.0
+    server: str = ""
 
     @property
     def started(self) -> bool:
         """Whether the declaration says how it is started."""
         return bool(self.run or self.launch or self.command)
+
+    @property
+    def how(self) -> str:
+        """How it is started, as descriptors have it; a command's words are told to no other module."""
+        if self.command:
+            return "command"
+        return f"run {self.run}" if self.run else f"launch {self.launch}" if self.launch else "attached"
 
 
 @dataclass(frozen=True, slots=True)

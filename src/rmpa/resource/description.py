@@ -26,6 +26,7 @@ The file is read into the declaration of ``rmpa.resource.resource``; nothing of 
 
 from __future__ import annotations
 
+import json
 import re
 from typing import TYPE_CHECKING, Any, Final
 
@@ -35,6 +36,7 @@ from rmpa.config.schema import NEEDED, Setting
 from rmpa.config.values import BOOL, TEXT, BadValue, JsonSchema, ValueType, list_of, member_of, text_type
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import is_legal_name
+from rmpa.resource import limits
 from rmpa.resource.declare import Binding, BindingKind, Measure, OfferSource, RestartPolicy, StartRule
 from rmpa.resource.quality import Category, Direction, Scale, parse_request, quantity
 from rmpa.resource.resource import Resource, Role
@@ -64,6 +66,8 @@ _VALUE: Final = _any(_SCALAR["type"])
 _NUMBER: Final = _any(["number", "integer"])
 _QUANTITY: Final = _any(["string", "number", "integer"])
 _TEXTS: Final = list_of(TEXT)
+# Arguments may be repeated; the schema has checked that they are texts.
+_WORDS: Final[ValueType[tuple[str, ...]]] = ValueType(tuple, {"type": "array", "items": TEXT.json_schema})
 _NAME: Final = text_type(lambda raw: raw, "/camera/image_raw")
 _CONTRACT: Final = CONTRACT_RULES.json_schema["items"]["properties"]
 
@@ -78,20 +82,21 @@ _NODE: Final = {
     "name": Setting(_NAME, "The node's name in the graph; by default /NAME of the table."),
     "run": Setting(TEXT, "Started as by rosrun: PACKAGE EXECUTABLE."),
     "launch": Setting(TEXT, "Started by roslaunch: PACKAGE FILE, or a path beside this file."),
-    "command": Setting(_TEXTS, "Started as this program with its arguments."),
-    "args": Setting(_TEXTS, "Further arguments, or NAME:=VALUE of the launch file."),
+    "command": Setting(_WORDS, "Started as this program with its arguments."),
+    "args": Setting(_WORDS, "Further arguments, or NAME:=VALUE of the launch file."),
     "params": Setting(_table_of(_SCALAR), "Private parameters that are set before it starts."),
     "remap": Setting(_table_of({"type": "string"}), "Names of topics and services, by the node's own name for them."),
     "env": Setting(_table_of({"type": "string"}), "Variables of its environment."),
     "restart": Setting(member_of(RestartPolicy, "a policy"), "When it is started again after its end.", "on-failure"),
     "stop_after": Setting(_QUANTITY, "How long it may take to end before it is killed.", "10 s"),
+    "server": Setting(_NAME, "Its dynamic_reconfigure server, where that has another name, as of a nodelet."),
 }
 _TOPIC: Final = {
     "topic": Setting(_NAME, "The topic's name in the graph.", NEEDED),
     "type": Setting(TEXT, "The message type, package/Name.", NEEDED),
 }
 _TERMS: Final = {
-    term: Setting(_any(_CONTRACT[term].get("type", [])), _CONTRACT[term]["description"]) for term in TERMS
+    term: Setting(ValueType(lambda raw: raw, _CONTRACT[term]), _CONTRACT[term]["description"]) for term in TERMS
 }
 _OUTPUT: Final = {
     **_TOPIC,
@@ -236,8 +241,28 @@ def read_description(data: bytes, path: Path) -> Resource:
     Raises:
         ConfigError: With line and key, for the first mistake.
     """
+    if len(data) > limits.DESCRIPTION_MAX:
+        problem = f"{len(data)} bytes, more than {limits.DESCRIPTION_MAX}"
+        raise ConfigError("the file", problem, "is it the right file?", path, 1, code="unreadable-settings")
     text, table = read_toml(data, path, _SCHEMA)
     return _Reader(text, table, path).read()
+
+
+def description_mistakes(data: bytes, path: Path) -> list[ConfigError]:
+    """What is wrong in a description: all unknown keys and wrong types, else the first of other mistakes."""
+    found: list[ConfigError] = []
+    try:
+        read_toml(data, path, _SCHEMA, found)
+        if not found:
+            read_description(data, path)
+    except ConfigError as error:
+        found.append(error)
+    return found
+
+
+def schema_text() -> str:
+    """The JSON Schema as it is printed and stands in docs/."""
+    return json.dumps(_SCHEMA, indent=2, ensure_ascii=False) + "\n"
 
 
 class _Reader:
@@ -255,7 +280,7 @@ class _Reader:
         except BadValue as error:
             remedy = error.remedy or (f"did you mean {error.better}?" if error.better else "")
             place = (*self._place, *error.at)
-            raise self._error(place, dotted(place), error.problem, remedy) from None
+            raise self._error(place, dotted(place) or "the file", error.problem, remedy) from None
         except ConfigError as error:
             raise self._error(self._blamed(error), error.source, error.problem, error.remedy) from None
         except RmpaError as error:  # a type that there is not
@@ -272,12 +297,13 @@ class _Reader:
             table = table[part]
         source = getattr(error, "source", "")
         last = re.split(r",| of ", source)[-1]
+        words = re.findall(r"[\w.]+", f"{last} {str(error).replace(source, '', 1)}")
         found: Place = self._place
         best = 0
         for place, value in _places(self._place, table):
-            words = re.findall(r"[\w.]+", f"{last} {str(error).replace(source, '', 1)}")
             shown = not isinstance(value, dict | list | bool) and len(str(value)) > 1 and str(value) in str(error)
-            score = 2 * shown + (str(place[-1]) in words) + (str(place[-1]) in last)
+            shown |= isinstance(value, str) and repr(value) in str(error)
+            score = 2 * shown + (str(place[-1]) in words) + 2 * (str(place[-1]) in last)
             if score > best:
                 found, best = place, score
         return found
@@ -309,6 +335,7 @@ class _Reader:
         if not is_legal_name(name) or "/" in name:
             raise ConfigError("name", f"{name!r} is not a ROS base name", 'give one: name = "camera"')
         made = Resource(name, **about)
+        made.file = self._path.name
         for key, node in self._named("node"):
             node["stop_after"] = quantity(node.get("stop_after", 10.0), "s", "stop_after")
             made.node(key, **node)
@@ -354,7 +381,7 @@ class _Reader:
                 raise BadValue("it names a node, and not what it is there", 'add dynamic = "NAME", private or arg')
             return None
         if len(given) > 1:
-            raise BadValue(f"{' and '.join(given)} are two places for one value", "keep one of them")
+            raise BadValue(f"{' and '.join(given)} are two places for one value", "keep one", at=(list(given)[-1],))
         kind, name = next(iter(given.items()))
         if not node and len(made.nodes) != 1:
             there = ", ".join(made.nodes) or "none"

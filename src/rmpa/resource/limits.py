@@ -49,7 +49,48 @@ CONTEXT_DWELL: Final = 1.0
 # At it: its node's own counters give rate and bandwidth
 # Why: A second subscriber of an image delays the first one.
 MEASURED_BYTES: Final = 256 * 1024
+# [Resources] Bytes of a file that describes a resource
+# At it: it is refused
+# Told in: its error
+# Why: A large one has some 10 KB, and each mistake is searched for its line.
+DESCRIPTION_MAX: Final = 64 * 1024
+# [Resources] Windows of each profile and attribute from which its learnt offer is computed
+# At it: the oldest is dropped
+# Told in: `rmpa profile list`, which shows the median, the spread and their number
+LEARNT_WINDOWS: Final = 60
+# [Resources] Windows that a learnt offer needs before profiles are compared by it (`offers = "learnt"`)
+# At it: with fewer the declared offer counts
+# Told in: `rmpa profile explain`
+LEARNT_LEAST: Final = 10
+# [Resources] Decisions that are told with their reasons
+# At it: the oldest is dropped
+# Told in: `rmpa profile explain`
+DECISIONS_KEPT: Final = 10
+# A status of ``/diagnostics`` is known so long: nodes repeat theirs each second, an aggregator drops it after 5 s.
+DIAGNOSTICS_LIFESPAN: Final = 10.0
+# Seconds between two readings of a process's figures, at least: processor time is counted in hundredths of a second.
+FIGURES_PAUSE: Final = 0.5
+# An operator's change at a node is judged when its configuration has been quiet so long: a node may publish what the
+# resource has set only after its reply.
+KNOB_QUIET: Final = 0.3
 # The function of a context may take so long; tasks are paused meanwhile.
 CONTEXT_ENTER_TIMEOUT: Final = 5.0
 # Seconds from a failed switch until the rules are evaluated again; also the longest between searches for topics.
 CONTEXT_RETRY: Final = 5.0
+# [Resources] Time for a node that a resource has started to be registered and to answer
+# At it: it is ended, and the profile that needs it fails
+# Told in: `profile explain`, the resource's log
+NODE_START_TIMEOUT: Final = 20.0
+# Seconds that a node has to end whose resource does not name it any more.
+NODE_END_TIMEOUT: Final = 10.0
+# Seconds until a node that has ended is started again; each further time it is twice as long, up to the second.
+NODE_RESTART_FIRST: Final = 0.5
+NODE_RESTART_MAX: Final = 30.0
+# After a run of this length the failures of a node count from the beginning.
+NODE_STEADY: Final = 60.0
+# [Resources] Times in a row that a node of a resource ends by itself
+# At it: it is not started again, and profiles that name it are not used for a minute
+# Told in: `profile explain`, the resource's alarms
+NODE_FAILURES_MAX: Final = 5
+# Seconds for which these profiles are not used.
+NODE_BLOCKED: Final = 60.0

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 import struct
+from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import SERIAL_HALF, SERIAL_MASK
 from rmpa.resource import limits
 from rmpa.resource.quality import Direction, find_attribute
+from rmpa.ros.wire.slave_api import sent_between
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping
@@ -21,11 +23,16 @@ if TYPE_CHECKING:
     from rmpa.resource.declare import DeclaredTopic
     from rmpa.resource.quality import Attribute, Value
     from rmpa.resource.resource import Resource
+    from rmpa.ros.wire.slave_api import Sent
 
 _HEADER: Final = struct.Struct("<III")
 _SECOND: Final = 1_000_000_000
 # Number of publishers of one topic whose sequence numbers are tracked; one more, and the tracking starts afresh.
 _SOURCES: Final = 64
+# A rate by counters is that of the last so many messages or seconds: of few messages it would jump by one in each
+# window.
+_COUNTED: Final = 10
+_COUNTED_SPAN: Final = 5.0
 
 
 class TopicQuality:
@@ -123,6 +130,43 @@ class TopicQuality:
         return found
 
 
+class TopicCounters:
+    """The rate of an observed output by what its publishers say that they have sent to a subscriber.
+
+    Without a subscriber nothing is known, so nothing is judged.
+    """
+
+    def __init__(self) -> None:
+        self._before: Mapping[str, Sent] = {}
+        self._at: float | None = None
+        # Seconds, messages and bytes between two answers, the newest last.
+        self._spans: deque[tuple[float, int, int]] = deque(maxlen=64)
+
+    def counted(self, sent: Mapping[str, Sent], now: float) -> None:
+        """Take the counts of each publisher that has answered, by its name."""
+        found = [sent_between(self._before.get(node, {}), each) for node, each in sent.items()]
+        known = [each for each in found if each is not None]
+        if known and self._at is not None:
+            self._spans.append((now - self._at, sum(count for count, _ in known), sum(size for _, size in known)))
+        else:
+            self._spans.clear()
+        self._before, self._at = sent, now
+
+    def restart(self, _now: float) -> None:
+        """Discard the counts so far, because another profile runs."""
+        self._spans.clear()
+        self._at = None
+
+    def window(self, _now: float) -> dict[str, Value]:
+        """``rate`` and ``bandwidth``, if they are known."""
+        seconds, messages, size = 0.0, 0, 0
+        for span, count, sent in reversed(self._spans):
+            seconds, messages, size = seconds + span, messages + count, size + sent
+            if messages >= _COUNTED or seconds >= _COUNTED_SPAN:
+                break
+        return {"rate": messages / seconds, "bandwidth": size / seconds} if seconds else {}
+
+
 class QualityMeasurement:
     """Measures messages and observations; each window yields their quality.
 
@@ -135,11 +179,12 @@ class QualityMeasurement:
         self._attributes = resource.attributes
         self._labels = resource.labels
         self._declared = resource.declared_attributes
-        self._topics: dict[str, TopicQuality] = {}
+        self._topics: dict[str, TopicQuality | TopicCounters] = {}
         # Inputs whose type is not known yet, by name; it is learnt from their first publisher.
         self._unknown: dict[str, DeclaredTopic] = {}
         for name, topic in (resource.outputs | resource.inputs).items():
-            self._add(topic, now, numbered=name in resource.inputs)
+            # The resource numbers its own messages without a gap.
+            self._add(topic, now, numbered=name in resource.inputs or getattr(topic, "observed", False))
             if topic.known is None:
                 self._unknown[name] = topic
         # The first output; its attributes are also available without the output's label.
@@ -160,12 +205,19 @@ class QualityMeasurement:
             raw: The serialized message.
             now: When it was sent or received.
             now_ns: The same moment by the wall clock (Unix nanoseconds), to which stamps refer.
-            caller: For inputs: name of the publishing node.
+            caller: For what another node publishes: its name.
         """
         if topic in self._unknown and self._unknown[topic].known is not None:
             self._add(self._unknown.pop(topic), now, numbered=True)
-        if (quality := self._topics.get(topic)) is not None:
+        if isinstance(quality := self._topics.get(topic), TopicQuality):
             quality.message(raw, now, now_ns, caller)
+
+    def counted(self, topic: str, sent: Mapping[str, Sent], now: float) -> None:
+        """Measure an observed output by the counts of its publishers, from the first call on (``TopicCounters``)."""
+        quality = self._topics[topic]
+        if not isinstance(quality, TopicCounters):
+            quality = self._topics[topic] = TopicCounters()
+        quality.counted(sent, now)
 
     def _add(self, topic: DeclaredTopic, now: float, *, numbered: bool) -> None:
         fields = topic.known.fields if topic.known is not None else ()
@@ -206,11 +258,13 @@ class QualityMeasurement:
     def format(self, measured: Mapping[str, Value]) -> dict[str, str]:
         """The values of a window as texts with units; the first output's attributes only by their short names."""
         twice = f"{self._labels[self._primary]}." if self._primary else None
-        return {
+        shown = {
             name: self._attributes[name].format(value)
             for name, value in measured.items()
             if name in self._attributes and not (twice and name.startswith(twice))
         }
+        counted = [name for name, topic in self._topics.items() if isinstance(topic, TopicCounters)]
+        return shown | {f"{self._labels[name]}.measured": "by its node's counters" for name in counted}
 
 
 # Quality as observed by clients, and things that a resource lacks; both are judged once in each window.

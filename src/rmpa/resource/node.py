@@ -8,12 +8,16 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
+from rmpa.resource.actuation import Actuation
 from rmpa.resource.adapter import Adapter
 from rmpa.resource.client import Demands
+from rmpa.resource.configuration import Reconfigure
 from rmpa.resource.contexts import Contexts
-from rmpa.resource.reconfigure import Reconfigure
+from rmpa.resource.observing import Observing
+from rmpa.resource.processes import Processes
 from rmpa.resource.runtime import LifecycleState, Runtime
 from rmpa.resource.saved import Persistence, SavedCoolDown, SavedState
+from rmpa.resource.sources import Sources
 from rmpa.resource.tasks import Tasks
 from rmpa.resource.values import ExpressionValues
 from rmpa.ros.http.rpc import call_api
@@ -70,17 +74,26 @@ class ResourceNode:
         node = Node(resource.name, master_uri=master_uri, on_shutdown=lambda _reason: self.ended.set())
         self.runtime = Runtime(resource, node)
         self.runtime.close_outputs()
+        self.processes = Processes(self.runtime, state.parent if state is not None else None)
         self.tasks = Tasks(self.runtime, self._deactivate_soon)
         self.values = ExpressionValues(self.runtime, resource.expressions())
-        self.adapter = Adapter(self.runtime, self.values, self.tasks, stop if stop is not None else asyncio.Event())
+        self.actuation = Actuation(self.runtime, self.processes)
+        stop = stop if stop is not None else asyncio.Event()
+        self.adapter = Adapter(self.runtime, self.values, self.tasks, self.actuation, stop)
+        self.adapter.processes = self.processes
+        self.processes.on_change = self.adapter.node_changed
         self.contexts = Contexts(self.runtime, self.values, self.tasks, self.adapter)
-        self.configuration = Reconfigure(self.runtime, self.tasks, self.adapter, self.contexts)
+        self.configuration = Reconfigure(self.runtime, self.tasks, self.actuation, self.adapter, self.contexts)
         self.demands = Demands(self.runtime)
         # In the order of their start.
         self.parts: list[RuntimePart] = [
+            self.processes,
             self.values,
+            Sources(self.runtime, self.values, self.processes),
             self.tasks,
+            self.actuation,
             self.adapter,
+            Observing(self.runtime, self.values, self.adapter),
             self.contexts,
             self.configuration,
             self.demands,
@@ -96,12 +109,12 @@ class ResourceNode:
         self._deactivating: asyncio.Task[None] | None = None
 
     async def learn(self) -> None:
-        """Wait until the types of all outputs are known: a publisher, here or at a peer, tells an unknown one.
+        """Wait until the types of all own outputs are known: a publisher, here or at a peer, tells an unknown one.
 
         Missing types and the places searched for them are logged once.
         """
         name, logged = self.runtime.node.name, set[str]()
-        while missing := [output for output in self.resource.outputs.values() if output.known is None]:
+        while missing := unknown_outputs(self.resource):
             for output in missing:
                 if not await self._learn(output) and output.type_name not in logged:
                     logged.add(output.type_name)
@@ -139,6 +152,9 @@ class ResourceNode:
         if self._persistence is not None:
             saved = self.adapter.saved = await self._persistence.restore()
             self.adapter.preset, self.contexts.chosen, self._last = saved.chosen, saved.context, saved.last
+            self.actuation.by_hand |= saved.by_hand
+        given = {name: self.resource.parameters[name] for name in self.resource.bound}
+        self.actuation.by_hand |= {name: one.value for name, one in given.items() if one.given}
         try:
             # Parameters are loaded before ``configure``, which opens the device before a profile sets it.
             await self.runtime.start(self.parts, self.configuration.load, self._configure)
@@ -244,6 +260,7 @@ class ResourceNode:
         elif not refused:
             self.tasks.activate()
         runtime.publish_text("state", runtime.state)
+        self.processes.note_soon()
         if refused:
             raise PeerRefused(f"resource {self.resource.name}", f"{transition}: {why}")
 
@@ -258,8 +275,11 @@ class ResourceNode:
         loop = self.adapter.adaptation
         self._last = loop.profile or self._last
         cooling = loop.cooling(asyncio.get_running_loop().time())
+        if self.runtime.state is _FINALIZED:
+            self.adapter.learnt.update()
+        own = {n: p for n, p in self.resource.parameters.items() if n not in self.resource.bound}
         return SavedState(
-            parameters={n: p.value for n, p in self.resource.parameters.items() if p.value != p.default},
+            parameters={n: p.value for n, p in own.items() if p.value != p.default},
             chosen=loop.pinned,
             last=self._last,
             context=self.contexts.chosen,
@@ -270,7 +290,14 @@ class ResourceNode:
                 )
                 for name, one in cooling.items()
             },
+            by_hand=dict(self.actuation.by_hand),
+            learnt=self.adapter.learnt.saved,
         )
+
+
+def unknown_outputs(resource: Resource) -> list[Output]:
+    """The outputs that the resource cannot publish yet, because their type is unknown."""
+    return [output for output in resource.outputs.values() if output.known is None and not output.observed]
 
 
 async def run_all(
@@ -296,7 +323,7 @@ async def run_all(
     stopped = start_task(stop.wait(), "wait for the end")
     try:
         # Resources that wait for the type of an output start last.
-        for resource in sorted(resources, key=lambda each: any(o.known is None for o in each.outputs.values())):
+        for resource in sorted(resources, key=lambda each: bool(unknown_outputs(each))):
             state = directory / f"{resource.name}.json" if directory is not None else None
             one = ResourceNode(resource, master_uri, state=state, stop=stop)
             types = start_task(one.learn(), f"types of {resource.name}", raises=(RmpaError,))

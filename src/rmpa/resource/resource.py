@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -54,6 +55,8 @@ from rmpa.resource.expression import Expression, parse_expression
 from rmpa.resource.quality import MEASURED, Attribute, Category, Direction, Scale, find_attribute, quantity
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rmpa.resource.quality import QoSRequest
 
 # The highest rate of a periodic task, in Hz.
@@ -131,6 +134,10 @@ class Resource:
         self.nodes: dict[str, ManagedNode] = {}
         self.alarms: dict[str, AlarmRule] = {}
         self.start = StartRule()
+        # Base name of the file that declares it; empty: unknown.
+        self.file = ""
+        # The folder of the file that declares it, in which its nodes are started; ``None``: that of the process.
+        self.folder: Path | None = None
         # Parameters of the control loop.
         self.settings = AdaptationSettings()
 
@@ -235,6 +242,9 @@ class Resource:
         if binding is not None and binding.node not in self.nodes:
             remedy = suggestion(binding.node, self.nodes, f"declared are {', '.join(self.nodes) or 'none'}")
             raise ConfigError(where, f"there is no node {binding.node}", remedy)
+        if binding is not None and binding.kind == "private" and binding.name in self.nodes[binding.node].params:
+            remedy = "leave it out there: default is its first value"
+            raise ConfigError(where, f"{binding.name} is among the params of node {binding.node} too", remedy)
         made = Parameter(name, default, low, high, tuple(choices), unit, description, binding)
         made.check_declaration(where)
         self.parameters[name] = made
@@ -287,6 +297,11 @@ class Resource:
         made = DeclaredAttribute(attribute, self.expression(value, where) if value else None)
         self.declared_attributes[name] = made
         return made
+
+    @property
+    def bound(self) -> dict[str, Binding]:
+        """Where other nodes have the values of parameters, by parameter."""
+        return {name: one.binding for name, one in self.parameters.items() if one.binding is not None}
 
     @property
     def labels(self) -> dict[str, str]:
@@ -447,6 +462,15 @@ class Resource:
             raise ConfigError(where, f"{made.name} is declared already, or the resource itself", "name it once")
         if sum(map(bool, (made.run, made.launch, made.command))) > 1:
             raise ConfigError(where, "run, launch and command are three ways to start it", "keep one of them")
+        if made.server and (not made.server.startswith("/") or not is_legal_name(made.server)):
+            raise ConfigError(where, f"{made.server!r} is not a global name", f"for example {made.name}/debayer")
+        for text, least in ((made.run, 2), (made.launch, 1)):
+            try:
+                enough = not text or len(shlex.split(text)) >= least
+            except ValueError:  # a quote is not closed
+                enough = False
+            if not enough:
+                raise ConfigError(where, f"{text!r} does not name a program", "write PACKAGE NAME, as for rosrun")
         self.nodes[key] = made
         return made
 

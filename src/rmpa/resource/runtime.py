@@ -24,6 +24,7 @@ from rmpa.ros.types.descriptor import (
     ContextDescriptor,
     DemandDescriptor,
     Descriptor,
+    NodeDescriptor,
     ParameterDescriptor,
     ProfileDescriptor,
     TaskDescriptor,
@@ -79,8 +80,8 @@ class RuntimePart:
     async def close(self) -> None:
         """End the part: the resource ends; the node is still registered."""
 
-    def published(self, output: Output, raw: bytes, now_ns: int) -> None:
-        """An output has sent a message."""
+    def published(self, output: Output, raw: bytes, now_ns: int, caller: str = "") -> None:
+        """An output has sent a message; ``caller``: of an observed one, the node that has."""
 
     def received(self, item: Input, message: Received) -> None:
         """An input has received a message."""
@@ -166,7 +167,7 @@ class Runtime:
             self.publish_descriptor()
             for item in self.resource.inputs.values():
                 if not item.observed:
-                    await self._subscribe(item)
+                    await self._receive(item)
             for step in first:
                 await step()
             for part in self.parts:
@@ -216,6 +217,24 @@ class Runtime:
         """Whether the messages of an input or output, by its declared name, come to the resource itself."""
         return name in self._publishers or name in self._subscribers
 
+    async def observe(self, output: Output, received: Callable[[Received], None]) -> None:
+        """Subscribe to an observed output; ``received`` is called after the parts."""
+
+        def deliver(message: Received) -> None:
+            for part in self.parts:
+                part.published(output, message.raw, message.stamp_ns, message.caller_id)
+            received(message)
+
+        await self._subscribe(output, deliver)
+
+    def subscriber(self, name: str) -> Subscriber | None:
+        """That of an input or observed output, by its declared name."""
+        return self._subscribers.get(name)
+
+    async def ignore(self, name: str) -> None:
+        """End the subscription to an observed output."""
+        await self._subscribers.pop(name).close()
+
     def call_in_loop(self, function: Callable[..., object], *args: Any) -> None:
         """Call a function in the event loop: at once if called in the loop's thread, else as soon as the loop can."""
         if threading.get_ident() == self._thread:
@@ -231,22 +250,28 @@ class Runtime:
         for part in self.parts:
             part.parameter_changed(parameter)
 
-    async def _subscribe(self, item: Input) -> None:
+    async def _receive(self, item: Input) -> None:
+        def deliver(message: Received) -> None:
+            for part in self.parts:
+                part.received(item, message)
+
+        await self._subscribe(item, deliver)
+
+    async def _subscribe(self, item: DeclaredTopic, deliver: Callable[[Received], None]) -> None:
         unknown = item.known is None
 
         def received(message: Received) -> None:
             if not unknown or self._learn(item, message):
-                for part in self.parts:
-                    part.received(item, message)
+                deliver(message)
 
         name, topic = self.node.name, topic_of(item.name, self.node.name)
         if unknown:
             text = "is not known here; a publisher of"
-            _log.info("= %s: the type of input %s, %s, %s %s tells it", name, item.name, item.type_name, text, topic)
+            _log.info("= %s: the type of %s, %s, %s %s tells it", name, item.name, item.type_name, text, topic)
         self._subscribers[item.name] = await self.node.subscribe(topic, item.known or item.type_name, received)
 
-    def _learn(self, item: Input, message: Received) -> bool:
-        """Take the type of an input from its publisher's header; false if the definition there cannot be used."""
+    def _learn(self, item: DeclaredTopic, message: Received) -> bool:
+        """Take the type of a topic from its publisher's header; false if the definition there cannot be used."""
         caller = printable(message.caller_id)
         try:
             kind = message.kind
@@ -255,7 +280,7 @@ class Runtime:
                 self._unusable.add((item.name, caller))
                 text = "its messages are dropped; this is said once"
                 _log.warning(
-                    "! %s: input %s from %s: %s; %s [unknown-type]", self.node.name, item.name, caller, error, text
+                    "! %s: %s from %s: %s; %s [unknown-type]", self.node.name, item.name, caller, error, text
                 )
             return False
         if item.known is None:
@@ -357,7 +382,7 @@ def describe(resource: Resource, node: str) -> Descriptor:
         description=resource.description,
         outputs=tuple(_topic(output, node) for output in resource.outputs.values()),
         inputs=tuple(_topic(item, node, required=item.required) for item in resource.inputs.values()),
-        parameters=tuple(_convert(p, ParameterDescriptor) for p in resource.parameters.values()),
+        parameters=tuple(_parameter(p) for p in resource.parameters.values()),
         attributes=tuple(
             AttributeDescriptor(name, a.direction, a.unit, a.scale, a.category, a.tolerance, a.words)
             for name, a in resource.attributes.items()
@@ -377,6 +402,23 @@ def describe(resource: Resource, node: str) -> Descriptor:
             DemandDescriptor(d.resource, {k.replace("__", "."): str(v) for k, v in d.requests.items()}, d.priority)
             for d in resource.demands.values()
         ),
+        nodes=tuple(NodeDescriptor(n.key, n.name, n.how) for n in resource.nodes.values()),
+        file=resource.file,
+    )
+
+
+def _parameter(one: Parameter) -> ParameterDescriptor:
+    binding = str(one.binding) if one.binding is not None else ""
+    return ParameterDescriptor(
+        name=one.name,
+        type=one.type,
+        default=one.default,
+        low=one.low,
+        high=one.high,
+        choices=one.choices,
+        unit=one.unit,
+        description=one.description,
+        binding=binding,
     )
 
 
@@ -393,4 +435,6 @@ def topic_of(name: str, node: str) -> str:
 def _topic(topic: DeclaredTopic, node: str, *, required: bool = True) -> TopicDescriptor:
     values = {key: getattr(topic.contract, key) for key in KEYS}
     contract = {key: value for key, value in values.items() if value != getattr(DEFAULT_CONTRACT, key)}
-    return TopicDescriptor(topic.name, topic_of(topic.name, node), topic.type_name, contract, required)
+    observed = getattr(topic, "observed", False)
+    full = topic_of(topic.name, node)
+    return TopicDescriptor(topic.name, full, topic.type_name, contract, required, observed, topic.label)

@@ -126,6 +126,8 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
         context: The context chosen by hand, or empty.
         requirements: Requirements of clients, which may come back.
         cool_downs: Cool-downs by profile.
+        by_hand: Values of other nodes that people have set, by parameter.
+        learnt: The values of each profile's last windows, by attribute.
     """
 
     format: int = FORMAT
@@ -135,6 +137,8 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
     context: str = ""
     requirements: tuple[SavedRequirement, ...] = ()
     cool_downs: dict[str, SavedCoolDown] = {}
+    by_hand: dict[str, bool | int | float | str] = {}
+    learnt: dict[str, dict[str, list[float]]] = {}
 
     def checked(self, resource: Resource, now_ns: int) -> tuple[SavedState, list[str]]:
         """What still fits the declaration of the resource, and a text about each part that does not.
@@ -171,6 +175,8 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
             context=declared("context", self.context, resource.contexts),
             requirements=tuple(requirements),
             cool_downs={n: c for n, c in self.cool_downs.items() if declared("profile", n, resource.profiles)},
+            by_hand={n: v for n, v in self.by_hand.items() if declared("parameter", n, resource.bound)},
+            learnt=self.learnt,
         )
         return found, lost
 

@@ -19,9 +19,10 @@ from rmpa.runtime.tasks import OwnedTasks
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from rmpa.resource.declare import Input, Output, Parameter
+    from rmpa.resource.declare import AlarmRule, Input, Output, Parameter
     from rmpa.resource.expression import Expression, Scalar, Source
     from rmpa.resource.quality import Value
+    from rmpa.resource.resource import Resource
     from rmpa.resource.runtime import Runtime
     from rmpa.ros.node.endpoints import Received, Subscriber
     from rmpa.ros.types.messages import MessageType
@@ -46,13 +47,14 @@ class ExpressionValues(RuntimePart):
         # Called with the references whose values have changed.
         self.listeners: list[Callable[[set[str]], None]] = []
         references: set[str] = set()
-        self._sources: dict[str, Source] = {}
+        # The functions that the expressions call, by their text.
+        self.sources: dict[str, Source] = {}
         for each in expressions:
             references.update(each.references)
-            self._sources.update(each.sources)
+            self.sources.update(each.sources)
         self._parameters = {reference for reference in references if reference.startswith("~")}
         self._fields = {text: TopicField(text) for text in references if text.startswith("/")}
-        self._attributes = references - self._parameters - self._fields.keys() - self._sources.keys()
+        self._attributes = references - self._parameters - self._fields.keys() - self.sources.keys()
         self._measured: Mapping[str, Value] = {}
         self._subscribers: dict[str, Subscriber] = {}
         # The topic of each input or output of the resource that a reference names, by the declared name.
@@ -85,7 +87,7 @@ class ExpressionValues(RuntimePart):
                 self._latest.pop(field.topic, None)  # without a publisher the value is unknown
             if (latest := self._latest.get(field.topic)) and (value := field.read(*latest)) is not None:
                 found[text] = value
-        for text, source in self._sources.items():
+        for text, source in self.sources.items():
             provider = self.providers.get(source.function)
             if provider is not None and (value := provider(*source.arguments)) is not None:
                 found[text] = value
@@ -115,14 +117,14 @@ class ExpressionValues(RuntimePart):
     def window_ended(self, measured: Mapping[str, Value]) -> None:
         """Take the values of a window."""
         self._measured = measured
-        self._changed(self._attributes | self._sources.keys())
+        self._changed(self._attributes | self.sources.keys())
 
     def received(self, item: Input, message: Received) -> None:
         """Keep the message of an input if an expression refers to its topic."""
         if item.name in self._taps:
             self._update(self._taps[item.name], message.kind, message.raw)
 
-    def published(self, output: Output, raw: bytes, now_ns: int) -> None:  # noqa: ARG002
+    def published(self, output: Output, raw: bytes, now_ns: int, caller: str = "") -> None:  # noqa: ARG002
         """Keep the message of an output if an expression refers to its topic."""
         if output.name in self._taps:
             self._update(self._taps[output.name], output.type, raw)
@@ -138,6 +140,10 @@ class ExpressionValues(RuntimePart):
     def _changed(self, references: set[str]) -> None:
         for listener in self.listeners if references else ():
             listener(references)
+
+    def uses(self, name: str) -> bool:
+        """Whether an expression has the messages of this input or output from the resource's own subscription."""
+        return name in self._taps
 
     async def _find_topics(self) -> None:
         """Look up the topics that expressions refer to, and subscribe to them, until all are found."""
@@ -162,6 +168,49 @@ class ExpressionValues(RuntimePart):
             self._subscribers[topic] = await node.subscribe(
                 topic, callback=lambda message: self._update(topic, message.kind, message.raw)
             )
+
+
+class Rules:
+    """The rules of one resource's alarms and profiles, judged once in each window.
+
+    Args:
+        resource: The resource, completely declared.
+        values: What the rules refer to.
+    """
+
+    def __init__(self, resource: Resource, values: ExpressionValues) -> None:
+        self._values = values
+        self._alarms = [(one, resource.expression(one.when, f"alarm {one.name}")) for one in resource.alarms.values()]
+        self._profiles = {
+            one.name: (one.rule, resource.expression(one.rule, f"profile {one.name}"))
+            for one in resource.profiles.values()
+            if one.rule
+        }
+        # The alarms that stand.
+        self.standing: dict[str, AlarmRule] = {}
+
+    def judge(self) -> list[tuple[AlarmRule, bool]]:
+        """The alarms that are raised (true) or over now; one whose rule is unknown stays as it is."""
+        values, changes = self._values.now() if self._alarms else {}, []
+        for alarm, rule in self._alarms:
+            holds, stands = rule.holds(values), alarm.name in self.standing
+            if holds is None or holds == stands:
+                continue
+            if holds:
+                self.standing[alarm.name] = alarm
+            else:
+                del self.standing[alarm.name]
+            changes.append((alarm, holds))
+        return changes
+
+    def blocked(self) -> dict[str, str]:
+        """The profiles whose rule is false, with the reason; an unknown rule blocks none."""
+        values = self._values.now() if self._profiles else {}
+        return {
+            name: f"its rule does not hold: {text}"
+            for name, (text, rule) in self._profiles.items()
+            if rule.holds(values) is False
+        }
 
 
 class TopicField:

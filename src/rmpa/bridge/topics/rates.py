@@ -25,7 +25,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.ros.http.rpc import call
 from rmpa.ros.node.subscription import PublisherConnection
-from rmpa.ros.wire.slave_api import read_bus_stats
+from rmpa.ros.wire.slave_api import read_bus_stats, sent_between
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.ros.wire.xmlrpc import RosFault
 from rmpa.runtime.tasks import OwnedTasks
@@ -147,13 +147,8 @@ class Rates(Part):
         self._counts[key] = now, sent
         if not sent and key in self._rates and self._rates[key].how == COUNTED:
             del self._rates[key]
-        same = [link for link in sent if link in before]
-        if same and now > at:
-            # Counters of the nodes have 32 bits; a slow subscriber's connection leaves messages out.
-            messages, size = max(
-                tuple((new - old) % 2**32 for new, old in zip(sent[link], before[link], strict=True)) for link in same
-            )
-            size = max(0, size - LENGTH.size * messages)  # both libraries count it
+        if now > at and (counted := sent_between(before, sent)) is not None:
+            messages, size = counted
             self._rates[key] = TopicRate(topic, messages / (now - at), size / (now - at), COUNTED)
 
     async def _sample(self, own: list[tuple[str, str, str, str]]) -> None:

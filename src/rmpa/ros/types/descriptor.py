@@ -31,6 +31,8 @@ class TopicDescriptor(msgspec.Struct, frozen=True):
         type: Name of the message type.
         contract: The contract's values that differ from the defaults, by key.
         required: For inputs only: whether the resource is stale without a publisher.
+        observed: Whether another node has the topic, and the resource only measures it.
+        label: The prefix of its measured attributes, where that is not made of its name.
     """
 
     name: str
@@ -38,10 +40,17 @@ class TopicDescriptor(msgspec.Struct, frozen=True):
     type: str
     contract: dict[str, str | int | float | None] = {}
     required: bool = True
+    observed: bool = False
+    label: str = ""
 
 
 class ParameterDescriptor(msgspec.Struct, frozen=True, kw_only=True):
-    """A parameter; ``type`` is the type's name in dynamic_reconfigure."""
+    """A parameter.
+
+    Attributes:
+        type: The type's name in dynamic_reconfigure.
+        binding: Where another node has the value: ``driver dynamic frame_rate``; empty: the resource itself has it.
+    """
 
     name: str
     type: str
@@ -51,6 +60,7 @@ class ParameterDescriptor(msgspec.Struct, frozen=True, kw_only=True):
     choices: tuple[bool | int | float | str, ...] = ()
     unit: str = ""
     description: str = ""
+    binding: str = ""
 
 
 class AttributeDescriptor(msgspec.Struct, frozen=True):
@@ -66,13 +76,21 @@ class AttributeDescriptor(msgspec.Struct, frozen=True):
 
 
 class ProfileDescriptor(msgspec.Struct, frozen=True, kw_only=True):
-    """A System Profile; ``offers`` has values by attribute, in the attributes' units."""
+    """A System Profile.
+
+    Attributes:
+        offers: Values by attribute, in the attributes' units, as its author declared them.
+        sets: The values of parameters in it, by name.
+        nodes: The declared nodes that must run in it, besides those that always run.
+    """
 
     name: str
     offers: dict[str, float | str]
     cost: float = 0.0
     best_effort: bool = False
     description: str = ""
+    sets: dict[str, bool | int | float | str] = {}
+    nodes: tuple[str, ...] = ()
 
 
 class ContextDescriptor(msgspec.Struct, frozen=True):
@@ -108,6 +126,20 @@ class DemandDescriptor(msgspec.Struct, frozen=True):
     priority: int = 0
 
 
+class NodeDescriptor(msgspec.Struct, frozen=True):
+    """A node that exists without the resource.
+
+    Attributes:
+        key: Its name in the declaration.
+        name: Its global name in the resource's module.
+        how: How it is started: ``run PACKAGE EXECUTABLE``, ``launch PACKAGE FILE``, ``command``; else ``attached``.
+    """
+
+    key: str
+    name: str
+    how: str = "attached"
+
+
 class Descriptor(msgspec.Struct, frozen=True, kw_only=True):
     """A whole resource.
 
@@ -119,6 +151,7 @@ class Descriptor(msgspec.Struct, frozen=True, kw_only=True):
         physical: Whether the resource has a real device; else it is simulated.
         description: A text for people.
         outputs: In the order of declaration, as are all the following.
+        file: Base name of the file that declares it, or empty.
     """
 
     version: int = VERSION
@@ -135,6 +168,8 @@ class Descriptor(msgspec.Struct, frozen=True, kw_only=True):
     contexts: tuple[ContextDescriptor, ...] = ()
     tasks: tuple[TaskDescriptor, ...] = ()
     asks: tuple[DemandDescriptor, ...] = ()
+    nodes: tuple[NodeDescriptor, ...] = ()
+    file: str = ""
 
     def serialize(self) -> str:
         """The descriptor as JSON."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 from rmpa.core.identity import is_global_name, is_legal_name
 from rmpa.core.limits import INT32_MAX
+from rmpa.ros.wire.tcpros import LENGTH
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -202,6 +203,23 @@ def read_bus_stats(answer: XmlRpcValue) -> dict[str, Sent]:
                         ]:
                             sent[number] = messages, size
     return found
+
+
+def sent_between(before: Sent, after: Sent) -> tuple[int, int] | None:
+    """Messages and bytes sent to one subscriber between two answers of a node; ``None`` if no connection lasted.
+
+    Of several connections that with the most counts: a slow subscriber's leaves messages out. Both libraries count
+    the length in front of each message, which is left out here, in counters of 32 bits.
+    """
+    found = [
+        tuple((new - old) % 2**32 for new, old in zip(sent, before[link], strict=True))
+        for link, sent in after.items()
+        if link in before
+    ]
+    if not found:
+        return None
+    messages, size = max(found)
+    return messages, max(0, size - LENGTH.size * messages)
 
 
 def _link(row: Sequence[XmlRpcValue]) -> BusLink | None:

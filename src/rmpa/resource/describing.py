@@ -1,0 +1,272 @@
+"""Writes a first description of a resource from what a live node shows (``rmpa resource describe``).
+
+What nearly every resource needs is active; all else that was found stands in comments, ready to be used.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from rmpa.config.settings import toml_value
+from rmpa.core.identity import is_legal_name
+from rmpa.resource.description import SUFFIX, read_description
+from rmpa.resource.resource import Role
+from rmpa.ros.types.definitions import known_types
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from rmpa.resource.declare import ParameterValue
+    from rmpa.resource.live import Knob, LiveGraph
+    from rmpa.ros.environment import NodeFacts
+
+# The name of a resource by the type of what it publishes.
+_NAMES: Final = {
+    "sensor_msgs/Image": "camera",
+    "sensor_msgs/CompressedImage": "camera",
+    "sensor_msgs/LaserScan": "laser",
+    "sensor_msgs/PointCloud2": "cloud",
+    "sensor_msgs/Imu": "imu",
+    "sensor_msgs/Range": "sonar",
+    "sensor_msgs/NavSatFix": "gps",
+    "nav_msgs/Odometry": "base",
+}
+_COMMANDS: Final = re.compile(r"(geometry_msgs/Twist|ackermann_msgs/|trajectory_msgs/JointTrajectory)|cmd|command")
+# Topics of every node, and those that image_transport's plugins add to each image.
+_OF_ALL: Final = re.compile(r"^/(rosout|diagnostics|clock)$|/parameter_(descriptions|updates)$|/bond$")
+_PLUGIN: Final = re.compile(r"/(compressed|compressedDepth|theora)$")
+_RATE: Final = re.compile(r"rate|fps|freq|hz", re.IGNORECASE)
+# Outputs, and inputs, that are active in the file.
+_ACTIVE: Final = 3
+# A smaller profile has so much of the present rate.
+_SMALLER: Final = 1 / 3
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What is known of the node that is described.
+
+    Args:
+        name: As the user writes it: ``/usb_cam``, ``arm:/usb_cam``.
+        facts: Its registrations in this graph.
+        live: What was seen while it was looked at.
+        server: The name of its dynamic_reconfigure server; empty: it has none.
+        started: How it seems to have been started.
+        seconds: For how long it was looked at.
+    """
+
+    name: str
+    facts: NodeFacts
+    live: LiveGraph
+    server: str = ""
+    started: Mapping[str, str | tuple[str, ...]] = field(default_factory=dict)
+    seconds: float = 0.0
+
+    @property
+    def knobs(self) -> Mapping[str, Knob]:
+        """The parameters of dynamic_reconfigure."""
+        return self.live.knobs.get(self.server, {})
+
+    @property
+    def outputs(self) -> list[str]:
+        """What it publishes, the most telling first: with a rate, then by bandwidth."""
+        topics = [topic for topic in self.facts.publications if not _OF_ALL.search(topic)]
+        flows = {topic: self.live.flows.get(topic, {}).get(self.facts.name) for topic in topics}
+
+        def telling(topic: str) -> tuple[bool, float, str]:
+            flow = flows[topic]
+            plugin = _PLUGIN.search(topic) is not None and topic.rpartition("/")[0] in self.facts.publications
+            return plugin, -flow.bandwidth if flow is not None else 0.0, topic
+
+        return sorted(topics, key=telling)
+
+    @property
+    def inputs(self) -> list[str]:
+        """What it subscribes to."""
+        return [topic for topic in self.facts.subscriptions if not _OF_ALL.search(topic)]
+
+    @property
+    def role(self) -> Role:
+        """The role that it seems to have."""
+        if any(_COMMANDS.search(f"{kind} {topic}") for topic, kind in self._kinds(self.inputs)):
+            return Role.ACTING
+        if any(_COMMANDS.search(f"{kind} {topic}") for topic, kind in self._kinds(self.outputs)):
+            return Role.CONTROLLING
+        sensing = any(kind in _NAMES for _, kind in self._kinds(self.outputs))
+        processing = any(kind in _NAMES for _, kind in self._kinds(self.inputs))
+        return Role.CONTROLLING if processing or (self.inputs and not sensing) else Role.SENSING
+
+    def _kinds(self, topics: Iterable[str]) -> Iterator[tuple[str, str]]:
+        yield from ((t, self.facts.publications.get(t) or self.facts.subscriptions.get(t, "*")) for t in topics)
+
+    @property
+    def title(self) -> str:
+        """A name for the resource, which must not be the node's own."""
+        base = self.name.rpartition("/")[2]
+        kinds = [kind for _, kind in self._kinds(self.outputs)] if self.role is not Role.CONTROLLING else []
+        name = next((_NAMES[kind] for kind in kinds if kind in _NAMES), base)
+        return f"{name}_resource" if self.name.rpartition(":")[2] == f"/{name}" else name
+
+
+def describe(found: Found, title: str = "") -> str:
+    """The text of a file, which ``read_description`` accepts.
+
+    Args:
+        found: What was found.
+        title: The resource's name; by default one that fits.
+
+    Raises:
+        ConfigError: A name of the node cannot stand in a description.
+    """
+    title = title or found.title
+    lines = [
+        f"# Written by `rmpa resource describe {found.name}`, which looked at it for {found.seconds:g} s.",
+        "# Lines with # are what else was found. `rmpa resource check FILE` compares the file with the live graph.",
+        *_assigned({"name": title, "role": found.role}),
+        *_node(found),
+    ]
+    labels: list[str] = []
+    for number, topic in enumerate(found.outputs):
+        lines += _topic(
+            found, "output", topic, labels, active=number < _ACTIVE and (not number or _flows(found, topic))
+        )
+    for number, topic in enumerate(found.inputs):
+        lines += _topic(found, "input", topic, labels, active=number < _ACTIVE)
+    pace = _pace(found)
+    for knob in found.knobs.values():
+        lines += _parameter(knob, active=knob is pace)
+    lines += [*_private(found), *_attributes(found), *_profiles(found, pace)]
+    text = "\n".join(lines) + "\n"
+    read_description(text.encode(), Path(f"{title}{SUFFIX}"))
+    return text
+
+
+def _assigned(values: Mapping[str, object]) -> list[str]:
+    return [f"{key} = {toml_value(value)}" for key, value in values.items()]
+
+
+def _table(kind: str, key: str, values: Mapping[str, object], *notes: str, active: bool = True) -> list[str]:
+    name = key if re.fullmatch(r"[\w-]+", key, re.ASCII) else toml_value(key)
+    sign = "" if active else "# "
+    body = [f"{sign}{line}" for line in (f"[{kind}.{name}]", *_assigned(values))]
+    return ["", *(f"# {note}" for note in notes), *body]
+
+
+def _node(found: Found) -> list[str]:
+    server = {"server": found.server} if found.server and found.server != found.facts.name else {}
+    lines = _table("node", "driver", {"name": found.facts.name} | server)
+    if found.started:
+        return [*lines, "# Start it too: (what is set here is guessed from its process)", *_commented(found.started)]
+    return [*lines, '# run = "PACKAGE EXECUTABLE", launch = "PACKAGE FILE" or command = ["PROGRAM"] would start it.']
+
+
+def _commented(values: Mapping[str, object]) -> list[str]:
+    return [f"# {line}" for line in _assigned(values)]
+
+
+def _flows(found: Found, topic: str) -> bool:
+    return found.live.rate(topic, found.facts.name) > 0
+
+
+def _topic(found: Found, kind: str, topic: str, labels: list[str], *, active: bool) -> list[str]:
+    type_name = (found.facts.publications if kind == "output" else found.facts.subscriptions)[topic]
+    parts = [part for part in topic.split("/") if part]
+    label = next(
+        (made for n in range(1, len(parts) + 1) if (made := "_".join(parts[-n:])) not in labels),
+        f"{kind}_{len(labels)}",
+    )
+    labels.append(label)
+    flow = found.live.flows.get(topic, {}).get(found.facts.name) if kind == "output" else None
+    note = f"{flow.rate:.3g} Hz, {flow.bandwidth / 1e3:.3g} kB/s" if flow is not None and flow.rate else ""
+    if kind == "output" and not note:
+        note = "no regular messages came"
+    if type_name == "*" or (not flow and type_name not in known_types() and kind == "input"):
+        active = False  # nothing says yet what it is
+    return _table(kind, label, {"topic": topic, "type": type_name}, *filter(None, [note]), active=active)
+
+
+def _pace(found: Found) -> Knob | None:
+    """The parameter that seems to say the rate, with room below its present value."""
+    for knob in found.knobs.values():
+        number = isinstance(knob.value, int | float) and not isinstance(knob.value, bool) and not knob.choices
+        if number and _RATE.search(knob.name) and knob.low is not None and _smaller(knob) < float(knob.value):
+            return knob
+    return None
+
+
+def _smaller(knob: Knob) -> float:
+    value = max(float(knob.value) * _SMALLER, knob.low or 0.0)
+    return max(1, round(value)) if isinstance(knob.value, int) else float(f"{value:.2g}")
+
+
+def _parameter(knob: Knob, *, active: bool) -> list[str]:
+    if not is_legal_name(knob.name) or "/" in knob.name:
+        return []
+    bounds = {"low": knob.low, "high": knob.high}
+    values: dict[str, object] = {"dynamic": knob.name, "default": _shown(knob.value, knob.type)}
+    values |= {key: int(bound) if knob.type == "int" else bound for key, bound in bounds.items() if bound is not None}
+    if knob.choices:
+        values["choices"] = tuple(_shown(value, knob.type) for value in knob.choices.values())
+    names = ", ".join(f"{value}: {name}" for name, value in knob.choices.items())
+    notes = filter(None, [" ".join(knob.description.split())[:110], names[:110]])
+    return _table("parameter", knob.name, values, *notes, active=active)
+
+
+def _shown(value: ParameterValue, kind: str = "") -> ParameterValue:
+    """A value whose text in TOML is of its own type: 30.0 is no whole number."""
+    return _Decimal(value) if kind == "double" or isinstance(value, float) else value
+
+
+class _Decimal(float):
+    """A number that has a point in TOML even where it is whole."""
+
+    def __format__(self, spec: str) -> str:
+        text = float.__format__(self, spec)
+        return text if re.search(r"[.en]", text) else f"{text}.0"
+
+
+def _private(found: Found) -> list[str]:
+    lines = []
+    for name, value in found.live.private.get(found.facts.name, {}).items():
+        if name not in found.knobs and isinstance(value, bool | int | float | str) and is_legal_name(name) and name:
+            values = {"private": name, "default": _shown(value)}
+            lines += _table(
+                "parameter", name, values, "Read at its start: the node must be started here.", active=False
+            )
+    return lines
+
+
+def _attributes(found: Found) -> list[str]:
+    lines = []
+    for name, values in found.live.diagnostics.items():
+        if found.live.status_of.get(name) != found.facts.name:
+            continue
+        for key, value in values.items():
+            if re.match(r"\s*[-+]?\d", value) and not {"'", '"'} & {*name, *key}:
+                label = re.sub(r"\W+", "_", key).strip("_").lower()
+                about = {"value": f"diagnostics('{name}', '{key}')", "better": "min"}
+                lines += _table("attribute", label, about, f"It says {value!r} there.", active=False)
+    if found.started:
+        lines += _table("attribute", "load", {"value": "cpu()", "better": "min"}, active=False)
+    return lines
+
+
+def _profiles(found: Found, pace: Knob | None) -> list[str]:
+    rate = found.live.rate(found.outputs[0], found.facts.name) if found.outputs else 0.0
+
+    def profile(name: str, value: float | None, hertz: float, rest: Mapping[str, object]) -> list[str]:
+        sets = f"{{ {pace.name} = {toml_value(_shown(value, pace.type))} }}" if pace and value is not None else ""
+        offers = f'{{ rate = "{hertz:.3g} Hz" }}' if hertz else "{ }"
+        middle = [f"set = {sets}"] if sets else []
+        return ["", f"[profile.{name}]", *middle, f"offers = {offers}", *_assigned(rest)]
+
+    if pace is None:
+        return profile("normal", None, rate, {"best_effort": True})
+    smaller = _smaller(pace)
+    return [
+        *profile("full", float(pace.value) if pace.type == "double" else int(pace.value), rate, {"cost": 2}),
+        *profile("small", smaller, rate * smaller / float(pace.value), {"cost": 1, "best_effort": True}),
+    ]
