@@ -214,7 +214,7 @@ def test_what_people_set_at_a_node_and_what_was_learnt_is_shown(
     background.do(one.configuration.set({"fps": 12, "profile": "full"}))
     explained = [" ".join(line.split()) for line in rmpa("profile", "explain", "camera")[1].splitlines()]
     assert "by hand: gain = 2.5, fps = 12; `rmpa profile set /camera --auto` gives it back" in explained
-    assert explained[-2].split()[1:] == "- small".split() + explained[-2].split()[3:]
+    assert explained[-2].split()[1:] == ["-", "small", *explained[-2].split()[3:]]
     assert explained[-2].endswith("s the resource starts")
     assert explained[-1].split()[1:3] == ["small", "full"]
     assert explained[-1].endswith("s full was chosen by hand")

@@ -12,10 +12,13 @@ until the operator sets what the profile wants. A node that has been started ane
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import logging
 import math
 from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
 
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
@@ -83,7 +86,9 @@ class Actuation(RuntimePart):
         for name, binding in self._bound.items():
             given = dict(text.partition(":=")[::2] for text in nodes[binding.node].args)
             if binding.kind is _ARGUMENT and binding.name in given:
-                self._known[name] = _read_argument(given[binding.name], parameters[name])
+                with contextlib.suppress(msgspec.ValidationError):
+                    kind = type(parameters[name].default)
+                    self._known[name] = msgspec.convert(given[binding.name], kind, strict=False)
         # By node: its whole configuration, whether it has come, and when it came or was set last.
         self._configs: dict[str, dict[str, ParameterValue]] = {}
         self._heard = {one.node: asyncio.Event() for one in self._bound.values() if one.kind is _DYNAMIC}
@@ -118,21 +123,6 @@ class Actuation(RuntimePart):
     async def close(self) -> None:
         """Follow nothing any more; the nodes keep their values."""
         await self._work.close()
-
-    def blocked(self) -> dict[str, str]:
-        """The profiles that cannot run, with the reason: a node does not run that nothing here starts."""
-        nodes = self._runtime.resource.nodes
-        absent = {key for key, one in nodes.items() if not one.started and self._processes.pid(key) is None}
-        return {
-            one.name: f"node {nodes[missing[0]].name} does not run"
-            for one in self._runtime.resource.profiles.values()
-            if (missing := sorted(absent & self._needed(one)))
-        }
-
-    def _needed(self, profile: Profile) -> set[str]:
-        """The nodes that run in a profile: its own, and those that no profile names."""
-        named = {key for one in self._runtime.resource.profiles.values() for key in one.nodes}
-        return (self._runtime.resource.nodes.keys() - named) | set(profile.nodes)
 
     async def apply(self, profile: Profile) -> None:
         """Have the profile's nodes run, then set its values, except those by hand.
@@ -183,18 +173,15 @@ class Actuation(RuntimePart):
                 self._show(parameter.name)
 
     async def _run_nodes(self, profile: Profile, values: Mapping[str, ParameterValue]) -> None:
-        """Have exactly the profile's nodes run. One that is started here is started with its values at once."""
-        named = set(profile.nodes)
-        absent = {key for key in self._needed(profile) if self._processes.pid(key) is None}
+        """Have exactly the profile's nodes run; one that is started for it is started with its values at once."""
+        absent = {key for key in self._runtime.resource.nodes if self._processes.pid(key) is None}
         for name, value in values.items():
             binding = self._bound[name]
             if binding.kind is _PRIVATE and binding.node in absent:
                 await self._set_private(name, value)
-        late = {key for key in absent if self._differing(key, values, _ARGUMENT)}
-        await _all(self._restart(key, values) for key in late - named)
-        if late & named:
-            await self._processes.require(named - late)  # ends those that may have the same device
-            await _all(self._restart(key, values) for key in late & named)
+        for key in absent:
+            if self._differing(key, values, _ARGUMENT):
+                await self._restart(key, values)  # before it is needed, it only takes the arguments
         await self._processes.require(profile.nodes)
 
     async def _set(self, values: Mapping[str, ParameterValue]) -> None:
@@ -398,16 +385,6 @@ class Actuation(RuntimePart):
             text = f"{value} by hand; profiles leave it alone" if name in self.by_hand else "no longer by hand"
             _log.info("= %s: parameter %s: %s", self._runtime.node.name, name, text)
             self.on_change()
-
-
-def _read_argument(text: str, parameter: Parameter) -> ParameterValue:
-    """The value of a launch argument; its text if it is none of the parameter's type."""
-    if isinstance(parameter.default, bool):
-        return text.lower() in ("true", "1")
-    try:
-        return type(parameter.default)(text)
-    except ValueError:
-        return text
 
 
 async def _all(work: Iterable[Awaitable[None]]) -> None:
