@@ -169,6 +169,18 @@ async def test_a_knob_that_is_turned_at_the_node_stays(core: RosCore, tmp_path: 
             assert (cam.values["frame_rate"], decision(one)["by_hand"]) == (10.0, {})
 
 
+async def test_a_value_by_hand_that_the_node_refuses_now_bars_no_profile(core: RosCore, tmp_path: Path) -> None:
+    state = tmp_path / "camera.json"
+    async with driver(core, frame_rate=25.0, gain=1.0) as cam:
+        async with running(core, camera(), state) as one:
+            await choose(one, fps=50)
+        cam.turn(frame_rate=25.0)
+        cam.accept = lambda asked: {name: min(value, 20.0) for name, value in asked.items()}
+        async with running(core, camera(), state) as one:
+            assert (one.adapter.adaptation.profile, decision(one)["by_hand"]) == ("small", {})
+            assert cam.values["frame_rate"] == 10.0
+
+
 async def test_parameters_of_the_resource_are_set_at_the_node(core: RosCore, node: Node) -> None:
     resource = camera()
     async with driver(core, frame_rate=25.0, gain=1.0) as cam, running(core, resource) as one:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from rmpa.resource.declare import Binding, Parameter, ParameterValue, Profile
     from rmpa.resource.processes import Processes
     from rmpa.resource.runtime import Runtime
-    from rmpa.ros.node.endpoints import Received
+    from rmpa.ros.node.endpoints import Received, Subscriber
 
 _log = logging.getLogger(__name__)
 _DYNAMIC, _PRIVATE, _ARGUMENT = BindingKind
@@ -93,6 +93,7 @@ class Actuation(RuntimePart):
         self._configs: dict[str, dict[str, ParameterValue]] = {}
         self._heard = {one.node: asyncio.Event() for one in self._bound.values() if one.kind is _DYNAMIC}
         self._touched: dict[str, float] = {}
+        self._updates: dict[str, Subscriber] = {}
         # The header of each node's connection; one that is new means that the node may have been started anew.
         self._headers: dict[str, Mapping[str, str]] = {}
         self._fresh: set[str] = set()
@@ -106,7 +107,7 @@ class Actuation(RuntimePart):
         if self._heard:
             self._service = await asyncio.to_thread(ServiceType, SERVICE_TYPE)
         for key in self._heard:
-            await node.subscribe(
+            self._updates[key] = await node.subscribe(
                 f"{nodes[key].name}/parameter_updates",
                 MessageType(CONFIG_TYPE),
                 functools.partial(self._configured, key),
@@ -132,9 +133,15 @@ class Actuation(RuntimePart):
         """
         async with self._lock:
             wanted = {name: value for name, value in profile.sets.items() if name in self._bound}
-            values = wanted | self.by_hand
-            await self._run_nodes(profile, values)
-            await self._set(values)
+            await self._run_nodes(profile, wanted | self.by_hand)
+            running = {name for name, one in self._bound.items() if self._processes.pid(one.node) is not None}
+            by_hand = {name: value for name, value in self.by_hand.items() if name in running}
+            try:
+                await self._set(by_hand)
+            except PeerRefused as error:  # the node has changed since; that must not bar all profiles
+                _log.warning("! %s: no longer by hand: %s [resource-trouble]", self._runtime.node.name, error)
+                self.release()
+            await self._set({name: value for name, value in wanted.items() if name not in self.by_hand})
             self._wanted = wanted
 
     async def set(self, values: Mapping[str, ParameterValue]) -> None:
@@ -259,6 +266,8 @@ class Actuation(RuntimePart):
         if key not in self._heard:
             return
         limit = self._runtime.resource.settings.apply_timeout
+        if not self._updates[key].publishers:
+            self._heard[key].clear()  # that was of a node that has ended
         try:
             async with asyncio.timeout(limit):
                 await self._heard[key].wait()

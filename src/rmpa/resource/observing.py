@@ -143,7 +143,7 @@ class Observing(RuntimePart):
                 if self._counted or self._inputs or self._nodes:
                     await self._look()
                     await self._count(self._publishers or {})
-            except RmpaError as error:
+            except (RmpaError, RosFault) as error:
                 _log.debug("! %s: %s", self._runtime.node.name, error)
             await asyncio.sleep(period)
 
