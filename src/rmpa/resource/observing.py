@@ -55,8 +55,7 @@ class Observing(RuntimePart):
         self._values = values
         # Called with an output, and what each of its publishers has sent, and when.
         self.on_counts: Callable[[str, Mapping[str, Sent], float], None] = lambda _output, _sent, _now: None
-        # Nodes that are needed and not started here, by their global names; and those of them that run.
-        self._nodes = {one.name: one.key for one in runtime.resource.nodes.values() if not one.started}
+        # All nodes that the master knows.
         self._present: set[str] = set()
         resource, node = runtime.resource, runtime.node.name
         # Observed outputs, and those of them that are counted, by global name.
@@ -82,7 +81,7 @@ class Observing(RuntimePart):
                 self._counted[topic] = output
             else:
                 await self._runtime.observe(output, functools.partial(self._received, output))
-        if self._outputs or self._inputs or self._nodes:
+        if self._outputs or self._inputs or self._runtime.resource.nodes:
             with contextlib.suppress(RmpaError):
                 await self._look()
             self._work.add(keep_task(self._watch, f"observe for {self._runtime.resource.name}"))
@@ -93,7 +92,8 @@ class Observing(RuntimePart):
 
     def problems(self) -> tuple[list[str], list[str]]:
         """Topics that no node publishes, and publishers of another type."""
-        missing, broken = [], []
+        absent, named = self._absent()
+        missing, broken = [f"node {name} does not run" for key, name in absent.items() if key not in named], []
         for topic, output in self._outputs.items():
             subscriber = self._runtime.subscriber(output.name)
             if subscriber is None and (self._publishers is None or self._publishers.get(topic)):
@@ -110,15 +110,20 @@ class Observing(RuntimePart):
 
     def blocked(self) -> dict[str, str]:
         """The profiles that cannot run, with the reason: a node does not run that nothing here starts."""
-        profiles = self._runtime.resource.profiles.values()
-        named = {key for one in profiles for key in one.nodes}
-        absent = {key: name for name, key in self._nodes.items() if self._said and name not in self._present}
+        absent, named = self._absent()
         return {
             one.name: f"node {name} does not run"
-            for one in profiles
+            for one in self._runtime.resource.profiles.values()
             for key, name in absent.items()
             if key not in named or key in one.nodes
         }
+
+    def _absent(self) -> tuple[dict[str, str], set[str]]:
+        """The nodes that nothing here starts and that do not run, by their keys, and those that profiles name."""
+        resource = self._runtime.resource
+        others = {one.key: one.name for one in resource.nodes.values() if not one.started and self._said}
+        named = {key for one in resource.profiles.values() for key in one.nodes}
+        return {key: name for key, name in others.items() if name not in self._present}, named
 
     def _received(self, output: Output, message: Received) -> None:
         """Change to counters if the topic carries much."""
@@ -140,7 +145,7 @@ class Observing(RuntimePart):
         period = min(max(self._runtime.resource.settings.window, _LEAST), _MOST)
         while True:
             try:
-                if self._counted or self._inputs or self._nodes:
+                if self._counted or self._inputs or self._runtime.resource.nodes:
                     await self._look()
                     await self._count(self._publishers or {})
             except (RmpaError, RosFault) as error:
@@ -159,8 +164,7 @@ class Observing(RuntimePart):
                 known = {str(topic): list(map(str, names)) for topic, names in published}  # type: ignore[misc, arg-type]
                 mine = self._outputs.keys() | self._inputs.keys()
                 self._publishers = {topic: [n for n in known.get(topic, ()) if n != node.name] for topic in mine}
-                present = {str(name) for _, names in (*published, *subscribed, *served) for name in names}  # type: ignore[misc, union-attr]
-                self._present = present & self._nodes.keys()
+                self._present = {str(name) for _, names in (*published, *subscribed, *served) for name in names}  # type: ignore[misc, union-attr]
                 self._said, self._uris = said, {}
 
     async def _count(self, publishers: Mapping[str, Sequence[str]]) -> None:

@@ -53,11 +53,6 @@ class Processes(RuntimePart):
         """The process of a node."""
         return self._pids.get(key)
 
-    def problems(self) -> tuple[list[str], list[str]]:
-        """Nodes that do not run."""
-        nodes = self._runtime.resource.nodes
-        return [f"node {nodes[key].name} does not run" for key, pid in self._pids.items() if pid is None], []
-
     async def _watch(self) -> None:
         while True:
             for key in self._runtime.resource.nodes:
