@@ -213,6 +213,7 @@ class Restarts:
     def __init__(self) -> None:
         self.done: list[Any] = []
         self.up = {"cam"}
+        self.bad = ""
 
     async def start(self) -> None: ...
 
@@ -222,6 +223,8 @@ class Restarts:
 
     async def restart(self, key: str, *, args: Any = {}) -> None:  # noqa: B006
         self.done.append((key, dict(args)))
+        if self.bad and self.bad in args.values():
+            raise PeerRefused("node /cam", "it has ended with code 1")
 
     def pid(self, key: str) -> int | None:
         return 7 if key in self.up else None
@@ -261,6 +264,10 @@ async def test_private_parameters_and_arguments_restart_the_node(core: RosCore, 
         assert await node.get_param("/cam/live") == 7.0
         assert stand_in.done == [[], ("cam", {"mode": "fast"}), [], ("cam", {"mode": "slow"})][: len(stand_in.done)]
         assert (await node.get_param("/cam/size"), len(stand_in.done)) == (2, 4)
+        stand_in.bad = "fast"
+        with pytest.raises(Exception, match="it has ended with code 1"):
+            await choose(one, profile="full")
+        assert stand_in.done[5:7] == [("cam", {"mode": "fast"}), ("cam", {"mode": "slow"})]  # and undone
         await node.set_param("/cam/live", 9.0)  # as rosparam does
         await until(lambda: decision(one)["by_hand"] == {"live": 9.0})
     finally:

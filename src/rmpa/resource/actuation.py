@@ -197,7 +197,9 @@ class Actuation(RuntimePart):
         for name, value in values.items():
             nodes.setdefault(self._bound[name].node, {})[name] = value
         await _all(self._read(key) for key in nodes)
-        before = dict(self._known)
+        parameters = self._runtime.resource.parameters
+        defaults = {name: parameters[name].default for name, one in self._bound.items() if one.kind is _ARGUMENT}
+        before = defaults | self._known
         todo = {key: wanted for key, wanted in nodes.items() if self._differing(key, wanted)}
         outcomes = await asyncio.gather(*(self._set_node(*each) for each in todo.items()), return_exceptions=True)
         if failed := next((one for one in outcomes if isinstance(one, BaseException)), None):
@@ -254,8 +256,8 @@ class Actuation(RuntimePart):
         if key in self._heard:
             self._heard[key].clear()
         texts = {self._bound[n].name: str(v).lower() if v in (True, False) else str(v) for n, v in arguments.items()}
+        self._known |= arguments  # also if that fails: what is undone differs then
         await self._processes.restart(key, args=texts)
-        self._known |= arguments
 
     async def _read(self, key: str) -> None:
         """Wait until the dynamic parameters of a node are known.
