@@ -79,9 +79,11 @@ class ResourceNode:
         self.values = ExpressionValues(self.runtime, resource.expressions())
         self.actuation = Actuation(self.runtime, self.processes)
         stop = stop if stop is not None else asyncio.Event()
-        self.adapter = Adapter(self.runtime, self.values, self.tasks, self.actuation, stop)
+        observing = Observing(self.runtime, self.values)
+        self.adapter = Adapter(self.runtime, self.values, self.tasks, self.actuation, observing, stop)
         self.adapter.processes = self.processes
         self.processes.on_change = self.adapter.node_changed
+        observing.profile = lambda: self.adapter.adaptation.profile
         self.contexts = Contexts(self.runtime, self.values, self.tasks, self.adapter)
         self.configuration = Reconfigure(self.runtime, self.tasks, self.actuation, self.adapter, self.contexts)
         self.demands = Demands(self.runtime)
@@ -92,8 +94,8 @@ class ResourceNode:
             Sources(self.runtime, self.values, self.processes),
             self.tasks,
             self.actuation,
+            observing,
             self.adapter,
-            Observing(self.runtime, self.values, self.adapter),
             self.contexts,
             self.configuration,
             self.demands,
