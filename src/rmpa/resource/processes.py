@@ -60,8 +60,18 @@ _BACK: Final = 1.0
 # Seconds that a node has to answer getPid.
 _ANSWER: Final = 2.0
 # Lines of a log that an error has at its end, and the most characters of them.
-_LOG_SHOWN: Final = 3
+_LOG_SHOWN: Final = 8
 _LOG_TEXT: Final = 400
+# Begins of lines of a log that say nothing: the command line, and what roslaunch has to say at its end.
+_EMPTY: Final = ("--- ", "shutting down processing", "... shutting down", "done", "all processes on machine")
+
+
+class NodeFailed(PeerRefused):
+    """A node of a resource is not up, and does not come up."""
+
+    def __str__(self) -> str:
+        """``node /camera has ended with code 1 …; what to do``."""
+        return f"{self.peer} {self.reason}" + (f"; {self.remedy}" if self.remedy else "")
 
 
 class NodeState(StrEnum):
@@ -180,8 +190,8 @@ class Processes(RuntimePart):
         if key not in self._wanted:
             return
         if not node.own and node.state is NodeState.RUNNING:
-            problem = f"node {node.declared.name} runs, and was not started by {self._runtime.resource.name}"
-            raise PeerRefused("its process", problem, "end it: the resource then starts it itself")
+            problem = f"runs, and was not started by {self._runtime.resource.name}"
+            raise NodeFailed(f"node {node.declared.name}", problem, "end it: the resource then starts it itself")
         await node.down()
         await node.up()
         node.restarts += 1
@@ -522,16 +532,16 @@ class _Supervised:
             self._process.poll()  # it is reaped
             self._process = None
 
-    def _refused(self, why: str, remedy: str = "") -> PeerRefused:
+    def _refused(self, why: str, remedy: str = "") -> NodeFailed:
         self._problem = why
-        return PeerRefused("its process", f"node {self.declared.name} {why}", remedy, code="resource-trouble")
+        return NodeFailed(f"node {self.declared.name}", why, remedy, code="resource-trouble")
 
     async def _log_end(self) -> str:
         """The end of its log, for texts."""
         if self.log is None or not self.own:
             return ""
         lines, _ = await asyncio.to_thread(read_log, self.log, None, _LOG_SHOWN)
-        told = " / ".join(line for line in lines if line and not line.startswith("--- "))
+        told = " / ".join(line for line in lines if line.strip() and not line.startswith(_EMPTY))
         return f"; its log ends: {told[-_LOG_TEXT:]}" if told else ""
 
 
