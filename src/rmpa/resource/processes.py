@@ -16,7 +16,7 @@ import shlex
 import signal
 import time
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.core.timers import Backoff
@@ -31,7 +31,6 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.programs import (
     LOGS,
     RUNS,
-    CpuShares,
     NodeRun,
     ProgramMark,
     ResourceRun,
@@ -87,30 +86,6 @@ class NodeState(StrEnum):
     FAILED = "failed"
 
 
-class ProcessFigures(NamedTuple):
-    """What one node costs.
-
-    Attributes:
-        node: Its name in the graph.
-        pid: Its process; ``None``: it does not run.
-        cpu: Processor time as a share of one core since it was last asked for.
-        rss: Bytes of memory that it holds.
-        restarts: How often it was started again.
-        since: Since when it runs, in Unix seconds; 0: it does not.
-        state: Its state.
-        own: Whether the resource has started it.
-    """
-
-    node: str
-    pid: int | None
-    cpu: float
-    rss: int
-    restarts: int
-    since: float
-    state: NodeState
-    own: bool
-
-
 class Processes(RuntimePart):
     """The part that sees to it that the nodes run which the present profile needs.
 
@@ -135,7 +110,6 @@ class Processes(RuntimePart):
         self._wanted: set[str] = set()
         # Called when a wanted node has ended (true), and when it runs again (false), with a text for people.
         self.on_change: Callable[[ManagedNode, str, bool], None] = lambda _node, _text, _ended: None
-        self._shares = CpuShares()
         self._work = OwnedTasks()
         self._writes = asyncio.Lock()
         self._noted: ResourceRun | None = None
@@ -200,18 +174,6 @@ class Processes(RuntimePart):
         """The process of a node; ``None``: it does not run."""
         node = self._nodes[key]
         return node.pid if node.state is NodeState.RUNNING else None
-
-    def info(self) -> list[ProcessFigures]:
-        """The figures of all nodes that the resource names."""
-        found = []
-        for key, node in self._nodes.items():
-            pid = self.pid(key)
-            about = figures(pid) if pid is not None else None
-            cpu, rss = (self._shares.of(pid, about), about.rss) if pid is not None and about is not None else (0.0, 0)
-            found.append(
-                ProcessFigures(node.declared.name, pid, cpu, rss, node.restarts, node.since, node.state, own=node.own)
-            )
-        return found
 
     def problems(self) -> tuple[list[str], list[str]]:
         """The wanted nodes that do not run."""
