@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,10 +30,12 @@ role = "sensing"
 name = "/driver"
 run = "seat talker"
 args = ["--name", "driver", "--topic", "/frames", "--type", "String"]
+env = { ROS_PACKAGE_PATH = "PACKAGES" }
 
 [node.second]
 name = "/far/second"
 launch = "second.launch"
+env = { ROS_PACKAGE_PATH = "PACKAGES:/usr/share" }
 
 [output.frames]
 topic = "/frames"
@@ -53,25 +54,16 @@ PYTHONPATH={PATHS}:$PYTHONPATH exec {PYTHON} {NODES}/talker.py "$@"
 """
 
 
-def folder(home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(home: Path) -> Path:
     """A folder with the camera, which is the same for all modules of a test, and a package of its nodes."""
     (made := home / "resources").mkdir()
-    (made / "camera.resource.toml").write_text(CAMERA)
+    (made / "camera.resource.toml").write_text(CAMERA.replace("PACKAGES", str(home / "packages")))
     (made / "second.launch").write_text(LAUNCH)
     (package := home / "packages" / "seat").mkdir(parents=True)
     (package / "package.xml").write_text("<package><name>seat</name></package>")
     (package / "talker").write_text(TALKER)
     (package / "talker").chmod(0o755)
-    monkeypatch.setattr(Agent, "env", property(_with_packages(home / "packages")))
     return made
-
-
-_ENV: Final = Agent.env.fget
-
-
-def _with_packages(path: Path) -> Callable[[Agent], dict[str, str]]:
-    """The environment of an agent in a shell where a workspace is sourced."""
-    return lambda agent: {**_ENV(agent), "ROS_PACKAGE_PATH": f"{path}:/usr/share"}  # type: ignore[misc]  # it has one
 
 
 def camera(agent: Agent, module: str = "b") -> dict[str, Any]:
@@ -99,10 +91,8 @@ def ends(pid: int) -> None:
     eventually(lambda: figures(pid) is None, LONG, what=f"process {pid} ends")
 
 
-def test_nodes_of_another_seat_are_started_read_taken_over_and_ended(
-    tmp_path: Path, modules: ModuleFactory, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = f'[resources]\nfolder = "{folder(tmp_path, monkeypatch)}"\nopen = true\n'
+def test_nodes_of_another_seat_are_started_read_taken_over_and_ended(tmp_path: Path, modules: ModuleFactory) -> None:
+    config = f'[resources]\nfolder = "{folder(tmp_path)}"\nopen = true\n'
     a, b = modules("a", "b", config=config, fresh=True, log_level="info")
     assert camera(a.agent)["state"] == "stopped"
     code, output = a.agent.rmpa("resource", "start", "b:camera", timeout=LONG)
@@ -145,12 +135,10 @@ def test_nodes_of_another_seat_are_started_read_taken_over_and_ended(
         ends(one["pid"])
 
 
-def test_an_agent_that_ends_in_order_ends_what_it_has_started(
-    tmp_path: Path, modules: ModuleFactory, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = CAMERA + "\n[start]\nboot = true\ntopics = ['/rosout']\n"
-    place = folder(tmp_path, monkeypatch)
-    (place / "camera.resource.toml").write_text(text)
+def test_an_agent_that_ends_in_order_ends_what_it_has_started(tmp_path: Path, modules: ModuleFactory) -> None:
+    place = folder(tmp_path)
+    with (place / "camera.resource.toml").open("a") as file:
+        file.write("\n[start]\nboot = true\ndelay = '100 ms'\n")
     (b,) = modules("b", config=f'[resources]\nfolder = "{place}"\n', fresh=True, log_level="info")
     started = nodes(b.agent)
     assert b.agent.terminate(LONG) == 0
@@ -159,9 +147,9 @@ def test_an_agent_that_ends_in_order_ends_what_it_has_started(
 
 
 def test_a_member_without_the_permission_and_a_stranger_start_nothing(
-    tmp_path: Path, modules: ModuleFactory, lab: Lab, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, modules: ModuleFactory, lab: Lab
 ) -> None:
-    place = folder(tmp_path, monkeypatch)
+    place = folder(tmp_path)
     SecuredMesh(tmp_path, "a").add("b", "c")
     config = f"""
 [trust]

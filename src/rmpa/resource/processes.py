@@ -360,7 +360,7 @@ class _Supervised:
         """Start it, and return its process once it is up."""
         node, declared = self._runtime.node, self.declared
         try:
-            command = await asyncio.to_thread(command_of, declared, self.arguments, os.environ)
+            command = await asyncio.to_thread(command_of, declared, self.arguments, {**os.environ, **declared.env})
             for key, value in declared.params.items():
                 await call_api(node.master_uri, "setParam", node.name, f"{declared.name}/{key}", value)
             await asyncio.shield(start_task(self._spawn(command), f"start {declared.name}", raises=(OSError,)))
