@@ -418,20 +418,17 @@ class _Supervised:
                 self._backoff.reset()
                 self._failures = 0
             self._failures += 1
-            own = self.own
+            own, final = self.own, self._final(code)
             delay = self._backoff.delay() if own else _BACK
             text = _how_ended(code)
-            again = self._again(code)
-            if not again and own:
-                text += f", and is not started again ({self._never(code)})"
+            if final:
+                text += f", and is not started again ({final})"
                 self._given_up = time.monotonic()
-            self._set(NodeState.WAITING if again else NodeState.FAILED, text + await self._log_end())
+            self._set(NodeState.FAILED if final else NodeState.WAITING, text + await self._log_end())
             _log.warning("! %s: node %s %s [node-gone]", self._runtime.node.name, self.declared.name, self.why)
             self._owner.on_change(self.declared, f"node {self.declared.name} {self.why}", True)
             await self._end()  # roslaunch, whose node has ended; what is left of its group
-            if not again:
-                return
-            if not await self._again_up(delay):
+            if final or not await self._again_up(delay):
                 return
             self.restarts += own
             self._owner.on_change(self.declared, f"node {self.declared.name} runs again", False)
@@ -450,18 +447,16 @@ class _Supervised:
                 self._set(NodeState.WAITING, why)
             delay = self._backoff.delay() if own else _BACK
 
-    def _again(self, code: int | None) -> bool:
-        """Whether it is started again, or expected."""
-        policy, own = self.declared.restart, self.own
-        if not own:
-            return True
-        wanted = policy is RestartPolicy.ALWAYS or (policy is RestartPolicy.ON_FAILURE and code != 0)
-        return wanted and self._failures < limits.NODE_FAILURES_MAX
-
-    def _never(self, code: int | None) -> str:
+    def _final(self, code: int | None) -> str:
+        """Why it is not started again; empty: it is, or is expected where it was not started here."""
+        policy = self.declared.restart
+        if not self.own:
+            return ""
         if self._failures >= limits.NODE_FAILURES_MAX:
             return f"{self._failures} times in a row"
-        return f'restart = "{self.declared.restart}"' + (", and it ended in order" if code == 0 else "")
+        if policy is RestartPolicy.ALWAYS or (policy is RestartPolicy.ON_FAILURE and code != 0):
+            return ""
+        return f'restart = "{policy}"' + (", and it ended in order" if code == 0 else "")
 
     async def _gone(self) -> int | None:
         """Wait until its process has ended; return the exit code, if it is known."""
