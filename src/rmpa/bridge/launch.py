@@ -185,7 +185,7 @@ class Launcher(Part):
                 lost[name] = f"waits for {', '.join(missing)}, which is not in the folder"
             if name in lost:
                 one.state, one.why = "failed", lost[name]
-                _log.warning("! resource %s is not started: it %s [%s]", name, lost[name], REFUSED)
+                _log.warning("! resource %s is not started: it %s [launch-refused]", name, lost[name])
             elif not one.runs:
                 one.state = "waiting"
                 self._waiting[name] = rule
