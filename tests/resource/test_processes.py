@@ -217,6 +217,16 @@ async def test_a_restart_gives_arguments_and_another_process(make: Make) -> None
     assert one.processes.pid("rest") is None, "its profile does not run"
 
 
+async def test_a_script_that_ends_in_order_behind_its_node_is_not_started_again(make: Make) -> None:
+    one = make(described((), laser=()))
+    words = ("sh", "-c", f"{' '.join(TINY)} /laser; sleep 0.1; exit 0")
+    one.processes._nodes["laser"].declared = ManagedNode("laser", "/laser", command=words)
+    await one.start()
+    os.kill(await runs(one, "laser"), signal.SIGTERM)
+    await until(lambda: one.runtime.problems()[1])
+    assert 'not started again (restart = "on-failure", and it ended in order)' in one.runtime.problems()[1][0]
+
+
 async def test_a_deaf_program_is_killed_in_time(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rmpa.runtime.programs._TERMINATED", 0.1)
     env = {**os.environ, "ROS_MASTER_URI": core.uri}

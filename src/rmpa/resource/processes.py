@@ -168,7 +168,6 @@ class Processes(RuntimePart):
             raise NodeFailed(f"node {node.declared.name}", problem, "end it: the resource then starts it itself")
         await node.down()
         await node.up()
-        node.restarts += 1
 
     def pid(self, key: str) -> int | None:
         """The process of a node; ``None``: it does not run."""
@@ -364,7 +363,7 @@ class _Supervised:
             for key, value in declared.params.items():
                 await call_api(node.master_uri, "setParam", node.name, f"{declared.name}/{key}", value)
             await asyncio.shield(start_task(self._spawn(command), f"start {declared.name}", raises=(OSError,)))
-        except (OSError, RmpaError) as error:
+        except (OSError, ValueError, RmpaError) as error:  # ValueError: of the words of ``run`` and ``launch``
             raise self._refused(f"cannot be started: {error}") from None
         return await self._wait()
 
@@ -468,6 +467,7 @@ class _Supervised:
         waits = [start_task(ended(pid), f"end of process {pid}") for pid in pids]
         try:
             await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(waits, timeout=_BACK)  # a script that has run the node ends behind it, with its code
         finally:
             await end_tasks(*waits)
         return self._code()
