@@ -14,6 +14,8 @@ from lab.bed.agents import RMPA, Agent
 from lab.bed.namespaces import Lab
 from lab.bed.processes import Process, eventually
 from lab.bed.ros import NODES as COMMON
+from rmpa.bridge.launched import LaunchedResource, ModuleResources
+from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.runtime.programs import figures
 from tests.interop.conftest import ModuleFactory
 from tests.interop.ros import NODES, PYTHON
@@ -66,8 +68,8 @@ def folder(home: Path) -> Path:
     return made
 
 
-def camera(agent: Agent, module: str = "b") -> dict[str, Any]:
-    """What a list at an agent tells of the camera of a module."""
+def listed(agent: Agent, module: str = "b") -> dict[str, Any]:
+    """What ``rmpa resource list`` at an agent shows of the camera of a module."""
     code, output = agent.rmpa("resource", "list", "--json", timeout=LONG)
     assert code == 0, output
     wanted = None if module == agent.name else module
@@ -75,15 +77,28 @@ def camera(agent: Agent, module: str = "b") -> dict[str, Any]:
     return next((one for one in found if one["name"] == "/camera" and one["peer"] == wanted), {})
 
 
-def nodes(agent: Agent) -> dict[str, Any]:
-    """The nodes of the camera, by name, once all of them run."""
+def camera(agent: Agent, module: str = "b") -> LaunchedResource | None:
+    """What an agent tells of the camera of a module."""
+    with ControlClient(choose_agent(agent.env, agent.name).path, LONG) as client:
+        told = client.call("launch", tuple[ModuleResources, ...], what="list")
+    return next((one for each in told if each.module == module for one in each.resources), None)
 
-    def find() -> dict[str, Any]:
-        its = camera(agent).get("processes") or []
-        return {one["node"]: one for one in its} if its and all(one["pid"] for one in its) else {}
 
-    found: dict[str, Any] = eventually(find, LONG, what="the nodes run")
-    return found
+def state(agent: Agent, module: str = "b") -> str:
+    """The state of the camera of a module; empty: it is not told."""
+    one = camera(agent, module)
+    return one.state if one is not None else ""
+
+
+def nodes(agent: Agent) -> dict[str, int]:
+    """The processes of the camera's nodes, by name, once all of them run."""
+
+    def find() -> dict[str, int]:
+        its = one.processes if (one := camera(agent)) is not None else ()
+        found = {each.node: each.pid for each in its if each.pid is not None and each.own}
+        return found if len(found) == 2 else {}
+
+    return eventually(find, LONG, what="the nodes run")
 
 
 def ends(pid: int) -> None:
@@ -94,14 +109,13 @@ def ends(pid: int) -> None:
 def test_nodes_of_another_seat_are_started_read_taken_over_and_ended(tmp_path: Path, modules: ModuleFactory) -> None:
     config = f'[resources]\nfolder = "{folder(tmp_path)}"\nopen = true\n'
     a, b = modules("a", "b", config=config, fresh=True, log_level="info")
-    assert camera(a.agent)["state"] == "stopped"
+    assert listed(a.agent)["state"] == "stopped"
     code, output = a.agent.rmpa("resource", "start", "b:camera", timeout=LONG)
     assert code == 0, output
     assert "b:camera is active" in output
     first = nodes(a.agent)
     assert first.keys() == {"/driver", "/far/second"}
-    assert all(one["own"] and one["rss"] > 1_000_000 for one in first.values())
-    assert "camera" not in str(camera(a.agent, "a")["pid"])
+    assert state(a.agent, "a") == "stopped"
     a.wait_topic("/second", LONG)
     command = a.host.command([RMPA, "resource", "log", "b:camera", "-f"])
     with Process(command, env={**a.agent.env, "RMPA_AGENT": "a"}, name="rmpa resource log") as follows:
@@ -112,27 +126,29 @@ def test_nodes_of_another_seat_are_started_read_taken_over_and_ended(tmp_path: P
     (told,) = json.loads(output)["modules"]
     started = {one["node"]: one["started_by"] for one in told["nodes"]}
     assert started["/driver"] == started["/far/second"] == "camera"
-    assert {one["pid"] for one in told["nodes"]} >= {one["pid"] for one in first.values()}
+    assert {one["pid"] for one in told["nodes"]} >= {*first.values()}
+    assert all(each["rss"] > 1_000_000 for each in listed(a.agent)["processes"])
 
-    pid = camera(a.agent)["pid"]
+    def process() -> int | None:
+        return one.pid if (one := camera(a.agent)) is not None else None
+
+    pid = process()
+    assert pid is not None
     b.agent.kill()
     b.agent.restart()
     a.agent.wait_peer("b", LONG)
-    eventually(lambda: camera(a.agent).get("state") == "active", LONG, what="the next agent finds it")
-    assert camera(a.agent)["pid"] == pid
-    assert {name: one["pid"] for name, one in nodes(a.agent).items()} == {
-        name: one["pid"] for name, one in first.items()
-    }
+    eventually(lambda: state(a.agent) == "active", LONG, what="the next agent finds it")
+    assert process() == pid
+    assert nodes(a.agent) == first
 
     os.kill(pid, signal.SIGKILL)
-    eventually(lambda: camera(a.agent).get("pid") not in (None, pid), LONG, what="it is started again")
-    assert {name: one["pid"] for name, one in nodes(a.agent).items()} == {
-        name: one["pid"] for name, one in first.items()
-    }
+    eventually(lambda: process() not in (None, pid), LONG, what="it is started again")
+    eventually(lambda: state(a.agent) == "active", LONG, what="it is active")
+    assert nodes(a.agent) == first
     code, output = a.agent.rmpa("resource", "stop", "b:camera", timeout=LONG)
     assert (code, "b:camera is stopped" in output) == (0, True), output
-    for one in first.values():
-        ends(one["pid"])
+    for each in first.values():
+        ends(each)
 
 
 def test_an_agent_that_ends_in_order_ends_what_it_has_started(tmp_path: Path, modules: ModuleFactory) -> None:
@@ -142,8 +158,8 @@ def test_an_agent_that_ends_in_order_ends_what_it_has_started(tmp_path: Path, mo
     (b,) = modules("b", config=f'[resources]\nfolder = "{place}"\n', fresh=True, log_level="info")
     started = nodes(b.agent)
     assert b.agent.terminate(LONG) == 0
-    for one in started.values():
-        ends(one["pid"])
+    for each in started.values():
+        ends(each)
 
 
 def test_a_member_without_the_permission_and_a_stranger_start_nothing(
@@ -170,14 +186,14 @@ open = true
     for name in ("../camera", "/etc/passwd", "camera.resource.toml\n", "other"):
         code, output = b.agent.rmpa("resource", "start", f"a:{name}")
         assert code in (1, 2), output
-    assert camera(a.agent, "a")["state"] == "stopped"
-    assert camera(c.agent, "a") == {}, "it is not named to those that may not"
+    assert state(a.agent, "a") == "stopped"
+    assert camera(c.agent, "a") is None, "it is not named to those that may not"
     assert "c may not start /camera" in a.agent.process.output
     stranger = ["setpriv", "--reuid", "65534", "--regid", "65534", "--clear-groups"]
     command = a.host.command([*stranger, RMPA, "resource", "start", "camera"])
     with Process(command, env={**a.agent.env, "RMPA_AGENT": "a"}, name="another user") as other:
         assert other.wait(LONG) != 0
-    assert camera(a.agent, "a")["state"] == "stopped"
+    assert state(a.agent, "a") == "stopped"
     code, output = b.agent.rmpa("resource", "start", "a:camera", timeout=LONG)
     assert (code, "a:camera is active" in output) == (0, True), output
     assert b.agent.rmpa("resource", "stop", "a:camera", timeout=LONG)[0] == 0
