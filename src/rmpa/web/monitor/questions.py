@@ -28,6 +28,7 @@ from rmpa.ros.types.descriptor import SERVICE_TYPE
 from rmpa.trust.permissions import InviteReply
 from rmpa.web.hub.params import value_at
 from rmpa.web.monitor import limits
+from rmpa.web.monitor.descriptions import Descriptions
 from rmpa.web.monitor.driving import TYPES
 from rmpa.web.monitor.messages import cut_text
 from rmpa.web.monitor.state import module_facts, node_key, shown_node
@@ -48,17 +49,21 @@ Args: TypeAlias = dict[str, Any]  # the edge: each question has its own
 # All questions, each with the right (``Rights``) that a page needs for it; the method ``_QUESTION`` answers it.
 QUESTIONS: Final = {
     **dict.fromkeys(("why", "agent", "contract", "node", "describe", "message", "past", "graph", "types"), ""),
-    **dict.fromkeys(("driven", "log", "log_levels"), ""),
+    **dict.fromkeys(("driven", "log", "log_levels", "launches", "top"), ""),
     **dict.fromkeys(("params", "param_names"), "view"),
     **dict.fromkeys(
         ("set_param", "delete_param", "set_log_level", "invite", "call", "profile", "context", "configure"), "control"
     ),
+    # What programs write, and how they are started, may hold secrets.
+    **dict.fromkeys(("launch", "description", "check_description", "save_description"), "control"),
 }
 _CALL_TIMEOUT: Final = 30.0
 _READ_TIMEOUT: Final = 5.0
 # Topics that a page offers for its joystick.
 _DRIVEN_MAX: Final = 200
 _KINDS: Final = ("topic", "service", "module")
+# What is done with a resource that a module can start.
+_LAUNCHES: Final = ("start", "stop", "restart", "log")
 # The service of a resource that takes another configuration (wiki.ros.org/dynamic_reconfigure).
 _SET_PARAMETERS: Final = "set_parameters"
 # How a page has floats that JSON cannot write.
@@ -76,6 +81,7 @@ class Answers:
         environ: Says where the agents' sockets are.
         agent: Returns the agent's name; empty for the only one.
         past: The past of the values of a status of ``/diagnostics``, by its key.
+        descriptions: The files that describe this module's resources.
     """
 
     def __init__(
@@ -85,12 +91,16 @@ class Answers:
         environ: Mapping[str, str],
         agent: Callable[[], str],
         past: Callable[[str], Any] = lambda _: {},
+        descriptions: Descriptions | None = None,
     ) -> None:
         self._hub = hub
         self._past_of = past
         self._resources = resources
         self._environ = environ
         self._agent_name = agent
+        self._descriptions = descriptions or Descriptions()
+        # Each check starts a program: one at a time, and no save between the check and the end of another.
+        self._checks = asyncio.Lock()
         self._threads = ThreadPoolExecutor(limits.ANSWERS_AT_ONCE, "rmpa-answers")
 
     async def answer(self, what: str, args: Args) -> Any:
@@ -182,6 +192,37 @@ class Answers:
         return await self.ask_agent("log_level", node=node, **more)
 
     _set_log_level = functools.partialmethod(_log_levels, change=("logger", "level"))
+
+    async def _launches(self, _args: Args) -> Any:
+        """The resources that each module can start, and those that it has started, with their processes."""
+        return await self.ask_agent("launch", what="list")
+
+    async def _top(self, _args: Args) -> Any:
+        """The processes of the nodes of all modules."""
+        return await self.ask_agent("top")
+
+    async def _launch(self, args: Args) -> Any:
+        """Start, stop or restart a resource of a module, or read its log; that module judges whether it may be."""
+        if (what := args.get("do")) not in _LAUNCHES:
+            raise ConfigError("do", f"{str(what)[:40]!r} is none of {', '.join(_LAUNCHES)}")
+        known = {key: args[key] for key in ("after", "lines") if isinstance(args.get(key), int)}
+        module = {"module": module} if (module := _text(args, "module")) else {}
+        return await self.ask_agent("launch", what=what, name=_text(args, "name"), **module, **known)
+
+    async def _described(self, do: Callable[[], Any]) -> Any:
+        async with self._checks:
+            return await asyncio.get_running_loop().run_in_executor(self._threads, do)
+
+    async def _description(self, args: Args) -> Any:
+        return await self._described(functools.partial(self._descriptions.read, _text(args, "file")))
+
+    async def _check_description(self, args: Args) -> Any:
+        check = functools.partial(self._descriptions.check, _text(args, "file"), _text(args, "text"))
+        return {"problems": await self._described(check)}
+
+    async def _save_description(self, args: Args) -> Any:
+        texts = (_text(args, key) for key in ("file", "text", "digest"))
+        return await self._described(functools.partial(self._descriptions.save, *texts))
 
     async def ask_agent(self, op: str, **args: object) -> Any:
         """Call an operation of the agent."""
