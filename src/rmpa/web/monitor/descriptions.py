@@ -16,7 +16,7 @@ import subprocess
 import tempfile
 import tomllib
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import msgspec
 
@@ -24,6 +24,9 @@ from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.runtime.files import replace_file
 from rmpa.runtime.interpreter import own_command
 from rmpa.web.monitor import limits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
 
 _log = logging.getLogger(__name__)
 # The end of the name of such a file, and what stands before it.
@@ -38,15 +41,32 @@ _TIMEOUT: Final = 20.0
 Problems: TypeAlias = list[dict[str, Any]]  # each: ``line``, ``problem``, ``remedy``
 
 
+class _Misfit(msgspec.Struct, frozen=True):
+    """A mistake, as ``rmpa resource check --json`` has it."""
+
+    line: int
+    where: str
+    problem: str
+    remedy: str = ""
+
+
+class _Checked(msgspec.Struct, frozen=True):
+    """All that it says."""
+
+    found: list[_Misfit]
+
+
 class Descriptions:
     """The files of one folder. All methods block.
 
     Args:
         folder: ``[resources] folder``; empty for none.
+        check: Says what is wrong with a file.
     """
 
-    def __init__(self, folder: str = "") -> None:
+    def __init__(self, folder: str = "", check: Callable[[Path], Problems] | None = None) -> None:
         self._folder = folder
+        self._check = check or checked
         self._help: dict[str, str] = {}
 
     def read(self, file: str) -> dict[str, Any]:
@@ -122,7 +142,7 @@ class Descriptions:
         with tempfile.TemporaryDirectory(prefix="rmpa-check-") as folder:
             path = Path(folder, file)  # the name of the file is that of the resource
             path.write_bytes(data)
-            problems = checked(path)
+            problems = self._check(path)
         return problems or _changes_of_starts(file, before, text)
 
 
@@ -134,12 +154,15 @@ def checked(path: Path) -> Problems:
     """
     status, output = _run("resource", "check", "--offline", "--json", str(path))
     try:
-        found = msgspec.json.decode(output, type=list[dict[str, Any]])
+        found = msgspec.json.decode(output, type=_Checked).found
     except msgspec.DecodeError:
         found = []
     if status not in (0, 2) or (status == 2 and not found):
         raise RmpaError(f"rmpa resource check ended with {status}, and nothing is saved", code="failed")
-    return found if status else []
+    return [
+        {"line": one.line, "problem": f"{one.where}: {one.problem}", "remedy": one.remedy}
+        for one in (found if status else ())
+    ]
 
 
 def _run(*words: str) -> tuple[int, bytes]:
@@ -152,14 +175,18 @@ def _run(*words: str) -> tuple[int, bytes]:
 
 
 def _read_help() -> dict[str, str]:
-    """What each key of a file means, by ``TABLE.KEY``; empty where ``rmpa resource schema`` does not say it."""
+    """What each key of a file means; empty where ``rmpa resource schema`` does not say it."""
     try:
         status, output = _run("resource", "schema")
-        tables = msgspec.json.decode(output)["properties"] if status == 0 else {}
-    except (RmpaError, msgspec.DecodeError, LookupError, TypeError):
+        return help_of(msgspec.json.decode(output)) if status == 0 else {}
+    except (RmpaError, msgspec.DecodeError, LookupError, AttributeError):
         return {}
+
+
+def help_of(schema: Mapping[str, Any]) -> dict[str, str]:
+    """What a JSON Schema of such files says of each key, by ``TABLE.KEY``."""
     found: dict[str, str] = {}
-    for name, table in tables.items():
+    for name, table in schema["properties"].items():
         found[name] = str(table.get("description", ""))
         inner = table.get("additionalProperties")
         keys = (inner if isinstance(inner, dict) else table).get("properties", {})
