@@ -53,7 +53,7 @@ from tests.web.monitor.test_sticks import Bus
 from tests.web.recorder import FakeHub, PageConnection, Recorded
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import AsyncIterator, Callable
 
 FIXTURES = Path(__file__).with_name("fixtures")
 STATIC = Path(__file__).parents[3] / "src/rmpa/web/static"
@@ -283,9 +283,8 @@ class FakeServer:
         reports: Any = self.reports_of_nodes
         self._diagnostics = DiagnosticsFeed(reports, reports, lambda: None)
         self._reported = 0.0
-        self._folder = tempfile.TemporaryDirectory()
-        self.folder = Path(self._folder.name)
-        self._descriptions = wrapped.CheckedHere(self.folder)
+        # Where the files of resources are, while it is served.
+        self.folder = Path()
 
     def app(self) -> web.Application:
         """The application."""
@@ -295,7 +294,14 @@ class FakeServer:
         app.router.add_post("/csp", self._report)
         app.router.add_static("/static", STATIC)
         app.on_response_prepare.append(self._headers)
+        app.cleanup_ctx.append(self._files)
         return app
+
+    async def _files(self, _app: web.Application) -> AsyncIterator[None]:
+        with tempfile.TemporaryDirectory() as folder:
+            self.folder = Path(folder)
+            self._descriptions = wrapped.CheckedHere(self.folder)
+            yield
 
     async def _headers(self, _request: web.Request, response: web.StreamResponse) -> None:
         response.headers.update(HEADERS)
@@ -487,9 +493,9 @@ class FakeServer:
 
     def _answer_launch(self, args: dict[str, Any]) -> Any:
         if args["do"] == "log":
-            lines = ["[INFO] using /dev/video0", "[WARN] unknown control 'focus_auto'"] if not args["after"] else []
+            lines = ["[INFO] using /dev/video0", "[WARN] unknown control 'focus_auto'"] if not args.get("after") else []
             return {"lines": lines, "next": 2}
-        if args["module"]:
+        if args.get("module"):
             raise PeerRefused(args["module"], "pc may not launch base", "[[permission]] of base: launch")
         return {}
 

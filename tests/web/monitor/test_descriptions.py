@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import stat
 import sys
-from collections.abc import Iterator
 from contextlib import closing, nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -228,7 +227,7 @@ class Agent:
 
 
 @pytest.fixture
-def agent(monkeypatch: pytest.MonkeyPatch) -> Iterator[Agent]:
+def agent(monkeypatch: pytest.MonkeyPatch) -> Agent:
     agent = Agent()
     monkeypatch.setattr(questions, "choose_agent", lambda *_: SimpleNamespace(path=""))
     monkeypatch.setattr(questions, "ControlClient", lambda *_: nullcontext(agent))

@@ -270,7 +270,7 @@ function Decision({ each, scores, explain, present }) {
       ${open &&
       (scores
         ? html`<p class="muted">${present ? "The scores as they are now:" : "The scores as they were then:"}</p>
-            ${explain(scores, each.to)}`
+            ${explain(scores, each.to, present ? "now" : `at ${clock(each.at)}`)}`
         : html`<p class="empty">Its scores are not kept: this page was not open then.</p>`)}
     </details>
   </li>`;

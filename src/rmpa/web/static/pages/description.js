@@ -53,8 +53,8 @@ function Editor({ name, connection }) {
     set((before) => ({ problems: before.problems }));
   };
   const order = (what, args, done) => {
-    set((before) => ({ problems: before.problems, waits: true }));
-    return connection.ask(what, args).then(done, (failure) => set({ failure, problems: [] }));
+    set(({ problems, saved }) => ({ problems, saved, waits: true }));
+    return connection.ask(what, args).then(done, (failure) => set(({ saved }) => ({ failure, saved, problems: [] })));
   };
   const check = () =>
     order("check_description", { file: name, text }, ({ problems }) =>
@@ -71,7 +71,9 @@ function Editor({ name, connection }) {
   const all = launches.value?.flatMap((each) => each.resources || []) || [];
   const resource = all.find((each) => each.file === name)?.name ?? stem;
   const restart = () =>
-    order("launch", { do: "restart", name: resource }, () => set({ problems: [], said: `${resource} starts again.` }));
+    order("launch", { do: "restart", name: resource }, () =>
+      set({ problems: [], saved: true, said: `${resource} starts again.` }),
+    );
   const revert = () => {
     drafts.delete(name);
     read();

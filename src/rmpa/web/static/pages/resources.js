@@ -215,7 +215,9 @@ export function ResourcePage({ name, state, connection }) {
           ...${{ connection, nodes, state, resource: descriptor.name, module: one.module }}
           peer=${whose.peer}
       /><//>`}
-      <${Panel} title="Why: each term of the decision" wide><${Terms} scores=${decision.scores || []} /><//>
+      <${Panel} title="Why: each term of the decision" wide
+        ><${Terms} caption="Terms" scores=${decision.scores || []}
+      /><//>
       ${lists.map(
         ([title, columns, list = [], empty, caption]) =>
           html`<${Panel} key=${title} title=${title}><${Table} ...${{ caption, columns, list, about, empty }} /><//>`,
@@ -228,7 +230,8 @@ function Past({ connection, name, peer, one, detail, decision, profiles, units }
   const base = section(detail, "descriptor").name;
   const told = { decision, health: detail.health, profile: one.profile };
   const past = usePast(connection, name, told, base && [peer, base, base]);
-  const explain = (scores, profile) => html`<${Distances} ...${{ scores, profile }} /><${Terms} scores=${scores} />`;
+  const explain = (scores, profile, when) =>
+    html`<${Distances} ...${{ scores, profile }} /><${Terms} scores=${scores} caption=${`Terms ${when}`} />`;
   return html`<${Panel} title="The last ten minutes" wide
       ><${Timeline} ...${{ past, decision, units }} profiles=${profiles.map((each) => each.name)}
     /><//>
@@ -319,12 +322,12 @@ const cell = (value) =>
         ? JSON.stringify(value)
         : String(value);
 
-function Terms({ scores }) {
+function Terms({ scores, caption }) {
   const terms = scores.flatMap((score) => (score.terms || []).map((term) => [score, term]));
   const keys = [...new Set(terms.flatMap(([, term]) => Object.keys(term)))];
   const rest = scores.filter((each) => !(each.terms || []).length);
   const columns = [["Profile", ([score]) => score.profile], ...keys.map((key) => [key, ([, term]) => cell(term[key])])];
-  return html`${terms.length > 0 && html`<${Table} caption="Terms" columns=${columns} list=${terms} />`}
+  return html`${terms.length > 0 && html`<${Table} ...${{ caption, columns }} list=${terms} />`}
   ${rest.map(
     (each) =>
       html`<p key=${each.profile} class="empty">
