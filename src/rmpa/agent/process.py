@@ -32,6 +32,7 @@ from rmpa.runtime import realtime
 from rmpa.runtime.accept import is_shortage, open_files_advice, raise_file_limit
 from rmpa.runtime.interpreter import own_command
 from rmpa.runtime.loop import AgentLoop
+from rmpa.runtime.programs import ended
 from rmpa.runtime.systemd import SERVICE_VARIABLES, feed_watchdog, notify_service_manager
 from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 
@@ -298,7 +299,7 @@ class WebProcess:
         pid = await asyncio.to_thread(self._take_over_or_start)
         try:
             self.pid = pid
-            await _ended(pid)
+            await ended(pid)
         finally:
             self.pid = None
             await asyncio.to_thread(_end, pid)
@@ -372,19 +373,6 @@ def _end(pid: int) -> None:
                 ended.poll()
         finally:
             os.close(descriptor)
-
-
-async def _ended(pid: int) -> None:
-    """Wait until a child process has ended, without a thread; it remains to be waited for."""
-    descriptor = os.pidfd_open(pid)
-    loop = asyncio.get_running_loop()
-    ended = asyncio.Event()
-    try:
-        loop.add_reader(descriptor, ended.set)
-        await ended.wait()
-    finally:
-        loop.remove_reader(descriptor)
-        os.close(descriptor)
 
 
 # The process of an agent. Its signals, its readiness, and the limits that it sets for itself.

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
 from rmpa.bridge.context import BridgeContext
+from rmpa.bridge.launch import Launcher
 from rmpa.bridge.log import ModuleLogs
 from rmpa.bridge.messages import decode, op_of
 from rmpa.bridge.nodes import ProxyKills
@@ -56,6 +57,7 @@ class Bridge:
         context: The rules that hold now; each reading of the settings makes another one.
         gate: Decides what each peer may do.
         log: The part with the log of this module and its peers.
+        launch: The part that starts this module's resources.
         proxy_nodes: Makes the nodes that stand for the nodes of peers.
     """
 
@@ -91,8 +93,10 @@ class Bridge:
         self.relay = Relay(enabled=settings.relay)
         self.topics = Topics(self)
         self.log = ModuleLogs(self)
+        self.launch = Launcher(self)
         self.add(self.topics)
         self.add(self.log)
+        self.add(self.launch)
         self._reconciler: asyncio.TimerHandle | None = None
 
     def add(self, part: Part) -> None:

@@ -280,3 +280,29 @@ RATES_BYTES: Final = 1 * MIB
 # At it: the rate of others is not known
 # Told in: the page of all topics
 RATES_MAX: Final = 2000
+
+# Seconds over which the processor time of nodes is measured for the first time.
+TOP_FIRST: Final = 0.3
+# Seconds that a node has to tell its process, and nodes that are asked at one time.
+TOP_ANSWER: Final = 1.0
+TOP_AT_ONCE: Final = 16
+# [Resources] Files in the folder of `[resources]` that are looked at, and bytes of one of them
+# At it: further ones are not started
+# Told in: `resource list`
+LAUNCH_FILES_MAX: Final = 256
+# Bytes of a file that are read for its table `[start]`.
+LAUNCH_FILE_BYTES: Final = 256 * KIB
+# Seconds until a resource that has failed is started again; each further time it is twice as long, up to the second.
+LAUNCH_RESTART_FIRST: Final = 1.0
+LAUNCH_RESTART_MAX: Final = 60.0
+# After a run of this length the next wait is the first one again.
+LAUNCH_STEADY: Final = 60.0
+# Seconds that a resource has to end, with its nodes, before it is killed; a node has 10 s by default.
+LAUNCH_END: Final = 20.0
+# Seconds that an answer waits until the resource is active or has ended, and that the asking agent waits for it: a
+# command has 30 s (``observe.limits.CONTROL_HANDLER_TIMEOUT``).
+LAUNCH_WAIT: Final = 20.0
+LAUNCH_ASK_TIMEOUT: Final = 25.0
+# Lines of each log in one answer, and logs of one resource.
+LAUNCH_LOG_LINES: Final = 500
+LAUNCH_LOGS_MAX: Final = 16

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -20,12 +21,23 @@ from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import OWN_NODE, is_global_name, is_own, matches, proxied_node
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.core.liveness import MASTER_ID, end_node, node_connections, ping_node
-from rmpa.ros.environment import NodeFacts, NodeLine, NodePing, describe_node, list_nodes
+from rmpa.ros.environment import (
+    NodeCost,
+    NodeFacts,
+    NodeLine,
+    NodePing,
+    describe_node,
+    host_of,
+    is_loopback,
+    list_nodes,
+)
+from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.node.service_server import ServiceEndpoint
 from rmpa.ros.node.slave_node import GET
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.ros.wire.xmlrpc import RosReply
 from rmpa.runtime.loop import yielding_to_data
+from rmpa.runtime.programs import figures
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -54,6 +66,8 @@ PING: Final = "node.ping"
 # The request to a node's agent to end the node, with ``node``, ``by`` (the caller's node) and ``reason``. The
 # response has ``gone``: whether nothing listens at the node's slave API any more.
 KILL: Final = "node.kill"
+# The request for what the processes of a module's nodes cost: a list of ``NodeCost``.
+TOP: Final = "node.top"
 # The type of each response; ``KILL`` ends a ``node``, where ``nodes.kill`` allows it.
 REPLIES: Final[dict[str, object]] = {
     LIST: tuple[NodeLine, ...],
@@ -99,6 +113,7 @@ class Nodes(Part):
         rpc.on_request(LIST, self._list, _VISIBLE)
         rpc.on_request(NODE_INFO, self._info, _VISIBLE)
         rpc.on_request(PING, self._ping, _VISIBLE)
+        rpc.on_request(TOP, lambda asker, _args: self.top(asker.link.name), _VISIBLE)
         rpc.on_request(KILL, self._kill, Needs((Access.KILL,), "the node"))
 
     async def close(self) -> None:
@@ -247,6 +262,56 @@ class Nodes(Part):
                 if gate.judge(Access.PUBLISH if one.inbound else Access.SUBSCRIBE, peer, one.topic).allowed
             )
         return msgspec.structs.replace(facts, pid=answer.pid, connections=connections)
+
+    async def top(self, peer: str = "") -> tuple[NodeCost, ...]:
+        """What the processes of this module's nodes cost; nodes of other machines have none here.
+
+        Args:
+            peer: A peer that asks, which is told only of what it may have; empty: this module.
+        """
+        known, launch = self._core.state().nodes, self._bridge.launch
+        names = self._visible(peer) if peer else known
+        asked = [(name, known[name]) for name in sorted(names) if name in known and not is_own(name)]
+        turns, starters = asyncio.Semaphore(limits.TOP_AT_ONCE), await launch.starters()
+
+        async def pid(name: str, uri: str) -> int | None:
+            async with turns:
+                try:
+                    async with asyncio.timeout(limits.TOP_ANSWER):
+                        return (await ping_node(name, uri, OWN_NODE)).pid
+                except (RmpaError, TimeoutError):
+                    return None
+
+        here = [is_loopback(host_of(uri)) or host_of(uri) in self._hosts() for _, uri in asked]
+        pids = await asyncio.gather(*(pid(*one) for one in asked))
+        pids = [each if local else None for each, local in zip(pids, here, strict=True)]
+        running = {each for each in pids if each is not None}
+        if not all(map(launch.shares.known, running)):
+            for each in running:
+                if (about := figures(each)) is not None:
+                    launch.shares.of(each, about)
+            await asyncio.sleep(limits.TOP_FIRST)
+        return tuple(
+            self._cost(name, each, starters.get(name, "")) for (name, _), each in zip(asked, pids, strict=True)
+        )
+
+    def _hosts(self) -> list[str]:
+        """The names under which nodes of this machine are registered."""
+        return [*local_addresses(), socket.gethostname()]
+
+    def _cost(self, node: str, pid: int | None, started_by: str) -> NodeCost:
+        about = figures(pid) if pid is not None else None
+        if pid is None or about is None:
+            return NodeCost(node=node, started_by=started_by)
+        return NodeCost(
+            node=node,
+            pid=pid,
+            cpu=self._bridge.launch.shares.of(pid, about),
+            rss=about.rss,
+            threads=about.threads,
+            since=about.since,
+            started_by=started_by,
+        )
 
     async def _ping(self, asker: PeerSession, args: dict[str, Any]) -> NodePing:
         node, uri = own_node(self._bridge, args, self._visible(asker.link.name))

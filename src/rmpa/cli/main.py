@@ -64,6 +64,7 @@ _DECLARED: Final = {
     "node ping": ("node", "Ask whether a node answers, and how fast."),
     "node kill": ("node", "End nodes."),
     "node log-level": ("node", "Show the levels of a node's loggers, and set one."),
+    "top": ("launch", "Show the processes and topics of all modules: CPU, memory, rates."),
     "log": ("log", "Show the log of the nodes and agents of all modules, in one order."),
     "param": ("main", "See and set parameters, here or at a peer."),
     "param get": ("param", "Print a parameter, or a namespace of them."),
@@ -73,12 +74,16 @@ _DECLARED: Final = {
     "param dump": ("param", "Write parameters as YAML."),
     "param load": ("param", "Set parameters from YAML."),
     "param followed": ("param", "List the parameters of other modules that this one follows ([[param]])."),
-    "resource": ("main", "See Smart Resources, here or at a peer."),
+    "resource": ("main", "See Smart Resources, here or at a peer; start and stop them."),
     "resource list": ("resource", "List resources; those of peers with the peers' names."),
     "resource info": (
         "profile",
         "Show all of a resource: topics, parameters, qualities, profiles, contexts, clients.",
     ),
+    "resource start": ("launch", "Start a resource of a module's folder."),
+    "resource stop": ("launch", "End a resource, with the nodes that it has started."),
+    "resource restart": ("launch", "End a resource and start it again."),
+    "resource log": ("launch", "Show what a resource and its nodes have written."),
     "profile": ("main", "See and choose the System Profile of a resource."),
     "profile list": ("profile", "List a resource's profiles and what they offer."),
     "profile get": ("profile", "Print the profile that runs."),
@@ -137,13 +142,16 @@ REMOVED_VERBS: Final = {
 MEANT: Final = {
     "help": ("--help",),
     "version": ("--version",),
-    "start": ("up", "service install"),
+    "start": ("up", "resource start", "service install"),
     **{word: (f"service {word}",) for word in ("install", "uninstall")},
     "enable": ("service install",),
     "roscore": ("core",),
     "status": ("service status", "peer list", "doctor"),
     "check": ("doctor",),
     "report": ("bug-report",),
+    "launch": ("resource start", "run"),
+    **{word: (f"resource {word}",) for word in ("stop", "restart")},
+    "ps": ("top", "node list"),
     "list": ("peer list", "topic list"),
     "info": ("peer info", "topic info"),
     "ping": ("peer ping", "node ping"),
@@ -395,10 +403,11 @@ def param() -> None:
 
 @_group
 def resource() -> None:
-    """See Smart Resources, here or at a peer.
+    """See Smart Resources, here or at a peer; start and stop them.
 
     ---
     A resource is written as its node, /sonar; PEER:/sonar is that peer's. It may be left out where there is only one.
+    What can be started lies in the folder of [resources] of each module's rmpa.toml, one file a resource.
     {master}
     """
 

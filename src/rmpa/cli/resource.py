@@ -10,13 +10,17 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+import msgspec
+
+from rmpa.bridge.launched import ModuleResources
 from rmpa.cli.completion import graph_of, of_peer
 from rmpa.cli.graph import GraphName, read_graph, read_name, run_stream, suggestion, with_node
 from rmpa.cli.options import Options, argument, count_option, flag, graph_verb
-from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, warn
+from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, size, warn
 from rmpa.config.rules import ROS2
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.core.identity import OUTSIDE_GUID, proxied_node, proxied_peer
+from rmpa.observe.control_client import ControlClient
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE, TOPIC, Descriptor
 from rmpa.ros.types.messages import MessageType
@@ -26,6 +30,7 @@ if TYPE_CHECKING:
 
     import click
 
+    from rmpa.bridge.launched import LaunchedResource
     from rmpa.cli.graph import Graph, Master
     from rmpa.ros.node.endpoints import Received
     from rmpa.ros.node.node import Node
@@ -40,7 +45,7 @@ _LOOK: Final = 1.0
 _COLOURS: Final = {
     **dict.fromkeys(("active", "OK"), "green"),
     **dict.fromkeys(("inactive", "unconfigured", "WARN"), "yellow"),
-    **dict.fromkeys(("finalized", "ERROR"), "red"),
+    **dict.fromkeys(("finalized", "failed", "refused", "ERROR"), "red"),
     "STALE": "magenta",
 }
 
@@ -249,7 +254,9 @@ def resource_verb(*parameters: Any) -> Callable[[Callable[..., Awaitable[None]]]
 
 @graph_verb()
 def resource_list(options: Options) -> None:
-    """List the resources of this module, and those of peers with the peers' names.
+    """List the resources of this module, and those of peers with the peers' names; also those that can be started.
+
+    PROCESSES are the nodes of one that its agent has started: processor time, memory, restarts.
 
     ---
 
@@ -257,8 +264,10 @@ def resource_list(options: Options) -> None:
       rmpa resource list
       rmpa resource list --json | jq -r '.[].name'
     """
+    master = options.master()
 
     async def body(graph: ResourceGraph) -> None:
+        launched = await asyncio.to_thread(_launched, master)
         for path, count in Counter(one.path for one in graph.seen).items():
             if count > 1:
                 text = "a request to that name reaches all of them; docs/guides/names.md shows how to separate them"
@@ -270,14 +279,54 @@ def resource_list(options: Options) -> None:
             said = one.descriptor
             about = {"name": one.path, "peer": one.peer, "role": said.role, "physical": said.physical}
             about |= {"description": said.description, "state": states.get(one)}
-            found.append(about | {"profile": profiles.get(one), "context": contexts.get(one)})
+            its = launched.pop((one.peer, one.path), None)
+            found.append(about | {"profile": profiles.get(one), "context": contexts.get(one)} | _started(its))
             kind = "device" if said.physical else "simulated"
-            ends = [profiles.get(one) or "-", contexts.get(one) or "-", said.description]
+            ends = [profiles.get(one) or "-", contexts.get(one) or "-", _processes(its), said.description]
             rows.append([str(one), states.get(one) or "does not answer", said.role, kind, *ends])
+        for (peer, path), its in launched.items():
+            empty = dict.fromkeys(("role", "physical", "profile", "context"))
+            about = {"name": path, "peer": peer, **empty, "description": its.why, "state": its.state}
+            found.append(about | _started(its))
+            rows.append([str(GraphName(path, peer)), its.state, "-", "-", "-", "-", _processes(its), its.why])
         colours = [_COLOURS.get(each["state"], "") for each in found]
-        options.show(found, Table("RESOURCE, STATE, ROLE, KIND, PROFILE, CONTEXT, DESCRIPTION", rows, colours))
+        titles = "RESOURCE, STATE, ROLE, KIND, PROFILE, CONTEXT, PROCESSES, DESCRIPTION"
+        if not any(row[6] for row in rows):
+            titles, rows = titles.replace("PROCESSES, ", ""), [[*row[:6], row[7]] for row in rows]
+        options.show(found, Table(titles, rows, colours))
 
-    run_with_resources(options, body)
+    asyncio.run(with_resources(master, body))
+
+
+def _launched(master: Master) -> dict[tuple[str | None, str], LaunchedResource]:
+    """What agents can start, by peer and by the name of the resource's node; nothing where they do not tell."""
+    if master.agent is None:
+        return {}
+    with contextlib.suppress(RmpaError), ControlClient(master.agent) as client:
+        told = client.call("launch", tuple[ModuleResources, ...], what="list")
+        own = told[0].module if told else ""
+        return {
+            (None if each.module == own else each.module, f"/{one.name}"): one
+            for each in told
+            for one in each.resources
+        }
+    return {}
+
+
+def _started(its: LaunchedResource | None) -> dict[str, Any]:
+    """What JSON has of a resource that its agent starts: its file, its process and its nodes."""
+    about = msgspec.to_builtins(its) if its is not None else {}
+    return {key: about.get(key) for key in ("file", "pid", "since", "restarts", "boot", "processes")}
+
+
+def _processes(its: LaunchedResource | None) -> str:
+    """What the nodes of a resource cost: ``2: 13 %, 85 MB, 1 restart``."""
+    run = [each for each in its.processes if each.pid is not None] if its is not None else []
+    if its is None or not run:
+        return ""
+    restarts = its.restarts + sum(each.restarts for each in its.processes)
+    more = f", {restarts} restart{'s' if restarts > 1 else ''}" if restarts else ""
+    return f"{len(run)}: {100 * sum(each.cpu for each in run):.0f} %, {size(sum(each.rss for each in run))}{more}"
 
 
 def status_of(status: Any) -> dict[str, Any]:

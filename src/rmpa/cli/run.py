@@ -177,7 +177,9 @@ def load(path: Path) -> list[Resource]:
     if path.suffix == ".toml":
         from rmpa.resource.description import read_description
 
-        return [read_description(path.read_bytes(), path)]
+        described = read_description(path.read_bytes(), path)
+        described.folder = path.resolve().parent
+        return [described]
 
     from rmpa.resource.resource import Resource
 
@@ -204,6 +206,7 @@ def load(path: Path) -> list[Resource]:
         if resource.name in seen:
             raise ConfigError(f"resource {resource.name}", "there are two of this name", "rename one of them", path)
         seen.add(resource.name)
+        resource.folder = path.resolve().parent
         if not resource.profiles:
             remedy = "declare one: @NAME.profile(offers={…})"
             raise ConfigError(f"resource {resource.name}", "it has no System Profile", remedy, path)

@@ -217,6 +217,13 @@ class Access(StrEnum):
         "node",
         "Nodes whose log lines it may read and levels it may set; /rmpa: the agent.",
     )
+    # No default gives it: what is started runs as the agent's user.
+    LAUNCH = (
+        "launch",
+        "start",
+        "resource",
+        "Resources of [resources] that it may start, stop and read the log of; trust.default never gives this.",
+    )
 
 
 # The key of a rule about actions of this module, whose client the other module is.

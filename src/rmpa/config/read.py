@@ -106,7 +106,7 @@ def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
     Raises:
         ConfigError: With line and key, if the text is not TOML, has an unknown key or a value of a wrong type.
     """
-    text, table = read_toml(data, path, json_schema())
+    _, table = read_toml(data, path, json_schema())
     found = {setting.key: value_at(table, setting.key) for setting in SETTINGS if setting.key}
     return {key: value for key, value in found.items() if value is not None}
 

@@ -93,6 +93,27 @@ class NodeSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class ResourceSettings:
+    """From where the agent starts Smart Resources, and who may ask it to."""
+
+    folder: str = setting(
+        "",
+        TEXT,
+        "The folder of the files NAME.resource.toml and NAME.py that may be started, such as "
+        "~/.config/rmpa/resources; no other user may write there.",
+        shown_default="none: nothing is started",
+    )
+    start: bool = setting(True, BOOL, "Start those with boot = true in their table [start].")
+    open: bool = setting(
+        False,
+        BOOL,
+        "In a mesh that is not secured every program in the network may then start, stop and read what is in the "
+        "folder; in a secured mesh a [[permission]] with launch says who may.",
+        live=True,
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class ParamSettings:
     """Rights of peers over this module's parameters; the peers' parameters that it follows (none within another)."""
 
@@ -357,6 +378,7 @@ class Settings:
     )
     services: ServiceSettings = table(ServiceSettings, "services", "SERVICE", live=True)
     nodes: NodeSettings = table(NodeSettings, "nodes", "NODE", live=True)
+    resources: ResourceSettings = table(ResourceSettings, "resources", "RESOURCES")
     params: ParamSettings = table(ParamSettings, "params", live=True)
     time: TimeSettings = table(TimeSettings, "time", "TIME", live=True)
     limits: LimitSettings = table(LimitSettings, "limits", "LIMIT", live=True)
@@ -418,6 +440,7 @@ TABLES: Final = {
     "bridge": "Which topics may cross, by globs.",
     "services": "Which services may cross, and how long a call may take.",
     "nodes": "What peers may do with this module's nodes.",
+    "resources": "Smart Resources that are started on request, from any module, and at boot.",
     "params": "What peers may do with this module's parameters.",
     "time": "Which peer's simulated time is used here, and whether peers may use this module's.",
     "limits": "How much is accepted from one peer.",

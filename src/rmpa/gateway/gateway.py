@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.agent.agent import Agent
 from rmpa.agent.process import run_process, serve
+from rmpa.config.settings import ResourceSettings
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.core.timers import Backoff
 from rmpa.gateway import limits
@@ -62,7 +63,7 @@ class Gateway:
         open_session: Callable[[Settings], Coroutine[None, None, OpenSession]] = open_trusted_session,
         make_neighbours: Callable[[AgentGraph, Any, Settings], Mapping[str, Neighbour]] | None = None,
     ) -> None:
-        self._settings = replace(settings, relay=True)
+        self._settings = _own(settings)
         self._open_session = open_session
         self._make_neighbours = make_neighbours or _make_neighbours
         self.agent = Agent(self._settings, realtime, load)
@@ -144,7 +145,7 @@ class Gateway:
 
     def _reloaded(self, settings: Settings) -> None:
         """Have other rules hold: the neighbours are made anew, and what crosses pauses for a moment."""
-        before, self._settings = self._settings, replace(settings, relay=True)
+        before, self._settings = self._settings, _own(settings)
         if settings.gateway.listen and before.trust != settings.trust:
             self._reopen = True  # Zenoh reads its table of access once
         if self._reopen or _rules(before) != _rules(settings):
@@ -258,6 +259,11 @@ class Gateway:
         except BaseException:
             self._changed.set()  # they are made anew when ``_run`` goes on
             raise
+
+
+def _own(settings: Settings) -> Settings:
+    """The settings of a gateway's agent: it relays; resources are started by the module's own."""
+    return replace(settings, relay=True, resources=ResourceSettings())
 
 
 def _rules(settings: Settings) -> tuple[object, ...]:

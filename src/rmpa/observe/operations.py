@@ -11,6 +11,7 @@ import msgspec
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge import nodes as node_requests
+from rmpa.bridge.launched import ModuleResources
 from rmpa.bridge.log import LEVEL
 from rmpa.bridge.log_ring import ModuleLog
 from rmpa.bridge.params import transfer
@@ -72,7 +73,8 @@ class ControlOperations:
 
     def handlers(self) -> dict[str, Handler]:
         """The handlers of the operations of this class, for ``ControlServer``."""
-        names = ("snapshot", "ping", "param", "followed", "agent", "contract", "node", "log", "log_level")
+        names: tuple[str, ...] = ("snapshot", "ping", "param", "followed", "agent", "contract", "node")
+        names += ("log", "log_level", "launch", "top")
         named = {name: getattr(self, name) for name in names}
         return {"site": self.sites.answer, "rates": self.topic_rates, **named}
 
@@ -156,6 +158,36 @@ class ControlOperations:
         """Log lines of this module and its peers: as ``ModuleLogs.read``."""
         return await self.facts.bridge.log.read(args)
 
+    async def launch(self, args: Args) -> list[ModuleResources]:
+        """List, start, stop or restart resources, or read their logs: as ``Launcher.answer``."""
+        return await self.facts.bridge.launch.answer(args)
+
+    async def top(self, args: Args) -> dict[str, Any]:
+        """What the nodes of each module cost, by its name; a text where a peer does not tell it.
+
+        ``modules``: the only ones that are wanted.
+        """
+        wanted = args.get("modules")
+        names = [str(name) for name in wanted] if isinstance(wanted, list) and wanted else None
+        peers = [
+            session
+            for session in self.facts.bridge.sessions.linked()
+            if names is None or any(is_meant(name, session.link.name, str(session.link.guid)) for name in names)
+        ]
+        told = await self._of_peers(peers, node_requests.TOP)
+        return ({self.name: await self.nodes.top()} if names is None or self.name in names else {}) | told
+
+    async def _of_peers(self, peers: list[PeerSession], what: str) -> dict[str, Any]:
+        """The answers of peers to a request, by name; a text where one does not give any."""
+        asked = (self.facts.bridge.rpc.request(session, what, {}) for session in peers)
+        told = await asyncio.gather(*asked, return_exceptions=True)
+        found: dict[str, Any] = {}
+        for session, answer in zip(peers, told, strict=True):
+            if isinstance(answer, BaseException) and not isinstance(answer, RmpaError):
+                raise answer
+            found[session.link.name] = str(answer) if isinstance(answer, RmpaError) else answer
+        return found
+
     async def log_level(self, args: Args) -> Any:
         """The levels of a ``node``'s loggers; ``level``: sets that of a ``logger``. ``peer``: the node's module."""
         request = {name: str(args[name]) for name in ("node", "logger", "level") if args.get(name)}
@@ -165,16 +197,8 @@ class ControlOperations:
 
     async def topic_rates(self, _args: Args) -> dict[str, Any]:
         """The rates of the topics that each module publishes, by its name; a text where a peer does not tell them."""
-        peers = [*self.facts.bridge.sessions.linked()]
-        told = await asyncio.gather(
-            *(self.facts.bridge.rpc.request(session, RATES, {}) for session in peers), return_exceptions=True
-        )
-        found: dict[str, Any] = {self.name: self.rates.now()}
-        for session, answer in zip(peers, told, strict=True):
-            if isinstance(answer, BaseException) and not isinstance(answer, RmpaError):
-                raise answer
-            found[session.link.name] = str(answer) if isinstance(answer, RmpaError) else answer
-        return found
+        told = await self._of_peers([*self.facts.bridge.sessions.linked()], RATES)
+        return {self.name: self.rates.now()} | told
 
     def contract(self, args: Args) -> dict[str, ContractTerm]:
         """The terms that this module's settings give a ``topic`` of a ``type_name``, by key; it need not exist."""
@@ -231,6 +255,8 @@ REPLIES: Final[dict[str, object]] = {
     "site": object,  # as ``QUESTIONS`` say
     "log": tuple[ModuleLog, ...],
     "log_level": dict[str, str],
+    "launch": tuple[ModuleResources, ...],
+    "top": object,  # tuple[NodeCost, ...] or a text, by module
     "node": object,  # tuple[PeerNodes, ...] for lists, else as node_requests.REPLIES says
 }
 

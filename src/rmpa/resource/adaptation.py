@@ -246,6 +246,12 @@ class Adaptation:
         # The failed profile may be partly in force, so even the profile that ran before is applied again.
         self._plan(now, f"{profile} failed: {why}", again=True)
 
+    def broken(self, profile: str, why: str, now: float) -> None:
+        """Report that the running profile does not work any more; the next best profile is applied instead."""
+        if profile and profile == self.profile and not self.applying:
+            self.begin_cool_down(profile, why, now)
+            self._plan(now, f"{profile} does not work any more: {why}", at_once=True)
+
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due; ``None``: no timer runs."""
         expiries = (r.expires for r in self.requirements.values() if r.expires is not None)

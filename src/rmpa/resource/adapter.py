@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from rmpa.resource.decision import Alarm
-    from rmpa.resource.declare import Context, Hook, Input, Output, Profile
+    from rmpa.resource.declare import Context, Hook, Input, ManagedNode, Output, Profile
+    from rmpa.resource.processes import Processes
     from rmpa.resource.quality import Attribute, Bound, Value
     from rmpa.resource.runtime import Runtime
     from rmpa.resource.tasks import Tasks
@@ -262,6 +263,8 @@ class Adapter(RuntimePart):
             MachineTimer(lambda: self._clients_check, self._check_clients),
         )
         self._closed = False
+        # The part that runs the nodes that profiles name; ``None``: there are none.
+        self.processes: Processes | None = None
 
     async def start(self) -> None:
         """Begin to measure, choose the first profile, and serve clients."""
@@ -332,7 +335,18 @@ class Adapter(RuntimePart):
 
     def _update_blocked(self) -> None:
         """Block the profiles whose preconditions do not hold, and those that the context excludes."""
-        self.adaptation.block(self._blocked_by_needs | self._blocked_by_context, self._loop.time())
+        by_nodes = self.processes.blocked() if self.processes is not None else {}
+        self.adaptation.block(by_nodes | self._blocked_by_needs | self._blocked_by_context, self._loop.time())
+
+    def node_changed(self, node: ManagedNode, text: str, ended: bool) -> None:
+        """Report that a node has ended, or runs again; the running profile has failed if it names one that ended."""
+        self._log_change(text, over=not ended)
+        level, profile = DiagnosticLevel.WARN if ended else DiagnosticLevel.OK, self.adaptation.profile
+        values = {"node": node.name, "cleared": str(not ended).lower()}
+        self._report("alarms", level, text if ended else f"over: {text}", values)
+        if ended and profile and node.key in self._runtime.resource.profiles[profile].nodes:
+            self.adaptation.broken(profile, text, self._loop.time())
+        self._tell()
 
     def _observation_received(self, message: Received) -> None:
         try:
@@ -414,6 +428,8 @@ class Adapter(RuntimePart):
         try:
             await self._tasks.pause()
             self._runtime.hold()
+            if self.processes is not None:
+                await self.processes.require(self._runtime.resource.profiles[profile].nodes)
             remedy = "mend it, or allow it longer: adaptation(apply_timeout=…)"
             await call_function(function, "profile", profile, limit, remedy)
         except HungError as error:

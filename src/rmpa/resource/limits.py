@@ -53,3 +53,20 @@ MEASURED_BYTES: Final = 256 * 1024
 CONTEXT_ENTER_TIMEOUT: Final = 5.0
 # Seconds from a failed switch until the rules are evaluated again; also the longest between searches for topics.
 CONTEXT_RETRY: Final = 5.0
+# [Resources] Time for a node that a resource has started to be registered and to answer
+# At it: it is ended, and the profile that needs it fails
+# Told in: `profile explain`, the resource's log
+NODE_START_TIMEOUT: Final = 20.0
+# Seconds that a node has to end whose resource does not name it any more.
+NODE_END_TIMEOUT: Final = 10.0
+# Seconds until a node that has ended is started again; each further time it is twice as long, up to the second.
+NODE_RESTART_FIRST: Final = 0.5
+NODE_RESTART_MAX: Final = 30.0
+# After a run of this length the failures of a node count from the beginning.
+NODE_STEADY: Final = 60.0
+# [Resources] Times in a row that a node of a resource ends by itself
+# At it: it is not started again, and profiles that name it are not used for a minute
+# Told in: `profile explain`, the resource's alarms
+NODE_FAILURES_MAX: Final = 5
+# Seconds for which these profiles are not used.
+NODE_BLOCKED: Final = 60.0

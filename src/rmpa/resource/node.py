@@ -11,6 +11,7 @@ from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaE
 from rmpa.resource.adapter import Adapter
 from rmpa.resource.client import Demands
 from rmpa.resource.contexts import Contexts
+from rmpa.resource.processes import Processes
 from rmpa.resource.reconfigure import Reconfigure
 from rmpa.resource.runtime import LifecycleState, Runtime
 from rmpa.resource.saved import Persistence, SavedCoolDown, SavedState
@@ -70,14 +71,18 @@ class ResourceNode:
         node = Node(resource.name, master_uri=master_uri, on_shutdown=lambda _reason: self.ended.set())
         self.runtime = Runtime(resource, node)
         self.runtime.close_outputs()
+        self.processes = Processes(self.runtime, state.parent if state is not None else None)
         self.tasks = Tasks(self.runtime, self._deactivate_soon)
         self.values = ExpressionValues(self.runtime, resource.expressions())
         self.adapter = Adapter(self.runtime, self.values, self.tasks, stop if stop is not None else asyncio.Event())
+        self.adapter.processes = self.processes
+        self.processes.on_change = self.adapter.node_changed
         self.contexts = Contexts(self.runtime, self.values, self.tasks, self.adapter)
         self.configuration = Reconfigure(self.runtime, self.tasks, self.adapter, self.contexts)
         self.demands = Demands(self.runtime)
         # In the order of their start.
         self.parts: list[RuntimePart] = [
+            self.processes,
             self.values,
             self.tasks,
             self.adapter,
@@ -244,6 +249,7 @@ class ResourceNode:
         elif not refused:
             self.tasks.activate()
         runtime.publish_text("state", runtime.state)
+        self.processes.note_soon()
         if refused:
             raise PeerRefused(f"resource {self.resource.name}", f"{transition}: {why}")
 

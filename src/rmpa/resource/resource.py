@@ -54,6 +54,8 @@ from rmpa.resource.expression import Expression, parse_expression
 from rmpa.resource.quality import MEASURED, Attribute, Category, Direction, Scale, find_attribute, quantity
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rmpa.resource.quality import QoSRequest
 
 # The highest rate of a periodic task, in Hz.
@@ -130,6 +132,8 @@ class Resource:
         self.nodes: dict[str, ManagedNode] = {}
         self.alarms: dict[str, AlarmRule] = {}
         self.start = StartRule()
+        # The folder of the file that declares it, in which its nodes are started; ``None``: that of the process.
+        self.folder: Path | None = None
         # Parameters of the control loop.
         self.settings = AdaptationSettings()
 

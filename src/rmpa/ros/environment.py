@@ -252,6 +252,28 @@ class NodeFacts(msgspec.Struct, frozen=True):
     connections: tuple[NodeConnection, ...] | None = None
 
 
+class NodeCost(msgspec.Struct, frozen=True, kw_only=True):
+    """What the process of a node costs.
+
+    Attributes:
+        node: Its name.
+        pid: Its process; ``None``: it does not answer, or runs on another machine.
+        cpu: Processor time as a share of one core, since it was last asked for.
+        rss: Bytes of memory that it holds.
+        threads: Its threads.
+        since: Since when it runs, in Unix seconds.
+        started_by: The resource that has started it; empty: none.
+    """
+
+    node: str
+    pid: int | None = None
+    cpu: float = 0.0
+    rss: int = 0
+    threads: int = 0
+    since: float = 0.0
+    started_by: str = ""
+
+
 class NodePing(msgspec.Struct, frozen=True):
     """One answer of a node to a ping.
 

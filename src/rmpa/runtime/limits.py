@@ -66,3 +66,12 @@ LOG_WAITING: Final = 10_000
 LOG_GATHER: Final = 0.01
 # Log lines in one write.
 LOG_BATCH: Final = 1000
+# [Resources] Bytes of the log of a program that the agent or a resource has started
+# At it: it becomes `NAME.log.1`, which has the place of the one before
+# Told in: `resource log`
+PROGRAM_LOG_MAX: Final = 2 * 1024 * KIB
+# Bytes of such a log that one answer has, and of one line in it.
+PROGRAM_LOG_READ: Final = 64 * KIB
+PROGRAM_LOG_LINE: Final = 4 * KIB
+# Seconds between two looks whether a log has to be rotated.
+PROGRAM_LOG_LOOK: Final = 2.0

@@ -87,7 +87,7 @@ class Permissions:
         for glob, decision in self._decisions(module)[access]:
             if matches(glob, name):
                 return decision
-        if self._settings.default == Effect.ALLOW:
+        if self._settings.default == Effect.ALLOW and access is not Access.LAUNCH:
             return PermissionDecision(True, 'no [[permission]] fits, and trust.default = "allow"')
         return PermissionDecision(False, f"no [[permission]] lets {asker_name(module)} {access.verb} {name}")
 
