@@ -90,7 +90,7 @@ async def test_resources_of_all_modules_are_started_and_a_refusal_says_whose_and
     await page.run(press % "Start base")
     await page.wait_text("pc may not launch base")
     await page.run(press % "Log camera")
-    await page.wait_text("unknown control 'focus_auto'")
+    await page.wait_text("driver: [WARN] unknown control 'focus_auto'")
     assert await violations(page) == []
     site.server.rights = Rights(view=True)
     page = await site.open(f"file/{FILE}", "wrapped")
@@ -112,6 +112,7 @@ async def test_top_is_sorted_and_asked_only_while_it_is_shown(site: Site) -> Non
         "[...document.querySelectorAll('thead button')].find((each) => /Memory/.test(each.textContent)).click()"
     )
     await page.wait(f"{first} === '/laser_filter'")
+    await page.wait_text("joystick: its agent is of an earlier release")
     assert await violations(page) == []
     asked = site.server.asked
     await page.run("location.hash = '#/topics'")

@@ -493,8 +493,8 @@ class FakeServer:
 
     def _answer_launch(self, args: dict[str, Any]) -> Any:
         if args["do"] == "log":
-            lines = ["[INFO] using /dev/video0", "[WARN] unknown control 'focus_auto'"] if not args.get("after") else []
-            return {"lines": lines, "next": 2}
+            lines = [] if args["after"] else ["[INFO] using /dev/video0", "[WARN] unknown control 'focus_auto'"]
+            return {"logs": [{"source": "driver", "lines": lines, "next": 2}]}
         if args.get("module"):
             raise PeerRefused(args["module"], "pc may not launch base", "[[permission]] of base: launch")
         return {}

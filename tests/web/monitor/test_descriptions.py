@@ -12,12 +12,16 @@ from typing import Any
 
 import pytest
 
-from rmpa.core.errors import RmpaError
+from rmpa.config.peer_rules import PermissionRule
+from rmpa.config.settings import TrustSettings
+from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.resource.description import resource_schema
+from rmpa.trust.permissions import Permissions
+from rmpa.web.hub.node_link import EVERYTHING, NodeRules
 from rmpa.web.monitor import descriptions, limits, questions
 from rmpa.web.monitor.descriptions import STARTS, Descriptions, help_of
 from rmpa.web.monitor.questions import QUESTIONS, Answers
-from tests.web.monitor.wrapped import FILE, CheckedHere
+from tests.web.monitor.wrapped import FILE, CheckedHere, check
 from tests.web.recorder import FakeHub
 
 # A file with all that says how programs are started.
@@ -220,10 +224,12 @@ def test_the_help_of_a_key_is_that_of_the_schema() -> None:
 class Agent:
     def __init__(self) -> None:
         self.asked: list[tuple[str, dict[str, Any]]] = []
+        self.problem = ""
 
     def call(self, op: str, _kind: object, **args: Any) -> Any:
-        self.asked.append((op, args))
-        return []
+        self.asked.append((op, {key: value for key, value in args.items() if value is not None}))
+        resources = [{"name": "camera"}, {"name": "laser"}]
+        return [{"module": args.get("module") or "pc", "problem": self.problem, "code": "x", "resources": resources}]
 
 
 @pytest.fixture
@@ -234,21 +240,51 @@ def agent(monkeypatch: pytest.MonkeyPatch) -> Agent:
     return agent
 
 
-async def test_a_resource_of_any_module_is_started_by_its_agent_and_under_control_alone(agent: Agent) -> None:
+def answers_of(rules: NodeRules = EVERYTHING, folder: str = "") -> Answers:
     hub: Any = FakeHub()
-    with closing(Answers(hub, hub, {}, lambda: "")) as answers:
+    hub.link = SimpleNamespace(rules=rules)
+    return Answers(hub, hub, {}, lambda: "", descriptions=Descriptions(folder, check))
+
+
+async def test_a_resource_of_any_module_is_started_by_its_agent_and_under_control_alone(agent: Agent) -> None:
+    with closing(answers_of()) as answers:
         await answers.answer("launches", {})
         await answers.answer("top", {})
         await answers.answer("launch", {"do": "start", "name": "camera", "module": ""})
-        await answers.answer("launch", {"do": "log", "name": "base", "module": "arm", "after": 7, "command": "id"})
+        await answers.answer("launch", {"do": "log", "name": "base", "module": "arm", "after": {"": 7}, "run": "id"})
         for wrong in ({"do": "list", "name": "camera"}, {"name": "camera"}, {"do": "start", "name": ["camera"]}):
             with pytest.raises(RmpaError):
                 await answers.answer("launch", wrong)
+        agent.problem = "pc may not start /base"
+        with pytest.raises(RmpaError, match="arm: pc may not start /base"):
+            await answers.answer("launch", {"do": "stop", "name": "base", "module": "arm"})
     assert agent.asked == [
         ("launch", {"what": "list"}),
         ("top", {}),
         ("launch", {"what": "start", "name": "camera"}),
-        ("launch", {"what": "log", "name": "base", "module": "arm", "after": 7}),
+        ("launch", {"what": "log", "name": "base", "module": "arm", "after": {"": 7}}),
+        ("launch", {"what": "stop", "name": "base", "module": "arm"}),
     ]
     ordered = ("launch", "description", "check_description", "save_description")
     assert {QUESTIONS[each] for each in ordered} == {"control"}
+
+
+async def test_in_a_secured_mesh_the_module_web_needs_the_permission(agent: Agent, folder: Path) -> None:
+    (folder / FILE).write_text(TEXT)
+    rule = PermissionRule(("web",), names={"launch": ("/laser",)})
+    rules = NodeRules(Permissions(TrustSettings(default="allow", rules=(rule,))))  # no default gives it
+    with closing(answers_of(rules, str(folder))) as answers:
+        (told,) = await answers.answer("launches", {})
+        assert [each["name"] for each in told["resources"]] == ["laser"]
+        agent.asked.clear()
+        for what, args in (
+            *(("launch", {"do": each, "name": "camera"}) for each in ("start", "stop", "restart", "log")),
+            ("description", {"file": FILE}),
+            ("check_description", {"file": FILE, "text": TEXT}),
+            ("save_description", {"file": FILE, "text": TEXT, "digest": descriptions._digest(TEXT)}),
+        ):
+            with pytest.raises(PeerRefused, match="web may not launch /camera"):
+                await answers.answer(what, args)
+        assert not agent.asked
+        await answers.answer("launch", {"do": "start", "name": "laser"})
+    assert not (folder / f"{FILE}.bak").exists()

@@ -128,7 +128,7 @@ def camera(started: float, now: float) -> ResourceFacts:
 def launches(started: float, now: float) -> list[dict[str, Any]]:
     """What the agents of the modules can start."""
     driver = {"node": "/usb_cam", "pid": 4711, "cpu": 0.31 + 0.02 * math.sin(now), "rss": 84_000_000, "restarts": 1,
-              "since": started - 300, "state": "running", "attached": False}  # fmt: skip
+              "since": started - 300, "state": "running", "own": True}  # fmt: skip
     own = [
         {"name": "camera", "file": FILE, "state": "active", "pid": 4700, "since": started - 540, "restarts": 0,
          "processes": [driver]},
@@ -156,7 +156,9 @@ def top(started: float, now: float) -> dict[str, Any]:
 
     cpu = 0.31 + 0.02 * math.sin(now)
     own = [one("/usb_cam", 4711, cpu, 84, "camera"), one("/tracker", 3100, 0.62, 210, "")]
-    return {"pc": own, "base": [one("/base", 990, 0.08, 41, ""), one("/laser_filter", 1020, 0.11, 37, "roslaunch")]}
+    base = [one("/base", 990, 0.08, 41, ""), one("/laser_filter", 1020, 0.11, 37, "laser")]
+    base.append({"node": "/far", "pid": None, "cpu": 0.0, "rss": 0, "threads": 0, "since": 0.0, "started_by": ""})
+    return {"pc": own, "base": base, "joystick": "its agent is of an earlier release, which does not tell it"}
 
 
 def check(path: Path) -> list[dict[str, Any]]:

@@ -65,7 +65,7 @@ class Descriptions:
     """
 
     def __init__(self, folder: str = "", check: Callable[[Path], Problems] | None = None) -> None:
-        self._folder = folder
+        self._folder = os.path.expanduser(folder)  # noqa: PTH111 - empty stays empty
         self._check = check or checked
         self._help: dict[str, str] = {}
 

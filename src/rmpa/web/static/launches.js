@@ -10,7 +10,8 @@ import { section } from "./state.js";
 
 const PERIOD = 3; // seconds; each module is asked
 const KEPT = 500; // lines of a log
-const MARKS = { active: "up", running: "up", attached: "up", starting: "linking", waiting: "pending", failed: "ERROR" };
+const MARKS = { active: "up", running: "up", starting: "linking", stopping: "linking", waiting: "pending" };
+MARKS.failed = MARKS.refused = "ERROR";
 const State = ({ state, why }) => under(html`<${Mark} state=${MARKS[state] ?? "away"} word=${state} />`, why);
 const sum = (list, key) => (list.length ? list.reduce((total, each) => total + (each[key] || 0), 0) : undefined);
 const share = (cpu) => percent(Number.isFinite(cpu) ? 100 * cpu : undefined);
@@ -22,7 +23,7 @@ const LAUNCHES = [
     (one, { known, own, may }) => {
       const key = one.module === own ? `/${one.title}` : `${one.module}:/${one.title}`;
       const title = key in known ? html`<${Link} page="resource" name=${key}>${one.title}<//>` : one.title;
-      const edits = may && one.module === own && one.file;
+      const edits = may && one.module === own && one.file.endsWith(".toml");
       return under(title, edits ? html`<a href=${href("file", one.file)}>${one.file}</a>` : one.file);
     },
     (one) => one.title,
@@ -41,14 +42,12 @@ const LAUNCHES = [
         html`<button type="button" disabled=${waits} aria-label=${`${label} ${one.title}`} onClick=${press(what)}>
           ${label}
         </button>`;
-      const runs = one.state !== "stopped" && one.state !== "failed";
+      const runs = one.pid !== undefined && one.pid !== null;
       return (
         may &&
         html`<div class="row orders">
-          ${runs ? button("stop", "Stop") : button("start", "Start")}${runs && button("restart", "Restart")}${button(
-            "log",
-            "Log",
-          )}
+          ${!runs && button("start", "Start")}${(runs || one.state === "waiting") && button("stop", "Stop")}
+          ${runs && button("restart", "Restart")}${button("log", "Log")}
         </div>`
       );
     },
@@ -95,14 +94,17 @@ const moduleOf = (module, state) => (module === section(state, "agent").name ? "
 // What a resource and its nodes have written, followed while it is shown.
 function Output({ connection, one, module, close }) {
   const [state, set] = useState({ lines: [] });
-  const after = useRef(0);
+  const after = useRef({}); // by the node that writes
   const box = useRef();
   useAgain(connection.phase === "open", 1, one.name, (still) =>
     connection.ask("launch", { do: "log", name: one.title, module, after: after.current, lines: 200 }).then(
-      ({ lines = [], next }) => {
+      ({ logs }) => {
         if (!still()) return;
-        after.current = next ?? after.current;
-        set((before) => ({ lines: lines.length ? [...before.lines, ...lines].slice(-KEPT) : before.lines }));
+        const fresh = logs.flatMap((each) => {
+          after.current[each.source] = each.next;
+          return each.lines.map((line) => (each.source ? `${each.source}: ${line}` : line));
+        });
+        set((before) => ({ lines: fresh.length ? [...before.lines, ...fresh].slice(-KEPT) : before.lines }));
       },
       (failure) => still() && set((before) => ({ ...before, failure })),
     ),
@@ -127,12 +129,12 @@ const PROCESSES = [
     (each) => each.node,
   ],
   ["State", (each) => html`<${State} ...${each} />`],
-  ["#PID", (each) => each.pid ?? "–"],
+  ["#PID", (each) => each.pid || "–"],
   ["#CPU", (each) => share(each.cpu), (each) => each.cpu],
   ["#Memory", (each) => bytes(each.rss), (each) => each.rss],
   ["#Restarts", (each) => each.restarts ?? "–"],
   ["Since", (each) => ago(each.since)],
-  ["Started by", (each) => (each.pid === undefined ? "–" : each.attached ? "somebody else" : "this resource")],
+  ["Started by", (each) => (each.pid ? (each.own ? "this resource" : "another program") : "–")],
 ];
 
 // The nodes that a resource describes, with their processes as far as its module tells them.

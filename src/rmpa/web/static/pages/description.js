@@ -2,7 +2,6 @@
 
 import { html, useEffect, useRef, useState } from "../markup.js";
 import { Failure, Mark, Page, Panel } from "../parts.js";
-import { useAnswer } from "../asking.js";
 
 const drafts = new Map(); // what is typed and not saved, by file: it stays while the page is open
 
@@ -36,7 +35,6 @@ function Editor({ name, connection }) {
   const [at, setAt] = useState(0);
   const area = useRef(),
     gutter = useRef();
-  const launches = useAnswer(connection, "launches", {});
   const read = () =>
     connection.ask("description", { file: name }).then(
       (found) => {
@@ -67,9 +65,7 @@ function Editor({ name, connection }) {
       setFile({ ...file, text, digest });
       return set({ problems, saved: true, said: `Saved. The text before is in ${backup}.` });
     });
-  const stem = name.replace(/\.resource\.toml$/, "");
-  const all = launches.value?.flatMap((each) => each.resources || []) || [];
-  const resource = all.find((each) => each.file === name)?.name ?? stem;
+  const resource = name.replace(/\.resource\.toml$/, "");
   const restart = () =>
     order("launch", { do: "restart", name: resource }, () =>
       set({ problems: [], saved: true, said: `${resource} starts again.` }),

@@ -12,11 +12,11 @@ const PERIOD = 2; // seconds
 const COLUMNS = [
   ["Node", (one) => html`<${NodeLink} name=${nodeKey(one.peer, one.node)}>${one.node}<//>`, (one) => one.node],
   ["Module", (one) => html`<${ModuleLink} name=${one.module} />`, (one) => one.module],
-  ["#CPU", (one) => percent(100 * one.cpu), (one) => one.cpu],
-  ["#Memory", (one) => bytes(one.rss), (one) => one.rss],
-  ["#Threads", (one) => one.threads ?? "–", (one) => one.threads],
-  ["#PID", (one) => one.pid, (one) => one.pid],
-  ["Since", (one) => (one.since ? html`<${Since} moment=${one.since} />` : "–"), (one) => one.since],
+  ["#CPU", (one) => (one.pid ? percent(100 * one.cpu) : "–"), (one) => one.pid && one.cpu],
+  ["#Memory", (one) => (one.pid ? bytes(one.rss) : "–"), (one) => one.pid && one.rss],
+  ["#Threads", (one) => one.threads || "–", (one) => one.threads || undefined],
+  ["#PID", (one) => one.pid || "–", (one) => one.pid],
+  ["Since", (one) => (one.since ? html`<${Since} moment=${one.since} />` : "–"), (one) => one.since || undefined],
   ["Started by", (one) => one.started_by || "–", (one) => one.started_by],
 ];
 
@@ -37,19 +37,18 @@ export function Top({ state, connection }) {
   const total = percent(100 * all.reduce((sum, one) => sum + (one.cpu || 0), 0));
   return html`<${Page}
     title="Top"
-    kind=${`${all.length} processes of nodes of ${told.length - problems.length} modules: ${total} of a core`}
+    kind=${`${all.length} nodes of ${told.length - problems.length} modules: ${total} of a core`}
   >
     ${filter.field}
     <${Panel}
       ><${Failure} failure=${answer.failure} />
       ${problems.map(
-        ([module, one]) =>
-          html`<p class="missing" key=${module}><${Mark} state="WARN" word="" />${module}: ${one.problem}</p>`,
+        ([module, why]) => html`<p class="missing" key=${module}><${Mark} state="WARN" word="" />${module}: ${why}</p>`,
       )}
       <${Table}
         caption="Top"
         columns=${COLUMNS}
         list=${sorted(shown, (one) => one.cpu, true)}
-        empty=${answer.value || answer.failure ? "No process of a node is known." : "Asking …"} /><//
+        empty=${answer.value || answer.failure ? "No node runs." : "Asking …"} /><//
   ><//>`;
 }
