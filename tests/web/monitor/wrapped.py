@@ -64,6 +64,8 @@ def camera(started: float, now: float) -> ResourceFacts:
         {"at": started - ago, "from": before, "to": after, "why": why, "took": took}
         for ago, before, after, why, took in _PAST
     ]
+    failed = {"at": started - 220, "from": "full", "to": "compressed", "why": "asked by /tracker", "took": 5.0}
+    history.insert(3, failed | {"failed": "node /republish: it does not come up"})
     wanted = {"rate": "at least 20 Hz", "latency": "at most 0.2 s"}
     scores = [
         {

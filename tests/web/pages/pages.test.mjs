@@ -316,6 +316,8 @@ test("the past of a resource is what it tells and what the page has seen, each d
     ["full", 100, 200],
     ["small", 200, 260],
   ]);
+  const failed = { at: 230, from: "small", to: "full", why: "better", took: 1, failed: "/usb_cam does not run" };
+  assert.equal(spells([...past.changes, failed], 50, 260).at(-1).until, 260); // what ran before goes on
   const later = spells([second], 50, 260).map((each) => [each.to, each.since, each.until]);
   assert.deepEqual(later, [
     ["full", 50, 200],

@@ -90,7 +90,7 @@ export function usePast(connection, key, told, status) {
 // Which profile ran from when to when, as far back as `from`.
 export function spells(changes, from, now) {
   const before = changes[0]?.from ? [{ at: -Infinity, to: changes[0].from, why: "" }] : [];
-  const all = [...before, ...changes];
+  const all = [...before, ...changes.filter((each) => !each.failed)];
   return all
     .map((each, at) => ({ ...each, since: Math.max(each.at, from), until: all[at + 1]?.at ?? Math.max(now, each.at) }))
     .filter((each) => each.until > from);
@@ -264,7 +264,9 @@ function Decision({ each, scores, explain, present }) {
     <details ref=${box} onToggle=${() => toggle(box.current.open)}>
       <summary>
         <time class="mono muted">${clock(each.at)}</time><strong>${names(each.from)} → ${names(each.to)}</strong
-        ><span>${each.why || reason(each)}</span
+        ><span
+          >${each.failed && html`<${Mark} state="ERROR" word=${`failed: ${each.failed}`} /> `}${each.why ||
+          reason(each)}</span
         ><span class="muted">${Number.isFinite(each.took) && seconds(each.took)}</span>
       </summary>
       ${open &&
