@@ -39,7 +39,12 @@ const LAUNCHES = [
     (one, { may, order, waits }) => {
       const press = (what) => () => order(what, one);
       const button = (what, label) =>
-        html`<button type="button" disabled=${waits} aria-label=${`${label} ${one.title}`} onClick=${press(what)}>
+        html`<button
+          type="button"
+          disabled=${waits === one.name}
+          aria-label=${`${label} ${one.title}`}
+          onClick=${press(what)}
+        >
           ${label}
         </button>`;
       const runs = one.pid !== undefined && one.pid !== null;
@@ -57,6 +62,7 @@ const LAUNCHES = [
 export function Launches({ state, connection }) {
   const answer = useAnswer(connection, "launches", {}, PERIOD);
   const [ordered, ask] = useAsk(connection);
+  const [busy, setBusy] = useState("");
   const [log, setLog] = useState(null);
   const told = useRef([]);
   if (answer.value) told.current = answer.value;
@@ -64,9 +70,12 @@ export function Launches({ state, connection }) {
     resources.map((one) => ({ processes: [], ...one, module, title: one.name, name: `${module}:${one.name}` })),
   );
   const problems = told.current.filter((each) => each.problem);
-  const order = (what, one) =>
-    what === "log" ? setLog(one) : ask("launch", { do: what, name: one.title, module: moduleOf(one.module, state) });
-  const about = { order, may: connection.may("control"), waits: ordered.waits };
+  const order = (what, one) => {
+    if (what === "log") return setLog(one);
+    setBusy(one.name);
+    return ask("launch", { do: what, name: one.title, module: moduleOf(one.module, state) });
+  };
+  const about = { order, may: connection.may("control"), waits: ordered.waits && busy };
   const own = section(state, "agent").name;
   return html`<${Panel} title="What modules can start"
     ><${Failure} failure=${ordered.failure} />${!list.length && html`<${Failure} failure=${answer.failure} />`}
