@@ -38,15 +38,10 @@ const LAUNCHES = [
     "#",
     (one, { may, order, waits }) => {
       const press = (what) => () => order(what, one);
-      const button = (what, label) =>
-        html`<button
-          type="button"
-          disabled=${waits === one.name}
-          aria-label=${`${label} ${one.title}`}
-          onClick=${press(what)}
-        >
-          ${label}
-        </button>`;
+      const button = (what, label) => {
+        const about = { disabled: waits === one.name, "aria-label": `${label} ${one.title}`, onClick: press(what) };
+        return html`<button type="button" ...${about}>${label}</button>`;
+      };
       const runs = one.pid !== undefined && one.pid !== null;
       return (
         may &&

@@ -2,7 +2,7 @@
 // for against its bound. The resource tells its last ten decisions; of all else a page knows what came while it was
 // open.
 
-import { html, useEffect, useRef, useState } from "./markup.js";
+import { html, useEffect, useState } from "./markup.js";
 import { clock, duration, seconds } from "./format.js";
 import { figure } from "./plot.js";
 import { Mark, useTick } from "./parts.js";
@@ -22,14 +22,7 @@ export function bound(wanted = "") {
   return { low: way === "at most" ? -Infinity : low, high: way === "at least" ? Infinity : high };
 }
 const isShort = (value, { low, high }) => value < low || value > high;
-
-const numbers = (values) =>
-  Object.fromEntries(
-    Object.entries(values || {}).flatMap(([key, text]) => {
-      const number = Number.parseFloat(text);
-      return Number.isFinite(number) ? [[key, number]] : [];
-    }),
-  );
+const mapped = (object, of) => Object.fromEntries(Object.entries(object || {}).map(([key, each]) => [key, of(each)]));
 const termsOf = (decision) => decision.scores?.find((each) => each.terms?.length)?.terms || [];
 
 export const fresh = () => ({ changes: [], samples: [], scores: new Map(), health: undefined });
@@ -44,13 +37,13 @@ export function record(past, { decision = {}, health, profile }, now) {
   const last = past.changes.at(-1);
   // An earlier release tells no history.
   if (!decision.history && decision.scores && profile !== last?.to)
-    past.changes.push({ at: now, from: last?.to ?? "", to: profile, seen: true });
+    past.changes.push({ at: now, from: last?.to ?? "", to: profile, why: "seen by this page" });
   if (past.changes.length > KEPT / 10) past.changes.splice(0, past.changes.length - KEPT / 10);
   // The scores of a decision are known where it was made while the page was open.
   if (!first && told.length) past.scores.set(past.changes.at(-1).at, decision.scores);
   if (health && health !== past.health) {
     const bounds = Object.fromEntries(termsOf(decision).map((each) => [each.attribute, each.wanted]));
-    past.samples.push({ at: now, values: numbers(health.values), bounds });
+    past.samples.push({ at: now, values: mapped(health.values, Number.parseFloat), bounds });
     if (past.samples.length > KEPT) past.samples.shift();
   }
   past.health = health;
@@ -61,12 +54,8 @@ export function record(past, { decision = {}, health, profile }, now) {
 // What was asked for then is not known: they are judged by what is asked now.
 export function earlier(past, columns) {
   const { at: first = Infinity, bounds = {} } = past.samples[0] || {};
-  const made = (columns[""] || []).map((at, row) => ({
-    at,
-    values: Object.fromEntries(Object.entries(columns).map(([key, column]) => [key, column[row]])),
-    bounds,
-  }));
-  past.samples.unshift(...made.filter((each) => each.at < first - 0.5));
+  const made = (columns[""] || []).map((at, row) => ({ at, values: mapped(columns, (column) => column[row]), bounds }));
+  return past.samples.unshift(...made.filter((each) => each.at < first - 0.5));
 }
 
 const pasts = new Map(); // by resource, for as long as the page is open
@@ -74,14 +63,11 @@ const pasts = new Map(); // by resource, for as long as the page is open
 export function usePast(connection, key, told, status) {
   if (!pasts.has(key)) pasts.set(key, fresh());
   const past = record(pasts.get(key), told, Date.now() / 1000);
-  const [, draw] = useState(0);
+  const [, draw] = useState();
   useEffect(() => {
     if (past.asked || !status) return;
     past.asked = true;
-    const take = (columns) => {
-      earlier(past, columns);
-      draw((n) => n + 1);
-    };
+    const take = (columns) => draw(earlier(past, columns));
     connection.ask("past", { status: status.join(BETWEEN) }).then(take, () => {});
   }, [status?.join(BETWEEN)]);
   return past;
@@ -138,12 +124,11 @@ function Strip({ past, profiles, from, now }) {
         })}
       </svg>
     </div>
-    <p role="status">${spell ? html`<strong>${said(spell)}</strong> ${reason(spell)}` : "Nothing ran yet."}</p>`;
+    <p role="status">
+      ${spell ? html`<strong>${said(spell)}</strong> ${spell.why}${took(spell)}` : "Nothing ran yet."}
+    </p>`;
 }
-const reason = (each) =>
-  `${each.why || (each.seen ? "seen by this page; the resource tells no reason" : "")}${
-    Number.isFinite(each.took) ? ` (the change took ${seconds(each.took)})` : ""
-  }`;
+const took = (each) => Number.isFinite(each.took) && ` (the change took ${seconds(each.took)})`;
 
 // The windows of one quality: each with the bound of its time, and whether it fell short of it.
 export const windows = (samples, name, from) =>
@@ -179,18 +164,18 @@ function Trend({ term, samples, unit, from, now }) {
   const y = (value) => ((1 - (value - low) / (high - low)) * TALL).toFixed(1);
   const line = own.map((each, at) => `${at ? "L" : "M"}${x(each.at)} ${y(each.value)}`).join("");
   const steps = bounds.flatMap((each) => edges(each).map((edge) => `M${x(each.at)} ${y(edge)}H${x(each.until)}`));
-  const judged = own.filter((each) => each.edge).length,
-    fell = own.filter((each) => each.short).length;
+  const fell = runs(own, "short", now).filter((each) => each.short);
   const value = own.at(-1)?.value;
   const shown = value === undefined ? "not measured yet" : `${figure(value)}${unit ? `\u2009${unit}` : ""}`;
-  const said = `${fell} of ${judged} windows fell short`;
+  const counted = (key) => own.filter((each) => each[key]).length;
+  const said = `${counted("short")} of ${counted("edge")} windows fell short`;
   const state = value === undefined || !last ? "STALE" : isShort(value, last) ? "WARN" : "OK";
   return html`<div class="trend">
     <div>
       <strong>${name}</strong> ${shown}
       <div class="muted">wanted ${term.wanted}${term.hard && ", hard"}</div>
       <${Mark} state=${state} word=${{ OK: "met", WARN: "falls short", STALE: "not judged" }[state]} />
-      <div class="muted">${judged > 0 && said}</div>
+      <div class="muted">${said}</div>
     </div>
     <div class="drawn">
       <span class="muted most">${Number(high.toPrecision(2))}</span>
@@ -201,19 +186,10 @@ function Trend({ term, samples, unit, from, now }) {
         aria-label=${`${name}: ${shown}, wanted ${term.wanted}; ${said}`}
       >
         <path class="base" d=${`M0 ${TALL}H${WIDE}`} />
-        ${runs(own, "short", now)
-          .filter((each) => each.short)
-          .map(
-            (each) =>
-              html`<rect
-                key=${each.at}
-                class="short"
-                x=${x(each.at)}
-                y=${TALL}
-                width=${Math.max(2, x(each.until) - x(each.at))}
-                height="8"
-              />`,
-          )}
+        ${fell.map(({ at, until }) => {
+          const wide = Math.max(2, x(until) - x(at));
+          return html`<rect key=${at} class="short" x=${x(at)} y=${TALL} width=${wide} height="8" />`;
+        })}
         <path class="bound" d=${steps.join("")} />
         <path class="line" d=${line && `${line}H${x(now)}`} />
       </svg>
@@ -228,15 +204,10 @@ export function Timeline({ past, decision, profiles, units }) {
   const terms = termsOf(decision);
   return html`<div class="timeline">
     <${Strip} ...${{ past, profiles, from, now }} />
-    ${terms.map(
-      (term) =>
-        html`<${Trend}
-          key=${term.attribute}
-          ...${{ term, from, now }}
-          samples=${past.samples}
-          unit=${units[term.attribute]}
-        />`,
-    )}
+    ${terms.map((term) => {
+      const about = { term, from, now, samples: past.samples, unit: units[term.attribute] };
+      return html`<${Trend} key=${term.attribute} ...${about} />`;
+    })}
     <div class="trend">
       <div></div>
       <p class="axis muted"><span>10 min ago</span><span>5 min</span><span>now</span></p>
@@ -258,21 +229,19 @@ export function Decisions({ past, decision, explain }) {
 }
 
 function Decision({ each, scores, explain, present }) {
-  const [open, toggle] = useState(false);
-  const box = useRef();
+  const [open, toggle] = useState(present);
+  const when = present ? "now" : `at ${clock(each.at)}`;
   return html`<li>
-    <details ref=${box} onToggle=${() => toggle(box.current.open)}>
+    <details open=${open} onToggle=${(event) => toggle(event.currentTarget.open)}>
       <summary>
         <time class="mono muted">${clock(each.at)}</time><strong>${names(each.from)} → ${names(each.to)}</strong
-        ><span
-          >${each.failed && html`<${Mark} state="ERROR" word=${`failed: ${each.failed}`} /> `}${each.why ||
-          reason(each)}</span
+        ><span>${each.failed && html`<${Mark} state="ERROR" word=${`failed: ${each.failed}`} /> `}${each.why}</span
         ><span class="muted">${Number.isFinite(each.took) && seconds(each.took)}</span>
       </summary>
       ${open &&
       (scores
-        ? html`<p class="muted">${present ? "The scores as they are now:" : "The scores as they were then:"}</p>
-            ${explain(scores, each.to, present ? "now" : `at ${clock(each.at)}`)}`
+        ? html`<p class="muted">The scores ${when}:</p>
+            ${explain(scores, each.to, when)}`
         : html`<p class="empty">Its scores are not kept: this page was not open then.</p>`)}
     </details>
   </li>`;

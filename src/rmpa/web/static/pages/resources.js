@@ -178,7 +178,7 @@ export function ResourcePage({ name, state, connection }) {
       html`<a class="button" href=${href("file", descriptor.file)}>Edit</a>`}`}
     ><div class="grid">
       <${Past} ...${{ connection, name, one, detail, decision, profiles, units }} peer=${whose.peer} />
-      <${Panel} title="State"
+      <${Panel} title="State" wide
         ><p>${one.description}</p>
         <${Facts}
           rows=${[
@@ -196,9 +196,6 @@ export function ResourcePage({ name, state, connection }) {
           ${decision.conflicts.map((each) => (typeof each === "string" ? each : JSON.stringify(each))).join("; ")}
         </p>`}<//
       >
-      <${Panel} title="Distance of each profile to what is asked"
-        ><${Distances} scores=${decision.scores || []} profile=${one.profile}
-      /><//>
       <${Panel} title="Profiles" wide
         ><${Table} caption="Profiles" columns=${PROFILES} ...${{ about }} list=${profiles} empty="It has no profiles."
       /><//>
@@ -215,9 +212,6 @@ export function ResourcePage({ name, state, connection }) {
           ...${{ connection, nodes, state, resource: descriptor.name, module: one.module }}
           peer=${whose.peer}
       /><//>`}
-      <${Panel} title="Why: each term of the decision" wide
-        ><${Terms} caption="Terms" scores=${decision.scores || []}
-      /><//>
       ${lists.map(
         ([title, columns, list = [], empty, caption]) =>
           html`<${Panel} key=${title} title=${title}><${Table} ...${{ caption, columns, list, about, empty }} /><//>`,
@@ -275,7 +269,6 @@ const amounts = (offers, units) => {
 
 // A bar for each profile: how far it is from what is asked. The nearest feasible one runs.
 function Distances({ scores, profile }) {
-  if (!scores.length) return html`<p class="empty">No decision has been made yet.</p>`;
   const finite = scores.map((each) => each.distance).filter(Number.isFinite);
   const most = Math.max(...finite, 0.01);
   const tall = 34;
