@@ -94,6 +94,7 @@ def camera(started: float, now: float) -> ResourceFacts:
             "latency": {"median": 0.12, "spread": 0.03, "n": 312},
         }
     }
+    now = math.floor(now)  # a window each second
     rate = _rate(now)
     values = {"rate": f"{rate:.4g} Hz", "latency": f"{_latency(now):.3g} s", "level_for": "12.0 s"}
     attributes = [

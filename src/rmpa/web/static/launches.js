@@ -30,7 +30,7 @@ const LAUNCHES = [
   ],
   ["Module", (one) => html`<${ModuleLink} name=${one.module} />`, (one) => one.module],
   ["State", (one) => html`<${State} ...${one} />`, (one) => one.state],
-  ["Since", (one) => ago(one.since)],
+  ["#Since", (one) => ago(one.since)],
   ["#Restarts", (one) => one.restarts || 0, (one) => one.restarts || 0],
   ["#CPU", (one) => share(sum(one.processes, "cpu")), (one) => sum(one.processes, "cpu")],
   ["#Memory", (one) => bytes(sum(one.processes, "rss")), (one) => sum(one.processes, "rss")],
@@ -137,7 +137,7 @@ const PROCESSES = [
   ["#CPU", (each) => share(each.cpu), (each) => each.cpu],
   ["#Memory", (each) => bytes(each.rss), (each) => each.rss],
   ["#Restarts", (each) => each.restarts ?? "–"],
-  ["Since", (each) => ago(each.since)],
+  ["#Since", (each) => ago(each.since)],
   ["Started by", (each) => (each.pid ? (each.own ? "this resource" : "another program") : "–")],
 ];
 

@@ -235,7 +235,7 @@ function Decision({ each, scores, explain, present }) {
     <details open=${open} onToggle=${(event) => toggle(event.currentTarget.open)}>
       <summary>
         <time class="mono muted">${clock(each.at)}</time><strong>${names(each.from)} → ${names(each.to)}</strong
-        ><span>${each.failed && html`<${Mark} state="ERROR" word=${`failed: ${each.failed}`} /> `}${each.why}</span
+        ><span>${each.why}${each.failed && html` <${Mark} state="ERROR" word=${`failed: ${each.failed}`} />`}</span
         ><span class="muted">${Number.isFinite(each.took) && seconds(each.took)}</span>
       </summary>
       ${open &&

@@ -16,7 +16,7 @@ const COLUMNS = [
   ["#Memory", (one) => (one.pid ? bytes(one.rss) : "–"), (one) => one.pid && one.rss],
   ["#Threads", (one) => one.threads || "–", (one) => one.threads || undefined],
   ["#PID", (one) => one.pid || "–", (one) => one.pid],
-  ["Since", (one) => (one.since ? html`<${Since} moment=${one.since} />` : "–"), (one) => one.since || undefined],
+  ["#Since", (one) => (one.since ? html`<${Since} moment=${one.since} />` : "–"), (one) => one.since || undefined],
   ["Started by", (one) => one.started_by || "–", (one) => one.started_by],
 ];
 
