@@ -136,9 +136,9 @@ def launches(started: float, now: float) -> list[dict[str, Any]]:
         {"name": "camera", "file": FILE, "state": "active", "pid": 4700, "since": started - 540, "restarts": 0,
          "processes": [driver]},
         {"name": "laser", "file": "laser.resource.toml", "state": "failed", "restarts": 3, "since": started - 20,
-         "why": "node /laser ended with 1: cannot open /dev/ttyUSB0"},
+         "why": "node /laser ended with 1: cannot open /dev/ttyUSB0", "processes": []},
     ]  # fmt: skip
-    base = [{"name": "base", "file": "base.resource.toml", "state": "stopped"}]
+    base = [{"name": "base", "file": "base.resource.toml", "state": "stopped", "processes": []}]
     return [
         {"module": "pc", "resources": own},
         {"module": "base", "resources": base},

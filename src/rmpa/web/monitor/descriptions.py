@@ -101,7 +101,7 @@ class Descriptions:
         before = self._text(file)
         if _digest(before) != digest:
             problem = "it has changed since this page read it, and is not saved"
-            raise ConfigError(file, problem, "keep what you have typed, and load the file again")
+            raise ConfigError(file, problem, "copy what you have typed, and load the file again")
         if problems := self._problems(file, before, text):
             return {"problems": problems}
         path = Path(self._folder, file)

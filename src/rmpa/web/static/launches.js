@@ -54,17 +54,19 @@ const LAUNCHES = [
   ],
 ];
 
-export function Launches({ state, connection }) {
+// All of them; or `only` that of one file of a module, with the `nodes` that the resource describes.
+export function Launches({ state, connection, only, nodes }) {
   const answer = useAnswer(connection, "launches", {}, PERIOD);
   const [ordered, ask] = useAsk(connection);
   const [busy, setBusy] = useState("");
   const [log, setLog] = useState(null);
   const told = useRef([]);
   if (answer.value) told.current = answer.value;
-  const list = told.current.flatMap(({ module, resources = [] }) =>
-    resources.map((one) => ({ processes: [], ...one, module, title: one.name, name: `${module}:${one.name}` })),
-  );
-  const problems = told.current.filter((each) => each.problem);
+  const list = told.current
+    .flatMap(({ module, resources }) => resources.map((one) => ({ ...one, module, title: one.name })))
+    .filter(({ module, file }) => !only || (module === only.module && file === only.file))
+    .map((one) => ({ ...one, name: `${one.module}:${one.name}` }));
+  const problems = told.current.filter((each) => each.problem && !only);
   const order = (what, one) => {
     if (what === "log") return setLog(one);
     setBusy(one.name);
@@ -72,31 +74,30 @@ export function Launches({ state, connection }) {
   };
   const about = { order, may: connection.may("control"), waits: ordered.waits && busy };
   const own = section(state, "agent").name;
-  return html`<${Panel} title="What modules can start"
+  return html`<${Panel} title=${only ? "Nodes and processes" : "What modules can start"} wide=${Boolean(only)}
     ><${Failure} failure=${ordered.failure} />${!list.length && html`<${Failure} failure=${answer.failure} />`}
     ${problems.map(
-      (each) =>
-        html`<p class="missing" key=${each.module}><${Mark} state="WARN" word="" />${each.module}: ${each.problem}</p>`,
+      ({ module, problem }) =>
+        html`<p class="missing" key=${module}><${Mark} state="WARN" word="" />${module}: ${problem}</p>`,
     )}
-    <${Table}
+    ${!(only && !list.length) &&
+    html`<${Table}
       caption="What modules can start"
       columns=${LAUNCHES}
       about=${{ ...about, own, known: section(state, "resources") }}
       list=${list}
       empty=${answer.value || answer.failure ? "No module has files of resources in a configured folder." : "Asking …"}
-    />
-    ${log &&
-    html`<${Output}
-      key=${log.name}
-      ...${{ connection, one: log, close: () => setLog(null) }}
-      module=${moduleOf(log.module, state)}
-    />`}<//
+    />`}
+    ${only &&
+    html`<${Processes} ...${{ state, nodes }} processes=${list[0]?.processes} peer=${moduleOf(only.module, state)} />`}
+    ${log && html`<${Output} key=${log.name} ...${{ connection, state, one: log, close: () => setLog(null) }} />`}<//
   >`;
 }
 const moduleOf = (module, state) => (module === section(state, "agent").name ? "" : module);
 
 // What a resource and its nodes have written, followed while it is shown.
-function Output({ connection, one, module, close }) {
+function Output({ connection, state: { agent }, one, close }) {
+  const module = moduleOf(one.module, { agent });
   const [state, set] = useState({ lines: [] });
   const after = useRef({}); // by the node that writes
   const box = useRef();
@@ -142,18 +143,16 @@ const PROCESSES = [
 ];
 
 // The nodes that a resource describes, with their processes as far as its module tells them.
-export function Processes({ connection, state, nodes, resource, module, peer }) {
-  const { value } = useAnswer(connection, "launches", {}, PERIOD);
-  const told = value?.find((each) => each.module === module)?.resources?.find((each) => each.name === resource);
+function Processes({ state, nodes, processes: told = [], peer }) {
   const known = section(state, "nodes");
-  const processes = new Map((told?.processes || []).map((each) => [each.node, each]));
+  const processes = new Map(told.map((each) => [each.node, each]));
   const list = nodes.map((each) => ({
     state: nodeKey(peer, each.name) in known ? "running" : "not there",
     ...each,
     node: each.name,
     ...processes.get(each.name),
   }));
-  const more = [...processes.values()].filter((each) => !nodes.some((one) => one.name === each.node));
+  const more = told.filter((each) => !nodes.some((one) => one.name === each.node));
   return html`<${Table}
     caption="Nodes and processes"
     columns=${PROCESSES}

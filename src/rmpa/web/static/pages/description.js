@@ -3,13 +3,13 @@
 import { html, useEffect, useRef, useState } from "../markup.js";
 import { Failure, Mark, Page, Panel } from "../parts.js";
 
-const drafts = new Map(); // what is typed and not saved, by file: it stays while the page is open
+// What is typed and not saved, by file, with the digest of the text that it changes: it stays while the page is open.
+const drafts = new Map();
 
 // What the key at a place of a text means, by the last heading above it; the server has it of the schema.
 export function meaning(text, at, help) {
   const lines = text.slice(0, at).split("\n");
-  const rest = text.slice(at).split("\n")[0];
-  const line = lines.at(-1) + rest;
+  const line = lines.at(-1) + text.slice(at).split("\n")[0];
   const heading = (each) => /^\s*\[\s*([\w-]+)/.exec(each)?.[1];
   const table = [...lines.slice(0, -1), line].map(heading).findLast(Boolean);
   const key = /^\s*([\w-]+)\s*=/.exec(line)?.[1];
@@ -18,8 +18,7 @@ export function meaning(text, at, help) {
 }
 
 export function DescriptionPage({ name, connection }) {
-  const may = connection.may("control");
-  const body = may
+  const body = connection.may("control")
     ? html`<${Editor} ...${{ name, connection }} />`
     : html`<p class="empty">
         This page may only look. A page with the right to control (<code>rmpa web --control</code>) reads and changes
@@ -30,7 +29,7 @@ export function DescriptionPage({ name, connection }) {
 
 function Editor({ name, connection }) {
   const [file, setFile] = useState(null); // as it was read: text, digest, help
-  const [text, setText] = useState(drafts.get(name) ?? "");
+  const [text, setText] = useState("");
   const [state, set] = useState({ problems: [] });
   const [at, setAt] = useState(0);
   const area = useRef(),
@@ -38,15 +37,15 @@ function Editor({ name, connection }) {
   const read = () =>
     connection.ask("description", { file: name }).then(
       (found) => {
-        setFile(found);
-        if (!drafts.has(name)) setText(found.text);
+        setFile({ ...found, ...drafts.get(name) });
+        setText(drafts.get(name)?.typed ?? found.text);
         set({ problems: [] });
       },
       (failure) => set({ failure, problems: [] }),
     );
   useEffect(() => void read(), []);
   const edit = (typed) => {
-    drafts.set(name, typed);
+    drafts.set(name, { typed, digest: file.digest });
     setText(typed);
     set((before) => ({ problems: before.problems }));
   };
@@ -61,7 +60,7 @@ function Editor({ name, connection }) {
   const save = () =>
     order("save_description", { file: name, text, digest: file.digest }, ({ problems, digest, backup }) => {
       if (problems.length) return set({ problems });
-      if (drafts.get(name) === text) drafts.delete(name);
+      drafts.delete(name);
       setFile({ ...file, text, digest });
       return set({ problems, saved: true, said: `Saved. The text before is in ${backup}.` });
     });
@@ -74,14 +73,11 @@ function Editor({ name, connection }) {
     drafts.delete(name);
     read();
   };
+  const lines = text.split("\n");
   const show = (line) => {
-    const from =
-      text
-        .split("\n")
-        .slice(0, line - 1)
-        .join("\n").length + (line > 1 ? 1 : 0);
+    const from = lines.slice(0, line - 1).reduce((sum, each) => sum + each.length + 1, 0);
     area.current.focus();
-    area.current.setSelectionRange(from, from + (text.split("\n")[line - 1] || "").length);
+    area.current.setSelectionRange(from, from + (lines[line - 1] || "").length);
   };
   if (!file)
     return html`<${Failure} failure=${state.failure} />${!state.failure && html`<p class="empty">Reading …</p>`}`;
@@ -91,9 +87,7 @@ function Editor({ name, connection }) {
   const changed = text !== file.text;
   return html`<div class="editor">
       <div ref=${gutter} class="gutter" aria-hidden="true">
-        ${text
-          .split("\n")
-          .map((_, row) => html`<div key=${row} class=${wrong.has(row + 1) ? "wrong" : ""}>${row + 1}</div>`)}
+        ${lines.map((_, row) => html`<div key=${row} class=${wrong.has(row + 1) ? "wrong" : ""}>${row + 1}</div>`)}
       </div>
       <textarea
         ref=${area}

@@ -9,7 +9,7 @@ import { Link, ModuleLink, href } from "../links.js";
 import { Editable } from "../asking.js";
 import { setting } from "../typed.js";
 import { Decisions, Timeline, usePast } from "../timeline.js";
-import { Launches, Processes } from "../launches.js";
+import { Launches } from "../launches.js";
 
 const RESOURCES = [
   ["Resource", ([name, one]) => under(html`<${Link} page="resource" name=${name}>${one.name}<//>`, one.description)],
@@ -207,11 +207,7 @@ export function ResourcePage({ name, state, connection }) {
         )}<//
       >`}
       ${(nodes.length > 0 || descriptor.file) &&
-      html`<${Panel} title="Nodes and processes" wide
-        ><${Processes}
-          ...${{ connection, nodes, state, resource: descriptor.name, module: one.module }}
-          peer=${whose.peer}
-      /><//>`}
+      html`<${Launches} ...${{ state, connection, nodes }} only=${{ module: one.module, file: descriptor.file }} />`}
       ${lists.map(
         ([title, columns, list = [], empty, caption]) =>
           html`<${Panel} key=${title} title=${title}><${Table} ...${{ caption, columns, list, about, empty }} /><//>`,
