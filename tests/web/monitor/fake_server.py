@@ -6,7 +6,7 @@ It has the real pages and the real ``MonitorSession``; the agent, the hub and al
 Scenes: ``demo`` (all is well), ``killed`` (the module base was killed), ``sick`` (one of each state, and alarms),
 ``large`` (16 modules, 300 topics), ``mute`` (the agent does not answer), ``sensors`` (a laser and a camera),
 ``cut`` (18,000 topics are left out), ``knock`` (modules that are not of this mesh, at its authority), ``ill`` (nodes
-report errors on /diagnostics).
+report errors on /diagnostics), ``wrapped`` (a camera that is described by a file).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import json
 import math
 import struct
 import sys
+import tempfile
 import time
 import zlib
 from pathlib import Path
@@ -29,7 +30,7 @@ from aiohttp import WSMsgType, web
 
 from rmpa.bridge.log_ring import LogQuery, LogRing, ModuleLog
 from rmpa.core.contract import ContractRule, Contracts
-from rmpa.core.errors import RmpaError
+from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.core.facts import LaneInfo, RouteInfo, TopicInfo
 from rmpa.core.identity import OWN_NODE
 from rmpa.observe.peers import judge_stranger
@@ -47,11 +48,12 @@ from rmpa.web.monitor.session import MonitorSession
 from rmpa.web.monitor.state import StateBuilder, details, node_detail, node_key
 from rmpa.web.monitor.sticks import Sticks
 from rmpa.web.server.app import HEADERS
+from tests.web.monitor import wrapped
 from tests.web.monitor.test_sticks import Bus
 from tests.web.recorder import FakeHub, PageConnection, Recorded
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import AsyncIterator, Callable
 
 FIXTURES = Path(__file__).with_name("fixtures")
 STATIC = Path(__file__).parents[3] / "src/rmpa/web/static"
@@ -138,7 +140,7 @@ class FakeAgent:
         self.scene = scene
         self._recorded = snapshots()
         self._resources = resources()
-        self._started = time.time() - 93.0
+        self.started = time.time() - 93.0
         self._since: dict[str, float] = {}
 
     def snapshot(self) -> Snapshot:
@@ -150,7 +152,7 @@ class FakeAgent:
         else:
             self._since.clear()
             base = getattr(self, f"_{self.scene}", lambda same: same)(base)
-        age, wobble = now - self._started, 1 + 0.004 * math.sin(now * 3)
+        age, wobble = now - self.started, 1 + 0.004 * math.sin(now * 3)
 
         def alive(route: RouteInfo) -> RouteInfo:
             rate = route.rate or 0
@@ -159,7 +161,7 @@ class FakeAgent:
 
         peers = tuple(self._peer(peer, age, now) for peer in base.peers)
         topics = tuple(replace(topic, routes=tuple(map(alive, topic.routes))) for topic in base.topics)
-        agent = replace(base.agent, started=self._started, uptime=age, cpu=11 + 2 * math.sin(now / 3))
+        agent = replace(base.agent, started=self.started, uptime=age, cpu=11 + 2 * math.sin(now / 3))
         return replace(base, agent=agent, taken=now, peers=peers, topics=topics)
 
     def _peer(self, peer: PeerInfo, age: float, now: float) -> PeerInfo:
@@ -183,11 +185,13 @@ class FakeAgent:
         }
         if self.scene == "sick":
             return [replace(one, health=(one.health or {}) | ill.get(str(one.peer), {})) for one in self._resources]
+        if self.scene == "wrapped":
+            return [*self._resources, wrapped.camera(self.started, time.time())]
         return [one for one in self._resources if (one.peer, self.scene) != ("base", "killed")]
 
     def alarms(self) -> list[Tree]:
         """The alarms that stand."""
-        about: Tree = {"at": round(self._started + 40, 1)}
+        about: Tree = {"at": round(self.started + 40, 1)}
         return [
             {"id": one.key, "module": str(one.peer), "resource": one.key, "level": one.level, **about}
             | {"text": str((one.health or {})["message"])}
@@ -279,6 +283,8 @@ class FakeServer:
         reports: Any = self.reports_of_nodes
         self._diagnostics = DiagnosticsFeed(reports, reports, lambda: None)
         self._reported = 0.0
+        # Where the files of resources are, while it is served.
+        self.folder = Path()
 
     def app(self) -> web.Application:
         """The application."""
@@ -288,7 +294,14 @@ class FakeServer:
         app.router.add_post("/csp", self._report)
         app.router.add_static("/static", STATIC)
         app.on_response_prepare.append(self._headers)
+        app.cleanup_ctx.append(self._files)
         return app
+
+    async def _files(self, _app: web.Application) -> AsyncIterator[None]:
+        with tempfile.TemporaryDirectory() as folder:
+            self.folder = Path(folder)
+            self._descriptions = wrapped.CheckedHere(self.folder)
+            yield
 
     async def _headers(self, _request: web.Request, response: web.StreamResponse) -> None:
         response.headers.update(HEADERS)
@@ -429,6 +442,8 @@ class FakeServer:
         }
 
     def _answer_past(self, args: dict[str, Any]) -> Any:
+        if self.agent.scene == "wrapped":
+            return wrapped.past(self.agent.started)
         return self._diagnostics.past(args["status"])
 
     def _answer_types(self, _args: dict[str, Any]) -> Any:
@@ -469,6 +484,29 @@ class FakeServer:
 
     def _answer_set_log_level(self, args: dict[str, Any]) -> Any:
         return dict.fromkeys((args["logger"],) if args["logger"] else ("rosout", "ros"), args["level"])
+
+    def _answer_launches(self, _args: dict[str, Any]) -> Any:
+        return wrapped.launches(self.agent.started, time.time()) if self.agent.scene == "wrapped" else []
+
+    def _answer_top(self, _args: dict[str, Any]) -> Any:
+        return wrapped.top(self.agent.started, time.time())
+
+    def _answer_launch(self, args: dict[str, Any]) -> Any:
+        if args["do"] == "log":
+            lines = [] if args["after"] else ["[INFO] using /dev/video0", "[WARN] unknown control 'focus_auto'"]
+            return {"logs": [{"source": "driver", "lines": lines, "next": 2}]}
+        if args.get("module"):
+            raise PeerRefused(args["module"], "pc may not launch base", "[[permission]] of base: launch")
+        return {}
+
+    def _answer_description(self, args: dict[str, Any]) -> Any:
+        return self._descriptions.read(args["file"])
+
+    def _answer_check_description(self, args: dict[str, Any]) -> Any:
+        return {"problems": self._descriptions.check(args["file"], args["text"])}
+
+    def _answer_save_description(self, args: dict[str, Any]) -> Any:
+        return self._descriptions.save(args["file"], args["text"], args["digest"])
 
     def _answer_configure(self, args: dict[str, Any]) -> Any:
         return {"value": args["value"], "text": f"{args['name']} is {args['value']} now"}

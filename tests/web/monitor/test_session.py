@@ -280,7 +280,8 @@ def test_a_question_has_one_answer(page: Page) -> None:
 
 
 def test_who_may_only_look_can_change_and_drive_nothing() -> None:
-    for what in ("call", "set_param", "delete_param", "profile", "context"):
+    orders = ("call", "set_param", "delete_param", "profile", "context")
+    for what in (*orders, "launch", "description", "check_description", "save_description"):
         page = Page(Rights())
         assert "only look" in page.send("ask", id=1, what=what)[0]["error"]
         assert page.asked == []

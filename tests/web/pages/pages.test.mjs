@@ -7,6 +7,8 @@ import { bandwidth, bytes, duration, hertz, plain, seconds, sentence } from "./s
 import { curve, layout } from "./static/layout.js";
 import { SIZE, arrange, chord, emptyRing, geometry, outside, place } from "./static/ring.js";
 import { adopt, applyPatch } from "./static/state.js";
+import { bound, earlier, fresh, record, spells, windows } from "./static/timeline.js";
+import { meaning } from "./static/pages/description.js";
 import { primitive } from "./static/typed.js";
 
 const THIN = "\u2009";
@@ -297,4 +299,79 @@ test("a value of a message is of its type, or says what would be", () => {
     ["bool", "2", "neither true nor false"],
   ])
     assert.ok(primitive(type, typed).error.includes(said), `${type} ${typed}`);
+});
+
+test("the past of a resource is what it tells and what the page has seen, each decision once", () => {
+  const past = fresh();
+  const told = (history, profile) => ({ decision: { history, scores: [profile] }, profile });
+  const first = { at: 100, from: "", to: "full", why: "it starts", took: 0.1 };
+  const second = { at: 200, from: "full", to: "small", why: "slow", took: 0.2 };
+  record(past, told([first], "full"), 150);
+  record(past, told([first, second], "small"), 201);
+  record(past, told([second], "small"), 202); // the resource keeps ten, the page those before too
+  assert.deepEqual(past.changes, [first, second]);
+  assert.deepEqual([...past.scores], [[200, ["small"]]]); // those of the first were not seen when it was made
+  const drawn = spells(past.changes, 50, 260).map((each) => [each.to, each.since, each.until]);
+  assert.deepEqual(drawn, [
+    ["full", 100, 200],
+    ["small", 200, 260],
+  ]);
+  const failed = { at: 230, from: "small", to: "full", why: "better", took: 1, failed: "/usb_cam does not run" };
+  assert.equal(spells([...past.changes, failed], 50, 260).at(-1).until, 260); // what ran before goes on
+  const later = spells([second], 50, 260).map((each) => [each.to, each.since, each.until]);
+  assert.deepEqual(later, [
+    ["full", 50, 200],
+    ["small", 200, 260],
+  ]);
+});
+
+test("of an earlier release the page itself sees which profile runs", () => {
+  const past = fresh();
+  for (const [profile, now] of [
+    ["a", 1],
+    ["a", 2],
+    ["b", 3],
+  ])
+    record(past, { decision: { scores: [] }, profile }, now);
+  assert.deepEqual(
+    past.changes.map((each) => [each.at, each.from, each.to]),
+    [
+      [1, "", "a"],
+      [3, "a", "b"],
+    ],
+  );
+});
+
+test("a window is judged by the bound of its time", () => {
+  assert.deepEqual(bound("at least 20 Hz"), { low: 20, high: Infinity });
+  assert.deepEqual(bound("at most 1e-05 s"), { low: -Infinity, high: 1e-5 });
+  assert.deepEqual(bound("1 m/s2 to 2 m/s2"), { low: 1, high: 2 });
+  assert.deepEqual(bound("exactly 3"), { low: 3, high: 3 });
+  assert.equal(bound("good or fair"), null);
+  assert.equal(bound(undefined), null);
+  const past = fresh();
+  const window = (rate, wanted, now) => {
+    const scores = [{ terms: [{ attribute: "rate", wanted }] }];
+    record(past, { decision: { scores, history: [] }, health: { values: { rate: `${rate} Hz` } }, profile: "a" }, now);
+  };
+  window(15, "at least 20 Hz", 10);
+  window(15, "at least 10 Hz", 11);
+  earlier(past, { "": [8, 9, 9.9], rate: [25, null, 12] });
+  assert.deepEqual(
+    windows(past.samples, "rate", 0).map((each) => [each.at, each.value, each.short]),
+    [
+      [8, 25, false],
+      [10, 15, true],
+      [11, 15, false],
+    ],
+  );
+});
+
+test("the key at the cursor is explained by the table that it is in", () => {
+  const help = { role: "what it is", node: "a node", "node.run": "how it starts" };
+  const text = 'role = "sensing"\n\n[node.driver]\nrun = "a b"\n';
+  assert.equal(meaning(text, 3, help)?.text, "what it is");
+  assert.equal(meaning(text, text.indexOf("driver"), help)?.text, "a node");
+  assert.equal(meaning(text, text.indexOf('a b"'), help)?.text, "how it starts");
+  assert.equal(meaning(text, text.length, help), null);
 });

@@ -44,6 +44,11 @@ FIELDS_MAX: Final = 8
 # At it: a further one is refused
 # Told in: the page
 ASKS_MAX: Final = 16
+# [Pages] Bytes of a file that describes a resource, read and changed by a page
+# At it: the page neither shows nor saves it
+# Told in: the page
+# Why: Within a message of a page, with each quote and line end as two characters.
+DESCRIPTION_MAX: Final = 24 * KIB
 # Samples of a plot in one message. Of more, the least and the greatest of each part are kept.
 POINTS_MAX: Final = 64
 # [Pages] Characters of a text in a live value

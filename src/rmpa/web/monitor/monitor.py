@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from rmpa.runtime.tasks import end_tasks, keep_task
 from rmpa.web import limits as web_limits
 from rmpa.web.monitor import limits
+from rmpa.web.monitor.descriptions import Descriptions
 from rmpa.web.monitor.diagnostics import DiagnosticsFeed
 from rmpa.web.monitor.questions import Answers
 from rmpa.web.monitor.rates import RatesFeed
@@ -155,6 +156,7 @@ class Monitor:
         watch: Asks the agent.
         environ: Says where the agents' sockets are; the process's environment unless it is given.
         agent: The agent's name; ``None``: the one that answers.
+        folder: Where the files that describe this module's resources are; empty for none.
     """
 
     def __init__(
@@ -163,6 +165,7 @@ class Monitor:
         watch: AgentWatch,
         environ: Mapping[str, str] | None = None,
         agent: str | None = None,
+        folder: str = "",
     ) -> None:
         self._hub = hub
         self.values = MessageValues(hub)
@@ -175,6 +178,7 @@ class Monitor:
             os.environ if environ is None else environ,
             lambda: agent or self.mesh.agent,
             self.mesh.diagnostics.past,
+            Descriptions(folder),
         )
         self.sticks = Sticks(hub, lambda: self.mesh.agent)
 

@@ -28,6 +28,7 @@ from rmpa.ros.types.descriptor import SERVICE_TYPE
 from rmpa.trust.permissions import InviteReply
 from rmpa.web.hub.params import value_at
 from rmpa.web.monitor import limits
+from rmpa.web.monitor.descriptions import SUFFIX, Descriptions
 from rmpa.web.monitor.driving import TYPES
 from rmpa.web.monitor.messages import cut_text
 from rmpa.web.monitor.state import module_facts, node_key, shown_node
@@ -48,17 +49,21 @@ Args: TypeAlias = dict[str, Any]  # the edge: each question has its own
 # All questions, each with the right (``Rights``) that a page needs for it; the method ``_QUESTION`` answers it.
 QUESTIONS: Final = {
     **dict.fromkeys(("why", "agent", "contract", "node", "describe", "message", "past", "graph", "types"), ""),
-    **dict.fromkeys(("driven", "log", "log_levels"), ""),
+    **dict.fromkeys(("driven", "log", "log_levels", "launches", "top"), ""),
     **dict.fromkeys(("params", "param_names"), "view"),
     **dict.fromkeys(
         ("set_param", "delete_param", "set_log_level", "invite", "call", "profile", "context", "configure"), "control"
     ),
+    # What programs write, and how they are started, may hold secrets.
+    **dict.fromkeys(("launch", "description", "check_description", "save_description"), "control"),
 }
 _CALL_TIMEOUT: Final = 30.0
 _READ_TIMEOUT: Final = 5.0
 # Topics that a page offers for its joystick.
 _DRIVEN_MAX: Final = 200
 _KINDS: Final = ("topic", "service", "module")
+# What is done with a resource that a module can start.
+_LAUNCHES: Final = ("start", "stop", "restart", "log")
 # The service of a resource that takes another configuration (wiki.ros.org/dynamic_reconfigure).
 _SET_PARAMETERS: Final = "set_parameters"
 # How a page has floats that JSON cannot write.
@@ -76,6 +81,7 @@ class Answers:
         environ: Says where the agents' sockets are.
         agent: Returns the agent's name; empty for the only one.
         past: The past of the values of a status of ``/diagnostics``, by its key.
+        descriptions: The files that describe this module's resources.
     """
 
     def __init__(
@@ -85,12 +91,16 @@ class Answers:
         environ: Mapping[str, str],
         agent: Callable[[], str],
         past: Callable[[str], Any] = lambda _: {},
+        descriptions: Descriptions | None = None,
     ) -> None:
         self._hub = hub
         self._past_of = past
         self._resources = resources
         self._environ = environ
         self._agent_name = agent
+        self._descriptions = descriptions or Descriptions()
+        # Each check starts a program: one at a time, and no save between the check and the end of another.
+        self._checks = asyncio.Lock()
         self._threads = ThreadPoolExecutor(limits.ANSWERS_AT_ONCE, "rmpa-answers")
 
     async def answer(self, what: str, args: Args) -> Any:
@@ -160,7 +170,8 @@ class Answers:
         found = await self.ask_agent("log", **{key: args[key] for key in known if key in args})
         for module in found:
             lines = module.get("lines", ())
-            hidden = {node: why for node in {line["node"] for line in lines} if (why := self._no_log(node))}
+            nodes = {line["node"] for line in lines}
+            hidden = {node: why for node in nodes if (why := self._denied(Access.LOG, node))}
             module["lines"] = [line for line in lines if line["node"] not in hidden]
             for line in module["lines"]:
                 line["text"] = cut_text(line["text"], limits.LOG_CHARACTERS)
@@ -168,10 +179,10 @@ class Answers:
                 module["problem"] = next(iter(hidden.values()))
         return found
 
-    def _no_log(self, node: str) -> str:
-        """Why a page may not see the log of a node, or empty."""
+    def _denied(self, access: Access, name: str) -> str:
+        """Why a page may not do that with what has this name; empty: it may."""
         try:
-            self._hub.link.rules.check(Access.LOG, node)
+            self._hub.link.rules.check(access, name)
         except PeerRefused as error:
             return str(error)
         return ""
@@ -182,6 +193,51 @@ class Answers:
         return await self.ask_agent("log_level", node=node, **more)
 
     _set_log_level = functools.partialmethod(_log_levels, change=("logger", "level"))
+
+    async def _launches(self, _args: Args) -> Any:
+        """The resources that each module can start, with their processes; those that the rules let a page start."""
+        found = await self.ask_agent("launch", what="list")
+        for module in found:
+            judged = [(each, self._denied(Access.LAUNCH, f"/{each['name']}")) for each in module["resources"]]
+            module["resources"] = [each for each, why in judged if not why]
+            if judged and not module["resources"]:
+                module["problem"] = judged[0][1]
+        return found
+
+    async def _top(self, _args: Args) -> Any:
+        """The processes of the nodes of all modules."""
+        return await self.ask_agent("top")
+
+    def _may_launch(self, name: str) -> None:
+        self._hub.link.rules.check(Access.LAUNCH, f"/{name}")
+
+    async def _launch(self, args: Args) -> Any:
+        """Start, stop or restart a resource of a module, or read its log; that module judges it too."""
+        if (what := args.get("do")) not in _LAUNCHES:
+            raise ConfigError("do", f"{str(what)[:40]!r} is none of {', '.join(_LAUNCHES)}")
+        name, module = _text(args, "name"), _text(args, "module")
+        self._may_launch(name)
+        asked = {"name": name, "module": module or None, "after": args.get("after"), "lines": args.get("lines")}
+        (found,) = await self.ask_agent("launch", what=what, **asked)
+        if found["problem"]:
+            raise RmpaError(f"{found['module']}: {found['problem']}", code=found["code"])
+        return found
+
+    async def _of_file(self, args: Args, do: Callable[..., Any], *keys: str) -> Any:
+        file = _text(args, "file")
+        self._may_launch(file.removesuffix(SUFFIX))
+        call = functools.partial(do, file, *(_text(args, key) for key in keys))
+        async with self._checks:
+            return await asyncio.get_running_loop().run_in_executor(self._threads, call)
+
+    async def _description(self, args: Args) -> Any:
+        return await self._of_file(args, self._descriptions.read)
+
+    async def _check_description(self, args: Args) -> Any:
+        return {"problems": await self._of_file(args, self._descriptions.check, "text")}
+
+    async def _save_description(self, args: Args) -> Any:
+        return await self._of_file(args, self._descriptions.save, "text", "digest")
 
     async def ask_agent(self, op: str, **args: object) -> Any:
         """Call an operation of the agent."""

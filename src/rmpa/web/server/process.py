@@ -268,7 +268,7 @@ class WebSetup:
     def serves_as(self, other: WebSetup) -> bool:
         """Whether a server made of the other one would let clients do the same under the same token."""
         mine, theirs = self.settings, other.settings
-        same = (mine.web, mine.trust) == (theirs.web, theirs.trust)
+        same = (mine.web, mine.trust, mine.resources) == (theirs.web, theirs.trust, theirs.resources)
         return same and (self.trusted, self.access.token) == (other.trusted, other.access.token)
 
 
@@ -348,7 +348,7 @@ async def serve(
     reader = ControlReader(os.environ, agent, follower.check)
     watch = AgentWatch(reader, read_whole=reader.read_whole)
     hub = make_hub(watch, web.port, setup.rules)
-    monitor = Monitor(hub, watch, agent=agent)
+    monitor = Monitor(hub, watch, agent=agent, folder=setup.settings.resources.folder)
     name, priority = f"RMPA {setup.module or socket.gethostname()}", priority_of(hub, setup.settings.make_contracts())
     sockets = WebSocketClients(hub, name, setup.rights, priority, monitor, other_protocols())
     certificate = ServerCertificate(setup.files)

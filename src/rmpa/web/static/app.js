@@ -22,6 +22,7 @@ const PLACES = {
   graph: ["Graph", "g", "graph.js", "GraphPage"],
   params: ["Parameters", "p", "params.js", "Params"],
   resources: ["Resources", "r", "resources.js", "Resources"],
+  top: ["Top", "u", "top.js", "Top"],
   map: ["Map", "o", "map.js", "MapPage"],
   tf: ["Frames", "f", "tf.js", "FramesPage"],
   panels: ["Panels", "b", "panels.js", "Panels"],
@@ -34,10 +35,13 @@ const PLACES = {
   service: ["", "", "services.js", "ServicePage"],
   node: ["", "", "nodes.js", "NodePage"],
   resource: ["", "", "resources.js", "ResourcePage"],
+  file: ["", "", "description.js", "DescriptionPage"],
 };
 const PAGES = Object.entries(PLACES).flatMap(([page, [title, key]]) => (title ? [[page, title, key]] : []));
 const LAZY = Object.fromEntries(Object.entries(PLACES).map(([page, [, , ...where]]) => [page, where]));
 const LISTED = { topic: "topics", service: "services", node: "nodes", resource: "resources", module: "" };
+// Pages that are a part of another one.
+const WITHIN = { file: "resources" };
 // What pages without a name look at.
 const LISTS = { diagnostics: [["diagnostics", ""]], panels: [["diagnostics", ""]], topics: [["rates", ""]] };
 // Pages on which a name chooses a part: what was filtered and opened there stays.
@@ -225,7 +229,7 @@ class App extends Component {
     const agent = section(state, "agent").name || connection.hello.agent;
     const alarms = Object.keys(section(state, "alarms")).length;
     const gone = connection.phase === "lost" || section(state, "reach").ok === false;
-    const current = LISTED[page] ?? page;
+    const current = LISTED[page] ?? WITHIN[page] ?? page;
     const dark = theme() === "dark";
     const skip = (event) => {
       event.preventDefault();

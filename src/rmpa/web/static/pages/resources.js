@@ -1,13 +1,15 @@
-// Smart Resources, and one of them: profiles and why one of them runs, what clients asked, contexts, configuration.
+// Smart Resources, and one of them: what it did and why, its profiles, clients, contexts, configuration and processes.
 
 import { html, useState } from "../markup.js";
 import { seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import { Facts, Failure, Gone, Mark, Page, Panel, under } from "../parts.js";
+import { Facts, Failure, Gone, Mark, Page, Panel, Since, under } from "../parts.js";
 import { Table } from "../lists.js";
-import { Link, ModuleLink } from "../links.js";
+import { Link, ModuleLink, href } from "../links.js";
 import { Editable } from "../asking.js";
 import { setting } from "../typed.js";
+import { Decisions, Timeline, usePast } from "../timeline.js";
+import { Launches } from "../launches.js";
 
 const RESOURCES = [
   ["Resource", ([name, one]) => under(html`<${Link} page="resource" name=${name}>${one.name}<//>`, one.description)],
@@ -19,7 +21,7 @@ const RESOURCES = [
   ["#Clients", ([, one]) => one.clients || 0],
 ];
 
-export function Resources({ state }) {
+export function Resources({ state, connection }) {
   const all = entries(state, "resources");
   return html`<${Page} title="Smart Resources" kind=${`${all.length} in all modules`}
     ><${Panel}
@@ -28,7 +30,8 @@ export function Resources({ state }) {
         columns=${RESOURCES}
         empty="No module has a Smart Resource."
         list=${all} /><//
-  ><//>`;
+    ><${Launches} ...${{ state, connection }}
+  /><//>`;
 }
 
 const said = (values) =>
@@ -78,7 +81,11 @@ const range = ({ choices, low, high, type }) =>
       ? `${low ?? ""} … ${high ?? ""}`
       : type;
 const PARAMETERS = [
-  ["Parameter", (each) => each.name],
+  [
+    "Parameter",
+    (each, { hands }) =>
+      under(each.name, each.name in hands && html`<${Mark} state="WARN" word="turned by hand" />`, each.binding),
+  ],
   [
     "#Value",
     (each, { now, set }) =>
@@ -101,9 +108,14 @@ const PROFILES = [
   [
     "Profile",
     (each, { resource }) =>
-      each.name === resource.profile ? html`<${Mark} state="up" word=${`${each.name} runs`} />` : each.name,
+      under(
+        each.name === resource.profile ? html`<${Mark} state="up" word=${`${each.name} runs`} />` : each.name,
+        Object.keys(each.sets || {}).length > 0 && `sets ${said(each.sets)}`,
+        each.nodes?.length > 0 && `needs ${each.nodes.join(", ")}`,
+      ),
   ],
-  ["Offers", (each, { units }) => offers(each, units)],
+  ["Declared", (each, { units }) => amounts(each.offers, units)],
+  ["Learnt", (each, { learnt, units }) => amounts(learnt[each.name], units)],
   ["#Cost", (each) => each.cost],
   ["Description", (each) => each.description],
   [
@@ -133,7 +145,9 @@ export function ResourcePage({ name, state, connection }) {
   const choose =
     may && ((what, choice) => connection.ask(what, { ...whose, choice }).then(() => setFailure(null), setFailure));
   const set = may && ((parameter, value) => connection.ask("configure", { ...whose, name: parameter, value }));
-  const { attributes = [] } = descriptor;
+  const { attributes = [], profiles = [], nodes = [] } = descriptor;
+  const hands = section(decision, "by_hand");
+  const alarms = entries(state, "alarms").filter(([, each]) => each.resource === name);
   const units = Object.fromEntries(attributes.map((each) => [each.name, each.unit]));
   const lists = [
     ["Quality", QUALITY, attributes.filter((each) => each.name in values), "It has measured nothing yet.", "Quality"],
@@ -150,13 +164,21 @@ export function ResourcePage({ name, state, connection }) {
       "Topics",
     ],
   ];
-  const about = { resource: one, values, decision, units, choose, set, now: section(detail, "parameters") };
+  const about = {
+    ...{ resource: one, values, decision, units, choose, set, hands },
+    now: section(detail, "parameters"),
+    learnt: section(decision, "learnt"),
+  };
   return html`<${Page}
     title=${one.name}
     kind=${`Smart Resource of ${one.module} · ${one.role || ""}${one.physical ? "" : ", simulated"}`}
-    aside=${html`<${Mark} state=${one.level} word=${one.message || undefined} />`}
+    aside=${html`<${Mark} state=${one.level} word=${one.message || undefined} />${may &&
+      descriptor.file &&
+      !whose.peer &&
+      html`<a class="button" href=${href("file", descriptor.file)}>Edit</a>`}`}
     ><div class="grid">
-      <${Panel} title="State"
+      <${Past} ...${{ connection, name, one, detail, decision, profiles, units }} peer=${whose.peer} />
+      <${Panel} title="State" wide
         ><p>${one.description}</p>
         <${Facts}
           rows=${[
@@ -166,6 +188,7 @@ export function ResourcePage({ name, state, connection }) {
             ["Chosen", decision.chosen ? `${decision.chosen}, by hand` : "by the resource"],
             ["Being applied", decision.applying],
             ["Last reaction", seconds(decision.reaction)],
+            ["Turned by hand", said(hands)],
             ["Alarm", decision.alarm],
           ]}
         /><${Failure} failure=${failure} /> ${(decision.conflicts || []).length > 0 &&
@@ -173,24 +196,36 @@ export function ResourcePage({ name, state, connection }) {
           ${decision.conflicts.map((each) => (typeof each === "string" ? each : JSON.stringify(each))).join("; ")}
         </p>`}<//
       >
-      <${Panel} title="Distance of each profile to what is asked"
-        ><${Distances} scores=${decision.scores || []} profile=${one.profile}
-      /><//>
       <${Panel} title="Profiles" wide
-        ><${Table}
-          caption="Profiles"
-          columns=${PROFILES}
-          ...${{ about }}
-          list=${descriptor.profiles || []}
-          empty="It has no profiles."
+        ><${Table} caption="Profiles" columns=${PROFILES} ...${{ about }} list=${profiles} empty="It has no profiles."
       /><//>
-      <${Panel} title="Why: each term of the decision" wide><${Terms} scores=${decision.scores || []} /><//>
+      ${alarms.length > 0 &&
+      html`<${Panel} title="Alarms" wide
+        >${alarms.map(
+          ([id, each]) =>
+            html`<p key=${id}><${Mark} state=${each.level} word=${each.text} /> for <${Since} moment=${each.at} /></p>`,
+        )}<//
+      >`}
+      ${(nodes.length > 0 || descriptor.file) &&
+      html`<${Launches} ...${{ state, connection, nodes }} only=${{ module: one.module, file: descriptor.file }} />`}
       ${lists.map(
         ([title, columns, list = [], empty, caption]) =>
           html`<${Panel} key=${title} title=${title}><${Table} ...${{ caption, columns, list, about, empty }} /><//>`,
       )}
     </div><//
   >`;
+}
+
+function Past({ connection, name, peer, one, detail, decision, profiles, units }) {
+  const base = section(detail, "descriptor").name;
+  const told = { decision, health: detail.health, profile: one.profile };
+  const past = usePast(connection, name, told, base && [peer, base, base]);
+  const explain = (scores, profile, when) =>
+    html`<${Distances} ...${{ scores, profile }} /><${Terms} scores=${scores} caption=${`Terms ${when}`} />`;
+  return html`<${Panel} title="The last ten minutes" wide
+      ><${Timeline} ...${{ past, decision, units }} profiles=${profiles.map((each) => each.name)}
+    /><//>
+    <${Panel} title="The last ten decisions" wide><${Decisions} ...${{ past, decision, explain }} /><//>`;
 }
 
 // A parameter's value; with the right to, it can be changed. What the resource made of it is said.
@@ -218,14 +253,18 @@ function quantity(text) {
     : text;
 }
 
-const offers = (profile, units) =>
-  Object.entries(profile.offers || {})
-    .map(([key, value]) => `${key} ${value}${units[key] ? `\u2009${units[key]}` : ""}`)
-    .join(", ") || "–";
+// Offers as their author declared them, or as they were measured: `{ median, spread, n }`.
+const amounts = (offers, units) => {
+  const lines = Object.entries(offers || {}).map(([key, value]) => {
+    const unit = units[key] ? `\u2009${units[key]}` : "";
+    if (typeof value !== "object") return [key, `${value}${unit}`];
+    return [key, `${cell(value.median)} ± ${cell(value.spread)}${unit} (${value.n})`];
+  });
+  return lines.length ? lines.map(([key, text]) => html`<div key=${key}>${key} ${text}</div>`) : "–";
+};
 
 // A bar for each profile: how far it is from what is asked. The nearest feasible one runs.
 function Distances({ scores, profile }) {
-  if (!scores.length) return html`<p class="empty">No decision has been made yet.</p>`;
   const finite = scores.map((each) => each.distance).filter(Number.isFinite);
   const most = Math.max(...finite, 0.01);
   const tall = 34;
@@ -272,12 +311,12 @@ const cell = (value) =>
         ? JSON.stringify(value)
         : String(value);
 
-function Terms({ scores }) {
+function Terms({ scores, caption }) {
   const terms = scores.flatMap((score) => (score.terms || []).map((term) => [score, term]));
   const keys = [...new Set(terms.flatMap(([, term]) => Object.keys(term)))];
   const rest = scores.filter((each) => !(each.terms || []).length);
   const columns = [["Profile", ([score]) => score.profile], ...keys.map((key) => [key, ([, term]) => cell(term[key])])];
-  return html`${terms.length > 0 && html`<${Table} caption="Terms" columns=${columns} list=${terms} />`}
+  return html`${terms.length > 0 && html`<${Table} ...${{ caption, columns }} list=${terms} />`}
   ${rest.map(
     (each) =>
       html`<p key=${each.profile} class="empty">
