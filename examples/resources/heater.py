@@ -11,7 +11,7 @@ updater.setHardwareID("none")
 heat = 20.0
 
 
-def element(status):
+def element(status: diagnostic_updater.DiagnosticStatusWrapper) -> diagnostic_updater.DiagnosticStatusWrapper:
     """Say how hot it is."""
     status.summary(0, "warm")
     status.add("Temperature", round(heat, 1))

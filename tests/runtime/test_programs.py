@@ -31,7 +31,7 @@ async def test_a_process_is_known_again_and_no_other_is_taken_for_it(tmp_path: P
     process = await asyncio.to_thread(start_program, words, log=log, cwd=tmp_path, env={"COLOUR": "red"})
     mark = ProgramMark.of(process.pid)
     assert mark is not None
-    assert mark.runs
+    assert (mark.runs, mark.pid) == (True, process.pid)
     assert os.getsid(process.pid) == process.pid, "no signal of the starter's terminal reaches it"
     assert not mark._replace(began=mark.began + 1).runs
     assert not mark._replace(boot="another").runs
