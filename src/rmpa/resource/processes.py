@@ -113,6 +113,7 @@ class Processes(RuntimePart):
         self._work = OwnedTasks()
         self._writes = asyncio.Lock()
         self._noted: ResourceRun | None = None
+        self._complained = False
         self._rotated = 0.0
 
     async def start(self) -> None:
@@ -220,11 +221,11 @@ class Processes(RuntimePart):
                 return
             try:
                 await asyncio.to_thread(run.save, self._record)
-                self._noted = run
+                self._noted, self._complained = run, False
             except OSError as error:
                 text = "! %s: its nodes cannot be noted: %s; after a crash they are not found [directory-unusable]"
-                _log.warning(text, self._runtime.node.name, error)
-                self._record = None
+                _log.log(logging.DEBUG if self._complained else logging.WARNING, text, self._runtime.node.name, error)
+                self._complained = True
 
     def _run(self, state: LifecycleState | None = None) -> ResourceRun:
         mark = ProgramMark.of(os.getpid())
