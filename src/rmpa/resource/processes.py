@@ -371,6 +371,8 @@ class _Supervised:
     async def _spawn(self, command: list[str]) -> None:
         """Start the process, and note it; not to be cancelled in between."""
         environ = {"PYTHONUNBUFFERED": "1", **os.environ, "ROS_MASTER_URI": self._runtime.node.master_uri}
+        if self.log is not None and not os.access(os.path.expanduser("~"), os.W_OK):  # noqa: PTH111 - it may have none
+            environ.setdefault("ROS_HOME", str(self.log.parents[1] / "ros"))  # as of a service; roslaunch logs there
         environ |= self.declared.env
         if self.log is not None:
             await asyncio.to_thread(_write_line, self.log, f"--- {time.strftime('%F %T')} {shlex.join(command)}\n")
