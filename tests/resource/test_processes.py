@@ -127,8 +127,9 @@ async def test_a_node_that_is_missing_fails_its_profile_with_the_reason(make: Ma
     one = make(described(("laser",), (), laser=None))
     await one.start()
     assert one.adapter.adaptation.profile == "p1"
-    why = one.adapter.adaptation.cooling(0.0)["p0"].why
-    assert "node /laser does not run; start it, or say in the file how it is started" in why
+    assert "/laser" in one.adapter.adaptation._excluded(0.0)["p0"]
+    with pytest.raises(PeerRefused, match="/laser does not run; start it, or say in the file how it is started"):
+        await one.processes.require(["laser"])
 
 
 async def test_a_node_that_cannot_start_fails_its_profile_with_the_end_of_its_log(make: Make) -> None:
