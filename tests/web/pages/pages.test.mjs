@@ -7,7 +7,7 @@ import { bandwidth, bytes, duration, hertz, plain, seconds, sentence } from "./s
 import { curve, layout } from "./static/layout.js";
 import { SIZE, arrange, chord, emptyRing, geometry, outside, place } from "./static/ring.js";
 import { adopt, applyPatch } from "./static/state.js";
-import { bound, earlier, fresh, record, spells, windows } from "./static/timeline.js";
+import { askedFor, bound, earlier, fresh, record, spells, windows } from "./static/timeline.js";
 import { meaning } from "./static/pages/description.js";
 import { primitive } from "./static/typed.js";
 
@@ -356,6 +356,14 @@ test("a window is judged by the bound of its time", () => {
   };
   window(15, "at least 20 Hz", 10);
   window(15, "at least 10 Hz", 11);
+  const later = askedFor(past, { scores: [{ terms: [{ attribute: "age", wanted: "at most 1 s" }] }] }, 0);
+  assert.deepEqual(
+    later.map((each) => [each.attribute, each.wanted]),
+    [
+      ["rate", ""], // asked for no more, and still drawn
+      ["age", "at most 1 s"],
+    ],
+  );
   earlier(past, { "": [8, 9, 9.9], rate: [25, null, 12] });
   assert.deepEqual(
     windows(past.samples, "rate", 0).map((each) => [each.at, each.value, each.short]),

@@ -167,13 +167,14 @@ function Trend({ term, samples, unit, from, now }) {
   const fell = runs(own, "short", now).filter((each) => each.short);
   const value = own.at(-1)?.value;
   const shown = value === undefined ? "not measured yet" : `${figure(value)}${unit ? `\u2009${unit}` : ""}`;
+  const asked = term.wanted ? `wanted ${term.wanted}${term.hard ? ", hard" : ""}` : "asked for no more";
   const counted = (key) => own.filter((each) => each[key]).length;
   const said = `${counted("short")} of ${counted("edge")} windows fell short`;
   const state = value === undefined || !last ? "STALE" : isShort(value, last) ? "WARN" : "OK";
   return html`<div class="trend">
     <div>
       <strong>${name}</strong> ${shown}
-      <div class="muted">wanted ${term.wanted}${term.hard && ", hard"}</div>
+      <div class="muted">${asked}</div>
       <${Mark} state=${state} word=${{ OK: "met", WARN: "falls short", STALE: "not judged" }[state]} />
       <div class="muted">${said}</div>
     </div>
@@ -183,7 +184,7 @@ function Trend({ term, samples, unit, from, now }) {
         viewBox=${`0 0 ${WIDE} ${TALL + 8}`}
         preserveAspectRatio="none"
         role="img"
-        aria-label=${`${name}: ${shown}, wanted ${term.wanted}; ${said}`}
+        aria-label=${`${name}: ${shown}, ${asked}; ${said}`}
       >
         <path class="base" d=${`M0 ${TALL}H${WIDE}`} />
         ${fell.map(({ at, until }) => {
@@ -197,11 +198,20 @@ function Trend({ term, samples, unit, from, now }) {
   </div>`;
 }
 
+// What is asked for, and what was within the time that is drawn.
+export function askedFor(past, decision, from) {
+  const found = new Map();
+  for (const { at, bounds } of past.samples)
+    if (at > from) for (const attribute of Object.keys(bounds)) found.set(attribute, { attribute, wanted: "" });
+  for (const term of termsOf(decision)) found.set(term.attribute, term);
+  return [...found.values()];
+}
+
 export function Timeline({ past, decision, profiles, units }) {
   useTick(2);
   const now = Date.now() / 1000,
     from = now - SPAN;
-  const terms = termsOf(decision);
+  const terms = askedFor(past, decision, from);
   return html`<div class="timeline">
     <${Strip} ...${{ past, profiles, from, now }} />
     ${terms.map((term) => {
@@ -229,11 +239,16 @@ export function Decisions({ past, decision, explain }) {
 }
 
 function Decision({ each, scores, explain, present }) {
-  const [open, toggle] = useState(present);
+  const [chosen, choose] = useState(null);
+  const open = chosen ?? present;
+  const press = (event) => {
+    event.preventDefault(); // the attribute says what is open
+    choose(!open);
+  };
   const when = present ? "now" : `at ${clock(each.at)}`;
   return html`<li>
-    <details open=${open} onToggle=${(event) => toggle(event.currentTarget.open)}>
-      <summary>
+    <details open=${open}>
+      <summary onClick=${press}>
         <time class="mono muted">${clock(each.at)}</time><strong>${names(each.from)} → ${names(each.to)}</strong
         ><span>${each.why}${each.failed && html` <${Mark} state="ERROR" word=${`failed: ${each.failed}`} />`}</span
         ><span class="muted">${Number.isFinite(each.took) && seconds(each.took)}</span>

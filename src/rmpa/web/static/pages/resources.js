@@ -253,12 +253,12 @@ function quantity(text) {
     : text;
 }
 
-// Offers as their author declared them, or as they were measured: `{ median, spread, n }`.
+const learntOf = ({ median, spread, n }, unit = "") => `${cell(median)} ± ${cell(spread)}${unit} (${n})`;
+// Offers as their author declared them, or as they were learnt from so many windows.
 const amounts = (offers, units) => {
   const lines = Object.entries(offers || {}).map(([key, value]) => {
     const unit = units[key] ? `\u2009${units[key]}` : "";
-    if (typeof value !== "object") return [key, `${value}${unit}`];
-    return [key, `${cell(value.median)} ± ${cell(value.spread)}${unit} (${value.n})`];
+    return [key, typeof value === "object" ? learntOf(value, unit) : `${value}${unit}`];
   });
   return lines.length ? lines.map(([key, text]) => html`<div key=${key}>${key} ${text}</div>`) : "–";
 };
@@ -308,7 +308,7 @@ const cell = (value) =>
     : typeof value === "number"
       ? Number(value.toPrecision(4))
       : typeof value === "object"
-        ? JSON.stringify(value)
+        ? learntOf(value)
         : String(value);
 
 function Terms({ scores, caption }) {
