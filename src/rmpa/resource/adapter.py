@@ -307,7 +307,8 @@ class Adapter(RuntimePart):
         self._window_end = max((self._window_end or now) + self._settings.window, now)
         measured = self._values.derive(self._measuring.window(now) if self._measuring is not None else {})
         self._measured = self.observed.worst(measured, self.adaptation.requirements, now)
-        for text, missing in count_missing(self._missing, self._runtime.problems()[0]):
+        lacks = self._runtime.problems()[0]
+        for text, missing in count_missing(self._missing, lacks):
             message = text if missing else f"over: {text}"
             self._log_change(message, over=not missing)
             level = DiagnosticLevel.STALE if missing else DiagnosticLevel.OK
@@ -316,7 +317,7 @@ class Adapter(RuntimePart):
         if self._checking is None or self._checking.done():
             self._checking = start_task(self._check_preconditions(), "check preconditions")
         profile = self.adaptation.profile
-        if self.adaptation.window(self._measured, now):
+        if self.adaptation.window(self._measured, now) and not lacks:  # what is missing tells nothing of the profile
             self.learnt.window(profile, self._measured)
         for part in self._runtime.parts:
             part.window_ended(self._measured)
