@@ -10,7 +10,7 @@ from typing import Any, Final
 import pytest
 
 from rmpa.resource import live
-from rmpa.resource.checking import Check, Misfit
+from rmpa.resource.checking import GraphCheck, Misfit
 from rmpa.resource.describing import Found, describe
 from rmpa.resource.description import read_description
 from rmpa.resource.live import Flow, Knob, LiveGraph
@@ -175,7 +175,7 @@ def check(text: str, **graph: Any) -> list[Misfit]:
         "types": topics,
         "running": ["/usb_cam", "/base"],
     }
-    return Check(resource, text, PATH, seen=CAMERA.live, **(known | graph)).misfits()
+    return GraphCheck(resource, text, PATH, seen=CAMERA.live, **(known | graph)).misfits()
 
 
 def test_a_file_that_fits_has_no_misfit() -> None:
@@ -230,5 +230,5 @@ def test_an_argument_that_the_launch_file_does_not_have_is_told(tmp_path: Path) 
     )
     resource = read_description(text.encode(), PATH)
     parts: Any = ({"/usb_cam/image_raw": ["/usb_cam"]}, {}, ["/usb_cam"], CAMERA.live)
-    (found,) = Check(resource, text, tmp_path / "x.toml", *parts).misfits()
+    (found,) = GraphCheck(resource, text, tmp_path / "x.toml", *parts).misfits()
     assert "has no argument frames" in found.problem
