@@ -23,6 +23,7 @@ from lab.bench import (
     startup,
     throughput,
     web,
+    wrapped,
 )
 from lab.bench.contenders import ENTRIES
 from lab.web.servers import why_no_web
@@ -62,6 +63,7 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     "startup": Measurement("how soon the first message arrives", startup.measure),
     "services": Measurement("a service call through two agents, and a direct one", services.measure),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
+    "wrapped": Measurement("what a Smart Resource costs the nodes that it wraps", wrapped.measure, (why_no_ros,)),
     "gateway": Measurement(_GATEWAY, gateway.measure, (why_no_ros, gateway.why_no_sites), gateway.PARTS),
     "ros2": Measurement(_ROS2, ros2.measure, (why_no_ros, why_no_hosts, ros2.why_no_ros2), ros2.PARTS),
     "web": Measurement(_WEB, web.measure, (why_no_ros, why_no_web), web.PARTS),

@@ -20,6 +20,7 @@ from rmpa.observe.peers import judge_refusal
 from rmpa.observe.sites import SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.snapshot import PeerInfo, PingReply
 from rmpa.observe.why.diagnosis import Diagnosis
+from rmpa.resource import limits
 from rmpa.ros.core.embedded import RosCore
 from rmpa.trust.permissions import TrustReason
 from tests.cli.conftest import Place, compare, with_core
@@ -103,6 +104,7 @@ def test_verbs_on_a_terminal(
         node=lambda _: (),
     )
     monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setattr(limits, "LEARNT_LEAST", 1 << 30)  # what was learnt would depend on the time
     said = ""
     for line in LINES:
         terminal = Terminal()
@@ -113,6 +115,7 @@ def test_verbs_on_a_terminal(
         # Ports and process ids have five digits, or the columns behind them would move.
         text = re.sub(r"\x1b\[[0-9;]*m", "", terminal.getvalue())
         text = re.sub(r"(127\.0\.0\.1|localhost):\d{5}", r"\1:40000", text)
+        text = re.sub(r"\d\d:\d\d:\d\d( .*)\d\.\d{3} s", r"12:00:00\g<1>0.002 s", text)
         text = re.sub(r"Pid: \d+", "Pid: 40000", re.sub(r"took [\d.e-]+ s", "took 0.002 s", text))
         said += f"$ rmpa {line}\n{text}\n"
     compare(str(width), said)

@@ -20,6 +20,8 @@ from rmpa.resource.runtime import describe
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 from tests.cli.conftest import Background, Rmpa
+from tests.resource.driver import Driver
+from tests.resource.test_actuation import camera
 from tests.resource.test_node import echo
 
 GROUP = ()
@@ -199,6 +201,32 @@ def test_a_decision_is_explained(
     scores = {score["profile"]: score for score in as_json(rmpa, "profile", "explain")["scores"]}
     assert scores["slow"]["feasible"] is False
     assert scores["slow"]["terms"][0]["delta"] == pytest.approx(0.5)
+
+
+def test_what_people_set_at_a_node_and_what_was_learnt_is_shown(
+    rmpa: Rmpa, run: Callable[[Resource], ResourceNode], node: Callable[..., Node], background: Background
+) -> None:
+    cam = Driver(node("/cam"), {"frame_rate": 25.0, "gain": 1.0})
+    background.do(cam.start())
+    one = run(camera())
+    background.call(one.adapter.learnt.window, "small", {"sharpness": 3.0})
+    background.do(one.configuration.set({"gain": 2.5}))
+    background.do(one.configuration.set({"fps": 12, "profile": "full"}))
+    explained = [" ".join(line.split()) for line in rmpa("profile", "explain", "camera")[1].splitlines()]
+    assert "by hand: gain = 2.5, fps = 12; `rmpa profile set /camera --auto` gives it back" in explained
+    assert explained[-2].split()[1:] == ["-", "small", *explained[-2].split()[3:]]
+    assert explained[-2].endswith("s the resource starts")
+    assert explained[-1].split()[1:3] == ["small", "full"]
+    assert explained[-1].endswith("s full was chosen by hand")
+    listed = as_json(rmpa, "profile", "list", "camera")
+    assert listed["by_hand"] == {"gain": 2.5, "fps": 12}
+    assert listed["learnt"]["small"]["sharpness"] == {"median": 3.0, "spread": 0.0, "n": 1}
+    assert "sharpness 3 (spread 0, n 1)" in rmpa("profile", "list", "camera")[1]
+    info = [" ".join(line.split()) for line in rmpa("resource", "info", "camera")[1].splitlines()]
+    assert "fps 12 by hand 1 .. 60 [cam dynamic frame_rate]" in info
+    assert "cam /cam attached" in info
+    assert rmpa("profile", "set", "camera", "--auto")[0] == 0
+    assert as_json(rmpa, "profile", "list", "camera")["by_hand"] == {}
 
 
 def test_a_context_by_hand(rmpa: Rmpa, running: ResourceNode) -> None:

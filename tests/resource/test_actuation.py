@@ -131,7 +131,7 @@ async def test_all_nodes_get_their_values_or_none(core: RosCore, how: str) -> No
         why = {
             "refuses": "node /laser refused: power = 9: no such mode",
             "hangs": "node /laser refused: power = 9: no answer within 1 s",
-            "is gone": "node /laser refused: power = 9: no server of service /laser/set_parameters answers",
+            "is gone": "node /laser (refused: it |refused: no parameter_updates|does not run)",
             "lacks it": "node /laser refused: power: it has no dynamic parameter power; did you mean pow",
         }[how]
         with pytest.raises(Exception, match=why):
@@ -139,7 +139,7 @@ async def test_all_nodes_get_their_values_or_none(core: RosCore, how: str) -> No
         laser.answers.set()
         assert cam.values["frame_rate"] == 10.0
         assert how == "is gone" or cam.calls[-2:] == [{"frame_rate": 30.0}, {"frame_rate": 10.0}]
-        assert one.adapter.adaptation.profile == "small"
+        assert one.adapter.adaptation.profile == ("" if how == "is gone" else "small")
 
 
 async def test_a_knob_that_is_turned_at_the_node_stays(core: RosCore, tmp_path: Path) -> None:
@@ -167,6 +167,18 @@ async def test_a_knob_that_is_turned_at_the_node_stays(core: RosCore, tmp_path: 
             await choose(one, profile="")
             await one.adapter.settled()
             assert (cam.values["frame_rate"], decision(one)["by_hand"]) == (10.0, {})
+
+
+async def test_a_value_by_hand_that_the_node_refuses_now_bars_no_profile(core: RosCore, tmp_path: Path) -> None:
+    state = tmp_path / "camera.json"
+    async with driver(core, frame_rate=25.0, gain=1.0) as cam:
+        async with running(core, camera(), state) as one:
+            await choose(one, fps=50)
+        cam.turn(frame_rate=25.0)
+        cam.accept = lambda asked: {name: min(value, 20.0) for name, value in asked.items()}
+        async with running(core, camera(), state) as one:
+            assert (one.adapter.adaptation.profile, decision(one)["by_hand"]) == ("small", {})
+            assert cam.values["frame_rate"] == 10.0
 
 
 async def test_parameters_of_the_resource_are_set_at_the_node(core: RosCore, node: Node) -> None:
@@ -201,6 +213,7 @@ class Restarts:
     def __init__(self) -> None:
         self.done: list[Any] = []
         self.up = {"cam"}
+        self.bad = ""
 
     async def start(self) -> None: ...
 
@@ -210,6 +223,8 @@ class Restarts:
 
     async def restart(self, key: str, *, args: Any = {}) -> None:  # noqa: B006
         self.done.append((key, dict(args)))
+        if self.bad and self.bad in args.values():
+            raise PeerRefused("node /cam", "it has ended with code 1")
 
     def pid(self, key: str) -> int | None:
         return 7 if key in self.up else None
@@ -249,6 +264,10 @@ async def test_private_parameters_and_arguments_restart_the_node(core: RosCore, 
         assert await node.get_param("/cam/live") == 7.0
         assert stand_in.done == [[], ("cam", {"mode": "fast"}), [], ("cam", {"mode": "slow"})][: len(stand_in.done)]
         assert (await node.get_param("/cam/size"), len(stand_in.done)) == (2, 4)
+        stand_in.bad = "fast"
+        with pytest.raises(Exception, match="it has ended with code 1"):
+            await choose(one, profile="full")
+        assert stand_in.done[5:7] == [("cam", {"mode": "fast"}), ("cam", {"mode": "slow"})]  # and undone
         await node.set_param("/cam/live", 9.0)  # as rosparam does
         await until(lambda: decision(one)["by_hand"] == {"live": 9.0})
     finally:

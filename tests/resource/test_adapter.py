@@ -12,8 +12,9 @@ import pytest
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.resource import limits
 from rmpa.resource.adaptation import Adaptation
-from rmpa.resource.adapter import HungError, Preconditions, alarm_values, answer_to, health
+from rmpa.resource.adapter import HungError, alarm_values, answer_to, health
 from rmpa.resource.client import ResourceClient
+from rmpa.resource.conditions import Preconditions
 from rmpa.resource.decision import Alarm, AlarmKind, Decider, Shortfall
 from rmpa.resource.declare import AdaptationSettings, Context, Profile
 from rmpa.resource.node import ResourceNode

@@ -55,7 +55,7 @@ async def test_another_nodes_output_is_measured_and_missed(core: RosCore, node: 
     quality = await node.subscribe("/camera/quality", ARRAY)
     async with running(core, described(IMAGE)):
         missing = await status(quality, lambda s: s.level == STALE)
-        assert missing.message == "node /cam does not run; no node publishes /cam/image"
+        assert missing.message.startswith("node /cam does not run; no node publishes /cam/image")
         async with Node("cam", master_uri=core.uri) as cam:
             talking = await talk(cam, "/cam/image", 50, 100)
             one = await status(quality, lambda s: s.level == OK and "latency" in pairs(s) and "period_sd" in pairs(s))

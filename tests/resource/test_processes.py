@@ -79,11 +79,13 @@ async def test_a_node_is_started_by_its_profile_and_ended_by_the_next(make: Make
     log = (tmp_path / "log" / "cam.laser.log").read_text()
     assert f"begins: ['--child'] in {tmp_path} with red" in log
     child = int(log.partition("child ")[2].split()[0])
-    assert {each.node: (each.own, each.state) for each in one.processes.info()} == {
-        "/always": (True, NodeState.RUNNING),
-        "/laser": (True, NodeState.RUNNING),
+    await one.processes.note()
+    told = {each.node: each for each in (await record(tmp_path)).nodes}
+    assert {name: (each.pid, each.state) for name, each in told.items()} == {
+        "/always": (always, NodeState.RUNNING),
+        "/laser": (laser, NodeState.RUNNING),
     }
-    assert all(each.rss > 1_000_000 and each.pid for each in one.processes.info())
+    assert all(each.mark and each.mark.runs and each.since for each in told.values())
     one.adapter.pin("p1")
     await until(lambda: one.adapter.adaptation.profile == "p1")
     assert figures(laser) is figures(child) is None, "with all processes that it has started"
@@ -121,12 +123,12 @@ async def test_a_node_that_the_user_started_is_attached_to_and_never_ended(
     await one.close()
 
 
-async def test_a_node_that_is_missing_excludes_its_profile_with_the_reason(make: Make) -> None:
+async def test_a_node_that_is_missing_fails_its_profile_with_the_reason(make: Make) -> None:
     one = make(described(("laser",), (), laser=None))
     await one.start()
     assert one.adapter.adaptation.profile == "p1"
-    scores = one.adapter.adaptation.explain(asyncio.get_running_loop().time())
-    assert "node /laser does not run" in next(each.excluded for each in scores if each.profile == "p0")
+    why = one.adapter.adaptation.cooling(0.0)["p0"].why
+    assert "node /laser does not run; start it, or say in the file how it is started" in why
 
 
 async def test_a_node_that_cannot_start_fails_its_profile_with_the_end_of_its_log(make: Make) -> None:
@@ -159,7 +161,7 @@ async def test_a_node_that_always_runs_is_started_again_by_its_policy(make: Make
     os.kill(laser, signal.SIGKILL)
     await status(alarms, lambda each: each.level == OK and "over: node /laser runs again" in each.message)
     assert await runs(one, "laser") != laser
-    assert [each.restarts for each in one.processes.info()] == [1, 0]
+    assert [each.restarts for each in one.processes._nodes.values()] == [1, 0]
     os.kill(once, signal.SIGTERM)
     told = await status(alarms, lambda each: "/once" in each.message)
     assert 'is not started again (restart = "never", and it ended in order)' in told.message
@@ -198,7 +200,7 @@ async def test_what_a_killed_run_had_started_is_taken_over_and_ended_in_order(ma
     await second.start()
     assert await runs(second, "laser") == before["laser"]
     assert figures(before["camera"]) is None
-    assert second.processes.info()[0].own
+    assert second.processes._nodes["laser"].own
     await second.close()
     assert figures(before["laser"]) is None
     assert [child is not None and child.poll() is not None for child in children] == [True, True]
@@ -213,6 +215,16 @@ async def test_a_restart_gives_arguments_and_another_process(make: Make) -> None
     assert figures(laser) is None
     await one.processes.restart("rest", args={"fps": "10"})
     assert one.processes.pid("rest") is None, "its profile does not run"
+
+
+async def test_a_script_that_ends_in_order_behind_its_node_is_not_started_again(make: Make) -> None:
+    one = make(described((), laser=()))
+    words = ("sh", "-c", f"{' '.join(TINY)} /laser; sleep 0.1; exit 0")
+    one.processes._nodes["laser"].declared = ManagedNode("laser", "/laser", command=words)
+    await one.start()
+    os.kill(await runs(one, "laser"), signal.SIGTERM)
+    await until(lambda: one.runtime.problems()[1])
+    assert 'not started again (restart = "on-failure", and it ended in order)' in one.runtime.problems()[1][0]
 
 
 async def test_a_deaf_program_is_killed_in_time(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:

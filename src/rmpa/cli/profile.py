@@ -227,7 +227,7 @@ def _decided(one: dict[str, Any]) -> Sequence[str]:
     """One of the last decisions."""
     why = f"{one.get('why', '')}; failed: {one['failed']}" if "failed" in one else str(one.get("why", ""))
     at = time.strftime("%H:%M:%S", time.localtime(one.get("at", 0)))
-    return at, str(one.get("from") or "-"), str(one.get("to")), f"{one.get('took', 0):.3g} s", why
+    return at, str(one.get("from") or "-"), str(one.get("to")), f"{one.get('took', 0):.3f} s", why
 
 
 def _verdict(score: dict[str, Any], runs: str, chosen: str) -> str:

@@ -12,10 +12,13 @@ until the operator sets what the profile wants. A node that has been started ane
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import logging
 import math
 from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
 
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
@@ -34,7 +37,7 @@ if TYPE_CHECKING:
     from rmpa.resource.declare import Binding, Parameter, ParameterValue, Profile
     from rmpa.resource.processes import Processes
     from rmpa.resource.runtime import Runtime
-    from rmpa.ros.node.endpoints import Received
+    from rmpa.ros.node.endpoints import Received, Subscriber
 
 _log = logging.getLogger(__name__)
 _DYNAMIC, _PRIVATE, _ARGUMENT = BindingKind
@@ -83,11 +86,14 @@ class Actuation(RuntimePart):
         for name, binding in self._bound.items():
             given = dict(text.partition(":=")[::2] for text in nodes[binding.node].args)
             if binding.kind is _ARGUMENT and binding.name in given:
-                self._known[name] = _read_argument(given[binding.name], parameters[name])
+                with contextlib.suppress(msgspec.ValidationError):
+                    kind = type(parameters[name].default)
+                    self._known[name] = msgspec.convert(given[binding.name], kind, strict=False)
         # By node: its whole configuration, whether it has come, and when it came or was set last.
         self._configs: dict[str, dict[str, ParameterValue]] = {}
         self._heard = {one.node: asyncio.Event() for one in self._bound.values() if one.kind is _DYNAMIC}
         self._touched: dict[str, float] = {}
+        self._updates: dict[str, Subscriber] = {}
         # The header of each node's connection; one that is new means that the node may have been started anew.
         self._headers: dict[str, Mapping[str, str]] = {}
         self._fresh: set[str] = set()
@@ -101,7 +107,7 @@ class Actuation(RuntimePart):
         if self._heard:
             self._service = await asyncio.to_thread(ServiceType, SERVICE_TYPE)
         for key in self._heard:
-            await node.subscribe(
+            self._updates[key] = await node.subscribe(
                 f"{nodes[key].server or nodes[key].name}/parameter_updates",
                 MessageType(CONFIG_TYPE),
                 functools.partial(self._configured, key),
@@ -119,21 +125,6 @@ class Actuation(RuntimePart):
         """Follow nothing any more; the nodes keep their values."""
         await self._work.close()
 
-    def blocked(self) -> dict[str, str]:
-        """The profiles that cannot run, with the reason: a node does not run that nothing here starts."""
-        nodes = self._runtime.resource.nodes
-        absent = {key for key, one in nodes.items() if not one.started and self._processes.pid(key) is None}
-        return {
-            one.name: f"node {nodes[missing[0]].name} does not run"
-            for one in self._runtime.resource.profiles.values()
-            if (missing := sorted(absent & self._needed(one)))
-        }
-
-    def _needed(self, profile: Profile) -> set[str]:
-        """The nodes that run in a profile: its own, and those that no profile names."""
-        named = {key for one in self._runtime.resource.profiles.values() for key in one.nodes}
-        return (self._runtime.resource.nodes.keys() - named) | set(profile.nodes)
-
     async def apply(self, profile: Profile) -> None:
         """Have the profile's nodes run, then set its values, except those by hand.
 
@@ -142,9 +133,15 @@ class Actuation(RuntimePart):
         """
         async with self._lock:
             wanted = {name: value for name, value in profile.sets.items() if name in self._bound}
-            values = wanted | self.by_hand
-            await self._run_nodes(profile, values)
-            await self._set(values)
+            await self._run_nodes(profile, wanted | self.by_hand)
+            running = {name for name, one in self._bound.items() if self._processes.pid(one.node) is not None}
+            by_hand = {name: value for name, value in self.by_hand.items() if name in running}
+            try:
+                await self._set(by_hand)
+            except PeerRefused as error:  # the node has changed since; that must not bar all profiles
+                _log.warning("! %s: no longer by hand: %s [resource-trouble]", self._runtime.node.name, error)
+                self.release()
+            await self._set({name: value for name, value in wanted.items() if name not in self.by_hand})
             self._wanted = wanted
 
     async def set(self, values: Mapping[str, ParameterValue]) -> None:
@@ -183,18 +180,15 @@ class Actuation(RuntimePart):
                 self._show(parameter.name)
 
     async def _run_nodes(self, profile: Profile, values: Mapping[str, ParameterValue]) -> None:
-        """Have exactly the profile's nodes run. One that is started here is started with its values at once."""
-        named = set(profile.nodes)
-        absent = {key for key in self._needed(profile) if self._processes.pid(key) is None}
+        """Have exactly the profile's nodes run; one that is started for it is started with its values at once."""
+        absent = {key for key in self._runtime.resource.nodes if self._processes.pid(key) is None}
         for name, value in values.items():
             binding = self._bound[name]
             if binding.kind is _PRIVATE and binding.node in absent:
                 await self._set_private(name, value)
-        late = {key for key in absent if self._differing(key, values, _ARGUMENT)}
-        await _all(self._restart(key, values) for key in late - named)
-        if late & named:
-            await self._processes.require(named - late)  # ends those that may have the same device
-            await _all(self._restart(key, values) for key in late & named)
+        for key in absent:
+            if self._differing(key, values, _ARGUMENT):
+                await self._restart(key, values)  # before it is needed, it only takes the arguments
         await self._processes.require(profile.nodes)
 
     async def _set(self, values: Mapping[str, ParameterValue]) -> None:
@@ -203,7 +197,9 @@ class Actuation(RuntimePart):
         for name, value in values.items():
             nodes.setdefault(self._bound[name].node, {})[name] = value
         await _all(self._read(key) for key in nodes)
-        before = dict(self._known)
+        parameters = self._runtime.resource.parameters
+        defaults = {name: parameters[name].default for name, one in self._bound.items() if one.kind is _ARGUMENT}
+        before = defaults | self._known
         todo = {key: wanted for key, wanted in nodes.items() if self._differing(key, wanted)}
         outcomes = await asyncio.gather(*(self._set_node(*each) for each in todo.items()), return_exceptions=True)
         if failed := next((one for one in outcomes if isinstance(one, BaseException)), None):
@@ -260,8 +256,8 @@ class Actuation(RuntimePart):
         if key in self._heard:
             self._heard[key].clear()
         texts = {self._bound[n].name: str(v).lower() if v in (True, False) else str(v) for n, v in arguments.items()}
+        self._known |= arguments  # also if that fails: what is undone differs then
         await self._processes.restart(key, args=texts)
-        self._known |= arguments
 
     async def _read(self, key: str) -> None:
         """Wait until the dynamic parameters of a node are known.
@@ -272,6 +268,8 @@ class Actuation(RuntimePart):
         if key not in self._heard:
             return
         limit = self._runtime.resource.settings.apply_timeout
+        if not self._updates[key].publishers:
+            self._heard[key].clear()  # that was of a node that has ended
         try:
             async with asyncio.timeout(limit):
                 await self._heard[key].wait()
@@ -399,16 +397,6 @@ class Actuation(RuntimePart):
             text = f"{value} by hand; profiles leave it alone" if name in self.by_hand else "no longer by hand"
             _log.info("= %s: parameter %s: %s", self._runtime.node.name, name, text)
             self.on_change()
-
-
-def _read_argument(text: str, parameter: Parameter) -> ParameterValue:
-    """The value of a launch argument; its text if it is none of the parameter's type."""
-    if isinstance(parameter.default, bool):
-        return text.lower() in ("true", "1")
-    try:
-        return type(parameter.default)(text)
-    except ValueError:
-        return text
 
 
 async def _all(work: Iterable[Awaitable[None]]) -> None:

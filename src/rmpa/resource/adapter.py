@@ -18,6 +18,7 @@ import msgspec
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.resource import limits
 from rmpa.resource.adaptation import Adaptation
+from rmpa.resource.conditions import Preconditions, Rules
 from rmpa.resource.decision import AlarmKind, Decider
 from rmpa.resource.declare import OfferSource
 from rmpa.resource.learnt import LearntOffers
@@ -25,7 +26,6 @@ from rmpa.resource.measuring import ObservedQualities, QualityMeasurement, count
 from rmpa.resource.quality import Requirement
 from rmpa.resource.runtime import CALLER, RuntimePart
 from rmpa.resource.saved import Clients, SavedState
-from rmpa.resource.values import Rules
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
 from rmpa.ros.types.descriptor import LEVEL_FOR
 from rmpa.ros.types.messages import MessageType
@@ -39,7 +39,8 @@ if TYPE_CHECKING:
 
     from rmpa.resource.actuation import Actuation
     from rmpa.resource.decision import Alarm
-    from rmpa.resource.declare import Context, Hook, Input, ManagedNode, Output, Profile
+    from rmpa.resource.declare import Context, Hook, Input, ManagedNode, Output
+    from rmpa.resource.observing import Observing
     from rmpa.resource.processes import Processes
     from rmpa.resource.quality import Attribute, Bound, Value
     from rmpa.resource.runtime import Runtime
@@ -58,9 +59,6 @@ _CLIENTS_INTERVAL: Final = 0.25
 _CONTEXT_PRIORITY: Final = 1 << 30
 # Prefix of the client name under which a context's requirement is kept.
 _CONTEXT_CLIENT: Final = "context "
-
-
-# Calls of the user's functions. Those of profiles and contexts, and preconditions.
 
 
 class HungError(RmpaError):
@@ -104,49 +102,6 @@ async def call_function(function: Hook, what: str, name: str, limit: float, reme
     if call.cancelled():
         raise RuntimeError("CancelledError: something that it awaited was cancelled")
     call.result()
-
-
-class Preconditions:
-    """The preconditions of one resource's profiles (``needs=``), each in a thread of its own: they may block.
-
-    Args:
-        profiles: The declared profiles, by name.
-    """
-
-    def __init__(self, profiles: Mapping[str, Profile]) -> None:
-        self._needs = {name: one.needs for name, one in profiles.items() if one.needs is not None}
-        # The call under way, by profile.
-        self._calls: dict[str, asyncio.Task[str | bool | None]] = {}
-
-    async def check(self) -> dict[str, str]:
-        """Call all preconditions, except those whose last call has not returned; at most one check at a time.
-
-        Returns:
-            The profiles that must not run, with the reason, after ``limits.PRECONDITION_TIMEOUT`` seconds at most.
-        """
-        for name, needs in self._needs.items():
-            if name not in self._calls:
-                what = f"needs of {name}"
-                self._calls[name] = start_task(in_thread(needs, what), what, raises=(Exception,))
-        if not self._calls:
-            return {}
-        done, _ = await asyncio.wait(self._calls.values(), timeout=limits.PRECONDITION_TIMEOUT)
-        found = {}
-        for name, call in list(self._calls.items()):
-            why: str | bool | None = f"its precondition has not answered for {limits.PRECONDITION_TIMEOUT:g} s"
-            if call in done:
-                del self._calls[name]
-                error = call.exception()
-                why = f"its precondition failed: {type(error).__name__}: {error}" if error else call.result()
-            if why is False:
-                why = "its precondition does not hold"
-            if why and isinstance(why, str):
-                found[name] = why
-        return found
-
-    async def close(self) -> None:
-        """Stop waiting for calls; threads that hang are left behind."""
-        await end_tasks(*self._calls.values())
 
 
 # Texts and values of a resource's reports. Alarms, health, responses (``docs/guides/smart-resources.md#reference``).
@@ -224,11 +179,18 @@ class Adapter(RuntimePart):
         values: The values of attributes that have an expression.
         tasks: The resource's tasks, paused while a profile is applied.
         actuation: Applies a profile to other nodes.
+        observing: Measures what other nodes publish.
         stop: Set when a function of a profile or context has exceeded its time-out: the resource has to end.
     """
 
     def __init__(
-        self, runtime: Runtime, values: ExpressionValues, tasks: Tasks, actuation: Actuation, stop: asyncio.Event
+        self,
+        runtime: Runtime,
+        values: ExpressionValues,
+        tasks: Tasks,
+        actuation: Actuation,
+        observing: Observing,
+        stop: asyncio.Event,
     ) -> None:
         resource = runtime.resource
         self._runtime = runtime
@@ -236,6 +198,8 @@ class Adapter(RuntimePart):
         self._tasks = tasks
         self._actuation = actuation
         actuation.on_change = self._tell
+        self._observing = observing
+        observing.on_counts = self._counted
         self._stop = stop
         self._name = runtime.node.name
         self._attributes = resource.attributes
@@ -324,8 +288,7 @@ class Adapter(RuntimePart):
         if self._measuring is not None:
             self._measuring.message(output.name, raw, self._loop.time(), now_ns, caller)
 
-    def counted(self, output: str, sent: Mapping[str, Sent], now: float) -> None:
-        """Measure an observed output by the counts of its publishers, from now on."""
+    def _counted(self, output: str, sent: Mapping[str, Sent], now: float) -> None:
         if self._measuring is not None:
             self._measuring.counted(output, sent, now)
 
@@ -371,7 +334,7 @@ class Adapter(RuntimePart):
 
     def _update_blocked(self) -> None:
         """Block profiles whose preconditions, rules or nodes are not as they need, and those out of the context."""
-        by_nodes = self._actuation.blocked() | (self.processes.blocked() if self.processes is not None else {})
+        by_nodes = self._observing.blocked() | (self.processes.blocked() if self.processes is not None else {})
         blocked = by_nodes | self._rules.blocked() | self._blocked_by_needs | self._blocked_by_context
         self.adaptation.block(blocked, self._loop.time())
 

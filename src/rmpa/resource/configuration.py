@@ -11,16 +11,8 @@ import logging
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import ConfigError, LocalProtocolError, RmpaError
-from rmpa.resource.reconfigure import (
-    CONTEXT,
-    DESCRIPTION_TYPE,
-    PROFILE,
-    checked,
-    config,
-    description,
-    entries,
-    read_config,
-)
+from rmpa.resource import reconfigure
+from rmpa.resource.reconfigure import CONTEXT, DESCRIPTION_TYPE, PROFILE, checked, config
 from rmpa.resource.runtime import RuntimePart
 from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE
 from rmpa.ros.types.installed import ServiceType
@@ -63,7 +55,7 @@ class Reconfigure(RuntimePart):
         self._actuation = actuation
         self._adapter = adapter
         self._contexts = contexts
-        self._known = entries(runtime.resource)
+        self._known = reconfigure.entries(runtime.resource)
         self._updates: Publisher | None = None
         self._published: Mapping[str, ParameterValue] = {}
         self._mirrored: dict[str, ParameterValue] = {}
@@ -94,7 +86,7 @@ class Reconfigure(RuntimePart):
         """Advertise the topics and the service."""
         node, kind = self._runtime.node, MessageType(DESCRIPTION_TYPE)
         described = await node.advertise(f"{node.name}/parameter_descriptions", kind, latch=True)
-        described.publish(description(self._known))
+        described.publish(reconfigure.description(self._known))
         self._updates = await node.advertise(f"{node.name}/parameter_updates", MessageType(CONFIG_TYPE), latch=True)
         self.changed()
         service = await asyncio.to_thread(ServiceType, SERVICE_TYPE)  # reads our file of definitions
@@ -161,7 +153,7 @@ class Reconfigure(RuntimePart):
             self._mirror = start_task(self._to_server(), "mirror parameters")
 
     async def _serve(self, request: Any) -> dict[str, object]:
-        await self.set(read_config(request.config))
+        await self.set(reconfigure.read_config(request.config))
         return {"config": config(self.values)}
 
     async def _set_parameters(self, values: Mapping[str, ParameterValue]) -> None:

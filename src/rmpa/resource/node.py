@@ -79,7 +79,8 @@ class ResourceNode:
         self.values = ExpressionValues(self.runtime, resource.expressions())
         self.actuation = Actuation(self.runtime, self.processes)
         stop = stop if stop is not None else asyncio.Event()
-        self.adapter = Adapter(self.runtime, self.values, self.tasks, self.actuation, stop)
+        observing = Observing(self.runtime, self.values)
+        self.adapter = Adapter(self.runtime, self.values, self.tasks, self.actuation, observing, stop)
         self.adapter.processes = self.processes
         self.processes.on_change = self.adapter.node_changed
         self.contexts = Contexts(self.runtime, self.values, self.tasks, self.adapter)
@@ -92,8 +93,8 @@ class ResourceNode:
             Sources(self.runtime, self.values, self.processes),
             self.tasks,
             self.actuation,
+            observing,
             self.adapter,
-            Observing(self.runtime, self.values, self.adapter),
             self.contexts,
             self.configuration,
             self.demands,

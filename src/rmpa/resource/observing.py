@@ -8,6 +8,7 @@ subscribers. Whether a topic has a publisher at all is asked of the master where
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import logging
 from typing import TYPE_CHECKING, Final
@@ -23,9 +24,8 @@ from rmpa.ros.wire.xmlrpc import RosFault, RosReply, call_pieces
 from rmpa.runtime.tasks import OwnedTasks, keep_task
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
-    from rmpa.resource.adapter import Adapter
     from rmpa.resource.declare import Output
     from rmpa.resource.runtime import Runtime
     from rmpa.resource.values import ExpressionValues
@@ -43,22 +43,33 @@ _ANSWER: Final = 1.0
 
 
 class Observing(RuntimePart):
-    """The observed outputs and inputs of one resource; must be started after the adapter.
+    """The observed topics of one resource, and the nodes that others start for it; starts before the adapter.
 
     Args:
         runtime: The runtime of the resource.
         values: A topic that an expression names stays subscribed to.
-        adapter: Measures.
     """
 
-    def __init__(self, runtime: Runtime, values: ExpressionValues, adapter: Adapter) -> None:
+    def __init__(self, runtime: Runtime, values: ExpressionValues) -> None:
         self._runtime = runtime
         self._values = values
-        self._adapter = adapter
+        # Called with an output, and what each of its publishers has sent, and when.
+        self.on_counts: Callable[[str, Mapping[str, Sent], float], None] = lambda _output, _sent, _now: None
+        # All nodes that the master knows.
+        self._present: set[str] = set()
         resource, node = runtime.resource, runtime.node.name
+        outputs = list(enumerate(resource.outputs.values()))
         # Observed outputs, and those of them that are counted, by global name.
         self._outputs = {topic_of(one.name, node): one for one in resource.outputs.values() if one.observed}
         self._counted: dict[str, Output] = {}
+        # Outputs without which a profile does, for it offers no messages of them.
+        prefixes = {one.name: (f"{resource.labels[one.name]}.", *([""] if not n else [])) for n, one in outputs}
+        offers = [one.offers for one in resource.profiles.values()]
+        self._optional = {
+            name
+            for name, each in prefixes.items()
+            if any(o.get(f"{prefix}rate") == 0 for o in offers for prefix in each)
+        }
         # Required inputs that other nodes receive, by global name.
         self._inputs = {
             topic_of(one.name, node): one.name for one in resource.inputs.values() if one.observed and one.required
@@ -79,7 +90,9 @@ class Observing(RuntimePart):
                 self._counted[topic] = output
             else:
                 await self._runtime.observe(output, functools.partial(self._received, output))
-        if self._outputs or self._inputs:
+        if self._outputs or self._inputs or self._runtime.resource.nodes:
+            with contextlib.suppress(RmpaError):
+                await self._look()
             self._work.add(keep_task(self._watch, f"observe for {self._runtime.resource.name}"))
 
     async def close(self) -> None:
@@ -88,12 +101,13 @@ class Observing(RuntimePart):
 
     def problems(self) -> tuple[list[str], list[str]]:
         """Topics that no node publishes, and publishers of another type."""
-        missing, broken = [], []
+        absent, named = self._absent()
+        missing, broken = [f"node {name} does not run" for key, name in absent.items() if key not in named], []
         for topic, output in self._outputs.items():
             subscriber = self._runtime.subscriber(output.name)
             if subscriber is None and (self._publishers is None or self._publishers.get(topic)):
                 continue
-            if (subscriber is None or not subscriber.publishers) and not self._is_off(output):
+            if (subscriber is None or not subscriber.publishers) and output.name not in self._optional:
                 missing.append(f"no node publishes {output.name}")
                 refusals = [*subscriber.refusals.values()][-1:] if subscriber is not None else []
                 broken += [f"{output.name}: {printable(text)}" for text in refusals]
@@ -103,15 +117,22 @@ class Observing(RuntimePart):
             ]
         return missing, broken
 
-    def _is_off(self, output: Output) -> bool:
-        """Whether the present profile offers no messages of an output: its node need not run."""
+    def blocked(self) -> dict[str, str]:
+        """The profiles that cannot run, with the reason: a node does not run that nothing here starts."""
+        absent, named = self._absent()
+        return {
+            one.name: f"node {name} does not run"
+            for one in self._runtime.resource.profiles.values()
+            for key, name in absent.items()
+            if key not in named or key in one.nodes
+        }
+
+    def _absent(self) -> tuple[dict[str, str], set[str]]:
+        """The nodes that nothing here starts and that do not run, by their keys, and those that profiles name."""
         resource = self._runtime.resource
-        profile = resource.profiles.get(self._adapter.adaptation.profile)
-        keys = [
-            f"{resource.labels[output.name]}.rate",
-            *(["rate"] if output.name == next(iter(resource.outputs)) else []),
-        ]
-        return profile is not None and any(profile.offers.get(key) == 0 for key in keys)
+        others = {one.key: one.name for one in resource.nodes.values() if not one.started and self._said}
+        named = {key for one in resource.profiles.values() for key in one.nodes}
+        return {key: name for key, name in others.items() if name not in self._present}, named
 
     def _received(self, output: Output, message: Received) -> None:
         """Change to counters if the topic carries much."""
@@ -124,7 +145,7 @@ class Observing(RuntimePart):
         if not much or topic in self._counted or self._values.uses(output.name):
             return
         self._counted[topic] = output
-        self._adapter.counted(output.name, {}, now)
+        self.on_counts(output.name, {}, now)
         self._work.start(self._runtime.ignore(output.name), f"measure {output.name} by counters")
         text = f"more than {limits.MEASURED_BYTES // 1024} KiB a second; it is measured by its node's own counters"
         _log.info("= %s: %s carries %s: rate and bandwidth only", self._runtime.node.name, output.name, text)
@@ -133,10 +154,10 @@ class Observing(RuntimePart):
         period = min(max(self._runtime.resource.settings.window, _LEAST), _MOST)
         while True:
             try:
-                if self._counted or self._inputs:
+                if self._counted or self._inputs or self._runtime.resource.nodes:
                     await self._look()
                     await self._count(self._publishers or {})
-            except RmpaError as error:
+            except (RmpaError, RosFault) as error:
                 _log.debug("! %s: %s", self._runtime.node.name, error)
             await asyncio.sleep(period)
 
@@ -148,14 +169,11 @@ class Observing(RuntimePart):
         if said == self._said:
             return
         match RosReply.of(await read_response(said)).value:
-            case [[*rows], *_]:
-                known = {str(row[0]): row[1] for row in rows if isinstance(row, list) and len(row) == 2}
+            case [[*published], [*subscribed], [*served]]:
+                known = {str(topic): list(map(str, names)) for topic, names in published}  # type: ignore[misc, arg-type]
                 mine = self._outputs.keys() | self._inputs.keys()
-                self._publishers = {
-                    topic: [str(name) for name in names if name != node.name]
-                    for topic, names in known.items()
-                    if topic in mine and isinstance(names, list)
-                }
+                self._publishers = {topic: [n for n in known.get(topic, ()) if n != node.name] for topic in mine}
+                self._present = {str(name) for _, names in (*published, *subscribed, *served) for name in names}  # type: ignore[misc, union-attr]
                 self._said, self._uris = said, {}
 
     async def _count(self, publishers: Mapping[str, Sequence[str]]) -> None:
@@ -165,7 +183,7 @@ class Observing(RuntimePart):
         for topic, output in self._counted.items():
             names = publishers.get(topic, ())
             sent = {name: found.get(topic, {}) for name in names if (found := answers.get(name)) is not None}
-            self._adapter.counted(output.name, sent, self._loop.time())
+            self.on_counts(output.name, sent, self._loop.time())
 
     async def _ask(self, node: str) -> dict[str, Sent] | None:
         """What a node has sent, by topic; ``None`` if it does not answer."""

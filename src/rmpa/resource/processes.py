@@ -16,7 +16,7 @@ import shlex
 import signal
 import time
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.core.timers import Backoff
@@ -31,7 +31,6 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.programs import (
     LOGS,
     RUNS,
-    CpuShares,
     NodeRun,
     ProgramMark,
     ResourceRun,
@@ -60,8 +59,18 @@ _BACK: Final = 1.0
 # Seconds that a node has to answer getPid.
 _ANSWER: Final = 2.0
 # Lines of a log that an error has at its end, and the most characters of them.
-_LOG_SHOWN: Final = 3
+_LOG_SHOWN: Final = 8
 _LOG_TEXT: Final = 400
+# Begins of lines of a log that say nothing: the command line, and what roslaunch has to say at its end.
+_EMPTY: Final = ("--- ", "shutting down processing", "... shutting down", "done", "all processes on machine")
+
+
+class NodeFailed(PeerRefused):
+    """A node of a resource is not up, and does not come up."""
+
+    def __str__(self) -> str:
+        """``node /camera has ended with code 1 …; what to do``."""
+        return f"{self.peer} {self.reason}" + (f"; {self.remedy}" if self.remedy else "")
 
 
 class NodeState(StrEnum):
@@ -75,30 +84,6 @@ class NodeState(StrEnum):
     WAITING = "waiting"
     # It could not be started, or has ended and is not started again.
     FAILED = "failed"
-
-
-class ProcessFigures(NamedTuple):
-    """What one node costs.
-
-    Attributes:
-        node: Its name in the graph.
-        pid: Its process; ``None``: it does not run.
-        cpu: Processor time as a share of one core since it was last asked for.
-        rss: Bytes of memory that it holds.
-        restarts: How often it was started again.
-        since: Since when it runs, in Unix seconds; 0: it does not.
-        state: Its state.
-        own: Whether the resource has started it.
-    """
-
-    node: str
-    pid: int | None
-    cpu: float
-    rss: int
-    restarts: int
-    since: float
-    state: NodeState
-    own: bool
 
 
 class Processes(RuntimePart):
@@ -125,7 +110,6 @@ class Processes(RuntimePart):
         self._wanted: set[str] = set()
         # Called when a wanted node has ended (true), and when it runs again (false), with a text for people.
         self.on_change: Callable[[ManagedNode, str, bool], None] = lambda _node, _text, _ended: None
-        self._shares = CpuShares()
         self._work = OwnedTasks()
         self._writes = asyncio.Lock()
         self._noted: ResourceRun | None = None
@@ -142,7 +126,6 @@ class Processes(RuntimePart):
                 node.adopt(one)
             else:
                 await end_program(one.mark, limits.NODE_END_TIMEOUT)
-        await asyncio.gather(*(node.expect() for node in self._nodes.values() if not node.declared.started))
         await self.note()
 
     async def close(self) -> None:
@@ -160,8 +143,7 @@ class Processes(RuntimePart):
             PeerRefused: One cannot be started, or is not there; the text says which, and has the end of its log.
         """
         self._wanted = {*self._always, *keys}
-        needless = (node for key, node in self._nodes.items() if key not in self._wanted and node.declared.started)
-        await asyncio.gather(*(node.down() for node in needless))
+        await asyncio.gather(*(node.down() for key, node in self._nodes.items() if key not in self._wanted))
         wanted = [node.up() for key, node in self._nodes.items() if key in self._wanted]
         for outcome in await asyncio.gather(*wanted, return_exceptions=True):
             if isinstance(outcome, BaseException):
@@ -182,28 +164,15 @@ class Processes(RuntimePart):
         if key not in self._wanted:
             return
         if not node.own and node.state is NodeState.RUNNING:
-            problem = f"node {node.declared.name} runs, and was not started by {self._runtime.resource.name}"
-            raise PeerRefused("its process", problem, "end it: the resource then starts it itself")
+            problem = f"runs, and was not started by {self._runtime.resource.name}"
+            raise NodeFailed(f"node {node.declared.name}", problem, "end it: the resource then starts it itself")
         await node.down()
         await node.up()
-        node.restarts += 1
 
     def pid(self, key: str) -> int | None:
         """The process of a node; ``None``: it does not run."""
         node = self._nodes[key]
         return node.pid if node.state is NodeState.RUNNING else None
-
-    def info(self) -> list[ProcessFigures]:
-        """The figures of all nodes that the resource names."""
-        found = []
-        for key, node in self._nodes.items():
-            pid = self.pid(key)
-            about = figures(pid) if pid is not None else None
-            cpu, rss = (self._shares.of(pid, about), about.rss) if pid is not None and about is not None else (0.0, 0)
-            found.append(
-                ProcessFigures(node.declared.name, pid, cpu, rss, node.restarts, node.since, node.state, own=node.own)
-            )
-        return found
 
     def problems(self) -> tuple[list[str], list[str]]:
         """The wanted nodes that do not run."""
@@ -337,24 +306,8 @@ class _Supervised:
                 return
             await end_tasks(self._keeper)
             self._keeper = None
-            try:
-                await self._begin()
-            except PeerRefused:
-                if not self.declared.started:
-                    self._keeper = start_task(self._keep_expected(), f"expect {self.declared.name}")
-                raise
+            await self._begin()
             self._keeper = start_task(self._keep(), f"keep {self.declared.name}")
-
-    async def expect(self) -> None:
-        """Attach to it, now or as soon as it runs: nothing here starts it."""
-        with contextlib.suppress(PeerRefused):
-            await self.up()
-
-    async def _keep_expected(self) -> None:
-        """Wait until it runs, then watch it."""
-        if await self._again_up(_BACK):
-            self._owner.on_change(self.declared, f"node {self.declared.name} runs", False)
-            await self._keep()
 
     async def down(self) -> None:
         """End it if it was started here, and watch it no more."""
@@ -406,11 +359,11 @@ class _Supervised:
         """Start it, and return its process once it is up."""
         node, declared = self._runtime.node, self.declared
         try:
-            command = await asyncio.to_thread(command_of, declared, self.arguments, os.environ)
+            command = await asyncio.to_thread(command_of, declared, self.arguments, {**os.environ, **declared.env})
             for key, value in declared.params.items():
                 await call_api(node.master_uri, "setParam", node.name, f"{declared.name}/{key}", value)
             await asyncio.shield(start_task(self._spawn(command), f"start {declared.name}", raises=(OSError,)))
-        except (OSError, RmpaError) as error:
+        except (OSError, ValueError, RmpaError) as error:  # ValueError: of the words of ``run`` and ``launch``
             raise self._refused(f"cannot be started: {error}") from None
         return await self._wait()
 
@@ -464,20 +417,17 @@ class _Supervised:
                 self._backoff.reset()
                 self._failures = 0
             self._failures += 1
-            own = self.own
+            own, final = self.own, self._final(code)
             delay = self._backoff.delay() if own else _BACK
             text = _how_ended(code)
-            again = self._again(code)
-            if not again and own:
-                text += f", and is not started again ({self._never(code)})"
+            if final:
+                text += f", and is not started again ({final})"
                 self._given_up = time.monotonic()
-            self._set(NodeState.WAITING if again else NodeState.FAILED, text + await self._log_end())
+            self._set(NodeState.FAILED if final else NodeState.WAITING, text + await self._log_end())
             _log.warning("! %s: node %s %s [node-gone]", self._runtime.node.name, self.declared.name, self.why)
             self._owner.on_change(self.declared, f"node {self.declared.name} {self.why}", True)
             await self._end()  # roslaunch, whose node has ended; what is left of its group
-            if not again:
-                return
-            if not await self._again_up(delay):
+            if final or not await self._again_up(delay):
                 return
             self.restarts += own
             self._owner.on_change(self.declared, f"node {self.declared.name} runs again", False)
@@ -496,18 +446,16 @@ class _Supervised:
                 self._set(NodeState.WAITING, why)
             delay = self._backoff.delay() if own else _BACK
 
-    def _again(self, code: int | None) -> bool:
-        """Whether it is started again, or expected."""
-        policy, own = self.declared.restart, self.own
-        if not own:
-            return True
-        wanted = policy is RestartPolicy.ALWAYS or (policy is RestartPolicy.ON_FAILURE and code != 0)
-        return wanted and self._failures < limits.NODE_FAILURES_MAX
-
-    def _never(self, code: int | None) -> str:
+    def _final(self, code: int | None) -> str:
+        """Why it is not started again; empty: it is, or is expected where it was not started here."""
+        policy = self.declared.restart
+        if not self.own:
+            return ""
         if self._failures >= limits.NODE_FAILURES_MAX:
             return f"{self._failures} times in a row"
-        return f'restart = "{self.declared.restart}"' + (", and it ended in order" if code == 0 else "")
+        if policy is RestartPolicy.ALWAYS or (policy is RestartPolicy.ON_FAILURE and code != 0):
+            return ""
+        return f'restart = "{policy}"' + (", and it ended in order" if code == 0 else "")
 
     async def _gone(self) -> int | None:
         """Wait until its process has ended; return the exit code, if it is known."""
@@ -519,6 +467,7 @@ class _Supervised:
         waits = [start_task(ended(pid), f"end of process {pid}") for pid in pids]
         try:
             await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(waits, timeout=_BACK)  # a script that has run the node ends behind it, with its code
         finally:
             await end_tasks(*waits)
         return self._code()
@@ -540,16 +489,16 @@ class _Supervised:
             self._process.poll()  # it is reaped
             self._process = None
 
-    def _refused(self, why: str, remedy: str = "") -> PeerRefused:
+    def _refused(self, why: str, remedy: str = "") -> NodeFailed:
         self._problem = why
-        return PeerRefused("its process", f"node {self.declared.name} {why}", remedy, code="resource-trouble")
+        return NodeFailed(f"node {self.declared.name}", why, remedy, code="resource-trouble")
 
     async def _log_end(self) -> str:
         """The end of its log, for texts."""
         if self.log is None or not self.own:
             return ""
         lines, _ = await asyncio.to_thread(read_log, self.log, None, _LOG_SHOWN)
-        told = " / ".join(line for line in lines if line and not line.startswith("--- "))
+        told = " / ".join(line for line in lines if line.strip() and not line.startswith(_EMPTY))
         return f"; its log ends: {told[-_LOG_TEXT:]}" if told else ""
 
 

@@ -409,17 +409,8 @@ def describe(resource: Resource, node: str) -> Descriptor:
 
 def _parameter(one: Parameter) -> ParameterDescriptor:
     binding = str(one.binding) if one.binding is not None else ""
-    return ParameterDescriptor(
-        name=one.name,
-        type=one.type,
-        default=one.default,
-        low=one.low,
-        high=one.high,
-        choices=one.choices,
-        unit=one.unit,
-        description=one.description,
-        binding=binding,
-    )
+    values = {name: getattr(one, name) for name in ParameterDescriptor.__struct_fields__}
+    return ParameterDescriptor(**values | {"binding": binding})
 
 
 def _convert(declared: object, kind: type[_Kind]) -> _Kind:

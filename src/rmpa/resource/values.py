@@ -19,10 +19,9 @@ from rmpa.runtime.tasks import OwnedTasks
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from rmpa.resource.declare import AlarmRule, Input, Output, Parameter
+    from rmpa.resource.declare import Input, Output, Parameter
     from rmpa.resource.expression import Expression, Scalar, Source
     from rmpa.resource.quality import Value
-    from rmpa.resource.resource import Resource
     from rmpa.resource.runtime import Runtime
     from rmpa.ros.node.endpoints import Received, Subscriber
     from rmpa.ros.types.messages import MessageType
@@ -168,49 +167,6 @@ class ExpressionValues(RuntimePart):
             self._subscribers[topic] = await node.subscribe(
                 topic, callback=lambda message: self._update(topic, message.kind, message.raw)
             )
-
-
-class Rules:
-    """The rules of one resource's alarms and profiles, judged once in each window.
-
-    Args:
-        resource: The resource, completely declared.
-        values: What the rules refer to.
-    """
-
-    def __init__(self, resource: Resource, values: ExpressionValues) -> None:
-        self._values = values
-        self._alarms = [(one, resource.expression(one.when, f"alarm {one.name}")) for one in resource.alarms.values()]
-        self._profiles = {
-            one.name: (one.rule, resource.expression(one.rule, f"profile {one.name}"))
-            for one in resource.profiles.values()
-            if one.rule
-        }
-        # The alarms that stand.
-        self.standing: dict[str, AlarmRule] = {}
-
-    def judge(self) -> list[tuple[AlarmRule, bool]]:
-        """The alarms that are raised (true) or over now; one whose rule is unknown stays as it is."""
-        values, changes = self._values.now() if self._alarms else {}, []
-        for alarm, rule in self._alarms:
-            holds, stands = rule.holds(values), alarm.name in self.standing
-            if holds is None or holds == stands:
-                continue
-            if holds:
-                self.standing[alarm.name] = alarm
-            else:
-                del self.standing[alarm.name]
-            changes.append((alarm, holds))
-        return changes
-
-    def blocked(self) -> dict[str, str]:
-        """The profiles whose rule is false, with the reason; an unknown rule blocks none."""
-        values = self._values.now() if self._profiles else {}
-        return {
-            name: f"its rule does not hold: {text}"
-            for name, (text, rule) in self._profiles.items()
-            if rule.holds(values) is False
-        }
 
 
 class TopicField:

@@ -5,6 +5,7 @@ Events: ``up``; ``config`` with ``int_`` and ``double_`` for each change.
 
 import sys
 import time
+from typing import Any
 
 import rospy
 from dynamic_reconfigure.cfg import TestConfig
@@ -20,7 +21,7 @@ def main() -> None:
     rospy.init_node(args.name or "tunable")
     rate = [1]
 
-    def changed(config: dict, _level: int) -> dict:
+    def changed(config: dict[str, Any], _level: int) -> dict[str, Any]:
         rate[0] = config["int_"]
         say("config", int_=config["int_"], double_=config["double_"])
         return config

@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.ros.wire.slave_api import BusConnection, BusLink, bus_info, bus_stats, read_bus_info, read_bus_stats
+from rmpa.ros.wire.slave_api import (
+    BusConnection,
+    BusLink,
+    bus_info,
+    bus_stats,
+    read_bus_info,
+    read_bus_stats,
+    sent_between,
+)
 from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 TALKER: Final = "http://127.0.0.1:36171/"
@@ -140,3 +148,11 @@ def test_whatever_a_node_answers_for_its_counts_is_read(value: XmlRpcValue) -> N
     answers: list[XmlRpcValue] = [value, [value], [1, "", value], [1, "", [[["/a", value], ["/a", [value]]]]]]
     for answer in answers:
         assert all(isinstance(sent, dict) for sent in read_bus_stats(answer).values())
+
+
+def test_what_was_sent_between_two_answers_is_that_of_the_best_connection() -> None:
+    before = {1: (2**32 - 2, 2**32 - 8), 2: (10, 1040), 4: (9, 9)}
+    after = {1: (3, 512), 2: (12, 1248), 3: (100, 10_000)}
+    assert sent_between(before, after) == (5, 500)  # counters of 32 bits; a new connection says nothing yet
+    assert sent_between(before, {3: (100, 10_000)}) is None
+    assert sent_between({}, {}) is None
