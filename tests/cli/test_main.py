@@ -147,7 +147,7 @@ def test_help_without_arguments_is_no_error_with_a_code(capsys: pytest.CaptureFi
         ("list", "Did you mean `rmpa peer list` or `rmpa topic list`?"),
         ("help", "Did you mean `rmpa --help`?"),
         ("version", "Did you mean `rmpa --version`?"),
-        ("start", "Did you mean `rmpa up` or `rmpa service install`?"),
+        ("start", "Did you mean `rmpa up` or `rmpa resource start` or `rmpa service install`?"),
         ("--json peer list", "--json belongs after the command: rmpa peer list --json"),
         ("topic --agent base list", "--agent belongs after the command: rmpa topic list --agent"),
         ("up --fresh", "No such option: --fresh; write --keep never"),

@@ -261,3 +261,12 @@ def test_what_is_decided_for_all_is_decided_so_for_each(
     assert decision is None or each == {decision.allowed}
     if not any(glob != "*" for rule in rules for glob in rule.modules) and "{peer}" not in str(rules):
         assert decision is not None
+
+
+def test_no_default_lets_a_module_start_resources() -> None:
+    given = PermissionRule(("arm",), names={"launch": ("/cam",)})
+    permissions = Permissions(TrustSettings("allow", rules=(given,)))
+    assert permissions.judge(Access.PUBLISH, "base", "/cmd_vel").allowed
+    assert not permissions.judge(Access.LAUNCH, "base", "/cam").allowed
+    assert permissions.judge(Access.LAUNCH, "arm", "/cam").allowed
+    assert not permissions.judge(Access.LAUNCH, "arm", "/base").allowed

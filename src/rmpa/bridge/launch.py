@@ -160,7 +160,10 @@ class Launcher(Part):
             replace_file(path, msgspec.json.encode(kept))
 
         async with self._writes:
-            await asyncio.to_thread(save)
+            try:
+                await asyncio.to_thread(save)
+            except OSError as error:
+                _log.warning("! what runs cannot be noted for the next agent: %s [directory-unusable]", error)
 
     def _of(self, name: str, path: Path) -> ResourceProgram:
         if name not in self._launched:
@@ -182,7 +185,7 @@ class Launcher(Part):
                 lost[name] = f"waits for {', '.join(missing)}, which is not in the folder"
             if name in lost:
                 one.state, one.why = "failed", lost[name]
-                _log.warning("! resource %s is not started: it %s [%s]", name, lost[name], REFUSED)
+                _log.warning("! resource %s is not started: it %s [launch-refused]", name, lost[name])
             elif not one.runs:
                 one.state = "waiting"
                 self._waiting[name] = rule
@@ -255,15 +258,19 @@ class Launcher(Part):
             rule = "the mesh is not secured, and open of [resources] is false"
             gate.refused(Access.LAUNCH, peer, "a resource", PermissionDecision(False, rule))
             raise RmpaError(f"{context.settings.name} starts nothing for others: {rule}", code="not-permitted")
+
+        def allowed(each: str) -> bool:
+            return gate.judge(Access.LAUNCH, peer, f"/{each}").allowed
+
         if what == LIST:
-            return await self._do(args, lambda each: gate.judge(Access.LAUNCH, peer, f"/{each}").allowed, peer)
+            return await self._do(args, allowed, peer)
         if not is_name(name):
             raise RmpaError("the request names no resource: letters, digits and _", code="unknown-name")
         if why := gate.why_not(Access.LAUNCH, peer, f"/{name}"):
             raise RmpaError(why, code="not-permitted")
         if verb := ACTS.get(str(what)):
             _log.info("= %s %s resource %s", asker_name(peer), verb, name)
-        return await self._do({"what": what, "name": name, "after": args.get("after"), "lines": args.get("lines")})
+        return await self._do(args, allowed)
 
     async def answer(self, args: Mapping[str, Any]) -> list[ModuleResources]:
         """Answer a program of this machine: ``what`` of the resource ``name``, here or at a peer, a ``module``.
@@ -287,8 +294,10 @@ class Launcher(Part):
 
     async def _ask(self, session: PeerSession, request: dict[str, Any]) -> ModuleResources:
         name = session.link.name
+        quick = request.get("what") in (LIST, LOG)
         try:
-            value = await self._bridge.rpc.request(session, LAUNCH, request, limits.LAUNCH_ASK_TIMEOUT)
+            timeout = limits.ASK_TIMEOUT if quick else limits.LAUNCH_ASK_TIMEOUT
+            value = await self._bridge.rpc.request(session, LAUNCH, request, timeout)
             return msgspec.structs.replace(msgspec.convert(value, ModuleResources), module=name)
         except PeerRefused as error:
             problem, code = (_EARLIER, "other-release") if error.unknown else (error.reason, "not-permitted")
@@ -319,7 +328,7 @@ class Launcher(Part):
                 if not files or told or not peer:
                     return ModuleResources(module=module, resources=told)
             elif not is_name(name) or (str(name) not in files and str(name) not in self._launched):
-                near = suggestion(str(name), files, "`rmpa resource list` shows what can be started")
+                near = suggestion(str(name), filter(allowed, files), "`rmpa resource list` shows what can be started")
                 problem = f"{module} has no file of a resource {str(name)[:64]!r}; {near}"
                 return ModuleResources(module=module, problem=problem, code="unknown-name")
             elif what == LOG:

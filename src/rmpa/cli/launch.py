@@ -138,7 +138,7 @@ def resource_stop(resource: str, options: Options) -> int:
 
 @agent_verb(argument("resource", _launchable, metavar="[MODULE:]RESOURCE"))
 def resource_restart(resource: str, options: Options) -> int:
-    """End a resource and start it again: it reads its file anew.
+    """End a resource and start it again, with its file as it is now.
 
     ---
 

@@ -378,7 +378,7 @@ class Settings:
     )
     services: ServiceSettings = table(ServiceSettings, "services", "SERVICE", live=True)
     nodes: NodeSettings = table(NodeSettings, "nodes", "NODE", live=True)
-    resources: ResourceSettings = table(ResourceSettings, "resources", "RESOURCES")
+    resources: ResourceSettings = table(ResourceSettings, "resources", "RESOURCE")
     params: ParamSettings = table(ParamSettings, "params", live=True)
     time: TimeSettings = table(TimeSettings, "time", "TIME", live=True)
     limits: LimitSettings = table(LimitSettings, "limits", "LIMIT", live=True)

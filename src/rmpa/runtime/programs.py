@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import functools
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 # Below the folder of a module's state: the logs of programs, and what resources tell of their runs (``ResourceRun``).
 LOGS: Final = "log"
 RUNS: Final = "run"
+_COLOURS: Final = re.compile(rb"\x1b\[[0-9;]*m")
 _TICKS: Final = os.sysconf("SC_CLK_TCK")
 _PAGE: Final = os.sysconf("SC_PAGE_SIZE")
 # Seconds between two looks whether the processes of a program have ended.
@@ -296,7 +298,7 @@ def rotate_log(path: Path) -> None:
 
 
 def read_log(path: Path, after: int | None, lines: int) -> tuple[list[str], int]:
-    """Lines of a log, and where the next ones begin.
+    """Lines of a log, without their colours, and where the next ones begin.
 
     Args:
         path: The file; one that is missing is empty.
@@ -314,7 +316,8 @@ def read_log(path: Path, after: int | None, lines: int) -> tuple[list[str], int]
         return [], 0
     if after is not None and (rest := len(text) - text.rfind(b"\n") - 1) and rest < limits.PROGRAM_LOG_LINE:
         text, end = text[:-rest], max(end - rest, 0)  # a line that is being written comes with the next answer
-    found = text[-limits.PROGRAM_LOG_READ :].decode("utf-8", "replace").splitlines()[-lines:]
+    plain = _COLOURS.sub(b"", text[-limits.PROGRAM_LOG_READ :])
+    found = plain.decode("utf-8", "replace").splitlines()[-lines:]
     return [line[: limits.PROGRAM_LOG_LINE] for line in found], end
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.config.settings import Settings
+from rmpa.config.settings import ResourceSettings, Settings
 from rmpa.observe.check import Check
 from rmpa.observe.doctor.machine import DoctorInput
 from rmpa.observe.doctor.repairs import Repair, directories, of_directories, of_group, of_leavings, of_mode, of_unit
@@ -97,6 +97,14 @@ def test_the_mode_of_a_directory_that_others_may_use_is_for_the_user_to_change(
     assert words in check.text
     given = DoctorInput({"RMPA_RUNTIME_DIR": str(place)}, Settings(), (), {}, ())
     assert "--fix" not in next(iter(directories(given))).remedy
+
+
+def test_a_folder_of_resources_that_others_may_write_is_told(tmp_path: Path) -> None:
+    tmp_path.chmod(0o777)
+    given = DoctorInput({}, Settings(resources=ResourceSettings(str(tmp_path))), (), {}, ())
+    assert any(check.where == str(tmp_path) and "0777" in check.text for check in directories(given))
+    tmp_path.chmod(0o755)
+    assert not any(check.where == str(tmp_path) for check in directories(given))
 
 
 @pytest.fixture

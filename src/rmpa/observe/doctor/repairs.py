@@ -132,6 +132,8 @@ def of_directories(given: DoctorInput) -> Iterator[Repair | Check]:
         if environ.get("HOME"):
             yield from of_owner(state, Path(environ["HOME"]))
         yield from of_mode(state, 0o022, "go-w")
+    if settings.resources.folder:  # what lies there is run
+        yield from of_mode(Path(settings.resources.folder).expanduser(), 0o022, "go-w")
     for place in dict.fromkeys((own, *runtime_dirs(environ))):
         yield from of_leavings(place)
 
