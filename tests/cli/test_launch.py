@@ -87,7 +87,10 @@ def test_the_log_of_a_resource_has_its_nodes_in_front(place: Place, agent: Fake)
     assert (code, "did you mean driver?" in errors) == (1, True)
 
 
-def test_top_shows_all_modules_and_says_which_does_not_answer(place: Place, agent: Fake) -> None:
+def test_top_shows_all_modules_and_says_which_does_not_answer(
+    place: Place, agent: Fake, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rmpa.cli.launch._MEASURED", 0.0)
     now = time.time()
     busy = NodeCost(node="/driver", pid=43, cpu=0.5, rss=25_000_000, threads=4, since=now - 90, started_by="camera")
     idle = NodeCost(node="/idle", pid=44, rss=1_000_000, threads=1, since=now - 3)

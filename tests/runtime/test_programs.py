@@ -40,7 +40,7 @@ async def test_a_process_is_known_again_and_no_other_is_taken_for_it(tmp_path: P
     assert abs(about.since - log.stat().st_mtime) < 60
     process.send_signal(signal.SIGKILL)
     await ended(process.pid)
-    assert not mark.runs, "a process that nobody has waited for does not run"
+    assert ProgramMark.of(process.pid) is None, "nobody has waited for it, and it does not run"
     assert figures(process.pid) is None
     process.wait()
     await ended(process.pid)
@@ -78,7 +78,7 @@ def test_a_log_is_read_on_from_where_it_was_left_also_over_its_rotation(
     assert read_log(log, None, 10) == ([], 0)
     with log.open("ab", buffering=0) as program:  # which knows nothing of the rotation
         program.write(b"one\n\x1b[31mtwo\x1b[0m\n")
-        assert read_log(log, None, 1) == (["two"], 17)
+        assert read_log(log, None, 1) == (["two"], 17)  # the place is that in the file
         lines, place = read_log(log, None, 10)
         assert lines == ["one", "two"]
         program.write(b"thr")

@@ -286,6 +286,7 @@ class Nodes(Part):
         pids = await asyncio.gather(*(pid(*one) for one in asked))
         pids = [each if local else None for each, local in zip(pids, here, strict=True)]
         running = {each for each in pids if each is not None}
+        launch.shares.keep(running)
         if not all(map(launch.shares.known, running)):
             for each in running:
                 if (about := figures(each)) is not None:

@@ -33,6 +33,8 @@ _BEFORE: Final = 10
 _LOOK: Final = 0.5
 # Topics that ``rmpa top`` shows of each module: those with the most bytes.
 _TOPICS: Final = 5
+# Seconds over which their rates are measured for one answer.
+_MEASURED: Final = 1.0
 _COLOURS: Final = {"active": "green", "failed": "red", "refused": "red", "stopped": "bright_black"}
 _CLEAR: Final = "\x1b[H\x1b[2J"
 
@@ -220,6 +222,9 @@ def top(modules: tuple[str, ...], once: bool, interval: float, options: Options)
     """
     live = sys.stdout.isatty() and not (once or options.as_json)
     with options.client(CONTROL_HANDLER_TIMEOUT) as client, contextlib.suppress(KeyboardInterrupt):
+        if not live:  # topics are measured once somebody asks
+            client.call("rates", dict[str, Any])
+            time.sleep(_MEASURED)
         while True:
             told = client.call("top", dict[str, Any], modules=list(modules))
             rates = client.call("rates", dict[str, Any])

@@ -113,6 +113,7 @@ class Processes(RuntimePart):
         self._work = OwnedTasks()
         self._writes = asyncio.Lock()
         self._noted: ResourceRun | None = None
+        self._complained = False
         self._rotated = 0.0
 
     async def start(self) -> None:
@@ -220,11 +221,11 @@ class Processes(RuntimePart):
                 return
             try:
                 await asyncio.to_thread(run.save, self._record)
-                self._noted = run
+                self._noted, self._complained = run, False
             except OSError as error:
                 text = "! %s: its nodes cannot be noted: %s; after a crash they are not found [directory-unusable]"
-                _log.warning(text, self._runtime.node.name, error)
-                self._record = None
+                _log.log(logging.DEBUG if self._complained else logging.WARNING, text, self._runtime.node.name, error)
+                self._complained = True
 
     def _run(self, state: LifecycleState | None = None) -> ResourceRun:
         mark = ProgramMark.of(os.getpid())
@@ -359,20 +360,31 @@ class _Supervised:
         """Start it, and return its process once it is up."""
         node, declared = self._runtime.node, self.declared
         try:
-            command = await asyncio.to_thread(command_of, declared, self.arguments, {**os.environ, **declared.env})
+            command, environ = await asyncio.to_thread(self._prepare)
             for key, value in declared.params.items():
                 await call_api(node.master_uri, "setParam", node.name, f"{declared.name}/{key}", value)
-            await asyncio.shield(start_task(self._spawn(command), f"start {declared.name}", raises=(OSError,)))
+            await asyncio.shield(
+                start_task(self._spawn(command, environ), f"start {declared.name}", raises=(OSError,))
+            )
         except (OSError, ValueError, RmpaError) as error:  # ValueError: of the words of ``run`` and ``launch``
             raise self._refused(f"cannot be started: {error}") from None
         return await self._wait()
 
-    async def _spawn(self, command: list[str]) -> None:
-        """Start the process, and note it; not to be cancelled in between."""
+    def _prepare(self) -> tuple[list[str], dict[str, str]]:
+        """Its command line, which its log tells, and its environment; uses the disk."""
         environ = {"PYTHONUNBUFFERED": "1", **os.environ, "ROS_MASTER_URI": self._runtime.node.master_uri}
+        if self.log is not None and not os.access(os.path.expanduser("~"), os.W_OK):  # noqa: PTH111 - there may be none
+            environ.setdefault("ROS_HOME", str(self.log.parents[1] / "ros"))  # as of a service; roslaunch logs there
         environ |= self.declared.env
+        command = command_of(self.declared, self.arguments, environ)
         if self.log is not None:
-            await asyncio.to_thread(_write_line, self.log, f"--- {time.strftime('%F %T')} {shlex.join(command)}\n")
+            self.log.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with self.log.open("a", encoding="utf-8") as file:
+                file.write(f"--- {time.strftime('%F %T')} {shlex.join(command)}\n")
+        return command, environ
+
+    async def _spawn(self, command: list[str], environ: Mapping[str, str]) -> None:
+        """Start the process, and note it; not to be cancelled in between."""
         self._process = await asyncio.to_thread(
             start_program, command, log=self.log, cwd=self._runtime.resource.folder, env=environ
         )
@@ -500,12 +512,6 @@ class _Supervised:
         lines, _ = await asyncio.to_thread(read_log, self.log, None, _LOG_SHOWN)
         told = " / ".join(line for line in lines if line.strip() and not line.startswith(_EMPTY))
         return f"; its log ends: {told[-_LOG_TEXT:]}" if told else ""
-
-
-def _write_line(path: Path, text: str) -> None:
-    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    with path.open("a", encoding="utf-8") as file:
-        file.write(text)
 
 
 def _how_ended(code: int | None) -> str:

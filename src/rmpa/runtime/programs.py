@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 # Below the folder of a module's state: the logs of programs, and what resources tell of their runs (``ResourceRun``).
 LOGS: Final = "log"
 RUNS: Final = "run"
-_COLOURS: Final = re.compile(rb"\x1b\[[0-9;]*m")
+# Colours, and the title that roslaunch gives its terminal.
+_COLOURS: Final = re.compile(rb"\x1b\[[0-9;]*m|\x1b\][^\x07\n]*\x07")
 _TICKS: Final = os.sysconf("SC_CLK_TCK")
 _PAGE: Final = os.sysconf("SC_PAGE_SIZE")
 # Seconds between two looks whether the processes of a program have ended.
