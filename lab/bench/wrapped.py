@@ -11,14 +11,11 @@ from __future__ import annotations
 import asyncio
 import time
 from array import array
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
 from lab import samples, tables
-from lab.bed.agents import RMPA
 from lab.bed.bench import TEST_NODES, Bed
-from lab.bed.processes import Process
 from lab.findings import Claim
 from lab.results import finish
 from lab.tables import percentiles, table_of
@@ -28,6 +25,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from lab.bed.processes import Process
     from lab.bed.ros import Ros
 
 # Bytes and messages a second.
@@ -36,7 +34,7 @@ _LIBRARIES: Final = ("roscpp", "rospy")
 _RATIO: Final = 1.02
 _NODES: Final = ("one", "two", "three")
 # Seconds until the resource has found the topic, and has seen how much it carries.
-_SETTLE: Final = 3.0
+_SETTLE: Final = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,14 +54,16 @@ class WrappedPlan:
     decisions: int
 
 
-FULL: Final = WrappedPlan(8, 10.0, 100, 5000)
+FULL: Final = WrappedPlan(20, 4.0, 100, 5000)
 QUICK: Final = WrappedPlan(2, 2.0, 10, 500)
 
 
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
     """Measure all of it, print the tables, write the file; return the result."""
     plan = QUICK if quick else FULL
-    attached = {(library, load): _attach(plan, library, load) for library in _LIBRARIES for load in _LOADS}
+    attached = {
+        (library, load): asyncio.run(_attach(plan, library, load)) for library in _LIBRARIES for load in _LOADS
+    }
     changes = asyncio.run(_change(plan.changes))
     decided = _decide(plan.decisions)
     table = table_of(
@@ -87,32 +87,40 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
     return finish(console, "wrapped", asdict(plan), result, json, claims=claims)
 
 
-def _attach(plan: WrappedPlan, library: str, load: str) -> dict[str, list[float]]:
+async def _attach(plan: WrappedPlan, library: str, load: str) -> dict[str, list[float]]:
     """Microseconds from due to arrival, by way."""
+    from rmpa.resource.description import read_description
+    from rmpa.resource.node import ResourceNode
+
     size, rate = _LOADS[load]
     took: dict[str, list[float]] = {"alone": [], "attached": []}
+    text = (
+        b'role = "sensing"\n[output.data]\ntopic = "/cam/data"\ntype = "std_msgs/UInt8MultiArray"\n'
+        b'[profile.only]\noffers = { rate = "30 Hz" }\n'
+    )
     with Bed() as bed:
         shell = bed.shell()
-        shell.master()
-        sink = shell.node(library, "sink", topics="/cam/data", commands=True)
-        source = shell.node(library, "source", topic="/cam/data", commands=True)
-        sink.wait_event("up")
-        source.wait_event("connected")
-        file = bed.home / "cam.resource.toml"
-        file.write_text(
-            'role = "sensing"\n[output.data]\ntopic = "/cam/data"\ntype = "std_msgs/UInt8MultiArray"\n'
-            '[profile.only]\noffers = { rate = "30 Hz" }\n'
-        )
+        source, sink = await asyncio.to_thread(_ends, shell, library)
         for turn in range(2 * plan.rounds):
             way = ("alone", "attached")[(turn + turn // 2) % 2]
-            with ExitStack() as stack:
-                if way == "attached":
-                    words: list[str | Path] = [RMPA, "run", file, "--master", shell.uri, "--no-state"]
-                    resource = stack.enter_context(Process(shell.host.command(words), env=shell.env, name="resource"))
-                    resource.wait_for("active on", 30.0)
-                _round(bed, source, sink, size, rate, _SETTLE)
-                took[way] += _round(bed, source, sink, size, rate, plan.seconds)
+            one = ResourceNode(await asyncio.to_thread(read_description, text, bed.home / "cam.toml"), shell.uri)
+            if way == "attached":
+                await one.start()
+            await asyncio.to_thread(_round, bed, source, sink, size, rate, _SETTLE)
+            took[way] += await asyncio.to_thread(_round, bed, source, sink, size, rate, plan.seconds)
+            if way == "attached":
+                await one.close()
     return took
+
+
+def _ends(shell: Ros, library: str) -> tuple[Process, Process]:
+    """The publisher and the subscriber."""
+    shell.master()
+    sink = shell.node(library, "sink", topics="/cam/data", commands=True)
+    source = shell.node(library, "source", topic="/cam/data", commands=True)
+    sink.wait_event("up")
+    source.wait_event("connected")
+    return source, sink
 
 
 def _round(bed: Bed, source: Process, sink: Process, size: int, rate: float, seconds: float) -> list[float]:
