@@ -3,6 +3,7 @@
 import sys
 import time
 from types import SimpleNamespace
+from typing import Any
 
 import rospy
 from dynamic_reconfigure.server import Server
@@ -38,7 +39,7 @@ def main() -> None:
     rospy.init_node(args.name or "usb_cam")
     rate = [30]
 
-    def changed(config: dict, _level: int) -> dict:
+    def changed(config: dict[str, Any], _level: int) -> dict[str, Any]:
         rate[0] = config["frame_rate"]
         return config
 
