@@ -116,6 +116,12 @@ def test_role_and_name_are_guessed(
     assert [made.role, made.name] == [role, name]
 
 
+def test_the_node_of_a_peer_is_described_by_its_own_name() -> None:
+    facts = NodeFacts("/rmpa/arm/laser", publications={"/scan": SCAN})
+    text = describe(Found("arm:/laser", facts, LiveGraph({}, {}, {}, {}, {})))
+    assert '# It runs at the module arm.\n[node.driver]\nname = "/laser"' in text
+
+
 def test_a_resource_is_not_named_as_its_node() -> None:
     facts = NodeFacts("/laser", publications={"/scan": SCAN})
     assert 'name = "laser_resource"' in describe(Found("/laser", facts, LiveGraph({}, {}, {}, {}, {})))
