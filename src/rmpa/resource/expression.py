@@ -62,7 +62,7 @@ _EXAMPLE: Final = "for example /battery/charging == true and ~gain > 3"
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class SourceCall:
     """A value that only the running resource knows: ``cpu('driver')``, ``diagnostics('usb_cam', 'Temperature')``.
 
     Args:
@@ -87,7 +87,7 @@ class Expression:
 
     value: _Value
     references: tuple[str, ...]
-    sources: Mapping[str, Source]
+    sources: Mapping[str, SourceCall]
 
     def holds(self, values: Mapping[str, Scalar]) -> bool | None:
         """Whether the expression, as a rule, is true; ``None``: that depends on unknown values."""
@@ -148,7 +148,7 @@ class _Parser:
         self._attributes = attributes
         self._sources = sources
         self.references: dict[str, None] = {}
-        self.found: dict[str, Source] = {}
+        self.found: dict[str, SourceCall] = {}
         self._tokens: deque[tuple[str, str]] = deque()
         at = 0
         while rest := text[at:].strip():
@@ -259,7 +259,7 @@ class _Parser:
                 raise self._error("a bracket is not closed")
         if len(arguments) not in counts:
             raise self._error(f"{word} takes {' or '.join(map(str, counts))} texts", f"it has {len(arguments)}")
-        source = Source(word, tuple(arguments))
+        source = SourceCall(word, tuple(arguments))
         text = f"{word}({', '.join(map(repr, arguments))})"
         self.found[text] = source
         return self._reference(text)

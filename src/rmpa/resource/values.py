@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from rmpa.resource.declare import Input, Output, Parameter
-    from rmpa.resource.expression import Expression, Scalar, Source
+    from rmpa.resource.expression import Expression, Scalar, SourceCall
     from rmpa.resource.quality import Value
     from rmpa.resource.runtime import Runtime
     from rmpa.ros.node.endpoints import Received, Subscriber
@@ -47,7 +47,7 @@ class ExpressionValues(RuntimePart):
         self.listeners: list[Callable[[set[str]], None]] = []
         references: set[str] = set()
         # The functions that the expressions call, by their text.
-        self.sources: dict[str, Source] = {}
+        self.sources: dict[str, SourceCall] = {}
         for each in expressions:
             references.update(each.references)
             self.sources.update(each.sources)
