@@ -123,18 +123,13 @@ async def test_a_node_that_the_user_started_is_attached_to_and_never_ended(
     await one.close()
 
 
-async def test_a_node_that_is_missing_excludes_its_profile_with_the_reason(make: Make) -> None:
+async def test_a_node_that_is_missing_fails_its_profile_with_the_reason(make: Make) -> None:
     one = make(described(("laser",), (), laser=None))
     await one.start()
     assert one.adapter.adaptation.profile == "p1"
-<<<<<<< HEAD
-    scores = one.adapter.adaptation.explain(asyncio.get_running_loop().time())
-    assert "node /laser does not run" in next(each.excluded for each in scores if each.profile == "p0")
-=======
     assert "/laser" in one.adapter.adaptation._excluded(0.0)["p0"]
     with pytest.raises(PeerRefused, match="/laser does not run; start it, or say in the file how it is started"):
         await one.processes.require(["laser"])
->>>>>>> w-launch
 
 
 async def test_a_node_that_cannot_start_fails_its_profile_with_the_end_of_its_log(make: Make) -> None:
