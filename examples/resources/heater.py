@@ -1,5 +1,7 @@
 """A heater's driver, as many are: it knows nothing of RMPA, and reports by diagnostic_updater (rospy)."""
 
+from typing import Any
+
 import diagnostic_updater
 import rospy
 from std_msgs.msg import Float64
@@ -11,7 +13,7 @@ updater.setHardwareID("none")
 heat = 20.0
 
 
-def element(status: diagnostic_updater.DiagnosticStatusWrapper) -> diagnostic_updater.DiagnosticStatusWrapper:
+def element(status: Any) -> Any:
     """Say how hot it is."""
     status.summary(0, "warm")
     status.add("Temperature", round(heat, 1))

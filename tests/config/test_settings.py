@@ -344,7 +344,7 @@ def test_what_is_ignored_is_noted(load: Load, environ: dict[str, str], note: str
         ("a = 1\na = 2", "2: the file: not TOML: Cannot overwrite a value"),
         ("name: robot", "1: the file: not TOML"),
         ("[core", "1: the file: not TOML: Expected ']'"),
-        ("x = " + "[" * 5000, " the file: lists or tables nested too deeply"),
+        ("x = " + "[" * 5000, "1: the file: lists or tables nested too deeply"),
         ("x = " + "1" * 5000, "1: the file: not TOML"),
     ],
 )

@@ -10,7 +10,7 @@ from typing import Any, Final
 import pytest
 
 from rmpa.resource import live
-from rmpa.resource.checking import Check, Misfit
+from rmpa.resource.checking import GraphCheck, Misfit
 from rmpa.resource.describing import Found, describe
 from rmpa.resource.description import read_description
 from rmpa.resource.live import Flow, Knob, LiveGraph
@@ -116,6 +116,12 @@ def test_role_and_name_are_guessed(
     assert [made.role, made.name] == [role, name]
 
 
+def test_the_node_of_a_peer_is_described_by_its_own_name() -> None:
+    facts = NodeFacts("/rmpa/arm/laser", publications={"/scan": SCAN})
+    text = describe(Found("arm:/laser", facts, LiveGraph({}, {}, {}, {}, {})))
+    assert '# It runs at the module arm.\n[node.driver]\nname = "/laser"' in text
+
+
 def test_a_resource_is_not_named_as_its_node() -> None:
     facts = NodeFacts("/laser", publications={"/scan": SCAN})
     assert 'name = "laser_resource"' in describe(Found("/laser", facts, LiveGraph({}, {}, {}, {}, {})))
@@ -175,7 +181,7 @@ def check(text: str, **graph: Any) -> list[Misfit]:
         "types": topics,
         "running": ["/usb_cam", "/base"],
     }
-    return Check(resource, text, PATH, seen=CAMERA.live, **(known | graph)).misfits()
+    return GraphCheck(resource, text, PATH, seen=CAMERA.live, **(known | graph)).misfits()
 
 
 def test_a_file_that_fits_has_no_misfit() -> None:
@@ -230,5 +236,5 @@ def test_an_argument_that_the_launch_file_does_not_have_is_told(tmp_path: Path) 
     )
     resource = read_description(text.encode(), PATH)
     parts: Any = ({"/usb_cam/image_raw": ["/usb_cam"]}, {}, ["/usb_cam"], CAMERA.live)
-    (found,) = Check(resource, text, tmp_path / "x.toml", *parts).misfits()
+    (found,) = GraphCheck(resource, text, tmp_path / "x.toml", *parts).misfits()
     assert "has no argument frames" in found.problem

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Final
 
 import pytest
+from click.testing import CliRunner
 
+from rmpa.cli.main import cli
 from rmpa.core.errors import ConfigError
 from rmpa.resource import limits
 from rmpa.resource.declare import Binding, BindingKind, RestartPolicy, StartRule
@@ -130,5 +132,6 @@ def test_the_examples_are_valid_and_short(path: Path) -> None:
 
 def test_the_schema_in_the_docs_is_of_this_version() -> None:
     assert (DOCS / "resource.schema.json").read_text(encoding="utf-8") == schema_text(), "run make reference"
+    assert CliRunner().invoke(cli, ["resource", "schema"]).output == schema_text()
     schema = json.loads(schema_text())
     assert set(schema["properties"]["profile"]["additionalProperties"]["properties"]) >= {"set", "offers", "nodes"}

@@ -123,7 +123,7 @@ async def test_a_node_that_the_user_started_is_attached_to_and_never_ended(
     await one.close()
 
 
-async def test_a_node_that_is_missing_excludes_its_profile_with_the_reason(make: Make) -> None:
+async def test_a_node_that_is_missing_fails_its_profile_with_the_reason(make: Make) -> None:
     one = make(described(("laser",), (), laser=None))
     await one.start()
     assert one.adapter.adaptation.profile == "p1"

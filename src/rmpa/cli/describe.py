@@ -131,7 +131,7 @@ def resource_schema() -> None:
 
 async def _misfits(options: Options, resource: Resource, text: str, file: Path, seconds: float) -> list[Misfit]:
     from rmpa.resource import live
-    from rmpa.resource.checking import Check
+    from rmpa.resource.checking import GraphCheck
 
     master = options.master()
     graph = await read_graph(master)
@@ -150,7 +150,7 @@ async def _misfits(options: Options, resource: Resource, text: str, file: Path, 
         )
 
     seen = await with_node(master, "rmpa_resource", body)
-    return Check(resource, text, file, graph.publishers, graph.types, graph.nodes, seen).misfits()
+    return GraphCheck(resource, text, file, graph.publishers, graph.types, graph.nodes, seen).misfits()
 
 
 async def _found(options: Options, wanted: GraphName, seconds: float) -> Found:

@@ -1,6 +1,6 @@
 """Compares the description of a resource with the live graph (``rmpa resource check``).
 
-``Check`` is a function of the declaration and of what was seen of the graph;
+``GraphCheck`` is a function of the declaration and of what was seen of the graph;
 it changes nothing.
 """
 
@@ -58,7 +58,7 @@ class Misfit:
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class GraphCheck:
     """One comparison.
 
     Args:

@@ -156,8 +156,9 @@ def _table(kind: str, key: str, values: Mapping[str, object], *notes: str, activ
 
 
 def _node(found: Found) -> list[str]:
-    server = {"server": found.server} if found.server and found.server != found.facts.name else {}
-    lines = _table("node", "driver", {"name": found.facts.name} | server)
+    module, _, name = found.name.rpartition(":")
+    server = {"server": found.server} if found.server not in ("", name) else {}
+    lines = _table("node", "driver", {"name": name} | server, *([f"It runs at the module {module}."] * bool(module)))
     if found.started:
         return [*lines, "# Start it too: (what is set here is guessed from its process)", *_commented(found.started)]
     return [*lines, '# run = "PACKAGE EXECUTABLE", launch = "PACKAGE FILE" or command = ["PROGRAM"] would start it.']

@@ -83,7 +83,6 @@ class ResourceNode:
         self.adapter = Adapter(self.runtime, self.values, self.tasks, self.actuation, observing, stop)
         self.adapter.processes = self.processes
         self.processes.on_change = self.adapter.node_changed
-        observing.profile = lambda: self.adapter.adaptation.profile
         self.contexts = Contexts(self.runtime, self.values, self.tasks, self.adapter)
         self.configuration = Reconfigure(self.runtime, self.tasks, self.actuation, self.adapter, self.contexts)
         self.demands = Demands(self.runtime)

@@ -60,9 +60,18 @@ class Observing(RuntimePart):
         # All nodes that the master knows.
         self._present: set[str] = set()
         resource, node = runtime.resource, runtime.node.name
+        outputs = list(enumerate(resource.outputs.values()))
         # Observed outputs, and those of them that are counted, by global name.
         self._outputs = {topic_of(one.name, node): one for one in resource.outputs.values() if one.observed}
         self._counted: dict[str, Output] = {}
+        # Outputs without which a profile does, for it offers no messages of them.
+        prefixes = {one.name: (f"{resource.labels[one.name]}.", *([""] if not n else [])) for n, one in outputs}
+        offers = [one.offers for one in resource.profiles.values()]
+        self._optional = {
+            name
+            for name, each in prefixes.items()
+            if any(o.get(f"{prefix}rate") == 0 for o in offers for prefix in each)
+        }
         # Required inputs that other nodes receive, by global name.
         self._inputs = {
             topic_of(one.name, node): one.name for one in resource.inputs.values() if one.observed and one.required
@@ -100,7 +109,7 @@ class Observing(RuntimePart):
             subscriber = self._runtime.subscriber(output.name)
             if subscriber is None and (self._publishers is None or self._publishers.get(topic)):
                 continue
-            if (subscriber is None or not subscriber.publishers) and not self._is_off(output):
+            if (subscriber is None or not subscriber.publishers) and output.name not in self._optional:
                 missing.append(f"no node publishes {output.name}")
                 refusals = [*subscriber.refusals.values()][-1:] if subscriber is not None else []
                 broken += [f"{output.name}: {printable(text)}" for text in refusals]
@@ -109,16 +118,6 @@ class Observing(RuntimePart):
                 f"no node publishes {name}" for topic, name in self._inputs.items() if not self._publishers.get(topic)
             ]
         return missing, broken
-
-    def _is_off(self, output: Output) -> bool:
-        """Whether the present profile offers no messages of an output: its node need not run."""
-        resource = self._runtime.resource
-        profile = resource.profiles.get(self.profile())
-        keys = [
-            f"{resource.labels[output.name]}.rate",
-            *(["rate"] if output.name == next(iter(resource.outputs)) else []),
-        ]
-        return profile is not None and any(profile.offers.get(key) == 0 for key in keys)
 
     def blocked(self) -> dict[str, str]:
         """The profiles that cannot run, with the reason: a node does not run that nothing here starts."""

@@ -127,7 +127,6 @@ class Processes(RuntimePart):
                 node.adopt(one)
             else:
                 await end_program(one.mark, limits.NODE_END_TIMEOUT)
-        await asyncio.gather(*(node.expect() for node in self._nodes.values() if not node.declared.started))
         await self.note()
 
     async def close(self) -> None:
@@ -145,8 +144,7 @@ class Processes(RuntimePart):
             PeerRefused: One cannot be started, or is not there; the text says which, and has the end of its log.
         """
         self._wanted = {*self._always, *keys}
-        needless = (node for key, node in self._nodes.items() if key not in self._wanted and node.declared.started)
-        await asyncio.gather(*(node.down() for node in needless))
+        await asyncio.gather(*(node.down() for key, node in self._nodes.items() if key not in self._wanted))
         wanted = [node.up() for key, node in self._nodes.items() if key in self._wanted]
         for outcome in await asyncio.gather(*wanted, return_exceptions=True):
             if isinstance(outcome, BaseException):
@@ -309,24 +307,8 @@ class _Supervised:
                 return
             await end_tasks(self._keeper)
             self._keeper = None
-            try:
-                await self._begin()
-            except PeerRefused:
-                if not self.declared.started:
-                    self._keeper = start_task(self._keep_expected(), f"expect {self.declared.name}")
-                raise
+            await self._begin()
             self._keeper = start_task(self._keep(), f"keep {self.declared.name}")
-
-    async def expect(self) -> None:
-        """Attach to it, now or as soon as it runs: nothing here starts it."""
-        with contextlib.suppress(PeerRefused):
-            await self.up()
-
-    async def _keep_expected(self) -> None:
-        """Wait until it runs, then watch it."""
-        if await self._again_up(_BACK):
-            self._owner.on_change(self.declared, f"node {self.declared.name} runs", False)
-            await self._keep()
 
     async def down(self) -> None:
         """End it if it was started here, and watch it no more."""

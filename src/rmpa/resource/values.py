@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from rmpa.resource.declare import Input, Output, Parameter
-    from rmpa.resource.expression import Expression, SourceCall, Scalar
+    from rmpa.resource.expression import Expression, Scalar, SourceCall
     from rmpa.resource.quality import Value
     from rmpa.resource.runtime import Runtime
     from rmpa.ros.node.endpoints import Received, Subscriber
