@@ -55,8 +55,6 @@ class Observing(RuntimePart):
         self._values = values
         # Called with an output, and what each of its publishers has sent, and when.
         self.on_counts: Callable[[str, Mapping[str, Sent], float], None] = lambda _output, _sent, _now: None
-        # Returns the name of the profile that runs; empty: none.
-        self.profile: Callable[[], str] = lambda: ""
         # All nodes that the master knows.
         self._present: set[str] = set()
         resource, node = runtime.resource, runtime.node.name
