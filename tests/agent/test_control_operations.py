@@ -41,6 +41,8 @@ ARGS: Final[dict[str, dict[str, Any]]] = {
     "log": {"modules": ["a", "b"], "level": "warn", "most": 5},
     "log_level": {"peer": "b", "node": "/rmpa"},
     "rates": {},
+    "launch": {"what": "list"},
+    "top": {},
     "node": {"what": "node.list", "peer": "b"},
     "site": {"what": "site.report", "args": {}},
 }

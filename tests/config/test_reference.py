@@ -21,6 +21,7 @@ from rmpa.config.read import load_settings
 from rmpa.config.settings import SETTINGS, TABLES, json_schema, json_value, schema_text
 from rmpa.config.values import Multicast
 from rmpa.core.errors import ConfigError
+from rmpa.resource.description import resource_schema
 from tests.core.example import EXAMPLE, uncommented
 
 # Options of ``rmpa up`` about what a gateway has not: a core of its nodes, a page.
@@ -111,9 +112,14 @@ def test_schema_accepts_the_files_of_the_documentation(validate: Any) -> None:
         block.partition("```")[0] for page in DOCS.rglob("*.md") for block in page.read_text().split("```toml\n")[1:]
     ]
     assert len(blocks) > 20
+    resource = pytest.importorskip("fastjsonschema").compile(resource_schema())
+    parts = re.compile(r"(?m)^\[(node|profile|parameter|attribute|output|input|context|alarm|ask|adaptation|start)\b")
     for block in blocks:
         try:
-            validate(tomllib.loads(block))
+            if parts.search(block):
+                resource({"role": "sensing", "profile": {}, **tomllib.loads(block)})
+            else:
+                validate(tomllib.loads(block))
         except Exception as error:
             raise AssertionError(block) from error
 

@@ -124,8 +124,8 @@ class Parameter:
         choices: The only valid values, if the parameter is an enumeration.
         unit: The unit, a text for people.
         description: A text for people.
-        binding: Where another node has the value; ``None``: the resource itself has it.
         on_change: Called with the parameter, in the thread that changed it; ``None`` while the resource does not run.
+        binding: Where another node has the value; ``None``: the resource itself has it.
     """
 
     name: str
@@ -135,8 +135,8 @@ class Parameter:
     choices: tuple[ParameterValue, ...] = ()
     unit: str = ""
     description: str = ""
-    binding: Binding | None = None
     on_change: Callable[[Parameter], None] | None = field(default=None, repr=False)
+    binding: Binding | None = None
 
     def __post_init__(self) -> None:
         self._value: Any = self.default
@@ -295,13 +295,13 @@ class DeclaredAttribute:
 
     Args:
         attribute: The attribute.
-        value: The expression that gives its value at the end of each window; ``None``: ``observe`` alone does.
         on_observation: Called in any thread with ``(attribute's name, value)``; ``None`` unless the resource runs.
+        value: The expression that gives its value at the end of each window; ``None``: ``observe`` alone does.
     """
 
     attribute: Attribute
-    value: Expression | None = None
     on_observation: Callable[[str, Value], None] | None = field(default=None, repr=False)
+    value: Expression | None = None
 
     def observe(self, value: Value) -> None:
         """Report one observed value in the attribute's unit; without effect while the resource does not run.

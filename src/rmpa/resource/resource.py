@@ -245,7 +245,7 @@ class Resource:
         if binding is not None and binding.kind == "private" and binding.name in self.nodes[binding.node].params:
             remedy = "leave it out there: default is its first value"
             raise ConfigError(where, f"{binding.name} is among the params of node {binding.node} too", remedy)
-        made = Parameter(name, default, low, high, tuple(choices), unit, description, binding)
+        made = Parameter(name, default, low, high, tuple(choices), unit, description, binding=binding)
         made.check_declaration(where)
         self.parameters[name] = made
         return made
@@ -294,7 +294,7 @@ class Resource:
             tolerance=plain,
             words=tuple(words),
         )
-        made = DeclaredAttribute(attribute, self.expression(value, where) if value else None)
+        made = DeclaredAttribute(attribute, value=self.expression(value, where) if value else None)
         self.declared_attributes[name] = made
         return made
 
