@@ -132,7 +132,6 @@ async def test_a_resource_is_started_restarted_and_stopped_and_its_log_is_read(m
 async def test_one_that_fails_is_started_again_and_one_that_is_wrong_is_not(
     make: Callable[..., Module], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "LAUNCH_RESTART_FIRST", 0.02)
     module = make()
     for name, text in (("bad", "# fail"), ("wrong", "# usage"), ("shaky", "# crash")):
         module.file(f"{name}.resource.toml", text)
@@ -142,6 +141,7 @@ async def test_one_that_fails_is_started_again_and_one_that_is_wrong_is_not(
     assert failed.problem.endswith("something is missing")
     wrong = await module.do("start", "wrong")
     assert "cannot run as it is written" in wrong.problem
+    monkeypatch.setattr(limits, "LAUNCH_RESTART_FIRST", 0.02)
     await module.do("start", "shaky")
     one = await module.wait("shaky", "active")
     async with asyncio.timeout(30):
