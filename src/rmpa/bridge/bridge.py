@@ -12,6 +12,7 @@ from rmpa.bridge.messages import decode, op_of
 from rmpa.bridge.nodes import ProxyKills
 from rmpa.bridge.policy import PermissionGate, Relay
 from rmpa.bridge.proxies import ProxyNodes
+from rmpa.bridge.recordings import Recordings
 from rmpa.bridge.rpc import PeerRpc
 from rmpa.bridge.sessions import Part, PeerSessions, call_each, guarded
 from rmpa.bridge.topics.part import Topics
@@ -56,6 +57,7 @@ class Bridge:
         context: The rules that hold now; each reading of the settings makes another one.
         gate: Decides what each peer may do.
         log: The part with the log of this module and its peers.
+        recordings: The part with the recordings of this module and its peers.
         proxy_nodes: Makes the nodes that stand for the nodes of peers.
     """
 
@@ -91,8 +93,10 @@ class Bridge:
         self.relay = Relay(enabled=settings.relay)
         self.topics = Topics(self)
         self.log = ModuleLogs(self)
+        self.recordings = Recordings(self)
         self.add(self.topics)
         self.add(self.log)
+        self.add(self.recordings)
         self._reconciler: asyncio.TimerHandle | None = None
 
     def add(self, part: Part) -> None:

@@ -280,3 +280,10 @@ RATES_BYTES: Final = 1 * MIB
 # At it: the rate of others is not known
 # Told in: the page of all topics
 RATES_MAX: Final = 2000
+# [Recording] Bytes of a file of a recording that one request of another module gets
+RECORDING_PART: Final = 256 * 1024
+# [Recording] Requests to keep that wait for modules that are not linked
+# At it: the oldest is forgotten
+KEEPS_WAITING: Final = 64
+# A recorder that has not written its status for so long does not run.
+RECORDER_SILENT: Final = 10.0
