@@ -66,11 +66,11 @@ class FilePart(msgspec.Struct, frozen=True):
 
     Attributes:
         size: Of the whole file, bytes.
-        text: The part, in base 64.
+        data: The part, in base 64.
     """
 
     size: int
-    text: str
+    data: str
 
 
 class Recordings(Part):

@@ -391,7 +391,7 @@ def _fetch_file(client: ControlClient, module: str, recording: str, name: str, p
         while True:
             offset = file.tell()
             part = client.call("record", FilePart, what="read", module=module, id=recording, file=name, offset=offset)
-            data = base64.b64decode(part.text)
+            data = base64.b64decode(part.data)
             file.write(data)
             yield len(data)
             if not data or file.tell() >= part.size:

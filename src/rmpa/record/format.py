@@ -14,7 +14,6 @@ import struct
 from typing import IO, TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
-from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, Footer, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
@@ -248,7 +247,9 @@ class SegmentReader:
                             chunk = [one for part in breakup_chunk(record) if (one := self._take(part)) is not None]
                         elif (one := self._take(record)) is not None:
                             chunk.append(one)
-                except (McapError, EOFError, struct.error, ValueError, RuntimeError, MemoryError) as error:
+                except OSError:
+                    raise
+                except Exception as error:  # noqa: BLE001 - whatever the libraries make of damaged bytes
                     if not self._channels and not self.module.name:
                         raise DamagedError(f"{self.path}: it is no recording: {error}") from None
                 self.unfinished = not ended

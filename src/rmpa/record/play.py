@@ -208,7 +208,10 @@ class Player:
                 ticking.cancel()
 
     def _played(self) -> Iterator[Recorded]:
-        return (message for message in self._messages() if message.source.topic in self._publishers)
+        for message in self._messages():
+            publisher = self._publishers.get(message.source.topic)
+            if publisher is not None and publisher.description.md5sum == message.source.md5sum:
+                yield message
 
     async def _wait(self, due: float, at: float) -> float:
         """Wait until the message of a time is due; returns when the recording's beginning would have been."""

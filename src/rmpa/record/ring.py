@@ -179,9 +179,9 @@ class RingThread(threading.Thread):
         try:
             assert self._writer is not None  # noqa: S101 - it is open
             self._writer.write(*message)
-        except OSError as error:
-            self._fail(error)
+        except Exception as error:  # noqa: BLE001 - no message may end the recorder
             self.lost[message[0].topic] += 1
+            self._fail(error)
 
     def _open(self, now: float) -> bool:
         if now < self._retry:
@@ -250,6 +250,20 @@ class RingThread(threading.Thread):
             oldest.path.unlink(missing_ok=True)
             del self.segments[0]
 
+    def _give_up(self, file: IO[bytes]) -> None:
+        """Close a segment that the disk did not take, and save what is in it."""
+        path = Path(file.name)
+        with contextlib.suppress(OSError):  # what was in memory is lost
+            file.close()
+        try:
+            done = finish_file(path)
+            times = [message.log_time for message in SegmentReader(done).messages()]
+            self.segments.append(SegmentInfo(done, min(times), max(times)))
+        except (DamagedError, ValueError):
+            path.unlink(missing_ok=True)  # nothing of it can be read
+        except OSError:
+            pass  # the next run does it
+
     def _fail(self, error: Exception) -> None:
         """The disk does not take it: give up the segment, make room in the ring, try again later."""
         text = f"{self._ring}: {getattr(error, 'strerror', None) or error}"
@@ -258,10 +272,8 @@ class RingThread(threading.Thread):
         self.problem = text
         self._retry = time.monotonic() + limits.RETRY
         file, self._writer, self._file = self._file, None, None
-        with contextlib.suppress(OSError):
-            if file is not None:
-                file.close()
-                finish_file(Path(file.name))
+        if file is not None:
+            self._give_up(file)
         for one in self.segments[: len(self.segments) // 2]:  # a full disk has room again
             with contextlib.suppress(OSError):
                 one.path.unlink(missing_ok=True)
