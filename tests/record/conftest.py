@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from rmpa.record.format import CLOCK, ClockRecord, ModuleRecord, SegmentWriter, Source
+from rmpa.record.format import CLOCK, ClockRecord, ModuleRecord, RecordedSource, SegmentWriter
 from rmpa.ros.types.messages import MessageType
 
 TEXT = MessageType("std_msgs/String")
@@ -19,9 +19,9 @@ START = 1_795_000_000 * SECOND
 Said = Iterable[tuple[float, str]]
 
 
-def source(topic: str, node: str = "/talker", *, latching: bool = False, module: str = "") -> Source:
+def source(topic: str, node: str = "/talker", *, latching: bool = False, module: str = "") -> RecordedSource:
     """A publisher of texts."""
-    return Source(topic, TEXT.name, TEXT.md5sum, TEXT.definition, node, latching, module)
+    return RecordedSource(topic, TEXT.name, TEXT.md5sum, TEXT.definition, node, latching, module)
 
 
 def text(data: str) -> bytes:
@@ -38,7 +38,7 @@ def recording(tmp_path: Path) -> Record:
 
     def write(
         module: str,
-        said: dict[Source, Said],
+        said: dict[RecordedSource, Said],
         clocks: dict[str, tuple[float, float | None]] | None = None,
         name: str = "00000001.mcap",
     ) -> Path:

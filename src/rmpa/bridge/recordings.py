@@ -157,7 +157,7 @@ class Recordings(Part):
 
     def _check(self, asker: PeerSession, name: object) -> str:
         kept = check_id(str(name))
-        if why := self._bridge.context.gate.why_not(Access.RECORD, asker.link.name, kept):
+        if why := self._bridge.context.gate.why_not(Access.RECORD, asker.link.name, f"/{kept}"):
             raise RmpaError(why, code="not-permitted")
         return kept
 
@@ -165,7 +165,7 @@ class Recordings(Part):
         gate, peer = self._bridge.context.gate, asker.link.name
         found = await asyncio.to_thread(self._here)
         return msgspec.structs.replace(
-            found, kept=tuple(one for one in found.kept if not gate.why_not(Access.RECORD, peer, one.id))
+            found, kept=tuple(one for one in found.kept if not gate.why_not(Access.RECORD, peer, f"/{one.id}"))
         )
 
     def _here(self) -> ModuleRecordings:

@@ -217,7 +217,7 @@ class Access(StrEnum):
         "node",
         "Nodes whose log lines it may read and levels it may set; /rmpa: the agent.",
     )
-    RECORD = "record", "use the recording", "recording", "Recordings that it may have kept, read and remove, by name."
+    RECORD = "record", "use the recording", "recording", "Recordings that it may have kept, read and remove: /NAME."
 
 
 # The key of a rule about actions of this module, whose client the other module is.

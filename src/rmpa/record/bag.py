@@ -8,7 +8,7 @@ from rosbags.rosbag1 import Reader, ReaderError, Writer
 
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import OWN_NODE
-from rmpa.record.format import DamagedError, Recorded, Source, read_in_order
+from rmpa.record.format import DamagedError, Recorded, RecordedSource, read_in_order
 from rmpa.record.merge import files_of
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def write_bag(messages: Iterable[Recorded], path: Path) -> int:
     count = 0
     writer = Writer(path)
     with writer:
-        connections: dict[Source, Connection] = {}
+        connections: dict[RecordedSource, Connection] = {}
         for source, log_time, _, data in messages:
             connection = connections.get(source)
             if connection is None:
@@ -71,7 +71,7 @@ def read_bag(path: Path) -> Iterator[Recorded]:
     try:
         with Reader(path) as reader:
             sources = {
-                one.id: Source(
+                one.id: RecordedSource(
                     one.topic,
                     one.msgtype.replace("/msg/", "/"),
                     one.digest,

@@ -14,7 +14,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.core.identity import is_own, matches
 from rmpa.core.timers import TokenBucket
 from rmpa.record import limits
-from rmpa.record.format import Source
+from rmpa.record.format import RecordedSource
 from rmpa.ros.http.rpc import call_api
 
 if TYPE_CHECKING:
@@ -42,15 +42,15 @@ class _Taken:
         rate = settings.topic_rate
         self._bytes = TokenBucket(rate, _BURST * rate) if rate else None
         # By the publisher's header: its source, and the bucket of its type's messages.
-        self._known: dict[int, tuple[Mapping[str, str], Source, TokenBucket | None]] = {}
+        self._known: dict[int, tuple[Mapping[str, str], RecordedSource, TokenBucket | None]] = {}
 
-    def source(self, topic: str, header: Mapping[str, str]) -> tuple[Source, TokenBucket | None]:
+    def source(self, topic: str, header: Mapping[str, str]) -> tuple[RecordedSource, TokenBucket | None]:
         """The source of a connection, and the bucket that thins its messages."""
         known = self._known.get(id(header))
         if known is not None and known[0] is header:
             return known[1:]
         kind = header.get("type", "")
-        source = Source(
+        source = RecordedSource(
             topic,
             kind,
             header.get("md5sum", ""),
@@ -89,8 +89,8 @@ class Capture:
         self,
         node: Node,
         settings: RecordSettings,
-        put: Callable[[Source, int, int, bytes], bool],
-        listeners: Mapping[str, Callable[[Source, bytes], None]],
+        put: Callable[[RecordedSource, int, int, bytes], bool],
+        listeners: Mapping[str, Callable[[RecordedSource, bytes], None]],
         *,
         everything: bool = False,
     ) -> None:
@@ -101,7 +101,7 @@ class Capture:
         self._everything = everything
         self._taken: dict[str, _Taken] = {}
         # The last message of each source that latches: repeated in each segment.
-        self.latched: dict[Source, tuple[int, bytes]] = {}
+        self.latched: dict[RecordedSource, tuple[int, bytes]] = {}
         # Messages that were left out for the budget of their topics, since this was last taken.
         self.left_out: Counter[str] = Counter()
         # Messages and bytes that were taken so far, by topic.

@@ -45,7 +45,7 @@ class DamagedError(RmpaError):
     code = "recording-damaged"
 
 
-class Source(NamedTuple):
+class RecordedSource(NamedTuple):
     """One publisher of one topic.
 
     Attributes:
@@ -77,7 +77,7 @@ class Recorded(NamedTuple):
         data: Its bytes.
     """
 
-    source: Source
+    source: RecordedSource
     log_time: int
     publish_time: int
     data: bytes
@@ -135,7 +135,7 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     facts: dict[str, str | float | int | None] = {}
 
 
-EVENT_SOURCE: Final = Source(EVENTS, _TEXT.name, _TEXT.md5sum, _TEXT.definition, "/record")
+EVENT_SOURCE: Final = RecordedSource(EVENTS, _TEXT.name, _TEXT.md5sum, _TEXT.definition, "/record")
 
 
 def event_bytes(event: Event) -> bytes:
@@ -166,7 +166,7 @@ class SegmentWriter:
         self._writer = Writer(file, chunk_size=limits.CHUNK, compression=compression)
         self._writer.start(_ENCODING, "rmpa")
         self._schemas: dict[tuple[str, str], int] = {}
-        self._channels: dict[Source, int] = {}
+        self._channels: dict[RecordedSource, int] = {}
         self._sequence = 0
         # Of the messages so far; 0: there are none.
         self.first = self.last = 0
@@ -181,7 +181,7 @@ class SegmentWriter:
         """Write an attachment of a time, Unix nanoseconds."""
         self._writer.add_attachment(at, at, name, media_type, data)
 
-    def write(self, source: Source, log_time: int, publish_time: int, data: bytes) -> None:
+    def write(self, source: RecordedSource, log_time: int, publish_time: int, data: bytes) -> None:
         """Write a message."""
         channel = self._channels.get(source)
         if channel is None:
@@ -199,7 +199,7 @@ class SegmentWriter:
         """Write the rest with the index of the file."""
         self._writer.finish()  # type: ignore[no-untyped-call] # of the library
 
-    def _register(self, source: Source) -> int:
+    def _register(self, source: RecordedSource) -> int:
         key = source.type, source.md5sum
         if key not in self._schemas:
             self._schemas[key] = self._writer.register_schema(source.type, _SCHEMA, source.definition.encode())
@@ -227,7 +227,7 @@ class SegmentReader:
         # Whether the end of the file is missing; known after ``messages``.
         self.unfinished = False
         self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Source] = {}
+        self._channels: dict[int, RecordedSource] = {}
 
     def messages(self) -> Iterator[Recorded]:
         """The messages in order of their log times; metadata is known after the first one.
@@ -269,12 +269,12 @@ class SegmentReader:
             self._metadata(record)
         return None
 
-    def _source(self, channel: Channel) -> Source:
+    def _source(self, channel: Channel) -> RecordedSource:
         schema, about = self._schemas.get(channel.schema_id), channel.metadata
         name, definition = (schema.name, schema.data.decode("utf-8", "replace")) if schema else ("", "")
         node, latching = about.get("callerid", ""), about.get("latching", "0") in ("1", "true")
         module = about.get("module", self.module.name)
-        return Source(channel.topic, name, about.get("md5sum", ""), definition, node, latching, module)
+        return RecordedSource(channel.topic, name, about.get("md5sum", ""), definition, node, latching, module)
 
     def _metadata(self, record: Metadata) -> None:
         try:

@@ -22,9 +22,9 @@ from rmpa.record.format import (
     ClockRecord,
     DamagedError,
     Recorded,
+    RecordedSource,
     SegmentReader,
     SegmentWriter,
-    Source,
 )
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ def merge(paths: Sequence[Path], file: IO[bytes], reference: str = "") -> MergeR
     about = {"reference": reference, **{name: msgspec.json.encode(one).decode() for name, one in offsets.items()}}
     writer.metadata(MERGE, about)
     count = doubles = 0
-    seen: dict[tuple[Source, int], bytes] = {}
+    seen: dict[tuple[RecordedSource, int], bytes] = {}
     streams = (_timed(head, clocks[head.module]) for head in heads)
     for message in heapq.merge(*streams, key=_order):
         if _is_double(message, nodes, seen):
@@ -152,12 +152,12 @@ class _Head(NamedTuple):
     module: str
     at: int
     clocks: dict[str, ClockRecord]
-    sources: frozenset[Source]
+    sources: frozenset[RecordedSource]
 
 
 def _head(path: Path) -> _Head:
     reader = SegmentReader(path)
-    first, sources = 0, set[Source]()
+    first, sources = 0, set[RecordedSource]()
     for message in reader.messages():
         first = first or message.log_time
         sources.add(message.source)
@@ -196,7 +196,7 @@ def _clocks(heads: list[_Head], modules: list[str], reference: str) -> dict[str,
 
 def _timed(head: _Head, clock: _Clock) -> Iterator[Recorded]:
     """The messages of a file by the reference's clock, with their module."""
-    named: dict[Source, Source] = {}
+    named: dict[RecordedSource, RecordedSource] = {}
     for source, log_time, publish_time, data in SegmentReader(head.path).messages():
         own = named.get(source)
         if own is None:
@@ -209,7 +209,9 @@ def _order(message: Recorded) -> tuple[int, str, str, str]:
     return message.log_time, source.module, source.topic, source.node
 
 
-def _is_double(message: Recorded, nodes: set[tuple[str, str, str]], seen: dict[tuple[Source, int], bytes]) -> bool:
+def _is_double(
+    message: Recorded, nodes: set[tuple[str, str, str]], seen: dict[tuple[RecordedSource, int], bytes]
+) -> bool:
     """Whether a message is in the result already, or comes again from its source.
 
     A proxy (``/rmpa/PEER/node``) is a copy of a node whose own module was recorded, too. A latched message that a

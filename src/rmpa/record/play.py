@@ -24,7 +24,7 @@ from rmpa.ros.wire.tcpros import TopicDescription
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from rmpa.record.format import Source
+    from rmpa.record.format import RecordedSource
     from rmpa.ros.node.endpoints import Publisher
     from rmpa.ros.node.node import Node
 
@@ -139,7 +139,7 @@ class Player:
                 else:
                     await self._node.set_param(_SIM_TIME, before)
 
-    def _wanted(self, source: Source) -> bool:
+    def _wanted(self, source: RecordedSource) -> bool:
         options, topic = self._options, source.topic
         return (
             topic != EVENTS
@@ -148,9 +148,9 @@ class Player:
             and not any(matches(glob, topic) for glob in options.deny)
         )
 
-    def _sources(self) -> dict[str, Source]:
+    def _sources(self) -> dict[str, RecordedSource]:
         """The sources to play, one of each topic: of those of several types the first."""
-        found: dict[str, Source] = {}
+        found: dict[str, RecordedSource] = {}
         for message in self._messages():
             source = message.source
             if not self._wanted(source):
@@ -162,7 +162,7 @@ class Player:
                 found[source.topic] = source
         return found
 
-    async def _advertise(self, sources: Mapping[str, Source]) -> None:
+    async def _advertise(self, sources: Mapping[str, RecordedSource]) -> None:
         state: Any = (await call_api(self._node.master_uri, "getSystemState", self._node.name)).value
         published: dict[str, list[str]] = dict(state[0])
         for topic, source in sources.items():
@@ -181,7 +181,7 @@ class Player:
         options = self._options
         ticking = asyncio.create_task(self._tick()) if options.clock else None
         began = end = 0
-        latched: dict[Source, bytes] = {}
+        latched: dict[RecordedSource, bytes] = {}
         due = 0.0
         try:
             for message in self._played():
@@ -234,7 +234,7 @@ class Player:
             if paused_at is not None:
                 due += time.monotonic() - paused_at
 
-    def _publish(self, source: Source, data: bytes) -> None:
+    def _publish(self, source: RecordedSource, data: bytes) -> None:
         self._publishers[source.topic].publish_raw(data)
         self.count += 1
 

@@ -34,7 +34,16 @@ from rmpa.core.identity import is_own, matches
 from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.record import limits
 from rmpa.record.capture import Capture
-from rmpa.record.format import CLOCK, EVENT_SOURCE, MODULE, ClockRecord, Event, ModuleRecord, Source, event_bytes
+from rmpa.record.format import (
+    CLOCK,
+    EVENT_SOURCE,
+    MODULE,
+    ClockRecord,
+    Event,
+    ModuleRecord,
+    RecordedSource,
+    event_bytes,
+)
 from rmpa.record.ring import RingThread
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
@@ -213,7 +222,7 @@ class Recorder:
     def _judged(self, event: Event) -> Event:
         return msgspec.structs.replace(event, trigger=event.kind in self._settings.keep_on)
 
-    def _alarms(self, source: Source, raw: bytes) -> None:
+    def _alarms(self, source: RecordedSource, raw: bytes) -> None:
         """Look for alarms of resources in a ``DiagnosticArray``."""
         if not source.topic.endswith("/alarms"):
             return
@@ -224,7 +233,7 @@ class Recorder:
             event = Event(ALARM if raised else "alarm_over", str(status.message), source.node, facts=facts)
             self.happened(self._judged(event))
 
-    def _stops(self, source: Source, raw: bytes) -> None:
+    def _stops(self, source: RecordedSource, raw: bytes) -> None:
         """Look for an emergency stop."""
         if raw[:1] != b"\0" and any(matches(glob, source.topic) for glob in self._settings.stop_topics):
             self.happened(Event("stop", f"emergency stop on {source.topic}", source.topic, trigger=True))

@@ -20,7 +20,15 @@ from typing import IO, TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.kept import Kept, write_kept
 from rmpa.record import limits
-from rmpa.record.format import SUFFIX, UNFINISHED, DamagedError, SegmentReader, SegmentWriter, Source, finish_file
+from rmpa.record.format import (
+    SUFFIX,
+    UNFINISHED,
+    DamagedError,
+    RecordedSource,
+    SegmentReader,
+    SegmentWriter,
+    finish_file,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -70,7 +78,7 @@ class RingThread(threading.Thread):
         self._fsync = fsync
         self._kept_bytes = kept_bytes
         self._lock = threading.Condition()
-        self._waiting: deque[tuple[Source, int, int, bytes]] = deque()
+        self._waiting: deque[tuple[RecordedSource, int, int, bytes]] = deque()
         self._waiting_bytes = 0
         self._jobs: deque[tuple[Callable[..., Any], tuple[Any, ...], Future[Any]]] = deque()
         self._ended = False
@@ -86,7 +94,7 @@ class RingThread(threading.Thread):
         self._writer: SegmentWriter | None = None
         self._began = self._flushed = self._synced = self._retry = 0.0
 
-    def put(self, source: Source, log_time: int, publish_time: int, data: bytes) -> bool:
+    def put(self, source: RecordedSource, log_time: int, publish_time: int, data: bytes) -> bool:
         """Queue a message; false: too much waits, and it is lost."""
         with self._lock:
             if self._waiting_bytes + len(data) > limits.QUEUE_BYTES:
@@ -172,7 +180,7 @@ class RingThread(threading.Thread):
         except (OSError, DamagedError, ValueError) as error:
             self._fail(error)
 
-    def _write(self, message: tuple[Source, int, int, bytes]) -> None:
+    def _write(self, message: tuple[RecordedSource, int, int, bytes]) -> None:
         if self._writer is None and not self._open(time.monotonic()):
             self.lost[message[0].topic] += 1
             return
