@@ -41,6 +41,7 @@ ARGS: Final[dict[str, dict[str, Any]]] = {
     "log": {"modules": ["a", "b"], "level": "warn", "most": 5},
     "log_level": {"peer": "b", "node": "/rmpa"},
     "rates": {},
+    "record": {"what": "list"},
     "node": {"what": "node.list", "peer": "b"},
     "site": {"what": "site.report", "args": {}},
 }
@@ -59,6 +60,8 @@ WRONG: Final[tuple[tuple[str, dict[str, Any], str], ...]] = (
     ("log_level", {"peer": "b", "node": "/rmpa/a/talker"}, "is no node of b: it is a's /talker: ask there"),
     ("node", {"what": "node.lst"}, "did you mean node.list?"),
     ("agent", {"peer": "c"}, "linked peer"),
+    ("record", {"what": "lst"}, "is no question about recordings"),
+    ("record", {"what": "read", "id": "../x"}, "is not the name of a recording"),
     ("contract", {"topic": "chatter"}, "is not a topic"),
     ("snapshots", {}, "did you mean snapshot?"),
 )

@@ -51,8 +51,9 @@ def test_other_readers_of_mcap_read_a_segment(tmp_path: Path) -> None:
         reader = make_reader(file)
         assert reader.get_header().profile == "ros1"
         found = [
-            (schema.name, channel.topic, message.log_time) for schema, channel, message in reader.iter_messages()
-        ]  # type: ignore[union-attr] # it has one
+            (schema.name if schema else "", channel.topic, message.log_time)
+            for schema, channel, message in reader.iter_messages()
+        ]
     assert found == [("std_msgs/String", "/odom", START + number) for number in range(30)]
 
 

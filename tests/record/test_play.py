@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.record.format import SegmentReader
 from rmpa.record.play import Player, PlayOptions
 from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.endpoints import Received
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
 from tests.record.conftest import Record, source
@@ -36,6 +38,10 @@ async def core() -> AsyncIterator[RosCore]:
     await one.close()
 
 
+def _hear(found: list[Any], received: Received) -> None:
+    found.append(received.message)
+
+
 async def played(
     core: RosCore, path: Path, listened: list[str], **options: Any
 ) -> tuple[Player, dict[str, list[Any]]]:
@@ -44,7 +50,7 @@ async def played(
     async with Node("listener", master_uri=core.uri) as ears, Node("player", master_uri=core.uri) as node:
         for topic, found in heard.items():
             kind = "rosgraph_msgs/Clock" if topic == "/clock" else "std_msgs/String"
-            await ears.subscribe(topic, kind, lambda received, found=found: found.append(received.message))
+            await ears.subscribe(topic, kind, partial(_hear, found))
         player = Player(node, lambda: SegmentReader(path).messages(), PlayOptions(**options))
         async with asyncio.timeout(30):
             await player.run()
