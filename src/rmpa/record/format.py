@@ -10,10 +10,12 @@ a latched message that a segment repeats has an earlier one. What happened besid
 from __future__ import annotations
 
 import heapq
+import logging
 import struct
 from typing import IO, TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
+from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Footer, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
+_log = logging.getLogger(__name__)
 # The topic of events.
 EVENTS: Final = "/rmpa/events"
 MODULE: Final = "rmpa.module"
@@ -228,6 +231,29 @@ class SegmentReader:
         self.unfinished = False
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, RecordedSource] = {}
+
+    def head(self) -> tuple[int, set[RecordedSource]]:
+        """The time of the first message, and all sources; by the file's index, where it has one.
+
+        Raises:
+            DamagedError: As for ``messages``.
+        """
+        try:
+            with self.path.open("rb") as file:
+                reader = SeekingReader(file)
+                if (summary := reader.get_summary()) is not None and summary.statistics is not None:
+                    for record in reader.iter_metadata():
+                        self._metadata(record)
+                    self._schemas = dict(summary.schemas)
+                    self._channels = {number: self._source(one) for number, one in summary.channels.items()}
+                    return summary.statistics.message_start_time, set(self._channels.values())
+        except Exception as error:  # noqa: BLE001 - it has no index, as after a crash
+            _log.debug("%s: %s", self.path, error)
+        first, sources = 0, set[RecordedSource]()
+        for message in self.messages():
+            first = first or message.log_time
+            sources.add(message.source)
+        return first, sources
 
     def messages(self) -> Iterator[Recorded]:
         """The messages in order of their log times; metadata is known after the first one.

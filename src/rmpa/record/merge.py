@@ -157,10 +157,7 @@ class _Head(NamedTuple):
 
 def _head(path: Path) -> _Head:
     reader = SegmentReader(path)
-    first, sources = 0, set[RecordedSource]()
-    for message in reader.messages():
-        first = first or message.log_time
-        sources.add(message.source)
+    first, sources = reader.head()
     return _Head(path, reader.module.name or path.parent.name, first, reader.clocks, frozenset(sources))
 
 

@@ -89,6 +89,8 @@ class Player:
         # Time of the recording, Unix nanoseconds, and seconds since its beginning.
         self.now = 0
         self.position = 0.0
+        # The time of the next message: the clock waits for it.
+        self._next = 0
         self._running = asyncio.Event()
         self._running.set()
         self._steps = 0
@@ -200,6 +202,7 @@ class Player:
                 for source, data in latched.items():
                     self._publish(source, data)
                 latched.clear()
+                self._next = message.log_time
                 due = await self._wait(due, at)
                 self.now, self.position = message.log_time, at
                 self._publish(message.source, message.data)
@@ -239,13 +242,14 @@ class Player:
         self.count += 1
 
     async def _tick(self) -> None:
-        """Publish the time of the recording."""
-        last, at = self.now, time.monotonic()
+        """Publish the time of the recording, which never goes back within a round."""
+        shown, before = 0, time.monotonic()
         while True:
-            if self.now != last:
-                last, at = self.now, time.monotonic()
-            since = 0.0 if self.paused else (time.monotonic() - at) * self._options.rate
-            shown = last + round(since * _SECOND)
-            if last and "/clock" in self._publishers:
+            now = time.monotonic()
+            if shown and not self.paused:
+                shown += round((now - before) * self._options.rate * _SECOND)
+                shown = min(shown, self._next) if self._next else shown
+            shown, before = max(shown, self.now), now
+            if shown and "/clock" in self._publishers:
                 self._publishers["/clock"].publish_raw(_TIME.pack(*divmod(shown, _SECOND)))
             await asyncio.sleep(_TICK)
