@@ -265,7 +265,7 @@ class Recorder:
         """Do what is requested by files, and write the status."""
         status = 0.0
         while True:
-            for kept in take_requests(self._folder):
+            for kept in await asyncio.to_thread(lambda: list(take_requests(self._folder))):
                 self._work.start(self._kept(kept), f"keep {kept.id}")
             if time.monotonic() - status >= _STATUS:
                 status = time.monotonic()
