@@ -286,4 +286,4 @@ RECORDING_PART: Final = 256 * 1024
 # At it: the oldest is forgotten
 KEEPS_WAITING: Final = 64
 # A recorder that has not written its status for so long does not run.
-RECORDER_SILENT: Final = 10.0
+RECORDER_SILENT: Final = 20.0

@@ -65,9 +65,9 @@ _SECOND: Final = 1_000_000_000
 _MB: Final = 1_000_000
 # Seconds between two looks for requests, and between two writings of the status.
 _REQUESTS: Final = 0.2
-_STATUS: Final = 2.0
+_STATUS: Final = 5.0
 # Seconds from one snapshot of the agent to the next, where its graph does not change.
-_PERIOD: Final = 2.0
+_PERIOD: Final = 5.0
 # Seconds between two readings of the parameters, and bytes of them that a segment repeats.
 _PARAMETERS: Final = 30.0
 _PARAMETERS_MAX: Final = 1024 * 1024
@@ -263,10 +263,13 @@ class Recorder:
 
     async def _tend(self) -> None:
         """Do what is requested by files, and write the status."""
-        status = 0.0
+        status, seen, requests = 0.0, 0, self._folder / REQUESTS
         while True:
-            for kept in await asyncio.to_thread(lambda: list(take_requests(self._folder))):
-                self._work.start(self._kept(kept), f"keep {kept.id}")
+            changed = requests.stat().st_mtime_ns  # one call of the kernel: the folder is read when it has changed
+            if changed != seen:
+                for kept in await asyncio.to_thread(lambda: list(take_requests(self._folder))):
+                    self._work.start(self._kept(kept), f"keep {kept.id}")
+                seen = changed
             if time.monotonic() - status >= _STATUS:
                 status = time.monotonic()
                 await asyncio.to_thread(self._write_status)

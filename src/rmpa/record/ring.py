@@ -102,7 +102,9 @@ class RingThread(threading.Thread):
                 return False
             self._waiting.append((source, log_time, publish_time, data))
             self._waiting_bytes += len(data)
-            if len(self._waiting) == 1:
+            if (
+                self._waiting_bytes > limits.CHUNK
+            ):  # else the thread looks by itself: waking it costs more than writing
                 self._lock.notify()
             return True
 
@@ -126,8 +128,8 @@ class RingThread(threading.Thread):
         self._take_over()
         while True:
             with self._lock:
-                if not (self._waiting or self._jobs or self._ended):
-                    self._lock.wait(limits.FLUSH)
+                if not (self._jobs or self._ended or self._waiting_bytes > limits.CHUNK):
+                    self._lock.wait(limits.FLUSH / 2)
                 batch, self._waiting = self._waiting, deque()
                 jobs, self._jobs = self._jobs, deque()
                 self._waiting_bytes, ended = 0, self._ended
