@@ -263,22 +263,42 @@ class AgentClient:
             RemoteProtocolError: The agent is of a release that cannot be understood.
         """
         positive(period, "the period of events")
-        last, problem = since, ""
+        last, lost = since, False
+        async with aclosing(self.snapshots(period=period)) as snapshots:
+            async for now in snapshots:
+                if isinstance(now, AgentLost):
+                    lost = True
+                    yield now
+                    continue
+                if lost:
+                    yield AgentReturned(now.agent)
+                    lost = False
+                for event in changes(last, now):
+                    yield event
+                last = now
+
+    async def snapshots(self, *, period: float = 1.0) -> AsyncGenerator[Snapshot | AgentLost, None]:
+        """What the agent shows, after each change of its graph and after a period without one, without end.
+
+        Args:
+            period: Seconds from one snapshot to the next at the most.
+
+        Raises:
+            RemoteProtocolError: The agent is of a release that cannot be understood.
+        """
+        positive(period, "the period of snapshots")
+        lost = False
         while True:
             try:
                 with await asyncio.to_thread(ControlClient, self._where) as client:
                     async with aclosing(_snapshots(client, period)) as snapshots:
                         async for now in snapshots:
-                            if problem:
-                                yield AgentReturned(now.agent)
-                                problem = ""
-                            for event in changes(last, now):
-                                yield event
-                            last = now
+                            lost = False
+                            yield now
             except UnreachableError as error:
-                if not problem:
-                    problem = str(error)
-                    yield AgentLost(problem)
+                if not lost:
+                    lost = True
+                    yield AgentLost(str(error))
                 await asyncio.sleep(period)
 
     @property

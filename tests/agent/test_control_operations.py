@@ -43,6 +43,7 @@ ARGS: Final[dict[str, dict[str, Any]]] = {
     "rates": {},
     "launch": {"what": "list"},
     "top": {},
+    "record": {"what": "list"},
     "node": {"what": "node.list", "peer": "b"},
     "site": {"what": "site.report", "args": {}},
 }
@@ -61,6 +62,8 @@ WRONG: Final[tuple[tuple[str, dict[str, Any], str], ...]] = (
     ("log_level", {"peer": "b", "node": "/rmpa/a/talker"}, "is no node of b: it is a's /talker: ask there"),
     ("node", {"what": "node.lst"}, "did you mean node.list?"),
     ("agent", {"peer": "c"}, "linked peer"),
+    ("record", {"what": "lst"}, "is no question about recordings"),
+    ("record", {"what": "read", "id": "../x"}, "is not the name of a recording"),
     ("contract", {"topic": "chatter"}, "is not a topic"),
     ("snapshots", {}, "did you mean snapshot?"),
 )

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.agent import process as limits
-from rmpa.agent.process import WebProcess, web_command, web_environment
+from rmpa.agent.process import ChildProcess, child_environment, web_command
 from rmpa.config.settings import Settings, WebSettings
 
 if TYPE_CHECKING:
@@ -30,13 +30,15 @@ def touch(file: Path) -> str:
     return f"pathlib.Path({str(file)!r}).touch()"
 
 
-Child = Callable[[str], WebProcess]
+Child = Callable[[str], ChildProcess]
 
 
 @pytest.fixture
 def child(tmp_path: Path) -> Child:
     """A child of an agent, which runs a program; several are of agents one after the other."""
-    return lambda program: WebProcess([sys.executable, "-c", program], lambda: 1.0, tmp_path / "base.web")
+    return lambda program: ChildProcess(
+        "rmpa web", "web-stopped", [sys.executable, "-c", program], lambda: 1.0, tmp_path / "base.web"
+    )
 
 
 async def until(condition: Callable[[], object]) -> None:
@@ -53,7 +55,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("quick")
 async def test_a_child_that_is_killed_is_started_again(child: Child) -> None:
     web = child(WAITS)
-    web.start()
+    await web.start()
     await until(lambda: web.pid)
     first = web.pid
     assert first is not None
@@ -67,7 +69,7 @@ async def test_the_child_ends_with_the_agent(child: Child, tmp_path: Path) -> No
     ready, file = tmp_path / "ready", tmp_path / "ended"
     asked = "import pathlib, signal; signal.signal(signal.SIGTERM, lambda *_: None)"
     web = child(f"{asked}; {touch(ready)}; signal.pause(); {touch(file)}")
-    web.start()
+    await web.start()
     await until(ready.exists)
     await web.close()
     assert file.exists()  # it was asked to end, not killed
@@ -80,7 +82,7 @@ async def test_a_child_that_does_not_end_is_killed(
     monkeypatch.setattr(limits, "WEB_END_TIMEOUT", 0.1)
     ready = tmp_path / "ready"
     web = child(f"import pathlib, signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); {touch(ready)}; {PAUSES}")
-    web.start()
+    await web.start()
     await until(ready.exists)
     pid = web.pid
     assert pid is not None
@@ -106,7 +108,7 @@ async def test_a_child_that_cannot_be_waited_for_is_found_again_and_no_second_on
         patch.setattr(os, "pidfd_open", no_descriptor)
         deaf = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)"
         web = child(f"{deaf}; open({str(runs)!r}, 'a').write('x'); {PAUSES}")
-        web.start()
+        await web.start()
         await until(lambda: "cannot be started" in caplog.text)
     await until(lambda: web.pid == children[0])
     assert runs.read_text() == "x"
@@ -118,7 +120,7 @@ async def test_a_usage_error_is_not_tried_again(
     child: Child, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     web = child(f"import sys; open({str(tmp_path / 'runs')!r}, 'a').write('x'); sys.exit(2)")
-    web.start()
+    await web.start()
     await until(lambda: "not started again" in caplog.text)
     await web.close()
     assert (tmp_path / "runs").read_text() == "x"
@@ -128,8 +130,8 @@ async def test_a_usage_error_is_not_tried_again(
 async def test_a_program_that_is_not_there_costs_the_agent_nothing(
     caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
-    web = WebProcess(["/nonexistent/program"], lambda: 1.0, tmp_path / "base.web")
-    web.start()
+    web = ChildProcess("rmpa web", "web-stopped", ["/nonexistent/program"], lambda: 1.0, tmp_path / "base.web")
+    await web.start()
     await until(lambda: caplog.text.count("cannot be started") >= 2)
     await web.close()
 
@@ -141,7 +143,7 @@ async def test_that_of_an_agent_before_is_taken_over(child: Child, tmp_path: Pat
     former, web = child(program), child(program)
     pid = former._take_over_or_start()  # by an agent that is killed then
     await until(ready.exists)
-    web.start()
+    await web.start()
     await until(lambda: web.pid)
     assert web.pid == pid
     await web.close()
@@ -152,7 +154,7 @@ async def test_that_of_an_agent_before_is_taken_over(child: Child, tmp_path: Pat
 async def test_one_of_another_program_is_replaced(child: Child) -> None:
     former, web = child(WAITS), child(f"{WAITS}  # other settings")
     former._take_over_or_start()
-    web.start()
+    await web.start()
     await until(lambda: web.pid)
     assert former._process is not None
     assert former._process.wait() == -signal.SIGTERM
@@ -167,7 +169,7 @@ async def test_one_that_was_not_noted_is_left_alone(
     with (tmp_path / "base.web").open("wb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         web = child(WAITS)
-        web.start()
+        await web.start()
         await until(lambda: "its process is not known" in caplog.text)
         assert web.pid is None
     await until(lambda: web.pid)
@@ -185,5 +187,5 @@ def test_its_command_and_environment_have_what_the_agent_was_told(tmp_path: Path
         assert part in command
     settings = Settings(log_level="debug", log_json=True)
     of_systemd = {"NOTIFY_SOCKET": "/run/systemd/notify", "WATCHDOG_USEC": "10000000"}
-    environ = web_environment(settings, {"RMPA_RUNTIME_DIR": "x", "RMPA_LOG_LEVEL": "error", **of_systemd})
+    environ = child_environment(settings, {"RMPA_RUNTIME_DIR": "x", "RMPA_LOG_LEVEL": "error", **of_systemd})
     assert environ == {"RMPA_RUNTIME_DIR": "x", "RMPA_LOG_LEVEL": "debug", "RMPA_LOG_JSON": "true"}

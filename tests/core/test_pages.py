@@ -9,7 +9,7 @@ from typing import Final
 
 _ROOT: Final = Path(__file__).parents[2]
 _PAGE: Final = _ROOT / "docs/start/install.md"
-_FROM_A_FILE: Final = '"$(ls $PWD/rmpa-*.whl)[web,zenoh,trust]"'
+_FROM_A_FILE: Final = '"$(ls $PWD/rmpa-*.whl)[record,web,zenoh,trust]"'
 _INSTALLS: Final = re.compile(r"(?:pip3?|pipx|uv tool) install [^`\n]*")
 
 
@@ -26,7 +26,7 @@ def test_it_says_once_where_the_wheel_is() -> None:
     assert len(re.findall(r"^\$ RMPA=", text, re.MULTILINE)) == 1
     commands = [words for words in _INSTALLS.findall(text) if "-c constraints" not in words]
     assert len(commands) == 3
-    assert all('"$RMPA[web,zenoh,trust]"' in words for words in commands)
+    assert all('"$RMPA[record,web,zenoh,trust]"' in words for words in commands)
 
 
 ROOT = Path(__file__).parents[2]

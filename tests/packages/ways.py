@@ -77,7 +77,7 @@ def unpack_bundle(machine: Machine, file: str) -> str:
 def install_by_pip(machine: Machine, file: str) -> str:
     """Into a virtual environment of the system's own Python."""
     machine.run("python3", "-m", "venv", ".rmpa", user=USER, timeout=_PATIENCE)
-    pip = [".rmpa/bin/pip", "install", "-q", f"{file}[web,zenoh,trust]"]
+    pip = [".rmpa/bin/pip", "install", "-q", f"{file}[record,web,zenoh,trust]"]
     machine.run(*pip, user=USER, online=True, timeout=_PATIENCE)
     return ".rmpa/bin/rmpa"
 
@@ -89,7 +89,7 @@ def install_by_uv(machine: Machine, file: str) -> str:
     python = "3.13"
     if machine.suite == "bookworm":  # has 3.11; as if somebody had put a newer one there
         python = f"{machine.bind(_python_312())}/bin/python3.12"
-    tool = [".uv/bin/uv", "tool", "install", "-q", "--python", python, f"{file}[web,zenoh,trust]"]
+    tool = [".uv/bin/uv", "tool", "install", "-q", "--python", python, f"{file}[record,web,zenoh,trust]"]
     machine.run(*tool, user=USER, online=True, timeout=_PATIENCE, env={"SSL_CERT_FILE": _CERTIFICATES})
     return "rmpa"
 

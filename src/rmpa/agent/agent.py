@@ -15,7 +15,7 @@ import os
 import random
 from typing import TYPE_CHECKING, Final
 
-from rmpa.agent.process import Reloader, WebProcess, run_process, serve
+from rmpa.agent.process import ChildProcess, Reloader, run_process, serve
 from rmpa.agent.trust import AgentTrust, TrustCommands, open_membership, restart_to_join
 from rmpa.bridge.bridge import Bridge
 from rmpa.bridge.facts import BridgeFacts
@@ -566,19 +566,17 @@ async def _serve(
     started: Callable[[], None] = lambda: None,
 ) -> None:
     agent = Agent(settings, realtime, load)
-    web = WebProcess.of(settings, random.random)
+    web, recorder = ChildProcess.web(settings, random.random), ChildProcess.recorder(settings, random.random)
     agent.reloaded = web.reload
 
     async def start() -> None:
         await agent.start()
         await asyncio.to_thread(started)
-        if settings.web.enabled:
-            web.start()
-        else:
-            await web.close()
+        for child, wanted in ((web, settings.web.enabled), (recorder, settings.record.enabled)):
+            await (child.start() if wanted else child.close())
 
     async def close() -> None:
-        await web.close()
+        await asyncio.gather(web.close(), recorder.close())
         await agent.close()
 
     await serve(start, close, agent.reloader)

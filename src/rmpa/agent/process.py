@@ -1,4 +1,4 @@
-"""The process of an agent: start, end, reload of settings, and the web server that runs beside it.
+"""The process of an agent: start, end, reload of settings, and the programs that run beside it.
 
 Limits of what an agent runs beside itself. Seconds.
 """
@@ -190,9 +190,10 @@ def _shown(value: object) -> str:
     return text if len(text) <= _VALUE_SHOWN else text[: _VALUE_SHOWN - 3] + "..."
 
 
-# Runs ``rmpa web`` as a child process of the agent, which does not depend on it. It ends with an agent that ends in
-# order. An agent that is killed leaves it, with its clients, to the next one: the file ``<name>.web`` beside the
-# control socket notes the process, and is locked as long as that runs, which has inherited the descriptor.
+# Runs ``rmpa web`` and ``rmpa record`` as child processes of the agent, which does not depend on them. They end with
+# an agent that ends in order. An agent that is killed leaves them, with their clients, to the next one: the file
+# ``<name>.web`` beside the control socket notes the process, and is locked as long as that runs, which has inherited
+# the descriptor.
 
 
 # The exit code of a command that cannot run as it is written: another start would end alike.
@@ -202,27 +203,36 @@ _READ: Final = ("RMPA_", "ROS_", "XDG_")
 
 
 def web_command(settings: Settings) -> list[str]:
-    """The command line of the child: all that the agent's own options may have changed is given."""
+    """The command line of ``rmpa web``: all that the agent's own options may have changed is given."""
     web = settings.web
     command = own_command("web", "--agent", settings.name)
     command += ["--port", str(web.port), "--listen", web.listen]
     if web.token_file:
         command += ["--token-file", web.token_file]
-    if settings.config_file is not None:
-        command += ["--config", str(settings.config_file.absolute())]
-    return command
+    return [*command, *_config(settings)]
 
 
-def web_environment(settings: Settings, environ: Mapping[str, str]) -> dict[str, str]:
+def record_command(settings: Settings) -> list[str]:
+    """The command line of ``rmpa record``."""
+    return [*own_command("record", "--agent", settings.name), *_config(settings)]
+
+
+def _config(settings: Settings) -> list[str]:
+    return ["--config", str(settings.config_file.absolute())] if settings.config_file is not None else []
+
+
+def child_environment(settings: Settings, environ: Mapping[str, str]) -> dict[str, str]:
     """The environment of the child: the agent's, with its log's level and format; systemd hears the agent alone."""
     own = {name: value for name, value in environ.items() if name not in SERVICE_VARIABLES}
     return {**own, "RMPA_LOG_LEVEL": settings.log_level, "RMPA_LOG_JSON": str(settings.log_json).lower()}
 
 
-class WebProcess:
-    """The child, started again with a growing delay whenever it ends; that of an agent before is taken over.
+class ChildProcess:
+    """A child, started again with a growing delay whenever it ends; that of an agent before is taken over.
 
     Args:
+        name: Of the command: ``rmpa web``.
+        code: Of the warning that it has ended, by ``core.codes``.
         command: Its command line.
         rng: Uniform numbers in [0, 1), for the delays.
         file: Where its process is noted.
@@ -234,12 +244,15 @@ class WebProcess:
 
     def __init__(
         self,
+        name: str,
+        code: str,
         command: Sequence[str],
         rng: Callable[[], float],
         file: Path,
-        *,
         environ: Mapping[str, str] | None = None,
     ) -> None:
+        self._name = name
+        self._code = code
         self._command = command
         self._environ = environ
         self._file = file
@@ -250,14 +263,18 @@ class WebProcess:
         self.pid: int | None = None
 
     @classmethod
-    def of(cls, settings: Settings, rng: Callable[[], float]) -> Self:
-        """That of an agent with these settings."""
-        file = runtime_dir(os.environ, settings.runtime_dir) / f"{settings.name}.web"
-        return cls(web_command(settings), rng, file, environ=web_environment(settings, os.environ))
+    def web(cls, settings: Settings, rng: Callable[[], float]) -> Self:
+        """``rmpa web`` of an agent with these settings."""
+        return cls("rmpa web", "web-stopped", web_command(settings), rng, *_place(settings, "web"))
 
-    def start(self) -> None:
+    @classmethod
+    def recorder(cls, settings: Settings, rng: Callable[[], float]) -> Self:
+        """``rmpa record`` of an agent with these settings."""
+        return cls("rmpa record", "recording-stopped", record_command(settings), rng, *_place(settings, "record"))
+
+    async def start(self) -> None:
         """Start the child, and look after it until ``close()``."""
-        self._task = keep_task(self._supervise, "rmpa web")
+        self._task = keep_task(self._supervise, self._name)
 
     def reload(self) -> None:
         """Have the child read its settings again; one that is not there reads them when it starts."""
@@ -282,17 +299,17 @@ class WebProcess:
             try:
                 code = await self._run()
             except OSError as error:
-                _log.warning("! rmpa web cannot be started: %s [web-stopped]", error)
+                _log.warning("! %s cannot be started: %s [%s]", self._name, error, self._code)
                 code = 1
             if code == _USAGE:
-                _log.warning(
-                    "! rmpa web cannot run with these settings (see above); it is not started again [web-stopped]"
-                )
+                text = "cannot run with these settings (see above); it is not started again"
+                _log.warning("! %s %s [%s]", self._name, text, self._code)
                 return
             if loop.time() - began >= WEB_STEADY:
                 self._backoff.reset()
             delay = self._backoff.delay()
-            _log.warning("! rmpa web ended with code %d; it is started again in %.1f s [web-stopped]", code, delay)
+            text = f"ended with code {code}; it is started again in {delay:.1f} s"
+            _log.warning("! %s %s [%s]", self._name, text, self._code)
             await asyncio.sleep(delay)
 
     async def _run(self) -> int:
@@ -316,7 +333,7 @@ class WebProcess:
                 if other == made_of:
                     if self._process is not None and self._process.pid != pid:
                         self._process = None
-                    _log.info("= rmpa web (process %d) goes on, of the agent before", pid)
+                    _log.info("= %s (process %d) goes on, of the agent before", self._name, pid)
                     os.kill(pid, signal.SIGHUP)  # what is in rmpa.toml may have changed
                     return pid
                 _end(pid)
@@ -340,6 +357,12 @@ class WebProcess:
             self._file.unlink()
         if self._process is not None:
             self._process.wait()
+
+
+def _place(settings: Settings, ending: str) -> tuple[Path, Mapping[str, str]]:
+    """The file that notes a child, and the child's environment."""
+    file = runtime_dir(os.environ, settings.runtime_dir) / f"{settings.name}.{ending}"
+    return file, child_environment(settings, os.environ)
 
 
 def _noted(file: BinaryIO) -> tuple[int, object] | None:

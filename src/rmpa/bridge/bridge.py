@@ -13,6 +13,7 @@ from rmpa.bridge.messages import decode, op_of
 from rmpa.bridge.nodes import ProxyKills
 from rmpa.bridge.policy import PermissionGate, Relay
 from rmpa.bridge.proxies import ProxyNodes
+from rmpa.bridge.recordings import Recordings
 from rmpa.bridge.rpc import PeerRpc
 from rmpa.bridge.sessions import Part, PeerSessions, call_each, guarded
 from rmpa.bridge.topics.part import Topics
@@ -58,6 +59,7 @@ class Bridge:
         gate: Decides what each peer may do.
         log: The part with the log of this module and its peers.
         launch: The part that starts this module's resources.
+        recordings: The part with the recordings of this module and its peers.
         proxy_nodes: Makes the nodes that stand for the nodes of peers.
     """
 
@@ -97,6 +99,8 @@ class Bridge:
         self.add(self.topics)
         self.add(self.log)
         self.add(self.launch)
+        self.recordings = Recordings(self)
+        self.add(self.recordings)
         self._reconciler: asyncio.TimerHandle | None = None
 
     def add(self, part: Part) -> None:

@@ -306,3 +306,10 @@ LAUNCH_ASK_TIMEOUT: Final = 25.0
 # Lines of each log in one answer, and logs of one resource.
 LAUNCH_LOG_LINES: Final = 500
 LAUNCH_LOGS_MAX: Final = 16
+# [Recording] Bytes of a file of a recording that one request of another module gets
+RECORDING_PART: Final = 256 * 1024
+# [Recording] Requests to keep that wait for modules that are not linked
+# At it: the oldest is forgotten
+KEEPS_WAITING: Final = 64
+# A recorder that has not written its status for so long does not run.
+RECORDER_SILENT: Final = 20.0

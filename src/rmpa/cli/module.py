@@ -232,6 +232,15 @@ def check_web() -> None:
     _check_libraries("rmpa web", "web", {name: name for name in ("aiohttp", "cbor2")})
 
 
+def check_record(command: str) -> None:
+    """Check that a command about recordings has its libraries.
+
+    Raises:
+        ConfigError: It has not.
+    """
+    _check_libraries(command, "record", {"mcap": "mcap", "jinja2": "Jinja2"})
+
+
 def _check_libraries(program: str, extra: str, libraries: Mapping[str, str]) -> None:
     """Check that the libraries of an extra are there.
 

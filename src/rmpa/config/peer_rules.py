@@ -224,6 +224,7 @@ class Access(StrEnum):
         "resource",
         "Resources of [resources] that it may start, stop and read the log of; trust.default never gives this.",
     )
+    RECORD = "record", "use the recording", "recording", "Recordings that it may have kept, read and remove: /NAME."
 
 
 # The key of a rule about actions of this module, whose client the other module is.

@@ -13,6 +13,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits, peer_rules
+from rmpa.config.recording import RecordSettings
 from rmpa.config.rules import CONTRACT_RULES, PARAM_RULES, FollowRule, GatewaySettings
 from rmpa.config.schema import setting, settings_of, table
 from rmpa.config.values import (
@@ -385,6 +386,7 @@ class Settings:
     lanes: LaneSettings = table(LaneSettings, "lanes")
     realtime: RealtimeSettings = table(RealtimeSettings, "realtime", "REALTIME")
     web: WebSettings = table(WebSettings, "web", "WEB")
+    record: RecordSettings = table(RecordSettings, "record", "RECORD")
     trust: TrustSettings = table(TrustSettings, "trust", "TRUST")
     gateway: GatewaySettings = table(GatewaySettings, "gateway", "GATEWAY", command="gateway")
     relay: bool = setting(
@@ -447,6 +449,7 @@ TABLES: Final = {
     "lanes": "How the packets of each lane are marked.",
     "realtime": "What the agent asks the kernel for.",
     "web": "Where the module's state is served over HTTP (docs/guides/web.md#rmpa-web).",
+    "record": "What the flight recorder keeps (docs/guides/recording.md).",
     "trust": "What the modules of a secured mesh may do here (docs/design/trust.md).",
     "gateway": "The sites that rmpa gateway joins (docs/guides/sites.md); the options are those of rmpa gateway.",
     "gateway.ros2": "The ROS 2 graph that rmpa gateway joins (docs/guides/ros2.md).",

@@ -74,7 +74,7 @@ class ControlOperations:
     def handlers(self) -> dict[str, Handler]:
         """The handlers of the operations of this class, for ``ControlServer``."""
         names: tuple[str, ...] = ("snapshot", "ping", "param", "followed", "agent", "contract", "node")
-        names += ("log", "log_level", "launch", "top")
+        names += ("log", "log_level", "launch", "top", "record")
         named = {name: getattr(self, name) for name in names}
         return {"site": self.sites.answer, "rates": self.topic_rates, **named}
 
@@ -195,6 +195,10 @@ class ControlOperations:
             return await self.facts.bridge.log.level(request)
         return await self.facts.bridge.rpc.request(self._session(peer), LEVEL, request)
 
+    async def record(self, args: Args) -> Any:
+        """Recordings of this module and its peers: as ``Recordings.answer``."""
+        return await self.facts.bridge.recordings.answer(args)
+
     async def topic_rates(self, _args: Args) -> dict[str, Any]:
         """The rates of the topics that each module publishes, by its name; a text where a peer does not tell them."""
         told = await self._of_peers([*self.facts.bridge.sessions.linked()], RATES)
@@ -257,6 +261,7 @@ REPLIES: Final[dict[str, object]] = {
     "log_level": dict[str, str],
     "launch": tuple[ModuleResources, ...],
     "top": object,  # tuple[NodeCost, ...] or a text, by module
+    "record": object,  # tuple[ModuleRecordings, ...], FilePart, Kept, or texts by module
     "node": object,  # tuple[PeerNodes, ...] for lists, else as node_requests.REPLIES says
 }
 

@@ -486,6 +486,7 @@ class Subscriber:
         on_bytes: Callable[[memoryview, Mapping[str, str]], None] | None = None,
         type_name: str = ANY,
         own_uri: str = "",
+        accepts: Callable[[str], bool] | None = None,
         nodelay: bool,
         queue_messages: int,
     ) -> None:
@@ -509,6 +510,7 @@ class Subscriber:
             on_message=self._message,
             on_refused=self._refused,
             own_uri=own_uri,
+            accepts=accepts,
             type_name=self.type_name,
             md5sum=kind.md5sum if kind is not None else ANY,
             definition=kind.definition if kind is not None else "",

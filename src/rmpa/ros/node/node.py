@@ -218,6 +218,7 @@ class Node(MasterClient):
         *,
         on_bytes: Callable[[memoryview, Mapping[str, str]], None] | None = None,
         own: bool = True,
+        accepts: Callable[[str], bool] | None = None,
         nodelay: bool = True,
         queue_messages: int = _RECEIVED_QUEUE,
     ) -> Subscriber:
@@ -231,6 +232,7 @@ class Node(MasterClient):
             on_bytes: ``(data, header)``: called in place of ``callback`` with a message's bytes, a view that is valid
                 during the call only, and the publisher's connection header.
             own: Whether what this node publishes on the topic is received too.
+            accepts: Whether the publisher of a slave API URI is connected to; ``None``: each.
             nodelay: Whether to ask publishers for TCP_NODELAY.
             queue_messages: Messages queued for the ``async for``; above it the oldest is dropped.
 
@@ -254,6 +256,7 @@ class Node(MasterClient):
             on_bytes=on_bytes,
             type_name=type_name,
             own_uri="" if own else self.uri,
+            accepts=accepts,
             nodelay=nodelay,
             queue_messages=queue_messages,
         )

@@ -470,6 +470,7 @@ class Subscription:
         on_message: ``(connection, framed)``; the view is only valid during the call.
         on_refused: ``(connection, text)``.
         own_uri: The node's slave API, if it is ignored in the list: the node does not subscribe to itself.
+        accepts: Whether the publisher of a slave API is connected to; ``None``: each.
         type_name: The type to ask for.
         md5sum: The md5 sum to ask for.
         definition: The definition to send.
@@ -485,6 +486,7 @@ class Subscription:
         on_message: Callable[[PublisherConnection, memoryview], None],
         on_refused: Callable[[PublisherConnection, str], None] = _ignore,
         own_uri: str = "",
+        accepts: Callable[[str], bool] | None = None,
         type_name: str = ANY,
         md5sum: str = ANY,
         definition: str = "",
@@ -505,6 +507,7 @@ class Subscription:
         self._on_message = on_message
         self._on_refused = on_refused
         self._own_uri = own_uri
+        self._accepts = accepts
         self._number = number
         self._connections: dict[str, PublisherConnection] = {}
 
@@ -529,7 +532,7 @@ class Subscription:
             uris: The slave APIs of the listed publishers.
             keep: Disconnect from none, because the list of a restarted master is incomplete.
         """
-        listed = {uri for uri in uris if uri != self._own_uri}
+        listed = {uri for uri in uris if uri != self._own_uri and (self._accepts is None or self._accepts(uri))}
         for uri, connection in tuple(self._connections.items()):
             if connection.refused is not None if uri in listed else not keep:
                 self._connections.pop(uri).close()

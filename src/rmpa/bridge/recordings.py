@@ -1,0 +1,265 @@
+"""The recordings of all modules: kept at one time at all of them, listed, read and removed from any.
+
+The recorder is a process of its own; here are only its files (``bridge.kept``).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import logging
+import os
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from rmpa.bridge import limits
+from rmpa.bridge.kept import KEPT, Kept, check_id, find_kept, read_kept, recording_id, remove_kept, request_keep
+from rmpa.bridge.policy import Needs
+from rmpa.bridge.sessions import Part
+from rmpa.config.module_name import module_dir, state_dir
+from rmpa.config.peer_rules import Access
+from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.core.identity import is_meant
+from rmpa.runtime.tasks import OwnedTasks
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from rmpa.bridge.bridge import Bridge
+    from rmpa.bridge.sessions import PeerSession
+
+_log = logging.getLogger(__name__)
+# Requests to another module: keep what its ring has of a time; list what it has; read a part of a file; remove one.
+KEEP: Final = "record.keep"
+LIST: Final = "record.list"
+READ: Final = "record.read"
+REMOVE: Final = "record.remove"
+_SECOND: Final = 1_000_000_000
+_EARLIER: Final = "its agent is of an earlier release, which has no recordings; install this release there"
+
+
+class ModuleRecordings(msgspec.Struct, frozen=True, kw_only=True):
+    """The recordings of one module.
+
+    Attributes:
+        module: Its name.
+        kept: What it has kept, oldest first.
+        status: What its recorder does (``record.recorder.RecorderStatus``); empty: none runs.
+        problem: Why it does not tell.
+        code: Of that, by ``core.codes``.
+    """
+
+    module: str
+    kept: tuple[Kept, ...] = ()
+    status: dict[str, Any] = {}
+    problem: str = ""
+    code: str = ""
+
+
+class FilePart(msgspec.Struct, frozen=True):
+    """A part of a file of a recording.
+
+    Attributes:
+        size: Of the whole file, bytes.
+        data: The part, in base 64.
+    """
+
+    size: int
+    data: str
+
+
+class Recordings(Part):
+    """The part of the bridge that keeps, lists and reads recordings here and at peers.
+
+    Args:
+        bridge: The peers and the rules.
+    """
+
+    def __init__(self, bridge: Bridge) -> None:
+        self._bridge = bridge
+        self._tasks = OwnedTasks()
+        # What was to be kept at all modules, with the names of those that have answered.
+        self._wanted: deque[tuple[Kept, set[str]]] = deque(maxlen=limits.KEEPS_WAITING)
+        needs = Needs((Access.RECORD,), "the recording's name")
+        bridge.rpc.on_request(KEEP, self._keep, needs)
+        bridge.rpc.on_request(READ, self._read, needs)
+        bridge.rpc.on_request(REMOVE, self._remove, needs)
+        bridge.rpc.on_request(LIST, self._list, Needs((Access.RECORD,), "each recording; others are left out"))
+
+    @property
+    def folder(self) -> Path | None:
+        """The recorder's folder of this module; ``None``: there is no state directory."""
+        settings = self._bridge.context.settings
+        place = state_dir(os.environ, settings.state_dir or None)
+        return module_dir(place, settings.name) / "record" if place is not None else None
+
+    async def close(self) -> None:
+        """Ask no more."""
+        await self._tasks.close()
+
+    def link_up(self, session: PeerSession) -> None:
+        """Ask a peer that is back for what the others have kept meanwhile."""
+        for kept, done in self._wanted:
+            if session.link.name not in done:
+                self._tasks.start(self._ask_keep(session, kept, done), f"keep {kept.id} at {session.link.name}")
+
+    async def keep(self, kept: Kept) -> dict[str, str]:
+        """Keep what the rings of this module and of all linked peers have of a time; the others when they are back.
+
+        Args:
+            kept: What to keep; its times are of this module's clock.
+
+        Returns:
+            By module: empty where it is being kept, or why not.
+        """
+        done: set[str] = set()
+        self._wanted.append((kept, done))
+        own = self._bridge.context.settings.name
+        found = {own: await self._keep_here(kept)}
+        peers = [*self._bridge.sessions.linked()]
+        answers = await asyncio.gather(*(self._ask_keep(session, kept, done) for session in peers))
+        return found | {session.link.name: why for session, why in zip(peers, answers, strict=True)}
+
+    async def _keep_here(self, kept: Kept) -> str:
+        folder = self.folder
+        try:
+            if folder is None:
+                return "there is no state directory; set RMPA_STATE_DIR"
+            await asyncio.to_thread(request_keep, folder, kept)
+        except (RmpaError, OSError) as error:
+            return str(error)
+        return ""
+
+    async def _ask_keep(self, session: PeerSession, kept: Kept, done: set[str]) -> str:
+        try:
+            why = await self._bridge.rpc.request(session, KEEP, {"kept": msgspec.to_builtins(kept)})
+        except PeerRefused as error:
+            done.add(session.link.name)
+            return _EARLIER if error.unknown else error.reason
+        except RmpaError as error:
+            return str(error)
+        done.add(session.link.name)
+        return str(why)
+
+    async def _keep(self, asker: PeerSession, args: dict[str, Any]) -> str:
+        kept = msgspec.convert(args.get("kept"), Kept)
+        self._check(asker, kept.id)
+        ahead = asker.time.ahead_ns  # its clock less this one
+        moved = msgspec.structs.replace(
+            kept, since=kept.since - ahead, until=kept.until - ahead, asked_by=kept.asked_by or asker.link.name
+        )
+        return await self._keep_here(moved)
+
+    def _check(self, asker: PeerSession, name: object) -> str:
+        kept = check_id(str(name))
+        if why := self._bridge.context.gate.why_not(Access.RECORD, asker.link.name, f"/{kept}"):
+            raise RmpaError(why, code="not-permitted")
+        return kept
+
+    async def _list(self, asker: PeerSession, _args: dict[str, Any]) -> ModuleRecordings:
+        gate, peer = self._bridge.context.gate, asker.link.name
+        found = await asyncio.to_thread(self._here)
+        return msgspec.structs.replace(
+            found, kept=tuple(one for one in found.kept if not gate.why_not(Access.RECORD, peer, f"/{one.id}"))
+        )
+
+    def _here(self) -> ModuleRecordings:
+        folder = self.folder
+        name = self._bridge.context.settings.name
+        if folder is None or not folder.is_dir():
+            return ModuleRecordings(module=name)
+        status: dict[str, Any] = {}
+        with contextlib.suppress(OSError, msgspec.DecodeError):  # no recorder has run
+            status = msgspec.json.decode((folder / "status.json").read_bytes(), type=dict[str, Any])
+        if time.time() - float(status.get("at", 0.0)) > limits.RECORDER_SILENT:
+            status = {}
+        return ModuleRecordings(module=name, kept=tuple(read_kept(folder / KEPT)), status=status)
+
+    async def list(self) -> list[ModuleRecordings]:
+        """The recordings of this module and of its peers."""
+        peers = [*self._bridge.sessions.linked()]
+        own = await asyncio.to_thread(self._here)
+        return [own, *await asyncio.gather(*map(self._list_of, peers))]
+
+    async def _list_of(self, session: PeerSession) -> ModuleRecordings:
+        try:
+            found = msgspec.convert(await self._bridge.rpc.request(session, LIST, {}), ModuleRecordings)
+            return msgspec.structs.replace(found, module=session.link.name)
+        except PeerRefused as error:
+            problem, code = (_EARLIER, "other-release") if error.unknown else (error.reason, "not-permitted")
+        except msgspec.ValidationError as error:
+            problem, code = f"its answer is malformed: {error}", "protocol-error"
+        except RmpaError as error:
+            problem, code = str(error), error.code
+        return ModuleRecordings(module=session.link.name, problem=problem, code=code)
+
+    async def _read(self, asker: PeerSession, args: dict[str, Any]) -> FilePart:
+        return await asyncio.to_thread(self._part, self._check(asker, args.get("id")), args)
+
+    def _part(self, name: str, args: Mapping[str, Any]) -> FilePart:
+        """A part of a file of a recording of this module.
+
+        Raises:
+            RmpaError: There is none, or it cannot be read.
+        """
+        file, offset = str(args.get("file", "")), args.get("offset", 0)
+        kept = find_kept(self._kept(), name)
+        if file not in kept.files or not isinstance(offset, int) or offset < 0:
+            raise RmpaError(f"{name} has no file {file[:80]!r}", code="unknown-name")
+        try:
+            with (self._kept() / name / file).open("rb") as opened:
+                size = os.fstat(opened.fileno()).st_size
+                opened.seek(offset)
+                return FilePart(size, base64.b64encode(opened.read(limits.RECORDING_PART)).decode())
+        except OSError as error:
+            raise RmpaError(f"{name}/{file}: {error.strerror}", code="recording-damaged") from None
+
+    def _kept(self) -> Path:
+        folder = self.folder
+        if folder is None:
+            raise RmpaError("there is no state directory; set RMPA_STATE_DIR", code="no-state-directory")
+        return folder / KEPT
+
+    async def _remove(self, asker: PeerSession, args: dict[str, Any]) -> Kept:
+        return await asyncio.to_thread(remove_kept, self._kept(), self._check(asker, args.get("id")))
+
+    async def answer(self, args: Mapping[str, Any]) -> Any:
+        """What a command asks: ``what`` is keep, list, read or remove, of the ``module`` (without one: this one).
+
+        Raises:
+            RmpaError: It cannot be done.
+        """
+        what, module = str(args.get("what", "list")), str(args.get("module", ""))
+        own = self._bridge.context.settings.name
+        if what == "list":
+            return await self.list()
+        if what == "keep":
+            return await self.keep(self._made(args))
+        request = {"read": READ, "remove": REMOVE}.get(what)
+        if request is None:
+            raise RmpaError(f"{what!r} is no question about recordings", code="unknown-name")
+        if module in ("", own):
+            if request == REMOVE:
+                return await asyncio.to_thread(remove_kept, self._kept(), str(args.get("id", "")))
+            return await asyncio.to_thread(self._part, check_id(str(args.get("id", ""))), args)
+        sessions = [s for s in self._bridge.sessions.linked() if is_meant(module, s.link.name, str(s.link.guid))]
+        if not sessions:
+            raise RmpaError(f"{module} is not linked; `rmpa peer list` shows why", code="peer-unlinked")
+        inner = {key: args[key] for key in ("id", "file", "offset") if key in args}
+        return await self._bridge.rpc.request(sessions[0], request, inner, limits.LOG_ASK_TIMEOUT)
+
+    def _made(self, args: Mapping[str, Any]) -> Kept:
+        """What to keep, by a recorder's own request or a person's words: ``why``, and ``seconds`` of the past."""
+        if isinstance(given := args.get("kept"), dict):
+            return msgspec.convert(given, Kept)
+        now, why = time.time_ns(), str(args.get("why", "")) or "by hand"
+        seconds, own = args.get("seconds"), self._bridge.context.settings
+        past = float(seconds) if isinstance(seconds, int | float) else own.record.seconds or 86_400.0
+        name = recording_id(why, own.name, now)
+        since = now - round(past * _SECOND)
+        return Kept(id=name, why=why, since=since, until=now, asked_by=own.name, by_hand=True)

@@ -1,0 +1,460 @@
+"""``rmpa record``: the flight recorder of this module, and the recordings of all."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import logging
+import os
+import signal
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+import msgspec
+
+from rmpa.bridge.kept import Kept
+from rmpa.bridge.recordings import FilePart, ModuleRecordings
+from rmpa.cli.completion import completes, topics
+from rmpa.cli.main import LazyGroup
+from rmpa.cli.module import check_record, find_module
+from rmpa.cli.options import (
+    FiniteRange,
+    Options,
+    agent_option,
+    agent_verb,
+    argument,
+    config_option,
+    flag,
+    json_option,
+    json_verb,
+)
+from rmpa.cli.output import Table, begin_log, print_text, printable, size
+from rmpa.core.errors import ConfigError, RmpaError, StartError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from rmpa.cli.module import Module
+    from rmpa.observe.control_client import ControlClient
+    from rmpa.record.merge import MergeResult
+
+_log = logging.getLogger("rmpa.record")
+_SECOND: Final = 1_000_000_000
+_BAG: Final = ".bag"
+_MB: Final = 1_000_000
+# Seconds between two lines of progress.
+_PROGRESS: Final = 0.5
+
+
+@click.group(cls=LazyGroup, path="record", invoke_without_command=True, help=None)
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), metavar="FILE", help="Record into this file: .mcap or .bag."
+)
+@click.option(
+    "-t",
+    "--topic",
+    "globs",
+    multiple=True,
+    metavar="GLOB",
+    shell_complete=completes(topics),
+    help="Only these topics.",
+)
+@click.option("--duration", type=FiniteRange(0.1), metavar="SECONDS", help="Stop after so long. [default: at Ctrl-C]")
+@click.option("--size", "megabytes", type=FiniteRange(0.1), metavar="MB", help="Stop after so many MB of messages.")
+@flag("--here", help="Record what nodes of other modules publish, too: it crosses the network.")
+@flag("--mesh", help="Let each module record its own nodes, then fetch and merge them.")
+@config_option
+@json_option
+@agent_option
+@click.pass_context
+def record(context: click.Context, /, config: str | None, as_json: bool, agent: str | None, **given: Any) -> int:
+    """Record what happens on this module: without a file into a ring, of which recordings are kept.
+
+    ---
+    The recorder subscribes to this module's nodes, beside the agent and never in its path. [record] says to which and
+    how much is kept ([record] enabled = true starts it with the agent). When an alarm is raised, a link or node is
+    lost, or by `rmpa record keep`, all linked modules keep the last minutes. With -o it writes a file until Ctrl-C,
+    as rosbag record does.
+
+    Examples:
+      rmpa record                                 the ring: the last two minutes are always there
+      rmpa record -o run.mcap                     all topics of this module, into a file
+      rmpa record -o run.bag -t '/scan' -t '/tf*' --duration 60
+      rmpa record -o run.mcap --here              with what other modules publish
+      rmpa record -o run.mcap --mesh --duration 60   each module its own, fetched and merged at the end
+      rmpa record keep "it fell over" -o fall.mcap   what all modules have of the last minutes, as one file
+    """
+    if context.invoked_subcommand is not None:
+        return 0
+    check_record("rmpa record")
+    options = Options(as_json, agent)
+    module = find_module(agent, {"config": config}, os.environ, "--agent")
+    if given["output"] is None:
+        if any(given[key] for key in ("globs", "duration", "megabytes", "here", "mesh")):
+            raise ConfigError("-o", "these options are for a recording into a file", "add -o FILE.mcap or FILE.bag")
+        return _ring(module)
+    if given["output"].suffix not in (_BAG, ".mcap"):
+        raise ConfigError("-o", f"{given['output']} is neither .mcap nor .bag", "name the file so")
+    if given["output"].exists():
+        raise ConfigError("-o", f"{given['output']} exists", "name another file")
+    if given["mesh"]:
+        return _of_the_mesh(options, given)
+    return _by_hand(module, options, given)
+
+
+def _ring(module: Module) -> int:
+    from rmpa.config.module_name import module_dir
+    from rmpa.record.recorder import Recorder
+
+    settings = module.loaded.settings
+    begin_log(settings, module.loaded.notes, _log, sys.stderr)
+    folder = module_dir(module.place, module.name) / "record"
+    recorder = Recorder(settings.record, folder, module.name, _core_of(module))
+    _log.info(
+        "= recording into %s: the last %g s, %d MB", folder, settings.record.seconds or 0, settings.record.megabytes
+    )
+    asyncio.run(_until_signal(recorder.run))
+    return 0
+
+
+def _core_of(module: Module) -> str:
+    if module.socket is None:
+        raise StartError("rmpa record", f"the agent {module.name} does not run", "start it: rmpa up")
+    from rmpa.observe.control_client import ControlClient
+
+    with ControlClient(module.socket) as client:
+        return client.agent().core_uri
+
+
+async def _until_signal(run: Callable[[asyncio.Event], Any]) -> None:
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    await run(stop)
+
+
+def _by_hand(module: Module, options: Options, given: dict[str, Any]) -> int:
+    """Record into a file: segments beside it, which are joined at the end."""
+    from rmpa.record.recorder import record_file
+
+    settings = module.loaded.settings
+    wanted = replace(settings.record, topics=given["globs"] or ("/**",), topic_rate=None, thin=None, deny=())
+    shown = 0.0
+
+    def progress(seconds: float, messages: int, total: int) -> bool:
+        nonlocal shown
+        if sys.stderr.isatty() and seconds - shown >= _PROGRESS:
+            shown = seconds
+            click.echo(f"\r{seconds:6.1f} s  {messages:,} messages  {size(total)}   ", err=True, nl=False)
+        return bool(given["megabytes"]) and total >= given["megabytes"] * _MB
+
+    output: Path = given["output"]
+    with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as parts:
+        counts = asyncio.run(
+            record_file(
+                wanted,
+                Path(parts),
+                module.name,
+                _core_of(module),
+                progress,
+                given["duration"],
+                everything=given["here"],
+            )
+        )
+        if sys.stderr.isatty():
+            click.echo("", err=True)
+        result = _write([Path(parts)], output)
+    options.show(
+        {"file": str(output), "messages": result.messages, "topics": counts},
+        f"{output}: {result.messages:,} messages of {len(counts)} topics, {size(output.stat().st_size)}",
+    )
+    return 0 if result.messages else 1
+
+
+def _write(paths: list[Path], output: Path, reference: str = "") -> MergeResult:
+    """Merge recordings into one file, MCAP or bag."""
+    from rmpa.record.bag import write_bag
+    from rmpa.record.format import read_in_order
+    from rmpa.record.merge import merge
+
+    if output.exists():
+        raise ConfigError("-o", f"{output} exists", "name another file")
+    whole = output.with_name(f".{output.name}.new")
+    try:
+        with whole.open("wb") as file:
+            result = merge(paths, file, reference)
+        if output.suffix == _BAG:
+            write_bag(read_in_order([whole]), output)
+        else:
+            whole.replace(output)
+    finally:
+        whole.unlink(missing_ok=True)
+    return result
+
+
+def _of_the_mesh(options: Options, given: dict[str, Any]) -> int:
+    """Wait, then keep what all modules have of that time."""
+    began = time.time()
+    with contextlib.suppress(KeyboardInterrupt):
+        time.sleep(given["duration"] or 86_400.0)
+    seconds = time.time() - began
+    return _keep(options, f"by hand for {seconds:.0f} s", seconds, given["output"])
+
+
+def _all(client: ControlClient) -> list[ModuleRecordings]:
+    return list(client.call("record", tuple[ModuleRecordings, ...], what="list"))
+
+
+def names(_ctx: click.Context, _: str) -> Iterator[str]:
+    """The names of recordings, for completion."""
+    with Options(False).client() as client:
+        yield from dict.fromkeys(kept.id for each in _all(client) for kept in each.kept)
+
+
+@agent_verb()
+def record_list(options: Options) -> int:
+    """List what the modules have kept, and what their recorders do.
+
+    ---
+
+    Examples:
+      rmpa record list
+      rmpa record list --json | jq -r '.[].kept[].id'
+    """
+    with options.client(60.0) as client:
+        found = _all(client)
+    recorders = [
+        (each.module, *(_state(each)), each.problem or str(each.status.get("problem", "")) or "-") for each in found
+    ]
+    by_id: dict[str, list[tuple[str, Kept]]] = {}
+    for each in found:
+        for kept in each.kept:
+            by_id.setdefault(kept.id, []).append((each.module, kept))
+    rows = [
+        (name, ", ".join(module for module, _ in parts), size(sum(kept.size for _, kept in parts)), parts[0][1].why)
+        for name, parts in sorted(by_id.items())
+    ]
+    options.show(
+        found,
+        Table("MODULE, RECORDER, >BACK, >RING, PROBLEM", recorders),
+        "",
+        Table("RECORDING, MODULES, >SIZE, WHY", rows),
+    )
+    return int(any(each.problem for each in found))
+
+
+def _state(each: ModuleRecordings) -> tuple[str, str, str]:
+    if not each.status:
+        return "-", "-", "-"
+    total, back = each.status.get("ring", (0, 0.0))
+    return "runs", f"{back:.0f} s", size(total)
+
+
+@agent_verb(argument("recording", names))
+def record_info(recording: str, options: Options) -> int:
+    """Show what is known of a RECORDING, at each module that has it.
+
+    ---
+
+    Examples:
+      rmpa record info 20261129-121500-arm-alarm
+    """
+    with options.client(60.0) as client:
+        parts = [(each.module, kept) for each in _all(client) for kept in each.kept if kept.id == recording]
+    if not parts:
+        raise RmpaError(f"no module has a recording {recording}; `rmpa record list` shows them", code="unknown-name")
+    rows = [
+        (
+            module,
+            _clock(kept.since),
+            f"{(kept.until - kept.since) / _SECOND:.0f} s",
+            str(len(kept.files)),
+            size(kept.size),
+        )
+        for module, kept in parts
+    ]
+    kept = parts[0][1]
+    about = f"{kept.id}: {kept.why}" + (f" (asked by {kept.asked_by})" if kept.asked_by else "")
+    options.show([kept for _, kept in parts], about, Table("MODULE, SINCE (UTC), >LENGTH, >FILES, >SIZE", rows))
+    return 0
+
+
+def _clock(at: int) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(at / _SECOND))
+
+
+@agent_verb(
+    argument("why", required=False, default="by hand"),
+    click.option("--seconds", type=FiniteRange(0.1), help="How much of the past. [default: all that is there]"),
+    click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FILE", help="Fetch and merge it, too."),
+)
+def record_keep(why: str, seconds: float | None, output: Path | None, options: Options) -> int:
+    """Keep what all modules have of the last minutes; WHY names it.
+
+    Modules that are not linked keep it when they are back. Exits 1 if a module cannot.
+
+    ---
+
+    Examples:
+      rmpa record keep
+      rmpa record keep "the arm hit the table" --seconds 60 -o hit.mcap
+    """
+    return _keep(options, why, seconds, output)
+
+
+def _keep(options: Options, why: str, seconds: float | None, output: Path | None) -> int:
+    with options.client(60.0) as client:
+        before = {kept.id for each in _all(client) for kept in each.kept}
+        answers = client.call("record", dict[str, str], what="keep", why=why, seconds=seconds)
+        wanted = {module for module, problem in answers.items() if not problem}
+        name = _kept_name(client, wanted, before)
+        rows = [(module, problem or "kept") for module, problem in answers.items()]
+        options.show({"id": name, "modules": answers}, name, Table("MODULE, STATE", rows))
+        if output is not None and name:
+            with tempfile.TemporaryDirectory() as folder:
+                _fetch(client, name, Path(folder))
+                result = _write([Path(folder)], output)
+            print_text(_merged(output, result))
+    return int(not name or any(answers.values()))
+
+
+def _kept_name(client: ControlClient, modules: set[str], before: set[str], limit: float = 20.0) -> str:
+    """Wait until all modules have what was just kept; its name, or nothing."""
+    deadline, name = time.monotonic() + limit, ""
+    while modules and time.monotonic() < deadline:
+        found = {each.module: {kept.id for kept in each.kept} - before for each in _all(client)}
+        common = set().union(*(found.get(module, set()) for module in modules))
+        name = max(common, default=name)
+        if name and all(name in found.get(module, ()) for module in modules):
+            break
+        time.sleep(0.1)
+    return name
+
+
+@agent_verb(
+    argument("recording", names),
+    click.option(
+        "-o", "--output", type=click.Path(path_type=Path), metavar="DIR", help="Where to. [default: ./RECORDING]"
+    ),
+)
+def record_fetch(recording: str, output: Path | None, options: Options) -> int:
+    """Fetch a RECORDING from all modules that have it, a folder each; what is there already is not fetched again.
+
+    ---
+
+    Examples:
+      rmpa record fetch 20261129-121500-arm-alarm
+      rmpa record fetch 20261129-121500-arm-alarm -o fall && rmpa record merge fall -o fall.mcap
+    """
+    folder = output or Path(recording)
+    with options.client(60.0) as client:
+        fetched = _fetch(client, recording, folder)
+    options.show(
+        {"folder": str(folder), "modules": fetched},
+        Table("MODULE, >FETCHED", [(module, size(count)) for module, count in fetched.items()]),
+        f"merge it: rmpa record merge {folder} -o {recording}.mcap",
+    )
+    return 0
+
+
+def _fetch(client: ControlClient, recording: str, folder: Path) -> dict[str, int]:
+    parts = [(each.module, kept) for each in _all(client) for kept in each.kept if kept.id == recording]
+    if not parts:
+        raise RmpaError(f"no module has a recording {recording}; `rmpa record list` shows them", code="unknown-name")
+    total, done = sum(kept.size for _, kept in parts), 0
+    fetched: dict[str, int] = {}
+    for module, kept in parts:
+        place = folder / module
+        place.mkdir(parents=True, exist_ok=True)
+        for name in kept.files:
+            for count in _fetch_file(client, module, recording, name, place / name):
+                done += count
+                fetched[module] = fetched.get(module, 0) + count
+                if sys.stderr.isatty():
+                    click.echo(f"\r{module}: {100 * done // max(total, 1)} % of {size(total)}  ", err=True, nl=False)
+    if sys.stderr.isatty():
+        click.echo("", err=True)
+    return fetched
+
+
+def _fetch_file(client: ControlClient, module: str, recording: str, name: str, path: Path) -> Iterator[int]:
+    """Append what is missing of a file; yields the bytes of each part."""
+    if "/" in name or name.startswith("."):
+        raise RmpaError(f"{module} names a file {printable(name)}", code="protocol-error")
+    with path.open("ab") as file:
+        while True:
+            offset = file.tell()
+            part = client.call("record", FilePart, what="read", module=module, id=recording, file=name, offset=offset)
+            data = base64.b64decode(part.data)
+            file.write(data)
+            yield len(data)
+            if not data or file.tell() >= part.size:
+                return
+
+
+@json_verb(
+    argument("recordings", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path)),
+    click.option(
+        "-o", "--output", required=True, type=click.Path(path_type=Path), metavar="FILE", help=".mcap or .bag."
+    ),
+    click.option("--clock", "reference", default="", metavar="MODULE", help="Whose clock. [default: the best known]"),
+)
+def record_merge(recordings: tuple[Path, ...], output: Path, reference: str, options: Options) -> int:
+    """Put RECORDINGS of several modules on one timeline: files, or folders as `rmpa record fetch` makes them.
+
+    ---
+
+    Examples:
+      rmpa record merge fall -o fall.mcap
+      rmpa record merge arm.mcap base.mcap --clock base -o both.bag
+    """
+    check_record("rmpa record")
+    result = _write(list(recordings), output, reference)
+    about = msgspec.to_builtins({**result._asdict(), "offsets": {k: v._asdict() for k, v in result.offsets.items()}})
+    rows = [
+        (name, "the clock" if name == result.reference else f"{1e3 * one.ahead:+.3f} ms", _bound(one.error))
+        for name, one in result.offsets.items()
+    ]
+    options.show({"file": str(output), **about}, _merged(output, result), Table("MODULE, >AHEAD, >±", rows))
+    return int(bool(result.damaged))
+
+
+def _bound(error: float | None) -> str:
+    return "not known" if error is None else f"{1e3 * error:.3f} ms"
+
+
+def _merged(output: Path, result: MergeResult) -> str:
+    doubles = f", {result.doubles:,} doubles left out" if result.doubles else ""
+    damaged = "".join(f"; not read: {text}" for text in result.damaged)
+    return f"{output}: {result.messages:,} messages of {len(result.offsets)} modules{doubles}{damaged}"
+
+
+@agent_verb(argument("recording", names), click.option("--module", default="", help="Only that of this module."))
+def record_rm(recording: str, module: str, options: Options) -> int:
+    """Remove a RECORDING at all modules that have it.
+
+    ---
+
+    Examples:
+      rmpa record rm 20261129-121500-arm-alarm
+    """
+    removed, problems = [], []
+    with options.client(60.0) as client:
+        holders = [each.module for each in _all(client) if any(kept.id == recording for kept in each.kept)]
+        for name in holders if not module else [module]:
+            try:
+                client.call("record", Kept, what="remove", module=name, id=recording)
+                removed.append(name)
+            except RmpaError as error:
+                problems.append((name, str(error)))
+    if not removed and not problems:
+        raise RmpaError(f"no module has a recording {recording}; `rmpa record list` shows them", code="unknown-name")
+    rows = [*((name, "removed") for name in removed), *problems]
+    options.show({"removed": removed, "problems": dict(problems)}, Table("MODULE, STATE", rows))
+    return int(bool(problems))

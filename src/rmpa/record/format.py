@@ -1,0 +1,358 @@
+"""Recordings as MCAP (mcap.dev, profile ``ros1``): writes segments, and reads them again, also unfinished ones.
+
+A channel is one publisher of one topic. Its metadata has ``callerid``, ``latching``, ``md5sum`` and, in a file of
+several modules, ``module``. ``log_time`` is when this module received a message, ``publish_time`` when it first did:
+a latched message that a segment repeats has an earlier one. What happened besides messages are events: JSON in
+``std_msgs/String`` on ``EVENTS``. Metadata records: ``rmpa.module`` (``ModuleRecord``) and ``rmpa.clock``
+(``ClockRecord`` as JSON, by peer), once in each segment.
+"""
+
+from __future__ import annotations
+
+import heapq
+import logging
+import struct
+from typing import IO, TYPE_CHECKING, Final, NamedTuple
+
+import msgspec
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Chunk, Footer, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import CompressionType, Writer
+
+from rmpa.core.errors import RmpaError
+from rmpa.record import limits
+from rmpa.ros.types.messages import MessageType
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+    from pathlib import Path
+
+_log = logging.getLogger(__name__)
+# The topic of events.
+EVENTS: Final = "/rmpa/events"
+MODULE: Final = "rmpa.module"
+CLOCK: Final = "rmpa.clock"
+MERGE: Final = "rmpa.merge"
+SUFFIX: Final = ".mcap"
+# The end of the name of a segment that is being written.
+UNFINISHED: Final = ".part"
+_ENCODING, _SCHEMA = "ros1", "ros1msg"
+_TEXT: Final = MessageType("std_msgs/String")
+_LENGTH: Final = struct.Struct("<I")
+
+
+class DamagedError(RmpaError):
+    """A recording cannot be read."""
+
+    code = "recording-damaged"
+
+
+class RecordedSource(NamedTuple):
+    """One publisher of one topic.
+
+    Attributes:
+        topic: The topic's name in its module.
+        type: The message type, ``package/Name``.
+        md5sum: Its MD5 sum.
+        definition: Its definition, with those of the types in it.
+        node: The publisher's name.
+        latching: Whether it latches.
+        module: The module that recorded it.
+    """
+
+    topic: str
+    type: str
+    md5sum: str
+    definition: str
+    node: str
+    latching: bool = False
+    module: str = ""
+
+
+class Recorded(NamedTuple):
+    """A message of a recording; times in Unix nanoseconds.
+
+    Attributes:
+        source: Where it came from.
+        log_time: When the module received it, or wrote it again.
+        publish_time: When the module first received it.
+        data: Its bytes.
+    """
+
+    source: RecordedSource
+    log_time: int
+    publish_time: int
+    data: bytes
+
+
+class ClockRecord(msgspec.Struct, frozen=True):
+    """What a module knew of another one's clock.
+
+    Attributes:
+        at: When, by the own clock, Unix nanoseconds.
+        ahead: By so many seconds the other clock was ahead.
+        error: The bound of that, seconds; ``None``: it was not known.
+    """
+
+    at: int
+    ahead: float
+    error: float | None
+
+
+class ModuleRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """The module that recorded a segment.
+
+    Attributes:
+        name: Its name.
+        guid: Its GUID.
+        instance: The random id of the agent's run.
+        host: The machine's host name.
+        version: Of RMPA.
+    """
+
+    name: str = ""
+    guid: str = ""
+    instance: str = ""
+    host: str = ""
+    version: str = ""
+
+
+class Event(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Something that happened, beside messages.
+
+    Attributes:
+        kind: ``peer_lost``, ``node_died``, ``contract`` …
+        text: A sentence for people.
+        subject: What it is about: a peer, node, topic or resource.
+        module: Where it was noticed.
+        trigger: Whether it is a reason to keep a recording.
+        facts: Further values.
+    """
+
+    kind: str
+    text: str
+    subject: str = ""
+    module: str = ""
+    trigger: bool = False
+    facts: dict[str, str | float | int | None] = {}
+
+
+EVENT_SOURCE: Final = RecordedSource(EVENTS, _TEXT.name, _TEXT.md5sum, _TEXT.definition, "/record")
+
+
+def event_bytes(event: Event) -> bytes:
+    """An event as the bytes of a ``std_msgs/String``."""
+    text = msgspec.json.encode(event)
+    return _LENGTH.pack(len(text)) + text
+
+
+def read_event(data: bytes) -> Event | None:
+    """The event in a message on ``EVENTS``; ``None`` if it is none of this release."""
+    try:
+        return msgspec.json.decode(data[_LENGTH.size :], type=Event)
+    except msgspec.DecodeError:
+        return None
+
+
+class SegmentWriter:
+    """Writes one MCAP file.
+
+    Args:
+        file: The file, open for writing; it stays open.
+        module: The module that records; ``None``: the file is one of several modules.
+        compress: Whether chunks are compressed.
+    """
+
+    def __init__(self, file: IO[bytes], module: ModuleRecord | None, *, compress: bool = True) -> None:
+        compression = CompressionType.ZSTD if compress else CompressionType.NONE
+        self._writer = Writer(file, chunk_size=limits.CHUNK, compression=compression)
+        self._writer.start(_ENCODING, "rmpa")
+        self._schemas: dict[tuple[str, str], int] = {}
+        self._channels: dict[RecordedSource, int] = {}
+        self._sequence = 0
+        # Of the messages so far; 0: there are none.
+        self.first = self.last = 0
+        if module is not None:
+            self.metadata(MODULE, msgspec.to_builtins(module))
+
+    def metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Write a metadata record."""
+        self._writer.add_metadata(name, dict(values))
+
+    def attachment(self, name: str, media_type: str, data: bytes, at: int) -> None:
+        """Write an attachment of a time, Unix nanoseconds."""
+        self._writer.add_attachment(at, at, name, media_type, data)
+
+    def write(self, source: RecordedSource, log_time: int, publish_time: int, data: bytes) -> None:
+        """Write a message."""
+        channel = self._channels.get(source)
+        if channel is None:
+            channel = self._channels[source] = self._register(source)
+        self._sequence = self._sequence + 1 & 0xFFFFFFFF
+        self._writer.add_message(channel, log_time, data, publish_time, self._sequence)
+        self.first = min(self.first or log_time, log_time)
+        self.last = max(self.last, log_time)
+
+    def flush(self) -> None:
+        """Write what is in memory to the file; the kernel has it then."""
+        self._writer.flush()  # type: ignore[no-untyped-call] # of the library
+
+    def finish(self) -> None:
+        """Write the rest with the index of the file."""
+        self._writer.finish()  # type: ignore[no-untyped-call] # of the library
+
+    def _register(self, source: RecordedSource) -> int:
+        key = source.type, source.md5sum
+        if key not in self._schemas:
+            self._schemas[key] = self._writer.register_schema(source.type, _SCHEMA, source.definition.encode())
+        about = {"callerid": source.node, "latching": str(int(source.latching)), "md5sum": source.md5sum}
+        if source.module:
+            about["module"] = source.module
+        return self._writer.register_channel(source.topic, _ENCODING, self._schemas[key], about)
+
+
+class SegmentReader:
+    """Reads one MCAP file of ROS 1, of this program or another one; an unfinished one as far as it goes.
+
+    Args:
+        path: The file.
+
+    Raises:
+        DamagedError: It cannot be opened, or is none.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.module = ModuleRecord()
+        self.clocks: dict[str, ClockRecord] = {}
+        self.merged: dict[str, str] = {}
+        # Whether the end of the file is missing; known after ``messages``.
+        self.unfinished = False
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, RecordedSource] = {}
+
+    def head(self) -> tuple[int, set[RecordedSource]]:
+        """The time of the first message, and all sources; by the file's index, where it has one.
+
+        Raises:
+            DamagedError: As for ``messages``.
+        """
+        try:
+            with self.path.open("rb") as file:
+                reader = SeekingReader(file)
+                if (summary := reader.get_summary()) is not None and summary.statistics is not None:
+                    for record in reader.iter_metadata():
+                        self._metadata(record)
+                    self._schemas = dict(summary.schemas)
+                    self._channels = {number: self._source(one) for number, one in summary.channels.items()}
+                    return summary.statistics.message_start_time, set(self._channels.values())
+        except Exception as error:  # noqa: BLE001 - it has no index, as after a crash
+            _log.debug("%s: %s", self.path, error)
+        first, sources = 0, set[RecordedSource]()
+        for message in self.messages():
+            first = first or message.log_time
+            sources.add(message.source)
+        return first, sources
+
+    def messages(self) -> Iterator[Recorded]:
+        """The messages in order of their log times; metadata is known after the first one.
+
+        Raises:
+            DamagedError: The file cannot be read from its beginning on.
+        """
+        chunk: list[Recorded] = []
+        try:
+            with self.path.open("rb") as file:
+                ended = False
+                try:
+                    for record in StreamReader(file, emit_chunks=True).records:
+                        ended = isinstance(record, Footer)
+                        if isinstance(record, Chunk):
+                            yield from _in_order(chunk)
+                            chunk = [one for part in breakup_chunk(record) if (one := self._take(part)) is not None]
+                        elif (one := self._take(record)) is not None:
+                            chunk.append(one)
+                except OSError:
+                    raise
+                except Exception as error:  # noqa: BLE001 - whatever the libraries make of damaged bytes
+                    if not self._channels and not self.module.name:
+                        raise DamagedError(f"{self.path}: it is no recording: {error}") from None
+                self.unfinished = not ended
+        except OSError as error:
+            raise DamagedError(f"{self.path}: {error.strerror or error}") from None
+        yield from _in_order(chunk)
+
+    def _take(self, record: object) -> Recorded | None:
+        if isinstance(record, Message):
+            source = self._channels.get(record.channel_id)
+            return source and Recorded(source, record.log_time, record.publish_time, record.data)
+        if isinstance(record, Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self._channels.setdefault(record.id, self._source(record))
+        elif isinstance(record, Metadata):
+            self._metadata(record)
+        return None
+
+    def _source(self, channel: Channel) -> RecordedSource:
+        schema, about = self._schemas.get(channel.schema_id), channel.metadata
+        name, definition = (schema.name, schema.data.decode("utf-8", "replace")) if schema else ("", "")
+        node, latching = about.get("callerid", ""), about.get("latching", "0") in ("1", "true")
+        module = about.get("module", self.module.name)
+        return RecordedSource(channel.topic, name, about.get("md5sum", ""), definition, node, latching, module)
+
+    def _metadata(self, record: Metadata) -> None:
+        try:
+            if record.name == MODULE:
+                self.module = msgspec.convert(record.metadata, ModuleRecord)
+            elif record.name == CLOCK:
+                self.clocks |= {
+                    peer: msgspec.json.decode(text, type=ClockRecord) for peer, text in record.metadata.items()
+                }
+            elif record.name == MERGE:
+                self.merged = dict(record.metadata)
+        except (msgspec.DecodeError, msgspec.ValidationError):
+            pass  # of another release
+
+
+def _in_order(messages: list[Recorded]) -> list[Recorded]:
+    """Messages of a chunk by their log times; those of one time as they were written."""
+    return sorted(messages, key=_log_time)
+
+
+def _log_time(message: Recorded) -> int:
+    return message.log_time
+
+
+def read_in_order(paths: Iterable[Path]) -> Iterator[Recorded]:
+    """The messages of several files of one module, or of a merged one, in order of their log times."""
+    return heapq.merge(*(SegmentReader(path).messages() for path in paths), key=_log_time)
+
+
+def finish_file(path: Path) -> Path:
+    """Write a segment that a crash left unfinished again, with its index.
+
+    Args:
+        path: The file, ``NAME.mcap.part``.
+
+    Returns:
+        The finished file; the unfinished one is gone.
+
+    Raises:
+        DamagedError: Nothing of it can be read.
+        OSError: It cannot be written.
+    """
+    reader, done = SegmentReader(path), path.with_name(path.name.removesuffix(UNFINISHED))
+    whole = done.with_name(f"{done.name}.new")
+    found: list[Recorded] = list(reader.messages())
+    with whole.open("wb") as file:
+        writer = SegmentWriter(file, reader.module)
+        if reader.clocks:
+            writer.metadata(CLOCK, {name: msgspec.json.encode(one).decode() for name, one in reader.clocks.items()})
+        for message in found:
+            writer.write(*message)
+        writer.finish()
+    whole.replace(done)
+    path.unlink()
+    return done

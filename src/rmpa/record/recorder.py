@@ -1,0 +1,401 @@
+"""The recorder's process: what it takes, what happened, and what makes it keep a recording."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import logging
+import os
+import signal
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from rmpa.bridge.kept import KEPT, REQUESTS, Kept, recording_id, request_keep, take_requests
+from rmpa.client import (
+    AgentClient,
+    AgentLost,
+    ContractBroken,
+    NoteCleared,
+    NoteRaised,
+    PeerLinked,
+    PeerLost,
+    ServiceAppeared,
+    ServiceGone,
+    TopicAppeared,
+    TopicGone,
+    changes,
+)
+from rmpa.config.recording import ALARM, CONTRACT, NODE_DIED, PEER_LOST
+from rmpa.core.errors import RmpaError
+from rmpa.core.identity import is_own, matches
+from rmpa.observe.control_client import ControlClient, choose_agent
+from rmpa.record import limits
+from rmpa.record.capture import Capture
+from rmpa.record.format import (
+    CLOCK,
+    EVENT_SOURCE,
+    MODULE,
+    ClockRecord,
+    Event,
+    ModuleRecord,
+    RecordedSource,
+    event_bytes,
+)
+from rmpa.record.ring import RingThread
+from rmpa.ros.node.node import Node
+from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
+from rmpa.ros.types.messages import MessageType
+from rmpa.runtime.files import replace_file
+from rmpa.runtime.tasks import OwnedTasks, keep_task
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from rmpa.client import AgentEvent
+    from rmpa.config.recording import RecordSettings
+    from rmpa.observe.snapshot import Snapshot
+    from rmpa.record.format import SegmentWriter
+
+_log = logging.getLogger(__name__)
+_SECOND: Final = 1_000_000_000
+_MB: Final = 1_000_000
+# Seconds between two looks for requests, and between two writings of the status.
+_REQUESTS: Final = 0.2
+_STATUS: Final = 5.0
+# Seconds from one snapshot of the agent to the next, where its graph does not change.
+_PERIOD: Final = 5.0
+# Seconds between two readings of the parameters, and bytes of them that a segment repeats.
+_PARAMETERS: Final = 30.0
+_PARAMETERS_MAX: Final = 1024 * 1024
+STATUS: Final = "status.json"
+_BOOL: Final = "std_msgs/Bool"
+
+
+class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """What the recorder of a module does, as ``status.json`` has it.
+
+    Attributes:
+        pid: Its process.
+        since: When it began, Unix seconds.
+        at: When this was written, Unix seconds.
+        messages: By topic.
+        size: Bytes of messages, by topic.
+        left_out: Messages above the budgets, or that the disk did not take, by topic.
+        written: Bytes written to the disk.
+        ring: Bytes of the ring, and how far it goes back, seconds.
+        problem: Why nothing can be written; empty: all is well.
+    """
+
+    pid: int
+    since: float
+    at: float
+    messages: dict[str, int] = {}
+    size: dict[str, int] = {}
+    left_out: dict[str, int] = {}
+    written: int = 0
+    ring: tuple[int, float] = (0, 0.0)
+    problem: str = ""
+
+
+class Recorder:
+    """Records one module.
+
+    Args:
+        settings: What, and how much.
+        folder: Its folder; made if it is missing.
+        agent: The name of the module's agent.
+        master_uri: The module's core.
+        everything: Record what nodes of other modules publish, too.
+    """
+
+    def __init__(
+        self, settings: RecordSettings, folder: Path, agent: str, master_uri: str, *, everything: bool = False
+    ) -> None:
+        self._settings = settings
+        self._folder = folder
+        self._agent = agent
+        self._node = Node("rmpa_record", master_uri=master_uri)
+        self._module = ModuleRecord(name=agent)
+        self._clocks: dict[str, str] = {}
+        self._parameters = b""
+        self._last: Snapshot | None = None
+        self._kept_at: dict[str, float] = {}
+        self._left_out: dict[str, int] = {}
+        self._since = time.time()
+        self._work = OwnedTasks()
+        listeners = {ARRAY_TYPE: self._alarms, _BOOL: self._stops}
+        self.ring = RingThread(
+            folder,
+            self._begin,
+            most_bytes=settings.megabytes * _MB,
+            most_seconds=settings.seconds or float("inf"),
+            fsync=settings.fsync,
+            kept_bytes=settings.kept_megabytes * _MB,
+        )
+        self.capture = Capture(self._node, settings, self.ring.put, listeners, everything=everything)
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Record until ``stop`` is set.
+
+        Raises:
+            RmpaError: There is no core, or the folder cannot be made.
+        """
+        for name in (KEPT, REQUESTS):
+            (self._folder / name).mkdir(parents=True, exist_ok=True)
+        self.ring.start()
+        tasks = [keep_task(one, name) for one, name in ((self._follow, "follow the agent"), (self._tend, "requests"))]
+        try:
+            async with self._node:
+                await stop.wait()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await self._work.close()
+            await asyncio.to_thread(self.ring.end)
+            self._write_status()
+
+    def happened(self, event: Event) -> None:
+        """Write an event, and keep a recording if it is a reason."""
+        now = time.time_ns()
+        self.ring.put(EVENT_SOURCE, now, now, event_bytes(msgspec.structs.replace(event, module=self._module.name)))
+        if event.trigger:
+            self._work.start(self._keep(event, now), "keep a recording")
+
+    def _begin(self, writer: SegmentWriter, now: int) -> None:
+        """The beginning of a segment; called in the ring's thread."""
+        writer.metadata(MODULE, msgspec.to_builtins(self._module))
+        if self._clocks:
+            writer.metadata(CLOCK, self._clocks)
+        if self._parameters:
+            writer.attachment("parameters.json", "application/json", self._parameters, now)
+        for source, (first, raw) in list(self.capture.latched.items()):
+            writer.write(source, now, first, raw)
+        if counts := {topic: n for topic, n in self._left_out_since().items() if n}:
+            text = f"left out: {', '.join(f'{n} of {topic}' for topic, n in counts.items())}"
+            event = Event("left_out", text, module=self._module.name, facts=dict(counts))
+            writer.write(EVENT_SOURCE, now, now, event_bytes(event))
+
+    def _left_out_since(self) -> dict[str, int]:
+        before, self._left_out = self._left_out, self._all_left_out()
+        return {topic: count - before.get(topic, 0) for topic, count in self._left_out.items()}
+
+    def _all_left_out(self) -> dict[str, int]:
+        return dict(self.capture.left_out)
+
+    async def _follow(self) -> None:
+        """Follow the agent: what there is to record, and what happens."""
+        read = 0.0
+        async with AgentClient(self._agent) as client:
+            async for now in client.snapshots(period=_PERIOD):
+                if isinstance(now, AgentLost):
+                    self.happened(Event("agent_lost", now.problem))
+                    continue
+                agent = now.agent
+                self._module = ModuleRecord(
+                    name=agent.name, guid=agent.guid, instance=agent.instance, host=agent.host, version=agent.version
+                )
+                self._clocks = {
+                    peer.name: msgspec.json.encode(
+                        ClockRecord(round(now.taken * 1e9), peer.link.clock_offset, peer.link.clock_error)
+                    ).decode()
+                    for peer in now.peers
+                    if peer.link is not None and peer.link.clock_offset is not None
+                }
+                for event in _events(self._last, now):
+                    self.happened(self._judged(event))
+                graph_changed = self._last is None or self._last.topics != now.topics
+                self._last = now
+                await self.capture.update(now.topics)
+                if graph_changed or time.monotonic() - read > _PARAMETERS:
+                    read = time.monotonic()
+                    await self._read_parameters()
+
+    async def _read_parameters(self) -> None:
+        with contextlib.suppress(RmpaError):
+            found = msgspec.json.encode(await self._node.get_param("/", default={}), enc_hook=str)
+            self._parameters = found if len(found) <= _PARAMETERS_MAX else b""
+
+    def _judged(self, event: Event) -> Event:
+        return msgspec.structs.replace(event, trigger=event.kind in self._settings.keep_on)
+
+    def _alarms(self, source: RecordedSource, raw: bytes) -> None:
+        """Look for alarms of resources in a ``DiagnosticArray``."""
+        if not source.topic.endswith("/alarms"):
+            return
+        for status in _ARRAY.deserialize(raw).status:
+            level = int(status.level)
+            raised = level in (DiagnosticLevel.WARN, DiagnosticLevel.ERROR)
+            facts: dict[str, Any] = {str(pair.key): str(pair.value) for pair in status.values}
+            event = Event(ALARM if raised else "alarm_over", str(status.message), source.node, facts=facts)
+            self.happened(self._judged(event))
+
+    def _stops(self, source: RecordedSource, raw: bytes) -> None:
+        """Look for an emergency stop."""
+        if raw[:1] != b"\0" and any(matches(glob, source.topic) for glob in self._settings.stop_topics):
+            self.happened(Event("stop", f"emergency stop on {source.topic}", source.topic, trigger=True))
+
+    async def _keep(self, event: Event, now: int) -> None:
+        """Ask the agent to keep a recording, here and at all peers; without an agent, here alone."""
+        if time.monotonic() - self._kept_at.get(event.kind, float("-inf")) < limits.KEEP_AGAIN:
+            return
+        self._kept_at[event.kind] = time.monotonic()
+        after, seconds = self._settings.after or 0.0, self._settings.seconds or 86_400.0
+        kept = Kept(
+            id=recording_id(event.kind, self._module.name, now),
+            why=event.text,
+            since=now - round(seconds * _SECOND),
+            until=now + round(after * _SECOND),
+            asked_by=self._module.name,
+        )
+        try:
+            await asyncio.to_thread(self._ask_agent, kept)
+        except RmpaError as error:
+            _log.warning("! only this module keeps %s: %s [%s]", kept.id, error, error.code)
+            await asyncio.to_thread(request_keep, self._folder, kept)
+
+    def _ask_agent(self, kept: Kept) -> None:
+        with ControlClient(choose_agent(os.environ, self._agent).path) as client:
+            client.call("record", object, what="keep", kept=msgspec.to_builtins(kept))
+
+    async def _tend(self) -> None:
+        """Do what is requested by files, and write the status."""
+        status, seen, requests = 0.0, 0, self._folder / REQUESTS
+        while True:
+            changed = requests.stat().st_mtime_ns  # one call of the kernel: the folder is read when it has changed
+            if changed != seen:
+                for kept in await asyncio.to_thread(lambda: list(take_requests(self._folder))):
+                    self._work.start(self._kept(kept), f"keep {kept.id}")
+                seen = changed
+            if time.monotonic() - status >= _STATUS:
+                status = time.monotonic()
+                await asyncio.to_thread(self._write_status)
+            await asyncio.sleep(_REQUESTS)
+
+    async def _kept(self, kept: Kept) -> None:
+        await asyncio.sleep(max(0.0, (kept.until - time.time_ns()) / _SECOND))
+        kept = msgspec.structs.replace(kept, module=self._module.name)
+        try:
+            made = await asyncio.wrap_future(self.ring.call(self.ring.keep, kept))
+        except OSError as error:
+            _log.warning("! %s cannot be kept: %s [recording-stopped]", kept.id, error.strerror or error)
+            return
+        if made is None:
+            _log.warning("! %s: nothing of that time is here any more [recording-stopped]", kept.id)
+        else:
+            _log.info("= kept %s: %s, %.1f MB in %d files", made.id, made.why, made.size / _MB, len(made.files))
+
+    def _write_status(self) -> None:
+        segments = list(self.ring.segments)
+        back = (time.time_ns() - segments[0].first) / _SECOND if segments else 0.0
+        lost = dict(self.ring.lost)
+        status = RecorderStatus(
+            pid=os.getpid(),
+            since=self._since,
+            at=time.time(),
+            messages=dict(self.capture.count),
+            size=dict(self.capture.bytes),
+            left_out={t: n + lost.get(t, 0) for t, n in {**lost, **self._all_left_out()}.items()},
+            written=self.ring.written,
+            ring=(sum(one.size for one in segments), back),
+            problem=self.ring.problem,
+        )
+        with contextlib.suppress(OSError):  # the disk is full: the log says so
+            replace_file(self._folder / STATUS, msgspec.json.encode(status))
+
+
+_ARRAY: Final = MessageType(ARRAY_TYPE)
+
+
+def _events(before: Snapshot | None, after: Snapshot) -> Iterator[Event]:
+    """What happened between two snapshots."""
+    for change in changes(before, after) if before is not None else ():
+        if (event := _event(change)) is not None:
+            yield event
+    nodes, known = _nodes(after), _nodes(before) if before is not None else None
+    if known is None:
+        return
+    dead = {one.node: one for one in after.unreachable}
+    told = {one.node for one in before.unreachable} if before is not None else set()
+    for node in sorted(dead.keys() - told):
+        yield Event(NODE_DIED, f"{node} does not answer: {dead[node].problem}", node)
+    yield from (Event("node_gone", f"{node} is gone", node) for node in sorted(known - nodes))
+    yield from (Event("node_came", f"{node} is there", node) for node in sorted(nodes - known))
+
+
+def _nodes(snapshot: Snapshot) -> set[str]:
+    """The nodes of the module that publish or subscribe."""
+    found = {node for topic in snapshot.topics for node in (*topic.publishers, *topic.subscribers)}
+    return {node for node in found if not is_own(node)}
+
+
+def _event(change: AgentEvent) -> Event | None:
+    match change:
+        case PeerLost():
+            text = f"the link to {change.peer.name} is lost: {change.peer.last_error}"
+            return Event(PEER_LOST, text, change.peer.name)
+        case PeerLinked():
+            return Event("peer_linked", f"{change.peer.name} is linked", change.peer.name)
+        case TopicAppeared():
+            return Event("topic_came", f"{change.topic.name} is there", change.topic.name)
+        case TopicGone():
+            return Event("topic_gone", f"{change.topic.name} is gone", change.topic.name)
+        case ServiceAppeared():
+            return Event("service_came", f"{change.service.name} is there", change.service.name)
+        case ServiceGone():
+            return Event("service_gone", f"{change.service.name} is gone", change.service.name)
+        case ContractBroken():
+            text = f"{change.topic}: {change.kind.replace('_', ' ')}, {change.count} times ({change.peer})"
+            return Event(CONTRACT, text, change.topic, facts={"kind": change.kind, "count": change.count})
+        case NoteRaised():
+            return Event("note", change.text)
+        case NoteCleared():
+            return Event("note_over", change.text)
+    return None
+
+
+async def record_file(
+    settings: RecordSettings,
+    folder: Path,
+    agent: str,
+    master_uri: str,
+    progress: Callable[[float, int, int], bool],
+    duration: float | None,
+    *,
+    everything: bool = False,
+) -> dict[str, int]:
+    """Record by hand into segments, until Ctrl-C.
+
+    Args:
+        settings: Which topics, and how much.
+        folder: Where the segments go.
+        agent: The name of the module's agent.
+        master_uri: The module's core.
+        progress: Called several times a second with seconds, messages and bytes so far; true: it is enough.
+        duration: The most seconds; ``None``: any.
+        everything: Record what nodes of other modules publish, too.
+
+    Returns:
+        The number of messages, by topic.
+
+    Raises:
+        RmpaError: There is no core.
+    """
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    endless = dataclasses.replace(settings, seconds=None, megabytes=1_000_000, keep_on=(), stop_topics=())
+    recorder = Recorder(endless, folder, agent, master_uri, everything=everything)
+    running = asyncio.create_task(recorder.run(stop))
+    began = time.monotonic()
+    while not running.done():
+        seconds, capture = time.monotonic() - began, recorder.capture
+        enough = progress(seconds, capture.count.total(), capture.bytes.total())
+        if enough or (duration is not None and seconds >= duration):
+            stop.set()
+        await asyncio.wait([running], timeout=_REQUESTS)
+    await running
+    return dict(recorder.capture.count)

@@ -1,0 +1,157 @@
+"""Recordings of all modules: what is asked of the recorder, and what others may have, read and remove."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import pytest
+
+from rmpa.bridge.context import BridgeContext
+from rmpa.bridge.data.reception import LinkTime
+from rmpa.bridge.kept import KEPT, REQUESTS, Kept, take_requests, write_kept
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate
+from rmpa.bridge.recordings import KEEP, LIST, READ, REMOVE, Recordings
+from rmpa.config.peer_rules import PermissionRule
+from rmpa.config.settings import Settings, TrustSettings
+from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.trust.permissions import Permissions
+
+NOW = 1_800_000_000 * 10**9
+
+
+class World:
+    """One module with a recorder's folder, and a peer that answers as it is told."""
+
+    def __init__(self, state: Path, *rules: PermissionRule, secured: bool = False, folder: bool = True) -> None:
+        self.folder = state / "arm" / "record"
+        if folder:
+            for name in (KEPT, REQUESTS):
+                (self.folder / name).mkdir(parents=True)
+        settings = Settings(name="arm", state_dir=str(state), trust=TrustSettings(rules=rules))
+        gate = PermissionGate(Permissions(settings.trust)) if secured else OPEN_GATE
+        self.handlers: dict[str, Any] = {}
+        self.asked: list[tuple[str, dict[str, Any]]] = []
+        self.answer: Any = ""
+        self.peer = SimpleNamespace(link=SimpleNamespace(name="base", guid="g"), time=LinkTime(), linked=True, peer=1)
+        self.sessions = [self.peer]
+        rpc = SimpleNamespace(
+            on_request=lambda what, handler, _: self.handlers.update({what: handler}), request=self._request
+        )
+        bridge = SimpleNamespace(
+            rpc=rpc,
+            context=BridgeContext.of(settings, gate),
+            sessions=SimpleNamespace(linked=lambda: self.sessions),
+        )
+        self.part = Recordings(bridge)  # type: ignore[arg-type] # it has what it uses
+
+    async def _request(self, _session: object, what: str, args: dict[str, Any], *_: float) -> Any:
+        self.asked.append((what, args))
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+    async def ask(self, what: str, **args: Any) -> Any:
+        """What the peer is answered."""
+        return await self.handlers[what](self.peer, args)
+
+    async def requests(self) -> list[Kept]:
+        """What the recorder is asked to keep."""
+        return await asyncio.to_thread(lambda: list(take_requests(self.folder)))
+
+    async def record(self, name: str, data: bytes = b"x" * 10) -> None:
+        """Put a recording there."""
+        await asyncio.to_thread(self._write, name, data)
+
+    def _write(self, name: str, data: bytes) -> None:
+        place = self.folder / KEPT / name
+        place.mkdir()
+        (place / "1.mcap").write_bytes(data)
+        write_kept(place, Kept(id=name, why="a test"))
+
+
+async def test_all_modules_keep_and_those_that_were_away_do_it_when_they_are_back(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    world.answer = UnreachableError("agent", "base", "try again")
+    first = await world.part.answer({"what": "keep", "why": "It fell!", "seconds": 30})
+    assert first["arm"] == ""
+    assert "base" in first["base"]
+    (kept,) = await world.requests()
+    assert kept.id.endswith("-arm-it_fell")
+    assert (kept.why, kept.by_hand, kept.until - kept.since) == ("It fell!", True, 30 * 10**9)
+    world.answer, world.asked = "", []
+    world.part.link_up(world.peer)  # type: ignore[arg-type] # it has what is used
+    while not world.asked:
+        await asyncio.sleep(0)
+    assert msgspec.convert(world.asked[0][1]["kept"], Kept) == kept
+    world.asked.clear()
+    world.part.link_up(world.peer)  # type: ignore[arg-type] # likewise
+    await world.part.close()
+    assert not world.asked, "it has answered"
+
+
+async def test_a_peers_times_are_put_on_this_clock(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    world.peer.time = SimpleNamespace(ahead_ns=5 * 10**9)
+    kept = Kept(id="fall", why="it fell", since=NOW, until=NOW + 10**9)
+    assert await world.ask(KEEP, kept=msgspec.to_builtins(kept)) == ""
+    (found,) = await world.requests()
+    assert (found.since, found.until, found.asked_by) == (NOW - 5 * 10**9, NOW - 4 * 10**9, "base")
+
+
+async def test_without_a_recorder_it_says_so(tmp_path: Path) -> None:
+    world = World(tmp_path, folder=False)
+    assert "no recorder has run here" in (await world.part.answer({"what": "keep"}))["arm"]
+    assert (await world.part.list())[0].kept == ()
+
+
+async def test_a_file_is_read_in_parts_and_nothing_beside_it(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    data = bytes(range(256)) * 2000
+    await world.record("fall", data)
+    await asyncio.to_thread((world.folder / "secret").write_text, "x")
+    found = b""
+    while len(found) < len(data):
+        part = await world.ask(READ, id="fall", file="1.mcap", offset=len(found))
+        assert part.size == len(data)
+        found += base64.b64decode(part.data)
+    assert found == data
+    for name, file in (("fall", "../../secret"), ("fall", "recording.json"), ("..", "secret"), ("none", "1.mcap")):
+        with pytest.raises(RmpaError, match=r"no file|no recording|not the name"):
+            await world.ask(READ, id=name, file=file, offset=0)
+    with pytest.raises(RmpaError, match="no file"):
+        await world.ask(READ, id="fall", file="1.mcap", offset=-1)
+
+
+async def test_a_member_without_record_keeps_lists_reads_and_removes_nothing(tmp_path: Path) -> None:
+    world = World(tmp_path, secured=True)
+    await world.record("fall")
+    kept = msgspec.to_builtins(Kept(id="other", since=0, until=1))
+    for what, args in ((KEEP, {"kept": kept}), (READ, {"id": "fall", "file": "1.mcap"}), (REMOVE, {"id": "fall"})):
+        with pytest.raises(RmpaError, match="let base use the recording"):
+            await world.ask(what, **args)
+    assert (await world.ask(LIST)).kept == ()
+    assert not await world.requests()
+    assert [one.id for one in (await world.part.list())[0].kept] == ["fall"]
+
+
+async def test_a_rule_lets_a_module_have_some(tmp_path: Path) -> None:
+    rule = PermissionRule(("base",), names={"record": ("/fall*",)})
+    world = World(tmp_path, rule, secured=True)
+    await world.record("fall")
+    await world.record("private")
+    assert [one.id for one in (await world.ask(LIST)).kept] == ["fall"]
+    assert (await world.ask(REMOVE, id="fall")).id == "fall"
+    with pytest.raises(RmpaError, match="let base use the recording"):
+        await world.ask(REMOVE, id="private")
+
+
+async def test_an_earlier_release_is_named(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    world.answer = PeerRefused("base", "this agent does not know the question 'record.keep'")
+    answers = await world.part.answer({"what": "keep"})
+    assert answers["base"]

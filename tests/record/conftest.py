@@ -1,0 +1,60 @@
+"""What the tests of recordings share: sources, and files made of few words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from rmpa.record.format import CLOCK, ClockRecord, ModuleRecord, RecordedSource, SegmentWriter
+from rmpa.ros.types.messages import MessageType
+
+TEXT = MessageType("std_msgs/String")
+SECOND = 1_000_000_000
+# A time of the recordings of tests, Unix nanoseconds.
+START = 1_795_000_000 * SECOND
+# Seconds from the start, and what was said.
+Said = Iterable[tuple[float, str]]
+
+
+def source(topic: str, node: str = "/talker", *, latching: bool = False, module: str = "") -> RecordedSource:
+    """A publisher of texts."""
+    return RecordedSource(topic, TEXT.name, TEXT.md5sum, TEXT.definition, node, latching, module)
+
+
+def text(data: str) -> bytes:
+    """A ``std_msgs/String`` as bytes."""
+    return TEXT.serialize(TEXT.given(None, {"data": data}))
+
+
+Record = Callable[..., Path]
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Record:
+    """Writes a recording of one module: what was said on each topic, and what it knew of others' clocks."""
+
+    def write(
+        module: str,
+        said: dict[RecordedSource, Said],
+        clocks: dict[str, tuple[float, float | None]] | None = None,
+        name: str = "00000001.mcap",
+    ) -> Path:
+        folder = tmp_path / module
+        folder.mkdir(exist_ok=True)
+        path = folder / name
+        with path.open("wb") as file:
+            writer = SegmentWriter(file, ModuleRecord(name=module))
+            if clocks:
+                known = {peer: ClockRecord(START, ahead, error) for peer, (ahead, error) in clocks.items()}
+                writer.metadata(CLOCK, {peer: msgspec.json.encode(one).decode() for peer, one in known.items()})
+            lines = sorted((at, one, data) for one, each in said.items() for at, data in each)
+            for at, one, data in lines:
+                when = START + round(at * SECOND)
+                writer.write(one, when, when, text(data))
+            writer.finish()
+        return path
+
+    return write
