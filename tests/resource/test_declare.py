@@ -14,6 +14,7 @@ import pytest
 import rmpa.resource
 from rmpa.core.contract import Contract, Reliability
 from rmpa.core.errors import ConfigError, LimitExceeded, LocalProtocolError, RemoteProtocolError
+from rmpa.resource.declaration import Role
 from rmpa.resource.declare import Parameter
 from rmpa.resource.quality import at_least, at_most
 from rmpa.resource.reconfigure import (
@@ -24,7 +25,7 @@ from rmpa.resource.reconfigure import (
     entries,
     read_config,
 )
-from rmpa.resource.resource import Resource, Role
+from rmpa.resource.resource import Resource
 from rmpa.resource.runtime import describe
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import DefinitionError

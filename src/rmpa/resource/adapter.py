@@ -51,7 +51,6 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.slave_api import Sent
 
 _log = logging.getLogger(__name__)
-# The value of ``quality`` that has how long its level has stood: an age, since the clocks of modules differ.
 # The longest time in seconds between two looks whether a profile has been applied.
 _WAIT: Final = 0.25
 # Seconds between checks whether clients are still connected.
@@ -103,9 +102,6 @@ async def call_function(function: Hook, what: str, name: str, limit: float, reme
     if call.cancelled():
         raise RuntimeError("CancelledError: something that it awaited was cancelled")
     call.result()
-
-
-# Texts and values of a resource's reports. Alarms, health, responses (``docs/guides/smart-resources.md#reference``).
 
 
 def alarm_values(
@@ -592,9 +588,9 @@ class Adapter(RuntimePart):
         self._publish(topic, [DiagnosticStatus(level, name, message, name, values).serialize()])
 
     def _publish(self, topic: str, statuses: list[bytes]) -> None:
-        if (publisher := self.publishers.get(topic)) is not None:
+        if (to := self.publishers.get(topic)) is not None:
             array = frame_array(0, time.time_ns(), statuses)[LENGTH.size :]
-            publisher.publish_raw(publisher.numbers.stamp(array) if publisher.numbers is not None else array)
+            to.publish_raw(to.numbers.stamp(array) if to.numbers is not None else array)
 
 
 def _pairs(message: Received) -> list[tuple[str, str]]:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.config.settings import toml_value
 from rmpa.core.identity import is_legal_name
+from rmpa.resource.declaration import Role
 from rmpa.resource.description import SUFFIX, read_description
-from rmpa.resource.resource import Role
 from rmpa.ros.types.definitions import known_types
 
 if TYPE_CHECKING:

@@ -37,9 +37,10 @@ from rmpa.config.values import BOOL, TEXT, BadValue, JsonSchema, ValueType, list
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import is_legal_name
 from rmpa.resource import limits
+from rmpa.resource.declaration import Role
 from rmpa.resource.declare import Binding, BindingKind, Measure, OfferSource, RestartPolicy, StartRule
 from rmpa.resource.quality import Category, Direction, Scale, parse_request, quantity
-from rmpa.resource.resource import Resource, Role
+from rmpa.resource.resource import Resource
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -41,7 +41,7 @@ class ExpressionValues(RuntimePart):
 
     def __init__(self, runtime: Runtime, expressions: Iterable[Expression]) -> None:
         self._runtime = runtime
-        # What answers the functions of ``resource.SOURCES``, by name: called with the arguments.
+        # What answers the functions of ``declaration.SOURCES``, by name: called with the arguments.
         self.providers: dict[str, Callable[..., Scalar | None]] = {}
         # Called with the references whose values have changed.
         self.listeners: list[Callable[[set[str]], None]] = []
