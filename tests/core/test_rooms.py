@@ -21,7 +21,8 @@ ROOT: Final = Path(__file__).parents[2]
 ROOMS: Final = {
     "gateway": ("gateway", "cli/gateway.py"),
     "web": ("web", "cli/web.py"),
-    "resource": ("resource", "cli/profile.py", "cli/resource.py", "cli/run.py"),
+    "record": ("record", "cli/record.py", "cli/play.py"),
+    "resource": ("resource", "cli/describe.py", "cli/profile.py", "cli/resource.py", "cli/run.py"),
     "doctor": ("observe/doctor", "cli/doctor.py"),
     "verbs": (
         *("cli/advice.py", "cli/agent.py", "cli/boot.py", "cli/bug_report.py", "cli/core.py", "cli/init.py"),
