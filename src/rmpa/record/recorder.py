@@ -329,7 +329,7 @@ def _events(before: Snapshot | None, after: Snapshot) -> Iterator[Event]:
 def _nodes(snapshot: Snapshot) -> set[str]:
     """The nodes of the module that publish or subscribe."""
     found = {node for topic in snapshot.topics for node in (*topic.publishers, *topic.subscribers)}
-    return {node for node in found if not is_own(node)}
+    return {node for node in found if not is_own(node) and not node.startswith("/rmpa_")}  # nodes of our commands
 
 
 def _event(change: AgentEvent) -> Event | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections import deque
+from collections import Counter, deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -42,7 +42,6 @@ _LEVELS: Final = {
     "contract": _WARN,
     "stop": _BAD,
     "agent_lost": _BAD,
-    "left_out": _WARN,
 }
 
 
@@ -95,6 +94,8 @@ class _Teller:
         self.lines: list[StoryLine] = []
         self.begin = self.end = self.count = 0
         self.modules: dict[str, None] = {}
+        # Messages that the recorders have left out, by topic.
+        self.left_out: Counter[str] = Counter()
         self._last: dict[tuple[str, str, str], int] = {}
         self._periods: dict[tuple[str, str, str], deque[float]] = {}
         self._profiles: dict[str, str] = {}
@@ -123,7 +124,9 @@ class _Teller:
 
     def _event(self, message: Recorded) -> None:
         event = read_event(message.data)
-        if event is not None and event.kind not in _QUIET:
+        if event is not None and event.kind == "left_out":
+            self.left_out.update({topic: int(count or 0) for topic, count in event.facts.items()})
+        elif event is not None and event.kind not in _QUIET:
             self._add(message, _LEVELS.get(event.kind, _INFO), event.kind, event.text)
 
     def _gap(self, message: Recorded) -> None:
@@ -178,6 +181,9 @@ def tell(messages: Iterable[Recorded], title: str, notes: Iterable[str] = (), ar
         at = teller.begin + round(around * _SECOND)
         lines = [line for line in lines if abs(line.at - at) <= 15 * _SECOND]
     modules = tuple(sorted(filter(None, teller.modules)))
+    if teller.left_out:
+        counts = ", ".join(f"{count:,} messages of {topic}" for topic, count in sorted(teller.left_out.items()))
+        notes = [*notes, f"Left out, for the budgets of [record]: {counts}."]
     return Story(title, teller.begin, teller.end, modules, teller.count, tuple(lines), tuple(notes))
 
 
