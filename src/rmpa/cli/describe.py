@@ -108,7 +108,9 @@ def resource_check(file: Path, offline: bool, seconds: float, options: Options) 
         + (f"; {one.remedy}" if one.remedy else "")
         for one in found
     ]
-    summary = f"{file}: {errors} errors, {len(found) - errors} warnings" if found else f"{file}: it fits"
+    counts = ((errors, "error"), (len(found) - errors, "warning"))
+    told_of = ", ".join(f"{count} {what}{'' if count == 1 else 's'}" for count, what in counts)
+    summary = f"{file}: {told_of if found else 'it fits'}"
     told = [{**asdict(one), "error": one.error} for one in found]
     options.show({"file": str(file), "errors": errors, "found": told}, *map(printable, lines), printable(summary))
     return 2 if wrong else int(errors > 0)
