@@ -136,7 +136,10 @@ def checked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-@pytest.mark.parametrize("gone", ROOMS.values(), ids=ROOMS)
+@pytest.mark.parametrize(
+    "gone",
+    [pytest.param(gone, id=room, marks=pytest.mark.long if room == "record" else ()) for room, gone in ROOMS.items()],
+)
 def test_what_remains_imports_and_type_checks(gone: tuple[str, ...], checked: Path, tmp_path: Path) -> None:
     tree = Tree(tmp_path, gone)
     tree.run("-c", IMPORT_ALL, str(tmp_path))

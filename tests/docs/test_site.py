@@ -28,6 +28,7 @@ PAGES: Final = (
 )
 PHONE: Final = 390
 pytestmark = [
+    pytest.mark.long,  # CI builds the site by `make docs`, which refuses broken links
     pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="MkDocs is not installed (the extra docs)"),
     pytest.mark.timeout(120),
 ]

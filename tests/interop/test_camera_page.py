@@ -71,6 +71,7 @@ def robots(lab: Lab, shell: ShellFactory, tmp_path: Path) -> Iterator[Robots]:
         yield Robots(tmp_path, agents, stack)
 
 
+@pytest.mark.long
 def test_its_commands_do_what_it_says(robots: Robots) -> None:
     described, viewer, _ = re.findall(r"^```toml\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
     (robots.folders["robot2"] / "viewer.resource.toml").write_text(viewer, encoding="utf-8")

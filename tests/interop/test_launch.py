@@ -151,6 +151,7 @@ def test_nodes_of_another_seat_are_started_read_taken_over_and_ended(tmp_path: P
         ends(each)
 
 
+@pytest.mark.long
 def test_an_agent_that_ends_in_order_ends_what_it_has_started(tmp_path: Path, modules: ModuleFactory) -> None:
     place = folder(tmp_path)
     with (place / "camera.resource.toml").open("a") as file:

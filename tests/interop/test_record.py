@@ -89,6 +89,7 @@ def test_what_all_modules_kept_is_one_file_that_ros_reads(modules: ModuleFactory
     )
 
 
+@pytest.mark.long
 def test_a_lost_link_keeps_both_sides_and_an_absent_module_later(modules: ModuleFactory, tmp_path: Path) -> None:
     a, b = modules("a", "b", fresh=True, config=CONFIG)
     a.ros.rospy("talker", topic="/odom", rate=50, name="base")
@@ -105,6 +106,7 @@ def test_a_lost_link_keeps_both_sides_and_an_absent_module_later(modules: Module
     assert any(event is not None and event.kind == "peer_lost" and event.trigger for event in events)
 
 
+@pytest.mark.long
 def test_a_recorder_that_is_killed_has_lost_less_than_a_second(modules: ModuleFactory, tmp_path: Path) -> None:
     (a,) = modules("a", fresh=True, config=CONFIG)
     talker = a.ros.rospy("talker", topic="/odom", rate=100, name="base")

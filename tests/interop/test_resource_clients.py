@@ -50,7 +50,7 @@ def client(ros: Ros, library: str, **options: str) -> Process:
 
 @pytest.mark.ros
 @pytest.mark.timeout(150)
-@pytest.mark.parametrize("library", ["rospy", "roscpp"])
+@pytest.mark.parametrize("library", ["rospy", pytest.param("roscpp", marks=pytest.mark.long)])
 def test_a_node_asks_and_hears_of_responses_profiles_and_alarms(ros: Ros, library: str) -> None:
     run_resource(ros, "camera.py")
     commands = {"commands": True} if library == "rospy" else {"rate": ">= 10 Hz hard"}
@@ -73,7 +73,7 @@ def test_a_node_asks_and_hears_of_responses_profiles_and_alarms(ros: Ros, librar
 
 @pytest.mark.ros
 @pytest.mark.timeout(150)
-@pytest.mark.parametrize("library", ["rospy", "roscpp"])
+@pytest.mark.parametrize("library", [pytest.param("rospy", marks=pytest.mark.long), "roscpp"])
 def test_a_node_of_the_resource_says_an_attribute_and_others_cannot(ros: Ros, library: str) -> None:
     resource = run_resource(ros, "wrapped.resource.toml")
     node = client(ros, library, name="driver", say="temperature", value="54.5")

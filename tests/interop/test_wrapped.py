@@ -108,6 +108,7 @@ async def test_a_drivers_values_are_set_read_back_and_respected(core: RosCore, r
         await configured(again, 5, 1.0)
 
 
+@pytest.mark.long
 async def test_large_images_are_counted_by_the_driver(core: RosCore, ros: Ros, node: Node) -> None:
     await driver(ros, size=2 * limits.MEASURED_BYTES)
     viewer = ros.start("rostopic", "hz", "/usb_cam/image")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from rmpa.web.hub.node_link import Rights
 from tests.web.browser.conftest import Site
 from tests.web.browser.test_pages import SMALL, WIDTH, violations
@@ -82,6 +84,7 @@ async def test_a_file_is_edited_its_error_told_at_its_line_and_saved_with_the_ol
     assert (site.server.reports, page.errors) == ([], [])
 
 
+@pytest.mark.long
 async def test_resources_of_all_modules_are_started_and_a_refusal_says_whose_and_why(site: Site) -> None:
     page = await site.open("resources", "wrapped")
     await page.wait_text("cannot open /dev/ttyUSB0")
@@ -100,6 +103,7 @@ async def test_resources_of_all_modules_are_started_and_a_refusal_says_whose_and
     assert await page.run("document.querySelectorAll('main table button:not(.sort)').length") == 0
 
 
+@pytest.mark.long
 async def test_top_is_sorted_and_asked_only_while_it_is_shown(site: Site) -> None:
     page = await site.open("top", "wrapped")
     first = "document.querySelector('tbody th').innerText"
