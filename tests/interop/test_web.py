@@ -111,7 +111,7 @@ async def test_a_resource_of_another_module_is_followed_and_its_profile_chosen(
             await driver.expect_event("up")
             driver.tell(json.dumps({"rate": ">= 10 Hz hard", "sharpness": ">= 640"}))
             await page.wait_text("full runs")
-            await page.wait("document.querySelector('[aria-label=Terms]').innerText.includes('sharpness')")
+            await page.wait_text("sharpness")
             await page.wait("document.querySelector('[aria-label=Clients]').innerText.includes('driver')")
 
             mark = driver.mark_events()

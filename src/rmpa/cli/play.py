@@ -17,7 +17,8 @@ import click
 from rmpa.cli.module import check_record
 from rmpa.cli.options import FiniteRange, Options, argument, flag, graph_verb, json_verb
 from rmpa.cli.output import Table, paint, print_text
-from rmpa.core.errors import ConfigError
+from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.runtime.tasks import start_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -81,7 +82,7 @@ async def _play(recording: Path, asked: PlayOptions, options: Options, *, paused
         player = Player(node, lambda: read_any(recording), asked)
         if paused:
             player.pause()
-        task = asyncio.create_task(player.run())
+        task = start_task(player.run(), "play", raises=(RmpaError,))
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, task.cancel)
@@ -115,7 +116,7 @@ def _keys(player: Player, task: asyncio.Task[None]) -> Iterator[None]:
 
     tty.setcbreak(sys.stdin)
     loop.add_reader(sys.stdin, pressed)
-    line = asyncio.create_task(show())
+    line = start_task(show(), "show the position")
     try:
         yield
     finally:

@@ -112,10 +112,10 @@ def _ring(module: Module) -> int:
     from rmpa.config.module_name import module_dir
     from rmpa.record.recorder import Recorder
 
-    settings = module.loaded.settings
+    settings, core = module.loaded.settings, _core_of(module)
     begin_log(settings, module.loaded.notes, _log, sys.stderr)
     folder = module_dir(module.place, module.name) / "record"
-    recorder = Recorder(settings.record, folder, module.name, _core_of(module))
+    recorder = Recorder(settings.record, folder, module.name, core)
     _log.info(
         "= recording into %s: the last %g s, %d MB", folder, settings.record.seconds or 0, settings.record.megabytes
     )
@@ -350,7 +350,7 @@ def record_fetch(recording: str, output: Path | None, options: Options) -> int:
 
     Examples:
       rmpa record fetch 20261129-121500-arm-alarm
-      rmpa record fetch 20261129-121500-arm-alarm -o fall && rmpa record merge fall -o fall.mcap
+      rmpa record fetch 20261129-121500-arm-alarm -o fall
     """
     folder = output or Path(recording)
     with options.client(60.0) as client:

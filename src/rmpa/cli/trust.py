@@ -96,7 +96,7 @@ def grouped(digits: str) -> str:
 
 @json_verb(
     argument("peer", peers),
-    argument("what", type=click.Choice(_WORDS), metavar="|".join(_WORDS)),
+    argument("what", type=click.Choice(_WORDS), metavar="ACCESS"),
     argument("name"),
     config_option,
 )

@@ -20,6 +20,7 @@ from rmpa.record.format import EVENTS, Recorded
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import TopicDescription
+from rmpa.runtime.tasks import start_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -181,7 +182,7 @@ class Player:
     async def _round(self) -> None:
         """Play it once."""
         options = self._options
-        ticking = asyncio.create_task(self._tick()) if options.clock else None
+        ticking = start_task(self._tick(), "publish the time") if options.clock else None
         began = end = 0
         latched: dict[RecordedSource, bytes] = {}
         due = 0.0

@@ -49,7 +49,7 @@ from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.messages import MessageType
 from rmpa.runtime.files import replace_file
-from rmpa.runtime.tasks import OwnedTasks, keep_task
+from rmpa.runtime.tasks import OwnedTasks, keep_task, start_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -389,7 +389,7 @@ async def record_file(
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     endless = dataclasses.replace(settings, seconds=None, megabytes=1_000_000, keep_on=(), stop_topics=())
     recorder = Recorder(endless, folder, agent, master_uri, everything=everything)
-    running = asyncio.create_task(recorder.run(stop))
+    running = start_task(recorder.run(stop), "record", raises=(RmpaError,))
     began = time.monotonic()
     while not running.done():
         seconds, capture = time.monotonic() - began, recorder.capture

@@ -14,6 +14,7 @@ import os
 import random
 import shlex
 import signal
+import subprocess
 import time
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
@@ -44,7 +45,6 @@ from rmpa.runtime.programs import (
 from rmpa.runtime.tasks import OwnedTasks, end_tasks, start_task
 
 if TYPE_CHECKING:
-    import subprocess
     from collections.abc import Callable, Collection, Mapping
     from pathlib import Path
 
@@ -498,7 +498,8 @@ class _Supervised:
             await end_program(self._mark, self.declared.stop_after)
             self._mark = None
         if self._process is not None:
-            self._process.poll()  # it is reaped
+            with contextlib.suppress(subprocess.TimeoutExpired):  # it is reaped
+                await asyncio.to_thread(self._process.wait, limits.NODE_END_TIMEOUT)
             self._process = None
 
     def _refused(self, why: str, remedy: str = "") -> NodeFailed:
