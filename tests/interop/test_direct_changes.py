@@ -408,6 +408,7 @@ def test_nodes_of_a_real_roscore_are_direct_if_they_are_on_its_machine(
     in_order(wait_direct(here, talker))
 
 
+@pytest.mark.long
 def test_two_hundred_topics_of_many_nodes_go_direct_at_once(modules: ModuleFactory) -> None:
     """Four publishers with 50 topics each, and two subscribers of all: 400 connections, and agents that answer."""
     a, b = modules("a", "b", config=AUTO, log_level="info")

@@ -224,7 +224,7 @@ def test_a_server_of_ros2_that_is_killed_aborts_the_goal(hall: Hall) -> None:
 
 
 @needs_actionlib
-@pytest.mark.parametrize("kind", ["rospy", "roscpp"])
+@pytest.mark.parametrize("kind", ["rospy", pytest.param("roscpp", marks=pytest.mark.long)])
 def test_a_client_of_ros2_uses_a_server_of_ros1(hall: Hall, kind: str) -> None:
     action = f"/count1_{kind}"
     server = hall.robot.ros.node(kind, "action_server", "--action", action, name=f"server_{kind}")

@@ -386,6 +386,7 @@ async def proxy(host: Host, web: Web) -> AsyncIterator[None]:
         await asyncio.wait(serving)
 
 
+@pytest.mark.long
 @pytest.mark.netns
 async def test_roslibpys_own_tests_pass(lab: Lab, agent: AgentFactory, web: WebFactory, tmp_path: Path) -> None:
     if importlib.util.find_spec("roslibpy") is None:
