@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.config.read import line_of
 from rmpa.config.rules import TERMS
 from rmpa.config.settings import Settings
+from rmpa.config.toml_file import line_of
 from rmpa.config.values import BadValue, read_duration, read_rate
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import (

@@ -13,9 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.config import limits
-from rmpa.config.read import find_config_file, line_of, parse_config
+from rmpa.config.read import find_config_file, parse_config
 from rmpa.config.rules import GatewaySettings
 from rmpa.config.settings import SETTINGS, RealtimeSettings, Settings, TrustSettings, json_value
+from rmpa.config.toml_file import line_of
 from rmpa.config.values import HostPort, Multicast, did_you_mean
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Transport

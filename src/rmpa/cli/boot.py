@@ -48,8 +48,9 @@ from rmpa.config.module_name import (
     kept_name,
     state_dir,
 )
-from rmpa.config.read import line_of, load_settings, parse_config
+from rmpa.config.read import load_settings, parse_config
 from rmpa.config.settings import Settings
+from rmpa.config.toml_file import line_of
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import peer_name_from, peer_name_problem
 from rmpa.runtime.systemd import INSTALL, is_set_up

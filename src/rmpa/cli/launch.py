@@ -222,7 +222,7 @@ def top(modules: tuple[str, ...], once: bool, interval: float, options: Options)
     """
     live = sys.stdout.isatty() and not (once or options.as_json)
     with options.client(CONTROL_HANDLER_TIMEOUT) as client, contextlib.suppress(KeyboardInterrupt):
-        if not live:  # topics are measured once somebody asks
+        if not live:  # topics are measured from the first request on
             client.call("rates", dict[str, Any])
             time.sleep(_MEASURED)
         while True:

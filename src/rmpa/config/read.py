@@ -1,26 +1,20 @@
-"""Reads the settings: from ``rmpa.toml``, the environment and options, each value with its source and line.
-
-The file ``rmpa.toml``: parsed, and its shape checked against the settings that ``config.settings`` declares.
-"""
+"""Reads the settings: from ``rmpa.toml``, the environment and options, each value with its source and line."""
 
 from __future__ import annotations
 
-import re
-import tomllib
-from bisect import bisect_left
 from dataclasses import dataclass, field, replace
 from ipaddress import AddressValueError, IPv4Address
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 from urllib.parse import urlsplit
 
-from rmpa.config import limits
 from rmpa.config.module_name import NAME_FILE, NameSource, choose_name, kept_name, state_dir
 from rmpa.config.peer_rules import peer_warnings, permission_problems
 from rmpa.config.rules import contract_warnings
 from rmpa.config.schema import REMOVED
 from rmpa.config.settings import SETTINGS, Settings, json_schema
-from rmpa.config.values import BadValue, JsonSchema, Place, did_you_mean, shown, suggestion
+from rmpa.config.toml_file import dotted, line_of, read_toml, value_at
+from rmpa.config.values import BadValue, did_you_mean, suggestion
 from rmpa.config.writers import check_writers
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_from
@@ -29,242 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from rmpa.config.schema import Key, Setting
-
-
-def value_at(table: object, place: Place) -> object:
-    """The value at a place of a parsed file; ``None`` if there is none."""
-    for part in place:
-        in_table = isinstance(table, dict) and part in table
-        in_list = isinstance(table, list) and isinstance(part, int) and part < len(table)
-        if not in_table and not in_list:
-            return None
-        table = table[part]  # type: ignore[index] # one of the two, as just seen
-    return table
-
-
-# What counts in a valid TOML text: strings, comments, brackets and the ends of lines.
-_PIECE: Final = re.compile(
-    r"""\"{3}(?:\\.|[^\\])*?\"{3,5}|'{3}.*?'{3,5}|"(?:\\.|[^"\\\n])*"|'[^'\n]*'|\#[^\n]*|[\[{\]}]|\n""", re.DOTALL
-)
-
-
-def _line_ends(text: str) -> Iterator[tuple[int, int]]:
-    """Each end of a line outside strings in a valid TOML text: the line's number, from 1, and the open brackets."""
-    line = depth = 0
-    for match in _PIECE.finditer(text):
-        piece = match[0]
-        depth += (piece in "[{") - (piece in "]}")
-        line += piece.count("\n")
-        if piece == "\n":
-            yield line, depth
-
-
-def line_of(text: str, place: Place) -> int | None:
-    """The line, from 1, on which the key or element at a place begins in a valid TOML text; ``None`` if it has none.
-
-    A prefix that ends with a statement is valid TOML. The first of these that contains the place ends with its
-    statement, which begins where the one before ends. An element of a list is searched within its statement.
-    """
-    lines = text.split("\n")
-    ends = [0, *(line for line, depth in _line_ends(text) if not depth), len(lines)]
-
-    def has_place(end: int) -> bool:
-        return value_at(tomllib.loads("\n".join(lines[:end])), place) is not None
-
-    if not has_place(len(lines)):
-        return None
-    at = bisect_left(ends, True, key=has_place)
-    return _element_line(lines, ends[at - 1], ends[at], place)
-
-
-def _element_line(lines: list[str], begin: int, end: int, place: Place) -> int:
-    """The line of a place in the statement between two lines: not its first only for an element of a list."""
-    if begin + 1 == end:
-        return end
-    text = "\n".join(lines[begin:end])
-    inline = value_at(tomllib.loads(text), place) is not None
-    indices = [part for part in (place if inline else place[-1:]) if isinstance(part, int)]
-    if not indices:
-        return begin + 1
-
-    def has_element(line: int) -> bool:
-        try:
-            value: object = tomllib.loads("\n".join(lines[begin : begin + line]) + "\n]")
-        except ValueError:
-            return False
-        while isinstance(value, dict) and value:
-            value = next(iter(value.values()))
-        return isinstance(value, list) and len(value) > indices[0]
-
-    stops = [line for line, depth in _line_ends(text) if depth == 1]
-    at = bisect_left(stops, True, key=has_element)
-    return begin + stops[at] if at < len(stops) else end
-
-
-_AT_LINE: Final = re.compile(r" \(at line (\d+), column \d+\)$")
-# By the name of a type in JSON Schema: the type of TOML values, and its name in errors.
-_TYPES: Final[dict[str, tuple[type, str]]] = {
-    "string": (str, "a text in quotes"),
-    "integer": (int, "a whole number"),
-    "number": (float, "a number"),
-    "boolean": (bool, "true or false"),
-    "array": (list, "a list"),
-    "object": (dict, "a table"),
-}
-
-
-def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
-    """Read a file's bytes.
-
-    Args:
-        data: UTF-8 text in TOML.
-        path: For the text of errors.
-
-    Returns:
-        What it says, by the key of a setting; only the keys and types are checked.
-
-    Raises:
-        ConfigError: With line and key, if the text is not TOML, has an unknown key or a value of a wrong type.
-    """
-    _, table = read_toml(data, path, json_schema())
-    found = {setting.key: value_at(table, setting.key) for setting in SETTINGS if setting.key}
-    return {key: value for key, value in found.items() if value is not None}
-
-
-def read_toml(
-    data: bytes, path: Path | None, schema: JsonSchema, found: list[ConfigError] | None = None
-) -> tuple[str, dict[str, Any]]:
-    """Read the bytes of a TOML file, and check its keys and types by a schema.
-
-    Args:
-        data: UTF-8 text in TOML.
-        path: For the text of errors.
-        schema: The keys and types that it may have, as JSON Schema.
-        found: Gets all unknown keys and wrong types; without it the first is raised.
-
-    Returns:
-        The text, and what it says.
-
-    Raises:
-        ConfigError: With line and key, if the text is not TOML, has an unknown key or a value of a wrong type.
-    """
-    if len(data) > limits.CONFIG_FILE_MAX:
-        raise ConfigError(
-            "the file",
-            f"{len(data)} bytes, more than {limits.CONFIG_FILE_MAX}",
-            "is it the right file?",
-            path,
-            code="unreadable-settings",
-        )
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise ConfigError(
-            "the file", "not UTF-8 text", "save it as UTF-8", path, line, code="unreadable-settings"
-        ) from None
-    table = _parse_toml(text, path)
-    for place, problem, remedy in _mistakes((), table, schema, schema):
-        wrong = ConfigError(dotted(place), problem, remedy, path, line_of(text, place))
-        if found is None:
-            raise wrong
-        found.append(wrong)
-    return text, table
-
-
-def _mistakes(place: Place, value: object, schema: JsonSchema, root: JsonSchema) -> Iterator[tuple[Place, str, str]]:
-    """Each unknown key and wrong type in a value: place, problem and remedy. All else is checked by the readers."""
-    expected = schema.get("type", [])
-    types = [expected] if isinstance(expected, str) else expected
-    if types and type(value) not in [_TYPES[name][0] for name in types]:
-        if isinstance(value, dict) and "properties" in schema.get("items", {}):
-            remedy = f"write [[{dotted(place)}]], in two brackets"
-            yield place, "one table, where a list of them is expected", remedy
-            return
-        remedy = f'did you mean ["{value}"]?' if types == ["array"] and isinstance(value, str) else ""
-        yield place, f"{shown(value)} is not {' or '.join(_TYPES[name][1] for name in types)}", remedy
-    elif isinstance(value, list):
-        for index, element in enumerate(value):
-            yield from _mistakes((*place, index), element, schema.get("items", {}), root)
-    elif isinstance(value, dict):
-        known, other = schema.get("properties", {}), schema.get("additionalProperties") or {}
-        for key, inner in value.items():
-            if known and key not in known and not other:
-                what = "an unknown table" if isinstance(inner, dict) else "an unknown key"
-                remedy = REMOVED.get(dotted((*place, key))) or _suggestion(place, key, list(known), root)
-                yield (*place, key), what, remedy
-            yield from _mistakes((*place, key), inner, known.get(key, other), root)
-
-
-# Lists, tables or parts of a key within each other: nothing has so many, and tomllib takes minutes for very many.
-_NESTED: Final = re.compile(r"""(?<![\w"'-])(?:[\w"'-]+\s*\.\s*){64}|(?:[\[{][^\[\]{}]*){64}""")
-
-
-def _parse_toml(text: str, path: Path | None) -> dict[str, Any]:
-    nested = _NESTED.search(text)
-    try:
-        table = tomllib.loads(text) if nested is None else None
-    except RecursionError:
-        table = None
-    except ValueError as error:  # TOMLDecodeError, and int() on thousands of digits
-        message = str(error)
-        match = _AT_LINE.search(message)
-        line = int(match[1]) if match else text.rstrip().count("\n") + 1
-        problem = f"not TOML: {_AT_LINE.sub('', message).removesuffix(' (at end of document)')}"
-        raise ConfigError(
-            "the file", problem, _toml_remedy(text, line), path, line, code="unreadable-settings"
-        ) from None
-    if table is None:
-        line = text.count("\n", 0, nested.start()) + 1 if nested is not None else 1
-        raise ConfigError("the file", "lists or tables nested too deeply", "", path, line, code="unreadable-settings")
-    return table
-
-
-def _toml_remedy(text: str, line: int) -> str:
-    lines = text.split("\n")
-    written = lines[line - 1] if line <= len(lines) else ""
-    match = re.match(r"\s*[\w.-]+\s*=\s*([^\s\"'\[{#][^#]*?)\s*(?:#.*)?$", written)
-    if match and not re.match(r"(true|false|[-+0-9])", match[1]):
-        return f'texts need quotes: "{match[1]}"'
-    if re.match(r"\s*[\w.-]+\s*:", written):
-        return "TOML writes key = value, not key: value"
-    return ""
-
-
-def dotted(place: Place) -> str:
-    """A place as a user reads it, without the indices: the line says which one."""
-    return ".".join(part for part in place if isinstance(part, str))
-
-
-def _suggestion(place: Place, word: str, here: list[str], root: JsonSchema) -> str:
-    """What to do about an unknown key: the key that was probably meant, or the table that it belongs in."""
-    everywhere = list(_keys(root))
-    homes = [key for key in everywhere if key[-1] == word]
-    near = did_you_mean(word, here)
-    if near is not None and (place or not homes):
-        return f"did you mean {dotted((*place, near))}?"
-    if homes:
-        table = homes[0][:-1]
-        titles = [setting.title for setting in SETTINGS if setting.key == table != ()]  # a table that is a list
-        where = f"in a {titles[0]}" if titles else f"in [{dotted(table)}]" if table else "above the first table"
-        return f"{word} belongs {where}"
-    near = did_you_mean(word, [key[-1] for key in everywhere])
-    if near is not None:
-        return f"did you mean {next(dotted(key) for key in everywhere if key[-1] == near)}?"
-    return f"known here: {', '.join(here)}"
-
-
-def _keys(schema: JsonSchema, table: Key = ()) -> Iterator[Key]:
-    """Every key of a table and of those in it."""
-    for name, inner in schema["properties"].items():
-        inside = inner.get("items", inner)
-        named = inside.get("additionalProperties") or {}  # of tables that the user names
-        if "properties" in inside:
-            yield from _keys(inside, (*table, name))
-        elif "properties" in named:
-            yield from _keys(named, (*table, name, "NAME"))
-        else:
-            yield (*table, name)
+    from rmpa.config.values import Place
 
 
 # Where settings come from, each source stronger than the one before it::
@@ -359,6 +118,24 @@ class Loaded:
     notes: tuple[str, ...] = ()
     given: Mapping[str, Given] = field(default_factory=dict, repr=False)
     names: Mapping[NameSource, str] = field(default_factory=dict)
+
+
+def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
+    """Read a file's bytes.
+
+    Args:
+        data: UTF-8 text in TOML.
+        path: For the text of errors.
+
+    Returns:
+        What it says, by the key of a setting; only the keys and types are checked.
+
+    Raises:
+        ConfigError: With line and key, if the text is not TOML, has an unknown key or a value of a wrong type.
+    """
+    _, table = read_toml(data, path, json_schema())
+    found = {setting.key: value_at(table, setting.key) for setting in SETTINGS if setting.key}
+    return {key: value for key, value in found.items() if value is not None}
 
 
 def load_settings(

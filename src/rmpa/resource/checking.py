@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 from xml.etree import ElementTree as ET
 
-from rmpa.config.read import line_of
+from rmpa.config.toml_file import line_of
 from rmpa.config.values import did_you_mean, suggestion
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.resource.declare import BindingKind

@@ -54,7 +54,7 @@ class Role(StrEnum):
     CONTROLLING = "controlling"
 
 
-class Declaration:
+class ResourceDeclaration:
     """The tables of a declaration, in the order in which its parts were declared.
 
     Args:

@@ -30,9 +30,9 @@ import json
 import re
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.config.read import dotted, line_of, read_toml
 from rmpa.config.rules import CONTRACT_RULES, TERMS
 from rmpa.config.schema import NEEDED, Setting
+from rmpa.config.toml_file import dotted, line_of, read_toml
 from rmpa.config.values import BOOL, TEXT, BadValue, JsonSchema, ValueType, list_of, member_of, text_type
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import is_legal_name

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import is_legal_name
-from rmpa.resource.declaration import Declaration
+from rmpa.resource.declaration import ResourceDeclaration
 from rmpa.resource.declare import (
     AdaptationSettings,
     AlarmRule,
@@ -73,7 +73,7 @@ _LEAST: Final = {"window": 0.05, "dwell": 0.0, "settle": 0.0, "cool_down": 0.0, 
 _DAY: Final = 86400
 
 
-class Resource(Declaration):
+class Resource(ResourceDeclaration):
     """The declaration of one Smart Resource.
 
     Args:
