@@ -17,13 +17,13 @@ import pytest
 from rmpa.bridge import launched, limits
 from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.launch import LAUNCH, Launcher
-from rmpa.bridge.launch_files import BootRule, circles, is_name, list_files
+from rmpa.bridge.launch_files import circles, is_name, list_files
 from rmpa.bridge.launched import LaunchedResource, ModuleResources
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.settings import ResourceSettings, Settings, TrustSettings
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
-from rmpa.runtime.programs import figures
+from rmpa.runtime.programs import StartRule, figures
 from rmpa.trust.permissions import Permissions
 from tests.waiting import until
 
@@ -357,10 +357,10 @@ async def test_all_modules_are_asked_and_each_problem_is_told(make: Callable[...
 
 def test_circles_are_found() -> None:
     rules = {
-        "a": BootRule(after=("b",)),
-        "b": BootRule(after=("c", "d")),
-        "c": BootRule(after=("b",)),
-        "d": BootRule(),
+        "a": StartRule(after=("b",)),
+        "b": StartRule(after=("c", "d")),
+        "c": StartRule(after=("b",)),
+        "d": StartRule(),
     }
     assert circles(rules) == {"b": "b after c after b", "c": "c after b after c"}
 
@@ -370,4 +370,4 @@ def test_a_table_that_cannot_be_read_is_said(tmp_path: Path) -> None:
         (tmp_path / "cam.resource.toml").write_text(text)
         assert "its table [start] cannot be read" in list_files(tmp_path, {})["cam"].problem
     (tmp_path / "cam.resource.toml").write_text("[start]\nboot = true\ndelay = '2 s'\n")
-    assert list_files(tmp_path, {})["cam"].rule == BootRule(boot=True, delay=2.0)
+    assert list_files(tmp_path, {})["cam"].rule == StartRule(boot=True, delay=2.0)

@@ -14,8 +14,9 @@ from click.testing import CliRunner
 from rmpa.cli.main import cli
 from rmpa.core.errors import ConfigError
 from rmpa.resource import limits
-from rmpa.resource.declare import Binding, BindingKind, RestartPolicy, StartRule
+from rmpa.resource.declare import Binding, BindingKind, RestartPolicy
 from rmpa.resource.description import description_mistakes, read_description, schema_text
+from rmpa.runtime.programs import StartRule
 from tests.fuzz.target_resource_description import FILES, SEEDS, mistaken, refused
 
 FULL: Final = Path(__file__).with_name("robot.resource.toml")

@@ -19,6 +19,7 @@ from rmpa.runtime.programs import (
     ResourceRun,
     ended,
     figures,
+    how_ended,
     read_log,
     rotate_log,
     start_program,
@@ -99,3 +100,14 @@ def test_a_log_is_read_on_from_where_it_was_left_also_over_its_rotation(
         program.write(b"x" * 3 * limits.PROGRAM_LOG_READ)
         (line,), _ = read_log(log, None, 10)
         assert len(line) == limits.PROGRAM_LOG_LINE
+
+
+def test_each_exit_code_has_a_text() -> None:
+    texts = [how_ended(code) for code in (None, 0, 3, -signal.SIGKILL, -(signal.SIGRTMIN + 6))]
+    assert texts == [
+        "has ended",
+        "has ended with code 0",
+        "has ended with code 3",
+        "was ended by SIGKILL",
+        "was ended by signal 40",
+    ]

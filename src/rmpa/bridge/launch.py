@@ -35,9 +35,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.launch_files import BootRule
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.runtime.programs import ResourceRun
+    from rmpa.runtime.programs import ResourceRun, StartRule
 
 _log = logging.getLogger(__name__)
 
@@ -78,7 +77,7 @@ class Launcher(Part):
         self._bridge = bridge
         self._launched: dict[str, ResourceProgram] = {}
         # The resources that wait for the conditions of their start at boot.
-        self._waiting: dict[str, BootRule] = {}
+        self._waiting: dict[str, StartRule] = {}
         self._work = OwnedTasks()
         self._main: asyncio.Task[None] | None = None
         self._writes = asyncio.Lock()

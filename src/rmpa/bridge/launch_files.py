@@ -12,6 +12,7 @@ from rmpa.bridge import limits
 from rmpa.config.values import BadValue, read_duration
 from rmpa.config.writers import other_writer
 from rmpa.core.errors import RmpaError
+from rmpa.runtime.programs import StartRule
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -21,22 +22,6 @@ REFUSED: Final = "launch-refused"
 _TOML: Final = ".resource.toml"
 _PYTHON: Final = ".py"
 _NAME: Final = re.compile("[A-Za-z][A-Za-z0-9_]{0,63}")
-
-
-class BootRule(NamedTuple):
-    """When the agent starts a resource by itself: the table ``[start]`` of its file.
-
-    Attributes:
-        boot: Whether it does.
-        delay: Seconds after the conditions below hold.
-        topics: Topics that must be published.
-        after: Resources of the module that must be active.
-    """
-
-    boot: bool = False
-    delay: float = 0.0
-    topics: tuple[str, ...] = ()
-    after: tuple[str, ...] = ()
 
 
 class LaunchFile(NamedTuple):
@@ -52,7 +37,7 @@ class LaunchFile(NamedTuple):
     name: str
     path: Path
     problem: str = ""
-    rule: BootRule = BootRule()
+    rule: StartRule = StartRule()
 
 
 def is_name(name: object) -> bool:
@@ -90,7 +75,7 @@ def list_files(folder: Path, environ: Mapping[str, str]) -> dict[str, LaunchFile
             problem = "the name of its file is not of 64 letters, digits and _ at most; rename it"
         if name in files:
             problem = f"{files[name].path.name} and {path.name} have one name; rename one"
-        rule = BootRule()
+        rule = StartRule()
         if not problem and ending == _TOML:
             rule, problem = _read_rule(path)
         files[name] = LaunchFile(name, path, problem, rule)
@@ -120,7 +105,7 @@ def _problem(path: Path, environ: Mapping[str, str], *, folder: bool = False) ->
     return f"{found[0]}; {found[1]}" if found else ""
 
 
-def _read_rule(path: Path) -> tuple[BootRule, str]:
+def _read_rule(path: Path) -> tuple[StartRule, str]:
     """The table ``[start]`` of a file; what else is wrong with the file its start will tell."""
     try:
         with path.open("rb") as file:
@@ -129,12 +114,12 @@ def _read_rule(path: Path) -> tuple[BootRule, str]:
         raw = table.get("delay", 0)
         delay = read_duration(raw, "a delay") if raw not in (0, "0 s") else 0.0
         topics, after = (tuple(map(str, table.get(key, ()))) for key in ("topics", "after"))
-        return BootRule(table.get("boot") is True, delay or 0.0, topics, after), ""
+        return StartRule(table.get("boot") is True, delay or 0.0, topics, after), ""
     except (OSError, ValueError, AttributeError, TypeError, BadValue) as error:
-        return BootRule(), f"its table [start] cannot be read: {error}"
+        return StartRule(), f"its table [start] cannot be read: {error}"
 
 
-def circles(rules: Mapping[str, BootRule]) -> dict[str, str]:
+def circles(rules: Mapping[str, StartRule]) -> dict[str, str]:
     """The resources that wait for themselves, by ``after``, each with the way round: ``a after b after a``."""
     found = {}
     for name in rules:

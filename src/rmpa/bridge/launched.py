@@ -22,6 +22,7 @@ from rmpa.runtime.programs import (
     end_program,
     ended,
     figures,
+    how_ended,
     read_log,
     rotate_log,
     start_program,
@@ -331,4 +332,4 @@ def _how(code: int | None) -> str:
         return "ended in order"
     if code == _USAGE:
         return "cannot run as it is written"
-    return "has ended" if code is None else f"has ended with code {code}"
+    return how_ended(code)

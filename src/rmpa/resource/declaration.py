@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Final
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import is_legal_name
-from rmpa.resource.declare import AdaptationSettings, StartRule
+from rmpa.resource.declare import AdaptationSettings
 from rmpa.resource.expression import Expression, parse_expression
 from rmpa.resource.quality import MEASURED, Attribute
+from rmpa.runtime.programs import StartRule
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

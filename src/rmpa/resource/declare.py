@@ -442,23 +442,6 @@ class ManagedNode:
 
 
 @dataclass(frozen=True, slots=True)
-class StartRule:
-    """When the module's agent starts the resource without being asked.
-
-    Args:
-        boot: Whether it does at all.
-        delay: Seconds after the conditions below hold.
-        topics: Topics that must be published.
-        after: Resources of the module that must be active.
-    """
-
-    boot: bool = False
-    delay: float = 0.0
-    topics: tuple[str, ...] = ()
-    after: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
 class Context:
     """A state of the world: what it requires, and which profiles and outputs apply in it.
 

@@ -38,9 +38,10 @@ from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import is_legal_name
 from rmpa.resource import limits
 from rmpa.resource.declaration import Role
-from rmpa.resource.declare import Binding, BindingKind, Measure, OfferSource, RestartPolicy, StartRule
+from rmpa.resource.declare import Binding, BindingKind, Measure, OfferSource, RestartPolicy
 from rmpa.resource.quality import Category, Direction, Scale, parse_request, quantity
 from rmpa.resource.resource import Resource
+from rmpa.runtime.programs import StartRule
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

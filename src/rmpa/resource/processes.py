@@ -13,7 +13,6 @@ import logging
 import os
 import random
 import shlex
-import signal
 import subprocess
 import time
 from enum import StrEnum
@@ -38,6 +37,7 @@ from rmpa.runtime.programs import (
     end_program,
     ended,
     figures,
+    how_ended,
     read_log,
     rotate_log,
     start_program,
@@ -397,7 +397,7 @@ class _Supervised:
         until = loop.time() + limits.NODE_START_TIMEOUT
         while (pid := await self._find()) is None:
             if self._mark is None or not self._mark.runs:
-                why = f"{_how_ended(self._code())} before it was registered by this name"
+                why = f"{how_ended(self._code())} before it was registered by this name"
                 raise self._refused(why + await self._log_end())
             if loop.time() > until:
                 why = f"was started, and is not registered by this name after {limits.NODE_START_TIMEOUT:g} s"
@@ -431,7 +431,7 @@ class _Supervised:
             self._failures += 1
             own, final = self.own, self._final(code)
             delay = self._backoff.delay() if own else _BACK
-            text = _how_ended(code)
+            text = how_ended(code)
             if final:
                 text += f", and is not started again ({final})"
                 self._given_up = time.monotonic()
@@ -513,12 +513,6 @@ class _Supervised:
         lines, _ = await asyncio.to_thread(read_log, self.log, None, _LOG_SHOWN)
         told = " / ".join(line for line in lines if line.strip() and not line.startswith(_EMPTY))
         return f"; its log ends: {told[-_LOG_TEXT:]}" if told else ""
-
-
-def _how_ended(code: int | None) -> str:
-    if code is None:
-        return "has ended"
-    return f"was ended by {signal.Signals(-code).name}" if code < 0 else f"has ended with code {code}"
 
 
 def command_of(node: ManagedNode, arguments: Mapping[str, str], environ: Mapping[str, str]) -> list[str]:

@@ -113,6 +113,22 @@ class ProgramMark(NamedTuple):
         return ProgramMark.of(self.pid) == self
 
 
+class StartRule(NamedTuple):
+    """When the module's agent starts a resource without being asked: the table ``[start]`` of its file.
+
+    Attributes:
+        boot: Whether it does at all.
+        delay: Seconds after the conditions below hold.
+        topics: Topics that must be published.
+        after: Resources of the module that must be active.
+    """
+
+    boot: bool = False
+    delay: float = 0.0
+    topics: tuple[str, ...] = ()
+    after: tuple[str, ...] = ()
+
+
 class NodeRun(msgspec.Struct, frozen=True, kw_only=True):
     """A node of a resource, as it is now.
 
@@ -233,6 +249,18 @@ async def ended(pid: int) -> None:
     finally:
         loop.remove_reader(descriptor)
         os.close(descriptor)
+
+
+def how_ended(code: int | None) -> str:
+    """How a program ended, as a text; ``code`` is that of ``Popen``, ``None``: it is not known."""
+    if code is None:
+        return "has ended"
+    if code >= 0:
+        return f"has ended with code {code}"
+    try:
+        return f"was ended by {signal.Signals(-code).name}"
+    except ValueError:  # most real-time signals have no name
+        return f"was ended by signal {-code}"
 
 
 async def end_program(mark: ProgramMark, after: float) -> None:
