@@ -19,11 +19,12 @@ from rmpa.bridge import limits
 from rmpa.bridge.launch_files import REFUSED, LaunchFile, circles, is_name, list_files
 from rmpa.bridge.launched import ModuleResources, ResourceProgram, load_runs
 from rmpa.bridge.policy import Needs
+from rmpa.bridge.rpc import why_unanswered
 from rmpa.bridge.sessions import Part
 from rmpa.config.module_name import module_dir, state_dir
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import suggestion
-from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.core.errors import RmpaError
 from rmpa.core.identity import is_meant
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.files import replace_file
@@ -298,12 +299,8 @@ class Launcher(Part):
             timeout = limits.ASK_TIMEOUT if quick else limits.LAUNCH_ASK_TIMEOUT
             value = await self._bridge.rpc.request(session, LAUNCH, request, timeout)
             return msgspec.structs.replace(msgspec.convert(value, ModuleResources), module=name)
-        except PeerRefused as error:
-            problem, code = (_EARLIER, "other-release") if error.unknown else (error.reason, "not-permitted")
-        except msgspec.ValidationError as error:
-            problem, code = f"its answer is malformed: {error}", "protocol-error"
-        except RmpaError as error:
-            problem, code = str(error), error.code
+        except (RmpaError, msgspec.ValidationError) as error:
+            problem, code = why_unanswered(error, _EARLIER)
         return ModuleResources(module=name, problem=problem, code=code)
 
     async def _do(

@@ -15,10 +15,11 @@ from rmpa.bridge import limits
 from rmpa.bridge.log_ring import LogLines, LogQuery, LogRing, ModuleLog
 from rmpa.bridge.nodes import own_node, permitted_nodes
 from rmpa.bridge.policy import Needs
+from rmpa.bridge.rpc import why_unanswered
 from rmpa.bridge.sessions import Part
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import suggestion
-from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.core.errors import RmpaError
 from rmpa.core.identity import OWN_NODE, is_meant, is_own
 from rmpa.ros.core.embedded import AGGREGATED, LOG, TOPIC
 from rmpa.ros.master.parameters import RegistrationKind
@@ -206,12 +207,8 @@ class ModuleLogs(Part):
     async def _of(self, name: str, session: PeerSession | None, query: LogQuery) -> ModuleLog:
         try:
             return await self._ask(name, session, query)
-        except PeerRefused as error:
-            problem, code = (_EARLIER, "other-release") if error.unknown else (error.reason, "not-permitted")
-        except msgspec.ValidationError as error:
-            problem, code = f"its answer is malformed: {error}", "protocol-error"
-        except RmpaError as error:
-            problem, code = str(error), error.code
+        except (RmpaError, msgspec.ValidationError) as error:
+            problem, code = why_unanswered(error, _EARLIER)
         return ModuleLog(name, problem=problem, code=code)
 
     async def _level(self, asker: PeerSession, args: dict[str, Any]) -> dict[str, str]:

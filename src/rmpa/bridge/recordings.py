@@ -19,6 +19,7 @@ import msgspec
 from rmpa.bridge import limits
 from rmpa.bridge.kept import KEPT, Kept, check_id, find_kept, read_kept, recording_id, remove_kept, request_keep
 from rmpa.bridge.policy import Needs
+from rmpa.bridge.rpc import why_unanswered
 from rmpa.bridge.sessions import Part
 from rmpa.config.module_name import module_dir, state_dir
 from rmpa.config.peer_rules import Access
@@ -190,12 +191,8 @@ class Recordings(Part):
         try:
             found = msgspec.convert(await self._bridge.rpc.request(session, LIST, {}), ModuleRecordings)
             return msgspec.structs.replace(found, module=session.link.name)
-        except PeerRefused as error:
-            problem, code = (_EARLIER, "other-release") if error.unknown else (error.reason, "not-permitted")
-        except msgspec.ValidationError as error:
-            problem, code = f"its answer is malformed: {error}", "protocol-error"
-        except RmpaError as error:
-            problem, code = str(error), error.code
+        except (RmpaError, msgspec.ValidationError) as error:
+            problem, code = why_unanswered(error, _EARLIER)
         return ModuleRecordings(module=session.link.name, problem=problem, code=code)
 
     async def _read(self, asker: PeerSession, args: dict[str, Any]) -> FilePart:

@@ -52,6 +52,20 @@ Handler = Callable[["PeerSession", dict[str, Any]], Awaitable[object] | object]
 Listener = Callable[["PeerSession", dict[str, Any]], None]
 
 
+def why_unanswered(error: RmpaError | msgspec.ValidationError, earlier: str) -> tuple[str, str]:
+    """Why a peer has not answered as asked, and the code of that.
+
+    Args:
+        error: That of the request, or of ``msgspec.convert`` on its answer.
+        earlier: The text for an agent of an earlier release, which does not know the question.
+    """
+    if isinstance(error, msgspec.ValidationError):
+        return f"its answer is malformed: {error}", "protocol-error"
+    if not isinstance(error, PeerRefused):
+        return str(error), error.code
+    return (earlier, "other-release") if error.unknown else (error.reason, "not-permitted")
+
+
 class PeerRpc(Part):
     """Sends requests to the peers, and responds to theirs.
 
