@@ -265,7 +265,9 @@ def total(listener: Process) -> tuple[object, ...]:
 
 
 @pytest.mark.parametrize(
-    ("size", "rate"), [pytest.param(MB, 30, marks=pytest.mark.alone), (64, 1000)], ids=["images", "commands"]
+    ("size", "rate"),
+    [pytest.param(MB, 30, marks=pytest.mark.alone), pytest.param(64, 1000, marks=pytest.mark.long)],
+    ids=["images", "commands"],
 )
 def test_a_stopped_subscriber_is_its_own_affair(modules: ModuleFactory, tmp_path: Path, size: int, rate: int) -> None:
     a, b, c = modules("a", "b", "c")

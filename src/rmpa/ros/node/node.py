@@ -20,7 +20,7 @@ import logging
 import os
 import signal
 import time
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from rmpa.config import limits as config_limits
@@ -28,7 +28,6 @@ from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.core.timers import Schedule, positive
 from rmpa.ros import limits
 from rmpa.ros.environment import RosEnvironment, host_of, is_loopback
-from rmpa.ros.node import rosout
 from rmpa.ros.node.endpoints import (
     Handler,
     MasterClient,
@@ -517,9 +516,7 @@ class Node(MasterClient):
         logger = logging.getLogger("rosout" + self.name.replace("/", "."))
         if logger.level == logging.NOTSET:
             logger.setLevel(logging.INFO)
-        self._rosout = RosoutHandler(
-            self.name, partial(self.advertise, rosout.TOPIC, rosout.TYPE, latch=True), topics
-        )
+        self._rosout = RosoutHandler(self.name, self.advertise, topics)
         logger.addHandler(self._rosout)
         return logger
 

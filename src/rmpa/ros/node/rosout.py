@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-TOPIC: Final = "/rosout"
-TYPE: Final = "rosgraph_msgs/Log"
+_TOPIC: Final = "/rosout"
+_TYPE: Final = "rosgraph_msgs/Log"
 # Records that wait for the connection of the core's /rosout; above it the oldest is dropped.
 _WAITING: Final = 1000
 # Time in which the core's /rosout connects: what is published before that would be lost.
@@ -39,12 +39,12 @@ class RosoutHandler(logging.Handler):
 
     Args:
         name: The node's name.
-        advertise: Advertises a topic: ``Node.advertise`` for ``/rosout``.
+        advertise: ``Node.advertise``.
         topics: The topics that the node publishes.
     """
 
     def __init__(
-        self, name: str, advertise: Callable[[], Awaitable[Publisher]], topics: Callable[[], list[str]]
+        self, name: str, advertise: Callable[..., Awaitable[Publisher]], topics: Callable[[], list[str]]
     ) -> None:
         super().__init__()
         self._node = name
@@ -90,7 +90,7 @@ class RosoutHandler(logging.Handler):
         publisher: Publisher | None = None
         while publisher is None:
             try:
-                publisher = await self._advertise()
+                publisher = await self._advertise(_TOPIC, _TYPE, latch=True)
             except RmpaError as error:
                 _log.debug("! %s: %s", self._node, error)
                 await asyncio.sleep(_RETRY)
