@@ -186,6 +186,7 @@ async def test_the_demos_modules_are_smart_resources(tidy: dict[str, str]) -> No
         assert await asyncio.to_thread(demo.interrupt) == 0, demo.output
 
 
+@pytest.mark.long
 def test_a_killed_module_is_shown_gone_and_comes_back(tidy: dict[str, str]) -> None:
     def command(*words: str) -> Process:
         return Process([sys.executable, DEMO, *words], env=tidy, name=" ".join(words))
@@ -236,7 +237,7 @@ def test_a_killed_module_is_shown_gone_and_comes_back(tidy: dict[str, str]) -> N
     assert restart["back_after"] > 0
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.long)])
 def test_it_ends_in_order_when_it_is_told_to(tidy: dict[str, str], number: signal.Signals) -> None:
     with Process([sys.executable, DEMO, "--no-web"], env=tidy, name="demo") as demo:
         demo.wait_for(r"base:linked.* ODOM [1-9]", 75)
@@ -276,6 +277,7 @@ def test_a_killed_demo_leaves_no_children_and_no_files(tidy: dict[str, str]) -> 
         assert following.wait(30) == 0, following.output
 
 
+@pytest.mark.long
 def test_two_demos_on_one_machine_do_not_meet(tidy: dict[str, str]) -> None:
     with (
         Process([sys.executable, DEMO, "--no-web", "--json"], env=tidy, name="first") as first,
@@ -314,6 +316,7 @@ def test_a_real_joystick_steers_and_may_be_unplugged(tidy: dict[str, str], tmp_p
         assert demo.interrupt() == 0, demo.output
 
 
+@pytest.mark.long
 def test_the_pc_itself_can_be_killed(tidy: dict[str, str]) -> None:
     with Process([sys.executable, DEMO, "--json"], env=tidy, name="demo") as demo:
         wait_for_view(demo, flows, "messages")

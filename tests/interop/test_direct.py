@@ -75,6 +75,7 @@ BY_TERMS: Final = {
 FREE: Final = ("/free", "/free_too")
 
 
+@pytest.mark.long
 def test_what_needs_the_agents_is_relayed_until_its_rules_change(modules: ModuleFactory) -> None:
     """Terms of a contract at either end, and another name at either end; the rest is direct all the time."""
     a, b = modules("a", "b", config=AUTO)
@@ -132,6 +133,7 @@ def test_nodes_that_are_bound_to_loopback_are_relayed(modules: ModuleFactory) ->
     assert {conditions(b)[f"/free_{client}"] for client in ("roscpp", "rospy")} == {"subscriber"}
 
 
+@pytest.mark.long
 def test_a_firewall_between_the_nodes_makes_them_fall_back(modules: ModuleFactory) -> None:
     """The agents' ports pass, those of nodes do not: from now on, and for who comes later; until it is open again."""
     a, b = modules("a", "b", config=AUTO)

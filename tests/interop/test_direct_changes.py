@@ -58,6 +58,7 @@ def test_a_changed_contract_moves_a_subscriber_and_back(
         assert gaps(report) <= 2 * turn * MOVE_GAP
 
 
+@pytest.mark.long
 def test_two_subscribers_of_one_publisher_move_each_for_itself(modules: ModuleFactory) -> None:
     """A local node with the caller id of a remote subscriber takes its place at the publisher (trap 12)."""
     a, b = modules("a", "b", config=AUTO)
@@ -185,6 +186,7 @@ def test_a_cable_that_is_out_for_long_ends_both_ends_connections(
     in_order(wait_direct(listener, talker, 6.0))
 
 
+@pytest.mark.long
 def test_a_host_that_was_switched_off_comes_back_with_new_nodes(modules: ModuleFactory, lab: Lab) -> None:
     client = "rospy"
     a, b, talker, listener = pair(modules, client, client)
@@ -235,6 +237,7 @@ def test_direct_messages_end_with_their_module(modules: ModuleFactory) -> None:
     eventually(lambda: links(listener, talker) == 0, what="no connection")
 
 
+@pytest.mark.long
 def test_a_host_with_another_address_is_direct_again(modules: ModuleFactory) -> None:
     a, b = modules("a", "b", config=AUTO)
     on_the_network(a, b)
@@ -251,7 +254,7 @@ def test_a_host_with_another_address_is_direct_again(modules: ModuleFactory) -> 
     eventually(lambda: any(other.startswith("10.77.0.77:") for _, other in connections(listener)))
 
 
-@pytest.mark.parametrize("prefix", [(), ORDINARY])
+@pytest.mark.parametrize("prefix", [(), pytest.param(ORDINARY, marks=pytest.mark.long)])
 def test_a_publisher_without_a_queue_is_freed_from_a_vanished_subscriber(
     modules: ModuleFactory, lab: Lab, prefix: tuple[str, ...]
 ) -> None:
@@ -268,6 +271,7 @@ def test_a_publisher_without_a_queue_is_freed_from_a_vanished_subscriber(
     unbroken(flows(at_home, 50, 6.0))
 
 
+@pytest.mark.long
 def test_without_the_right_to_end_connections_only_rospy_subscribers_stay(modules: ModuleFactory) -> None:
     """roscpp moves by the list of publishers; rospy stays direct, which the agent says, and hears nothing twice."""
     a, b = modules("a", "b", config=AUTO, prefix=UNPRIVILEGED)
@@ -382,6 +386,7 @@ def test_modules_of_one_machine_are_direct_over_loopback(
     in_order(unbroken_since)
 
 
+@pytest.mark.long
 def test_nodes_of_a_real_roscore_are_direct_if_they_are_on_its_machine(
     lab: Lab, agent: AgentFactory, shell: ShellFactory
 ) -> None:

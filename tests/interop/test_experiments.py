@@ -52,6 +52,7 @@ def run(*words: str | Path) -> None:
 @pytest.mark.parametrize(
     "name", [name if name in _SHORT else pytest.param(name, marks=pytest.mark.long) for name in EXPERIMENTS]
 )
+@pytest.mark.long
 def test_an_experiment_measures_both_systems_and_reports(name: str, tmp_path: Path) -> None:
     out = tmp_path / "run"
     only = [word for setting in _ONLY.get(name, ()) for word in ("--only", setting)]

@@ -220,6 +220,7 @@ def wait_lost(module: Module, within: float, *peers: str) -> None:
     eventually(lambda: not links(module).keys() & {*peers}, within, what=f"{module.name} without {peers}", every=0.1)
 
 
+@pytest.mark.long
 def test_a_pause_a_hang_and_a_cut_at_rest(modules: ModuleFactory) -> None:
     a, b, c = modules("a", "b", "c")
     for module in (a, b, c):

@@ -39,6 +39,7 @@ def launch(process: Process, word: str, event: str) -> Event:
     return process.wait_event(event, 60.0, since=mark)
 
 
+@pytest.mark.long
 def test_fifty_nodes_that_start_do_not_disturb_a_stream(modules: ModuleFactory, tmp_path: Path) -> None:
     a, b = modules("a", "b", log_level="info")
     source = a.ros.roscpp("source", nodes=NODES, commands=True, topic="/command", queue=QUEUE)

@@ -90,7 +90,7 @@ def listeners_at(module: Module, tmp_path: Path, name: str = "came") -> dict[Pat
     }
 
 
-@pytest.mark.parametrize("sending", KINDS)
+@pytest.mark.parametrize("sending", ["roscpp", pytest.param("rospy", marks=pytest.mark.long)])
 def test_each_byte_arrives(modules: ModuleFactory, tmp_path: Path, sending: str) -> None:
     here, there = modules("a", "b") if sending == "roscpp" else reversed(modules("a", "b"))
     (sent := tmp_path / "sent").mkdir()
@@ -128,6 +128,7 @@ def test_what_dies_in_the_middle_leaves_no_half_message(modules: ModuleFactory, 
         assert set(md5s(folder)) - {f"1-{told + 1}"} == {f"2-{last + 1}"}
 
 
+@pytest.mark.long
 def test_the_receiving_agent_dies_in_the_middle(modules: ModuleFactory, tmp_path: Path) -> None:
     a, b = modules("a", "b")
     heard = listeners_at(b, tmp_path)

@@ -305,6 +305,7 @@ def test_a_relay_takes_over_at_once_when_a_cable_is_pulled(
     triangle.after(lambda: None)
 
 
+@pytest.mark.long
 def test_a_way_that_joins_is_taken_without_a_break(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:
     triangle = Triangle(lab, agent, shell, unplugged=(DIRECT, SECOND))
     assert triangle.via() == "m2"
@@ -321,7 +322,7 @@ def test_a_relay_that_leaves_takes_nothing_along(lab: Lab, agent: AgentFactory, 
     assert triangle.via() == other
 
 
-@pytest.mark.parametrize(("who", "before"), [("m1", 0.0), ("m4", 3.0)])
+@pytest.mark.parametrize(("who", "before"), [("m1", 0.0), pytest.param("m4", 3.0, marks=pytest.mark.long)])
 def test_an_address_that_changes_loses_nothing(
     lab: Lab, agent: AgentFactory, shell: ShellFactory, who: str, before: float
 ) -> None:

@@ -116,6 +116,7 @@ def test_losses_beyond_the_buffer_are_counted_exactly(modules: ModuleFactory, tm
     b.agent.process.wait_for(rf"(?i)warning.*/chatter.*\b{missing[0]} messages lost")
 
 
+@pytest.mark.long
 def test_after_an_outage_beyond_the_contract_messages_may_be_lost(modules: ModuleFactory, tmp_path: Path) -> None:
     a, b = modules("a", "b", config=contract(100_000, 'outage = "4 s"\n'))
     heard, teller, first = stream(a, b, tmp_path)
@@ -145,6 +146,7 @@ def test_after_an_outage_beyond_the_contract_messages_may_be_lost(modules: Modul
     eventually(lambda: "loss unknown 1 times" in b.agent.rmpa("why", "a:/chatter")[1], what="the loss in rmpa why")
 
 
+@pytest.mark.long
 def test_a_topic_of_which_the_newest_counts_is_fresh_after_a_cut(modules: ModuleFactory, tmp_path: Path) -> None:
     a, b = modules("a", "b", config='[[contract]]\ntopics = ["/chatter"]\ndepth = 1\n')
     heard, teller, first = stream(a, b, tmp_path)

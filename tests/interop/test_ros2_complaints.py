@@ -105,6 +105,7 @@ def test_nothing_comes_back_as_an_echo(hall: Hall, node: OtherEnd) -> None:
         assert len(there) == len(set(there)), "a message came twice in ROS 2"
 
 
+@pytest.mark.long
 def test_a_failing_and_a_slow_service_end_nothing(hall: Hall, node: OtherEnd) -> None:
     """#277, #340: after a call that fails the next one works; a call of 20 s is waited for."""
     with hall.robot.ros.rospy("switch", service="/broken", fail="it is out of order"):

@@ -87,9 +87,8 @@ def reaches(end: OtherEnd, topic: str, listeners: list[Process], text: str) -> N
     eventually(told, FORGOTTEN, what=f"{text} at each listener", every=0.2)
 
 
-@pytest.mark.parametrize(
-    ("size", "rate", "count"), [(64, 100, 100), pytest.param(1 << 20, 10, 20, marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize(("size", "rate", "count"), [(64, 100, 100), (1 << 20, 10, 20)])
 def test_bytes_of_roscpp_go_to_ros2_and_back_to_three_modules(hall: Hall, size: int, rate: int, count: int) -> None:
     """#352, #218: each message once at each module, whichever library is there, and each byte right."""
     there, back = f"/there{size}", f"/back{size}"
@@ -205,15 +204,15 @@ def test_a_node_of_ros2_that_is_killed_leaves_nothing(hall: Hall) -> None:
     assert "/rmpa/ros2/victim2" not in hall.robot.ros.tool("rosnode", "list").split()
 
 
-@pytest.mark.parametrize("times", [3, pytest.param(30, marks=pytest.mark.long)])
-def test_a_node_of_ros2_is_restarted_again_and_again(hall: Hall, times: int) -> None:
-    with listener(hall.robot, f"/restarted{times}") as here:
-        for turn in range(times):
-            end = hall.node(f"restarted{times}")
-            reaches(end, f"/restarted{times}", [here], f"turn {turn} of it")
+@pytest.mark.long
+def test_a_node_of_ros2_is_restarted_again_and_again(hall: Hall) -> None:
+    with listener(hall.robot, "/restarted") as here:
+        for turn in range(30):
+            end = hall.node("restarted")
+            reaches(end, "/restarted", [here], f"turn {turn} of it")
             end.process.end()
         once(texts(here))
-    hall.robot.wait_no_topic(f"/restarted{times}", FORGOTTEN)
+    hall.robot.wait_no_topic("/restarted", FORGOTTEN)
 
 
 @pytest.mark.parametrize("seconds", [4, pytest.param(60, marks=pytest.mark.long)])
@@ -240,6 +239,7 @@ def test_nothing_is_lost_at_500_hz(hall: Hall, node: OtherEnd, seconds: int) -> 
 
 
 @pytest.mark.skipif(not python_of("cyclonedds").exists(), reason="Cyclone DDS is not there: scripts/install-ros2")
+@pytest.mark.long
 def test_a_program_of_another_vendors_dds_is_heard_and_hears(hall: Hall) -> None:
     other = hall.end("cyclonedds_end", python=python_of("cyclonedds"))
     with listener(hall.robot, "/vendor2") as here:

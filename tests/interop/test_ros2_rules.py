@@ -169,6 +169,7 @@ def test_diagnostics_cross_both_ways(hall: Hall, node: OtherEnd) -> None:
     node.do("untell", topic="/diagnostics")
 
 
+@pytest.mark.long
 def test_a_rate_holds_both_ways(hall: Hall, node: OtherEnd) -> None:
     with (
         hall.robot.ros.rospy("talker", topic="/slow/one", type="String", rate=100),
@@ -209,6 +210,7 @@ def _now(node: OtherEnd) -> float:
     return float(str(node.ask("now", "now")["seconds"]))
 
 
+@pytest.mark.long
 def test_nodes_of_ros1_follow_the_clock_of_a_simulator_of_ros2(tmp_path: Path) -> None:
     """The module takes its time from the gateway, and the gateway's from ROS 2."""
     follows = '[time]\nfollow = "gate"\n'

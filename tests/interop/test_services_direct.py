@@ -120,7 +120,7 @@ def test_a_server_that_restarts_on_another_port_is_found_again(modules: ModuleFa
         eventually(lambda: not known(b), what="the service has left")
 
 
-@pytest.mark.parametrize("kind", CLIENTS)
+@pytest.mark.parametrize("kind", ["roscpp", pytest.param("rospy", marks=pytest.mark.long)])
 def test_a_call_under_way_fails_within_the_lease_when_the_cable_is_cut(modules: ModuleFactory, kind: str) -> None:
     a, b = modules("a", "b", config=AUTO)
     on_the_network(a, b)
@@ -241,6 +241,7 @@ def test_a_port_that_a_firewall_closes_is_relayed_soon(modules: ModuleFactory) -
     assert known(b)["calls"] == 2
 
 
+@pytest.mark.long
 def test_a_roscore_answers_all_nodes_alike_so_its_module_is_relayed(
     lab: Lab, agent: AgentFactory, shell: ShellFactory
 ) -> None:

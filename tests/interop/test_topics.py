@@ -51,9 +51,9 @@ def greeted(listener: Process, beyond: int = 0) -> dict[str, dict[str, int]]:
     ("kind", "size", "greeting", "latch", "config"),
     [
         pytest.param("rospy", 64, BIG, False, "", id="map-rospy"),
-        pytest.param("roscpp", BIG, 64, False, "", id="images-roscpp"),
+        pytest.param("roscpp", BIG, 64, False, "", id="images-roscpp", marks=pytest.mark.long),
         pytest.param("roscpp", 64, 1000, True, "", id="latched"),  # rospy latches what it says to one subscriber, too
-        pytest.param("roscpp", 64, 1000, False, DIRECT, id="direct-roscpp"),
+        pytest.param("roscpp", 64, 1000, False, DIRECT, id="direct-roscpp", marks=pytest.mark.long),
     ],
 )
 def test_each_subscriber_anywhere_is_a_new_connection(
@@ -206,10 +206,10 @@ MEGABYTE = 1024 * 1024
 @pytest.mark.parametrize(
     ("talker", "listener", "rate", "size"),
     [
-        ("roscpp", "roscpp", 1000, 64),
+        pytest.param("roscpp", "roscpp", 1000, 64, marks=pytest.mark.long),
         ("rospy", "rospy", 1000, 64),
         pytest.param("roscpp", "rospy", 100, 3000, marks=pytest.mark.long),
-        ("rospy", "roscpp", 10, MEGABYTE),
+        pytest.param("rospy", "roscpp", 10, MEGABYTE, marks=pytest.mark.long),
     ],
 )
 def test_rates_from_10_hz_to_1_khz(modules: ModuleFactory, talker: str, listener: str, rate: int, size: int) -> None:

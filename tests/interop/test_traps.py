@@ -318,7 +318,7 @@ def test_a_topic_of_both_sides_is_heard_once_each(two: Two, library: str) -> Non
 
 
 @pytest.mark.trap(38)
-@libraries
+@pytest.mark.parametrize("library", ["rospy", pytest.param("roscpp", marks=pytest.mark.long)])
 def test_an_early_subscriber_loses_nothing(two: Two, library: str) -> None:
     first = two.at_b.node(library, "listener", "__name:=first", count=100)
     anything = two.at_b.start("rostopic", "echo", "-n", "1", "/other", name="echo")
@@ -357,7 +357,9 @@ async def test_every_byte_of_a_message_arrives_unchanged(two: Two) -> None:
 
 
 @pytest.mark.trap(40)
-@pytest.mark.parametrize(("library", "number"), [("rospy", signal.SIGKILL), ("roscpp", signal.SIGTERM)])
+@pytest.mark.parametrize(
+    ("library", "number"), [("rospy", signal.SIGKILL), pytest.param("roscpp", signal.SIGTERM, marks=pytest.mark.long)]
+)
 def test_a_node_that_was_killed_leaves_both_graphs(two: Two, library: str, number: signal.Signals) -> None:
     """roscpp unregisters at no signal but SIGINT; the agent learns it from the connection that breaks."""
     talker = two.at_a.node(library, "talker", "__name:=speaker", rate=100)

@@ -92,6 +92,7 @@ async def test_a_killed_module_its_return_and_a_new_topic_show_at_once(
 
 
 @needs_browser
+@pytest.mark.long
 async def test_a_resource_of_another_module_is_followed_and_its_profile_chosen(
     lab: Lab, agent: AgentFactory, shell: ShellFactory, web: WebFactory, tmp_path: Path
 ) -> None:
