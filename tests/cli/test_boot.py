@@ -115,7 +115,8 @@ def test_a_machine_below_a_folder(service: Service, root: Path) -> None:
     said = service("install --name base --web --realtime --dry-run")
     assert _files(root) == before
     said += service(
-        "install --name base --web --realtime", "install --web --realtime", "install --json", "install --name 1base",
+        "install --name base --web --realtime --resources", "install --web --realtime", "install --json",
+        "install --name 1base",
         "uninstall --dry-run", "uninstall", "uninstall --purge --yes --json", "uninstall",
     )  # fmt: skip
     compare("boot", said)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from rmpa.cli.units import CONFIG, config_text, realtime_text, unit_texts
+from rmpa.cli.units import CONFIG, DROP_INS, config_text, drop_in_text, unit_texts
 from rmpa.config.settings import SETTINGS
 from tests.cli.conftest import Machine
 from tests.core.example import EXAMPLE
@@ -31,7 +31,7 @@ def test_the_first_configuration_has_every_line_of_the_example_and_sets_nothing(
 
 
 def test_each_variable_of_ours_is_one() -> None:
-    texts = [*unit_texts().values(), realtime_text()]
+    texts = [*unit_texts().values(), *map(drop_in_text, DROP_INS)]
     assert set(re.findall(r"\b(RMPA_\w+)=", "".join(texts))) <= {setting.env for setting in SETTINGS}
 
 
@@ -39,12 +39,13 @@ def test_each_variable_of_ours_is_one() -> None:
 def test_systemd_takes_every_line_and_finds_little_exposed(tmp_path: Path) -> None:
     for name, text in unit_texts(shutil.which("true") or "").items():
         (tmp_path / name).write_text(text)
-    drop_in = tmp_path / "rmpa.service.d" / "realtime.conf"
-    drop_in.parent.mkdir()
-    drop_in.write_text(realtime_text())
+    (tmp_path / "rmpa.service.d").mkdir()
+    for option, name in DROP_INS.items():
+        (tmp_path / name).write_text(drop_in_text(option))
     units = [tmp_path / name for name in _EXPOSURE]
     done = subprocess.run(["systemd-analyze", "verify", *units], capture_output=True, text=True, check=False)
     assert not [line for line in done.stderr.splitlines() if "rmpa" in line], done.stderr
+    (tmp_path / DROP_INS["resources"]).unlink()  # it gives devices to the nodes
     for unit in units:
         limit = f"--threshold={_EXPOSURE[unit.name]}"
         done = subprocess.run(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,6 +22,7 @@ from rmpa.runtime.programs import (
     ended,
     figures,
     how_ended,
+    keep_capabilities,
     read_log,
     rotate_log,
     start_program,
@@ -111,3 +114,20 @@ def test_each_exit_code_has_a_text() -> None:
         "was ended by SIGKILL",
         "was ended by signal 40",
     ]
+
+
+WHO = "import re; print(re.findall(r'CapEff:\\s*(\\w+)', open('/proc/self/status').read())[0])"
+
+
+@pytest.mark.skipif(os.geteuid() != 0 or not shutil.which("setpriv"), reason="it takes root and setpriv")
+def test_a_capability_of_the_units_is_not_that_of_the_nodes() -> None:
+    program = (
+        f"{inspect.getsource(keep_capabilities)}\nkeep_capabilities()\nsubprocess.run([sys.executable, '-c', WHO])"
+    )
+    script = f"import ctypes, subprocess, sys\n_CAP_AMBIENT, _CLEAR_ALL = 47, 4\nWHO = {WHO!r}\n{program}\nexec(WHO)"
+    unit = ["setpriv", "--reuid", "65534", "--inh-caps", "+net_admin", "--ambient-caps", "+net_admin"]
+    done = subprocess.run([*unit, "/usr/bin/python3", "-c", script], capture_output=True, text=True, check=False)
+    if "setpriv" in done.stderr:
+        pytest.skip(f"setpriv cannot do it here: {done.stderr.strip()}")
+    node, agent = (int(line, 16) for line in done.stdout.split())
+    assert (node, agent) == (0, 1 << 12), done

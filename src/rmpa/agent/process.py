@@ -32,7 +32,7 @@ from rmpa.runtime import realtime
 from rmpa.runtime.accept import is_shortage, open_files_advice, raise_file_limit
 from rmpa.runtime.interpreter import own_command
 from rmpa.runtime.loop import AgentLoop
-from rmpa.runtime.programs import ended
+from rmpa.runtime.programs import ended, keep_capabilities
 from rmpa.runtime.systemd import SERVICE_VARIABLES, feed_watchdog, notify_service_manager
 from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 
@@ -456,6 +456,7 @@ def run_process(
         StartError: The agent cannot start on this machine with these settings.
     """
     raise_file_limit()
+    keep_capabilities()
     sys.setswitchinterval(runtime_limits.THREAD_SWITCH)
     wanted = settings.realtime
     outcomes = realtime.apply(wanted.priority, lock_memory=wanted.lock_memory) if wanted.enabled else ()

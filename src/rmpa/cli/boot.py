@@ -29,15 +29,15 @@ from rmpa.cli.options import Options, flag, json_verb
 from rmpa.cli.output import confirm
 from rmpa.cli.units import (
     CONFIG,
+    DROP_INS,
     GROUP,
     PACKAGED,
-    REALTIME_FILE,
     RUNTIME,
     STATE,
     UNITS,
     USER,
     config_text,
-    realtime_text,
+    drop_in_text,
     unit_texts,
 )
 from rmpa.config.module_name import (
@@ -154,6 +154,7 @@ def _runs_as(program: str, uid: int, gid: int) -> bool:
     flag("--web", help="The web server too: rmpa web, in a unit of its own."),
     flag("--gateway", help="The gateway too, with [gateway] of /etc/rmpa/rmpa.toml."),
     flag("--realtime", help="Let the agent have real-time priority and locked memory."),
+    flag("--resources", help="Let nodes that the agent starts use devices, and go on without it."),
     click.option("--name", metavar="NAME", help="The module's name. [default: the one that it has had]"),
     click.option("--user", metavar="NAME", help="The user that the units run as. [default: rmpa, which is made]"),
     flag("--dry-run", help="Change nothing; say what would be done, and print the units."),
@@ -163,6 +164,7 @@ def service_install(
     web: bool,
     gateway: bool,
     realtime: bool,
+    resources: bool,
     name: str | None,
     user: str | None,
     dry_run: bool,
@@ -184,6 +186,7 @@ def service_install(
     Examples:
       sudo rmpa service install --name base
       sudo rmpa service install --web --realtime
+      sudo rmpa service install --resources        it starts drivers of cameras and motors
       rmpa service install --dry-run               what would be done?
       sudo rmpa service install --root /mnt/image  for a machine that is not running
     """
@@ -213,8 +216,9 @@ def service_install(
     renamed = _take_over(machine, before, user, name)
     # Units that were made for another program would hide the package's.
     changed = _remove_made(machine, UNITS.values()) if packaged else _write_units(machine, wanted, program, user)
-    if realtime and machine.write(f"{UNIT_FOLDER}/{REALTIME_FILE}", realtime_text(_MARK.format(unit=UNITS["up"]))):
-        changed.append(UNITS["up"])
+    for option in (*(["realtime"] if realtime else []), *(["resources"] if resources else [])):
+        if machine.write(f"{UNIT_FOLDER}/{DROP_INS[option]}", drop_in_text(option, _MARK.format(unit=UNITS["up"]))):
+            changed.append(UNITS["up"])
     if renamed:
         changed.extend(wanted)
     _start(machine, wanted, changed)
@@ -522,7 +526,7 @@ def service_uninstall(purge: bool, yes: bool, dry_run: bool, root: str, options:
     parts = [unit for unit, path in units if (_is_made(path) if path.is_file() else machine.has_packaged(unit))]
     if parts:
         machine.systemctl("disable", *([] if root else ["--now"]), *parts)
-    removed = _remove_made(machine, (*UNITS.values(), REALTIME_FILE))
+    removed = _remove_made(machine, (*UNITS.values(), *DROP_INS.values()))
     for unit in removed:
         old = machine.path(f"{UNIT_FOLDER}/{unit}{_BY_HAND}")
         if old.is_file() and machine.change(f"rename {UNIT_FOLDER}/{old.name} to {unit}"):

@@ -1,4 +1,4 @@
-"""What runs RMPA at boot: the units of systemd, the drop-in of ``--realtime``, and ``/etc/rmpa/rmpa.toml``.
+"""What runs RMPA at boot: the units of systemd, their drop-ins, and ``/etc/rmpa/rmpa.toml``.
 
 ``rmpa service install`` writes these texts, and so does the build of the Debian package:
 
@@ -28,8 +28,8 @@ CONFIG: Final = "/etc/rmpa/rmpa.toml"
 PACKAGED: Final = "/usr/bin/rmpa"
 # By the command behind ``rmpa``: its unit.
 UNITS: Final = {"up": "rmpa.service", "web": "rmpa-web.service", "gateway": "rmpa-gateway.service"}
-# The drop-in of ``--realtime``, below the folder of units.
-REALTIME_FILE: Final = "rmpa.service.d/realtime.conf"
+# The drop-ins of the agent's unit, by the option of ``rmpa service install``; below the folder of units.
+DROP_INS: Final = {"realtime": "rmpa.service.d/realtime.conf", "resources": "rmpa.service.d/resources.conf"}
 
 _DESCRIPTIONS: Final = {
     "up": "RMPA agent: this module's ROS core and its place in the mesh",
@@ -107,14 +107,25 @@ _NET_ADMIN: Final = """\
 # To end connections whose host has vanished (docs/guides/direct-transport.md#cap_net_admin).
 AmbientCapabilities=CAP_NET_ADMIN
 CapabilityBoundingSet=CAP_NET_ADMIN"""
-_REALTIME: Final = """\
-{header}# rmpa up --realtime (docs/guides/running.md#real-time).
+_DROP_INS: Final = {
+    "realtime": """\
+# rmpa up --realtime (docs/guides/running.md#real-time).
 [Service]
 Environment=RMPA_REALTIME=true
 LimitRTPRIO=50
 LimitMEMLOCK=infinity
 RestrictRealtime=no
-"""
+""",
+    "resources": """\
+# Nodes that the agent starts ([resources] in rmpa.toml) may use devices, CAN and compilers at run time, and go on
+# when the agent is killed. Which devices is said by groups: sudo usermod -aG video,dialout USER of the unit.
+[Service]
+PrivateDevices=no
+MemoryDenyWriteExecute=no
+RestrictAddressFamilies=
+KillMode=process
+""",
+}
 _SETTING: Final = re.compile(r"^(?=[a-z_]+ = )", re.MULTILINE)
 _HEADING: Final = """\
 # rmpa.toml: the settings of this machine's module. To change one, remove the "# " in front of it. Where two lines
@@ -158,9 +169,9 @@ def _reload(command: str, program: str) -> tuple[str, ...]:
     return (f"{program} reload --agent $MAINPID",)
 
 
-def realtime_text(header: str = "") -> str:
-    """The drop-in for ``REALTIME_FILE``."""
-    return _REALTIME.format(header=header)
+def drop_in_text(option: str, header: str = "") -> str:
+    """The drop-in of an option of ``DROP_INS``."""
+    return header + _DROP_INS[option]
 
 
 def config_text() -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ctypes
 import functools
 import os
 import re
@@ -38,6 +39,8 @@ _LOOK: Final = 0.05
 # Seconds that they have after SIGTERM, and after SIGKILL.
 _TERMINATED: Final = 3.0
 _KILLED: Final = 5.0
+# Of prctl(2).
+_CAP_AMBIENT, _CLEAR_ALL = 47, 4
 # The states of proc_pid_stat(5) of a process that has ended.
 _ENDED: Final = ("Z", "X")
 
@@ -233,6 +236,15 @@ def start_program(
         return subprocess.Popen(  # noqa: S603 - what the user has written
             command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, cwd=cwd, env=env, start_new_session=True
         )
+
+
+def keep_capabilities() -> None:
+    """Keep this process's ambient capabilities, such as its unit's CAP_NET_ADMIN, from all programs that it starts.
+
+    They have what a user's node has without the agent. Each thread has a set of its own (capabilities(7)), so this is
+    called before others are started.
+    """
+    ctypes.CDLL(None).prctl(_CAP_AMBIENT, _CLEAR_ALL, 0, 0, 0)  # an older kernel has none
 
 
 async def ended(pid: int) -> None:
