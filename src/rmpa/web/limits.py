@@ -232,8 +232,5 @@ RECORDING_FREE: Final = 256 * MIB
 # Recordings whose files are kept, and for how long after the last use of any.
 RECORDINGS_CACHED: Final = 3
 RECORDINGS_KEPT: Final = 600.0
-# Seconds between two looks at a process that makes such a file, and its niceness: the robot goes first.
+# Seconds between two looks at a process that makes such a file.
 RECORDING_LOOK: Final = 0.3
-RECORDING_NICE: Final = 10
-# Bytes of such a file that are read at once.
-RECORDING_CHUNK: Final = 256 * KIB

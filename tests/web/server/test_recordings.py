@@ -50,15 +50,9 @@ class Site:
         self.fetch = COPY
         self.fetched = fetched
         self.commands: list[tuple[str, ...]] = []
-        self.files = RecordingFiles(
-            self._ask, rules, self.folder, lambda: "arm", view=view, command=self._command
-        )
+        self.files = RecordingFiles(rules, self.folder, lambda: "arm", view=view, command=self._command)
         policy = AccessPolicy(0, own_names(("base",)))
         self.server = WebServer(AgentWatch(lambda: FULL), policy, "127.0.0.1", recordings=self.files)
-
-    async def _ask(self, _op: str, **_: Any) -> Any:
-        size = sum(path.stat().st_size for path in self.fetched.rglob("*.mcap"))
-        return [{"module": "arm", "kept": [{"id": HIT, "size": size}]}, {"module": "base", "problem": "no answer"}]
 
     def _command(self, *words: str) -> list[str]:
         self.commands.append(words[:2])
@@ -102,8 +96,8 @@ async def test_a_story_is_made_once_for_all_that_ask_and_then_sent_as_each_kind_
     async with serving(tmp_path, tmp_path / "arm") as site:
         first, second = await asyncio.gather(site.told(f"{HIT}.json"), site.told(f"{HIT}.json"))
         for told in (first, second):
-            doing = list(dict.fromkeys(line["doing"] for line in told[:-1]))
-            assert doing == ["wait", "fetch", "merge", "story"]
+            doing = {line["doing"] for line in told[:-1]}
+            assert {"wait", "story"} <= doing <= {"wait", "fetch", "merge", "story"}
             assert told[-1] == {"ready": True}
         status, body = await site.get(f"{HIT}.json")
         story = json.loads(body)
@@ -152,10 +146,9 @@ async def test_why_a_file_is_not_made_is_told_with_what_to_do(
     recording("arm", {source("/odom"): [(0.0, "x")]})
     async with serving(tmp_path, tmp_path / "arm") as site:
 
-        async def why(name: str = HIT) -> dict[str, Any]:
-            return (await site.told(f"{name}.json"))[-1]
+        async def why() -> dict[str, Any]:
+            return (await site.told(f"{HIT}.json"))[-1]
 
-        assert (await why("other"))["error"] == "no linked module has a recording other; base: no answer"
         site.fetch = print_and_fail(error="base is not linked; `rmpa peer list` shows why", code="peer-unlinked")
         assert await why() == {"error": "base is not linked; `rmpa peer list` shows why", "code": "peer-unlinked"}
         status, body = await site.get(f"{HIT}.bag")
@@ -223,7 +216,7 @@ async def test_what_is_kept_is_listed_kept_and_removed_by_the_rules(monkeypatch:
     asks: Callable[[Answers, str], Any] = lambda one, what: one.answer(what, {"name": HIT, "why": "hit"})  # noqa: E731
     with closing(answers(EVERYTHING)) as free:
         (module,) = await asks(free, "recordings")
-        assert ([one["id"] for one in module["kept"]][0], module["status"]) == (HIT, {})
+        assert (next(one["id"] for one in module["kept"]), module["status"]) == (HIT, {})
         assert (await asks(free, "keep_recording"))["base"] == "no recorder has run here"
         assert await asks(free, "remove_recording") == {"base": "arm may not use the recording"}
     assert [args for args in agent.asked if args["what"] != "list"] == [

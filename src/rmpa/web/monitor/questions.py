@@ -229,10 +229,8 @@ class Answers:
         """What each module has kept, as far as the rules let a page see it, and what its recorder does."""
         found = await self.ask_agent("record", what="list")
         for module in found:
-            judged = [(each, self._denied(Access.RECORD, f"/{each['id']}")) for each in module.get("kept", ())]
-            module["kept"] = [each for each, why in judged if not why]
-            if judged and not module["kept"]:
-                module["problem"] = judged[0][1]
+            kept = module.get("kept", ())
+            module["kept"] = [each for each in kept if not self._denied(Access.RECORD, f"/{each['id']}")]
             for key in ("messages", "size", "left_out"):  # of each topic
                 module.get("status", {}).pop(key, None)
         return found

@@ -177,9 +177,10 @@ class WebServer:
         if self._video is not None:
             app.router.add_get(VIEWER, self._video.page)
             for path in PICTURES:
-                app.router.add_get(path, self._pictures)
+                app.router.add_get(path, functools.partial(self._streamed, self._video))
         if self._recordings is not None:
-            app.router.add_get(ROUTE, self._recording, allow_head=False)
+            handler = functools.partial(self._streamed, self._recordings)
+            app.router.add_get(ROUTE, handler, allow_head=False)
         self._runner = runner = web.AppRunner(
             app,
             access_log_class=self._access_logger(),
@@ -229,7 +230,7 @@ class WebServer:
         if self._video is not None:
             self._video.close()
         if self._recordings is not None:
-            self._recordings.end()
+            await self._recordings.end()
         if self._runner is not None:
             await self._runner.cleanup()
         if self._table is not None:
@@ -356,14 +357,8 @@ class WebServer:
             return _response(api.problem(503, "the agent does not answer"))
         return web.Response(text="ok\n")
 
-    async def _pictures(self, request: web.Request) -> web.StreamResponse:
-        assert self._video is not None, "its routes are there"  # noqa: S101 - for the type checker
-        return await self._video.respond(request, _connection(request), functools.partial(self._dress, request))
-
-    async def _recording(self, request: web.Request) -> web.StreamResponse:
-        assert self._recordings is not None, "its route is there"  # noqa: S101 - for the type checker
-        dress = functools.partial(self._dress, request)
-        made = await self._recordings.respond(request, _connection(request), dress)
+    async def _streamed(self, source: VideoStreams | RecordingFiles, request: web.Request) -> web.StreamResponse:
+        made = await source.respond(request, _connection(request), functools.partial(self._dress, request))
         return _response(made) if isinstance(made, api.RestResponse) else made
 
     async def _api(self, request: web.Request) -> web.Response:

@@ -13,6 +13,7 @@ import contextlib
 import os
 import shutil
 import subprocess
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final
 
@@ -27,49 +28,32 @@ from rmpa.runtime.tasks import OwnedTasks, end_tasks, start_task
 from rmpa.web import api, limits
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Callable
     from pathlib import Path
 
     from rmpa.web.hub.node_link import NodeRules
     from rmpa.web.server.access import GuardedConnection
 
 ROUTE: Final = "/recording/{name}"
-_TYPES: Final = {
-    **dict.fromkeys(("mcap", "bag"), "application/octet-stream"),
-    "html": "text/html; charset=utf-8",
-    "json": "application/json",
-}
+_TYPES: Final = dict.fromkeys(("mcap", "bag", "html"), "application/octet-stream") | {"json": "application/json"}
 _NO_TOKEN: Final = "recordings need a token: start rmpa web with --token-file FILE, or --control"  # noqa: S105 - a text
+_CHUNK: Final = 1 << 18
+_NICENESS: Final = 10  # the robot goes first
 
 
+@dataclass(slots=True)
 class _Making:
-    """A file that is being made, for all that wait for it."""
+    """A file that is being made, for all that wait for it: their number, how far it is, and what becomes of it."""
 
-    def __init__(self) -> None:
-        self.users = 0
-        self.told: dict[str, Any] = {"doing": "wait"}
-        self.task: asyncio.Task[None] | None = None
-        self._changed = asyncio.Event()
-
-    def tell(self, **told: Any) -> None:
-        self.told = told
-        self.wake()
-
-    def wake(self) -> None:
-        changed, self._changed = self._changed, asyncio.Event()
-        changed.set()
-
-    async def change(self, told: dict[str, Any], transport: asyncio.Transport) -> None:
-        """Wait until something else is told, or the client has gone."""
-        while self.told is told and not transport.is_closing():
-            await self._changed.wait()
+    users: int = 0
+    told: dict[str, Any] = field(default_factory=lambda: {"doing": "wait"})
+    task: asyncio.Task[dict[str, Any]] | None = None
 
 
 class RecordingFiles:
     """Makes and sends them.
 
     Args:
-        ask: Calls an operation of the agent.
         rules: What clients may do.
         folder: Where files are made; ``None``: there is no state directory.
         agent: Returns the agent's name; empty for the only one.
@@ -79,7 +63,6 @@ class RecordingFiles:
 
     def __init__(
         self,
-        ask: Callable[..., Awaitable[Any]],
         rules: NodeRules,
         folder: Path | None,
         agent: Callable[[], str],
@@ -87,7 +70,6 @@ class RecordingFiles:
         view: bool,
         command: Callable[..., list[str]] = own_command,
     ) -> None:
-        self._ask = ask
         self._rules = rules
         self._folder = folder
         self._agent = agent
@@ -108,12 +90,9 @@ class RecordingFiles:
                 self._folder.rename(gone)  # at once: files may be asked for meanwhile
             await asyncio.to_thread(shutil.rmtree, gone, ignore_errors=True)
 
-    def end(self) -> None:
-        """End the processes; what waits for them is told so."""
-        for each in self._makings.values():
-            if each.task is not None:
-                each.task.cancel()
-            each.tell(error="rmpa web ends", code="failed")
+    async def end(self) -> None:
+        """End the processes; requests that wait for them end, too."""
+        await end_tasks(*(each.task for each in self._makings.values()))
 
     async def close(self) -> None:
         """Remove all files, when no request is left."""
@@ -134,66 +113,65 @@ class RecordingFiles:
             return api.problem(403 if isinstance(error, PeerRefused) else 404, str(error))
         if kind not in _TYPES:
             return api.problem(404, f"there is no kind {kind[:20]!a} of files; these are: {', '.join(_TYPES)}")
-        making = self._makings.get(name)
-        if making is None:
-            if len(self._makings) >= limits.RECORDINGS_WAITING:
-                return api.problem(429, "files of other recordings are being made; ask again later")
-            self._idle.cancel()
-            making = self._makings[name] = _Making()
-            making.task = start_task(self._make(making, recording, kind), f"make {name}")
+        if name not in self._makings and len(self._makings) >= limits.RECORDINGS_WAITING:
+            return api.problem(429, "files of other recordings are being made; ask again later")
+        self._idle.cancel()
+        making = self._makings.setdefault(name, _Making())
+        making.task = making.task or start_task(self._make(making, recording, kind), f"make {name}")
         making.users += 1
         if guard is not None:
-            guard.stream(making.wake)  # it may take minutes
+            guard.stream(lambda: None)  # it may take minutes
+        response = web.StreamResponse(headers={"Content-Type": _TYPES[kind]})
+        response.force_close()  # its guard expects no further request
+        dress(response)
         try:
-            return await self._serve(request, making, recording, kind, dress)
+            told = await self._follow(request, response, making, making.task)
+            if told is not None and "error" in told:
+                return api.problem(502, told["error"], (("Connection", "close"),))
+            if told is not None:
+                await _send(request, response, self._path(recording, kind))
+        except (OSError, TimeoutError):  # the client has gone, or takes nothing
+            if request.transport is not None:
+                request.transport.abort()
         finally:
             making.users -= 1
             if not making.users:
                 del self._makings[name]
                 await end_tasks(making.task)
-                if not self._makings:
-                    self._idle.cancel()
-                    self._idle.start(self.clear(limits.RECORDINGS_KEPT), "remove files of recordings")
+                self._idle.cancel()
+                self._idle.start(self.clear(limits.RECORDINGS_KEPT), "remove files of recordings")
+        return response
 
-    async def _serve(
+    async def _follow(
         self,
         request: web.Request,
+        response: web.StreamResponse,
         making: _Making,
-        recording: str,
-        kind: str,
-        dress: Callable[[web.StreamResponse], None],
-    ) -> web.StreamResponse | api.RestResponse:
-        transport, tells = request.transport, "progress" in request.query
-        response = web.StreamResponse(headers={"Content-Type": "application/x-ndjson" if tells else _TYPES[kind]})
-        response.force_close()  # its guard expects no further request
-        dress(response)
-        try:
-            if tells:
-                await response.prepare(request)
-            while transport is not None and not transport.is_closing():
-                told = making.told
-                if tells:
-                    await _write(response, msgspec.json.encode(told) + b"\n")
-                if "doing" in told:
-                    await making.change(told, transport)
-                    continue
-                if not tells and "error" in told:
-                    return api.problem(502, told["error"], (("Connection", "close"),))
-                if not tells:
-                    await _send(request, response, self._path(recording, kind))
-                break
-        except (OSError, TimeoutError):  # the client has gone, or takes nothing
-            if transport is not None:
-                transport.abort()
-        return response
+        task: asyncio.Task[dict[str, Any]],
+    ) -> dict[str, Any] | None:
+        """Wait for what becomes of a file; ``None``: the client was told, or has gone."""
+        if tells := "progress" in request.query:
+            response.headers["Content-Type"] = "application/x-ndjson"
+            await response.prepare(request)
+        shown: dict[str, Any] = {}
+        while request.transport is not None and not request.transport.is_closing():
+            if task.done():
+                making.told = {"error": "rmpa web ends"} if task.cancelled() else task.result()
+            if tells and making.told is not shown:
+                shown = making.told
+                await _write(response, msgspec.json.encode(shown) + b"\n")
+            if task.done():
+                return None if tells else making.told
+            await asyncio.wait((task,), timeout=limits.RECORDING_LOOK)
+        return None
 
     def _path(self, recording: str, kind: str) -> Path:
         if self._folder is None:
             raise ConfigError("rmpa web", "there is no state directory for files", "set RMPA_STATE_DIR")
         return self._folder / recording / f"{recording}.{kind}"
 
-    async def _make(self, making: _Making, recording: str, kind: str) -> None:
-        """Make a file unless it is there; what becomes of it is told."""
+    async def _make(self, making: _Making, recording: str, kind: str) -> dict[str, Any]:
+        """Make a file unless it is there; what becomes of it."""
         try:
             whole = self._path(recording, "mcap")
             async with self._turn, asyncio.timeout(limits.RECORDING_TIME):
@@ -201,28 +179,24 @@ class RecordingFiles:
                 await self._steps(making, whole, {"html": "json"}.get(kind, kind), there)
         except TimeoutError:
             text = f"it is not made within {limits.RECORDING_TIME:g} s; in a terminal: rmpa record fetch {recording}"
-            making.tell(error=text, code="limit-reached")
+            return {"error": text, "code": "limit-reached"}
         except RmpaError as error:
-            making.tell(error=str(error), code=error.code)
+            return {"error": str(error), "code": error.code}
         except OSError as error:
-            making.tell(error=f"files of recordings cannot be written: {error}", code="directory-unusable")
-        else:
-            making.tell(ready=True)
+            return {"error": f"files of recordings cannot be written: {error}", "code": "directory-unusable"}
+        return {"ready": True}
 
     async def _steps(self, making: _Making, whole: Path, kind: str, there: set[str]) -> None:
-        parts, made = whole.with_name("parts"), whole.with_name("made")
+        parts, made, wanted = whole.with_name("parts"), whole.with_name("made"), whole.with_suffix(f".{kind}")
         if whole.name not in there:
             if find_spec("mcap") is None or find_spec("jinja2") is None:
                 text = f"this module has not the extra record; run {missing_extra('record')}"
                 raise RmpaError(text, code="extra-missing")
-            agent, total = self._agent(), await self._size(whole.stem)
-            words = whole.stem, "-o", str(parts), *(("--agent", agent) if agent else ())
-            await self._run(making, "fetch", parts, "record", "fetch", *words, total=total)  # goes on where it ended
-            new = made / whole.name
-            await self._run(making, "merge", made, "record", "merge", str(parts), "-o", str(new), total=total)
-            new.replace(whole)
+            words = whole.stem, "-o", str(parts), *(("--agent", agent) if (agent := self._agent()) else ())
+            await self._run(making, "fetch", parts, "record", "fetch", *words)  # it goes on where it ended
+            await self._run(making, "merge", made, "record", "merge", str(parts), "-o", str(made / whole.name))
+            (made / whole.name).replace(whole)
             await asyncio.to_thread(shutil.rmtree, parts)
-        wanted = whole.with_suffix(f".{kind}")
         if wanted.name not in there and kind == "bag":
             await self._run(making, kind, made, "record", "merge", str(whole), "-o", str(made / wanted.name))
             (made / wanted.name).replace(wanted)
@@ -230,26 +204,17 @@ class RecordingFiles:
             await self._run(making, "story", made, "story", str(whole), "-o", str(whole.with_suffix(".html")))
             whole.with_name("result").replace(wanted)
 
-    async def _size(self, recording: str) -> int:
-        """Bytes of a recording at all modules that have it."""
-        modules = await self._ask("record", what="list")
-        kept = [one for each in modules for one in each.get("kept", ()) if one["id"] == recording]
-        if not kept:
-            why = "".join(f"; {each['module']}: {each['problem']}" for each in modules if each.get("problem"))
-            raise RmpaError(f"no linked module has a recording {recording}{why}", code="unknown-name")
-        return sum(one.get("size", 0) for one in kept)
-
-    async def _run(self, making: _Making, doing: str, grows: Path, *words: str, total: int = 0) -> None:
-        """Run a command to its end, its answer into a file; tell how many bytes of ``total`` a folder has."""
+    async def _run(self, making: _Making, doing: str, grows: Path, *words: str) -> None:
+        """Run a command to its end, its answer into a file; tell how many bytes a folder has."""
         result, size = grows.with_name("result"), 0
         with result.open("wb") as file:
             command = self._command(*words, "--json")
             child = await asyncio.create_subprocess_exec(*command, stdin=subprocess.DEVNULL, stdout=file)
         try:
             with contextlib.suppress(ProcessLookupError):
-                os.setpriority(os.PRIO_PROCESS, child.pid, limits.RECORDING_NICE)
+                os.setpriority(os.PRIO_PROCESS, child.pid, _NICENESS)
             while child.returncode is None:
-                making.tell(doing=doing, size=size, total=total)
+                making.told = {"doing": doing, "size": size}
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(child.wait(), limits.RECORDING_LOOK)
                 size = await asyncio.to_thread(_check_room, result.parents[1], grows)
@@ -283,8 +248,8 @@ def _check_room(root: Path, grows: Path) -> int:
     size = own = 0
     for path in root.rglob("*"):
         with contextlib.suppress(OSError):  # it is gone
-            size += path.stat().st_size
-            own += path.stat().st_size if grows in path.parents else 0
+            size += (each := path.stat().st_size)
+            own += each * (grows in path.parents)
     if size > limits.RECORDING_BYTES:
         text = f"its files have more than {limits.RECORDING_BYTES >> 30} GiB; in a terminal: rmpa record fetch"
         raise RmpaError(text, code="limit-reached")
@@ -296,7 +261,7 @@ async def _send(request: web.Request, response: web.StreamResponse, path: Path) 
         response.content_length = os.fstat(file.fileno()).st_size
         response.headers["Content-Disposition"] = f'attachment; filename="{path.name}"'
         await response.prepare(request)
-        while data := await asyncio.to_thread(file.read, limits.RECORDING_CHUNK):
+        while data := await asyncio.to_thread(file.read, _CHUNK):
             await _write(response, data)
 
 

@@ -25,9 +25,8 @@ const runs = ({ pid, problem }, silent) =>
     ? { state: "WARN", word: "not known" }
     : { state: problem ? "ERROR" : pid ? "up" : "away", word: pid ? "runs" : "none" };
 const RECORDINGS = [
-  ["Recording", (one) => html`<${Link} page="recording" name=${one.name} />`, (one) => one.name],
+  ["Recording", (one) => under(html`<${Link} page="recording" name=${one.name} />`, one.why), (one) => one.name],
   ["When", (one) => clock(one.until / BILLION), (one) => one.until],
-  ["^Why", (one) => one.why, (one) => one.why],
   [
     "Modules",
     (one) => one.modules.map((name, at) => [at > 0 && ", ", html`<${ModuleLink} key=${name} name=${name} />`]),
@@ -78,30 +77,54 @@ const Problems = ({ list = [] }) =>
 
 function Keep({ connection }) {
   const [why, setWhy] = useState("");
-  const [state, ask] = useAsk(connection, (answer) => ({ told: Object.entries(answer) }));
+  const [{ told, waits, failure }, ask] = useAsk(
+    connection,
+    (answer) => (setWhy(""), { told: Object.entries(answer) }),
+  );
   const submit = (event) => {
     event.preventDefault();
-    ask("keep_recording", { why }).then(() => setWhy(""));
+    ask("keep_recording", { why });
   };
-  const failed = state.told?.filter(([, problem]) => problem);
+  const failed = told?.filter(([, problem]) => problem);
   return html`<form class="row" onSubmit=${submit}>
-    <${Text} label="What happened" value=${why} maxlength="200" onInput=${setWhy} /><button disabled=${state.waits}>
+    <${Text} label="What happened" value=${why} maxlength="200" onInput=${setWhy} /><button disabled=${waits}>
       Keep the last minutes
     </button>
-    <p class="said" role="status">
-      ${state.told && `${state.told.length - failed.length} of ${state.told.length} modules keep it.`}
-    </p>
-    <${Problems} list=${failed} />
-    <${Failure} failure=${state.failure} />
+    <p class="said" role="status">${told && `${told.length - failed.length} of ${told.length} modules keep it.`}</p>
+    <${Problems} list=${failed} /><${Failure} failure=${failure} />
   </form>`;
 }
 
-const address = (name, kind) => new URL(`recording/${encodeURIComponent(name)}.${kind}`, document.baseURI);
-const KINDS = [
-  ["mcap", "Download .mcap"],
-  ["bag", "Download .bag"],
-  ["html", "Story as HTML"],
-];
+// Has a file made: how far it is (`doing`, `size`), why it is not there (`failure`), or what `take` makes of its
+// address; and the function that begins. The server ends it when the page does.
+function useMade(name, kind, take) {
+  const [state, set] = useState({});
+  const ended = useRef(new AbortController());
+  useEffect(() => () => ended.current.abort(), []);
+  const make = async () => {
+    const { signal } = ended.current;
+    const url = new URL(`recording/${encodeURIComponent(name)}.${kind}`, document.baseURI);
+    try {
+      const response = await fetch(`${url}?progress`, { signal });
+      if (!response.ok) throw { error: (await response.json()).detail };
+      const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
+      for (let rest = "", told = {}; !told.ready; ) {
+        const { value, done } = await reader.read();
+        if (done) throw new Error("it has ended");
+        const lines = (rest + value).split("\n");
+        rest = lines.pop();
+        for (const line of lines) set((told = JSON.parse(line)));
+        if (told.error) throw told;
+      }
+      set(await take(url));
+    } catch (error) {
+      if (signal.aborted) return;
+      set({ failure: error.error ? error : { error: `rmpa web does not answer: ${error.message}` } });
+    }
+  };
+  return [state, make];
+}
+
 const DOING = {
   wait: "Waiting for another recording",
   fetch: "Fetching from the modules",
@@ -109,89 +132,42 @@ const DOING = {
   bag: "Writing the bag",
   story: "Reading what happened",
 };
-
-// Has a file made; `show` gets how far it is. The server ends it when the page does.
-async function made(name, kind, show, signal) {
-  const url = address(name, kind);
-  url.search = "progress";
-  const response = await fetch(url, { signal });
-  if (!response.ok) throw { error: (await response.json()).detail };
-  const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
-  for (let rest = "", told = {}; ; ) {
-    const { value, done } = await reader.read();
-    const lines = (rest + (value ?? "")).split("\n");
-    rest = lines.pop();
-    for (const line of lines) show((told = JSON.parse(line)));
-    if (told.error) throw told;
-    if (told.ready) return;
-    if (done) throw { error: "rmpa web has ended before the file was made; try again" };
-  }
-}
-
-function Progress({ doing, size, total }) {
-  if (!doing) return null;
-  const share = total ? Math.min(1, size / total) : undefined;
-  return html`<p role="status">
-    ${DOING[doing]} … ${total > 0 && `${bytes(size)} of ${bytes(total)}`}<br />
-    <progress aria-label=${DOING[doing]} value=${share} />
+const Progress = ({ doing, size, total }) =>
+  doing &&
+  html`<p role="status">
+    ${DOING[doing]} … ${size > 0 && total && `${bytes(size)} of ${bytes(total)}`}<br />
+    <progress aria-label=${DOING[doing]} value=${total && size ? Math.min(1, size / total) : undefined} />
   </p>`;
-}
 
-const wrong = (error) => (error.error ? error : { error: `rmpa web does not answer: ${error.message}` });
-
-function Download({ name, kind, label }) {
-  const [state, set] = useState({});
-  const ended = useRef(new AbortController());
-  useEffect(() => () => ended.current.abort(), []);
-  const press = async () => {
-    try {
-      await made(name, kind, set, ended.current.signal);
-      const link = Object.assign(document.createElement("a"), { href: address(name, kind), download: "" });
-      link.click();
-      set({});
-    } catch (error) {
-      set({ failure: wrong(error) });
-    }
-  };
-  return html`<button type="button" disabled=${Boolean(state.doing)} onClick=${press}>${label}</button
+function Download({ name, kind }) {
+  const [state, make] = useMade(name, kind, (url) => {
+    Object.assign(document.createElement("a"), { href: url, download: "" }).click();
+    return {};
+  });
+  return html`<button type="button" disabled=${Boolean(state.doing)} onClick=${make}>Download .${kind}</button
     ><${Progress} ...${state} /><${Failure} failure=${state.failure} />`;
 }
 
 export function RecordingPage({ name, state, connection }) {
-  const [told, set] = useState({ doing: "wait" });
-  const [tries, again] = useState(0);
+  const [told, make] = useMade(name, "json", async (url) => ({ story: await (await fetch(url)).json() }));
   const [sure, setSure] = useState(false);
-  const [removed, ask] = useAsk(connection, (answer) => ({ problems: Object.entries(answer) }));
+  const [{ problems, failure }, ask] = useAsk(connection, (answer) => ({ problems: Object.entries(answer) }));
   const about = gathered(useRecordings(connection).told || []).find((one) => one.name === name);
-  useEffect(() => {
-    const ended = new AbortController();
-    set({ doing: "wait" });
-    made(name, "json", set, ended.signal)
-      .then(() => fetch(address(name, "json"), { signal: ended.signal }))
-      .then((response) => response.json())
-      .then(
-        (story) => set({ story }),
-        (error) => ended.signal.aborted || set({ failure: wrong(error) }),
-      );
-    return () => ended.abort();
-  }, [name, tries]);
+  useEffect(() => void make(), []);
   const remove = () => (sure ? ask("remove_recording", { name }).then(() => setSure(false)) : setSure(true));
-  const gone = removed.problems?.length === 0;
+  const gone = problems?.length === 0;
   return html`<${Page}
     title=${name}
     kind=${about ? `${about.why} · ${about.modules.join(", ")} · ${bytes(about.size)}` : "Recording"}
     aside=${html`${told.story &&
-    KINDS.map(([kind, label]) => html`<${Download} key=${kind} ...${{ name, kind, label }} />`)}
+    ["mcap", "bag", "html"].map((kind) => html`<${Download} key=${kind} ...${{ name, kind }} />`)}
     ${connection.may("control") &&
     !gone &&
     html`<button type="button" onClick=${remove}>${sure ? "Yes, remove it everywhere" : "Remove"}</button>`}`}
-    ><${Failure} failure=${removed.failure} /><${Problems} list=${removed.problems} />
+    ><${Failure} failure=${failure} /><${Problems} list=${problems} />
     ${gone && html`<p role="status">It is removed. <a href=${href("recordings")}>All recordings</a></p>`}
-    <${Progress} ...${told} />
-    ${told.failure &&
-    html`<${Failure} failure=${told.failure} /><button type="button" onClick=${() => again(tries + 1)}>
-        Try again
-      </button>`}
+    <${Progress} ...${told} total=${about?.size} /><${Failure} failure=${told.failure} /> ${told.failure &&
+    html`<button type="button" onClick=${make}>Try again</button>`}
     ${told.story && html`<${Story} story=${told.story} topics=${section(state, "topics")} />`}<//
   >`;
 }
@@ -203,9 +179,11 @@ const WIDE = 1000; // units of a drawing
 const time = (at) => `${clock(at / BILLION)}.${String(Math.floor((at / 1e6) % 1000)).padStart(3, "0")}`;
 const LINES = [
   ["Time", (line, { begin }) => under(time(line.at), `+${((line.at - begin) / BILLION).toFixed(1)}\u2009s`)],
+  [
+    "What happened",
+    (line) => html`<${Mark} state=${LEVELS[line.level]} word=${line.kind.replaceAll("_", " ")} /><br />${line.text}`,
+  ],
   ["Module", (line) => (line.module ? html`<${ModuleLink} name=${line.module} />` : "–")],
-  ["Kind", (line) => html`<${Mark} state=${LEVELS[line.level]} word=${line.kind.replaceAll("_", " ")} />`],
-  ["^What happened", (line) => line.text],
   [
     "Seen in",
     ({ evidence }, { known }) =>
@@ -237,9 +215,9 @@ function Story({ story, topics }) {
 
 // A row for each module with a tick for each line: the worse, the longer. A press picks the nearest one.
 function Drawing({ story: { begin, end, modules, lines }, picked, pick }) {
-  const rows = lines.every((line) => modules.includes(line.module)) ? modules : [...modules, ""];
+  const rows = modules.length ? modules : [""];
   const x = (line) => ((line.at - begin) / (end - begin || 1)) * WIDE;
-  const row = (line) => rows.indexOf(modules.includes(line.module) ? line.module : "");
+  const row = (line) => Math.max(0, rows.indexOf(line.module));
   const point = (event) => {
     const box = event.currentTarget.getBoundingClientRect();
     const across = ((event.clientX - box.left) / box.width) * WIDE;
