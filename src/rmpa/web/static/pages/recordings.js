@@ -18,7 +18,6 @@ const RECORDERS = [
   ],
   ["#Goes back", ({ status }) => duration(status.ring?.[1])],
   ["#Ring", ({ status }) => bytes(status.ring?.[0])],
-  ["#Written", ({ status }) => bytes(status.written)],
 ];
 const runs = ({ pid, problem }, silent) =>
   silent
@@ -45,15 +44,8 @@ function gathered(told) {
   return [...found.values()].sort((a, b) => b.until - a.until);
 }
 
-function useRecordings(connection) {
-  const answer = useAnswer(connection, "recordings", {}, PERIOD);
-  const last = useRef();
-  last.current = answer.value ?? last.current;
-  return { told: last.current, failure: answer.failure };
-}
-
 export function Recordings({ connection }) {
-  const { told, failure } = useRecordings(connection);
+  const { last: told, failure } = useAnswer(connection, "recordings", {}, PERIOD);
   const list = gathered(told || []);
   return html`<${Page} title="Recordings" kind=${`${list.length} in all modules`}
     ><${Failure} failure=${failure} />
@@ -95,6 +87,12 @@ function Keep({ connection }) {
   </form>`;
 }
 
+async function got(url, how) {
+  const response = await fetch(url, how);
+  if (!response.ok) throw { error: (await response.json()).detail };
+  return response;
+}
+
 // Has a file made: how far it is (`doing`, `size`), why it is not there (`failure`), or what `take` makes of its
 // address; and the function that begins. The server ends it when the page does.
 function useMade(name, kind, take) {
@@ -105,9 +103,7 @@ function useMade(name, kind, take) {
     const { signal } = ended.current;
     const url = new URL(`recording/${encodeURIComponent(name)}.${kind}`, document.baseURI);
     try {
-      const response = await fetch(`${url}?progress`, { signal });
-      if (!response.ok) throw { error: (await response.json()).detail };
-      const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
+      const reader = (await got(`${url}?progress`, { signal })).body.pipeThrough(new TextDecoderStream()).getReader();
       for (let rest = "", told = {}; !told.ready; ) {
         const { value, done } = await reader.read();
         if (done) throw new Error("it has ended");
@@ -149,10 +145,11 @@ function Download({ name, kind }) {
 }
 
 export function RecordingPage({ name, state, connection }) {
-  const [told, make] = useMade(name, "json", async (url) => ({ story: await (await fetch(url)).json() }));
+  const [told, make] = useMade(name, "json", async (url) => ({ story: await (await got(url)).json() }));
   const [sure, setSure] = useState(false);
   const [{ problems, failure }, ask] = useAsk(connection, (answer) => ({ problems: Object.entries(answer) }));
-  const about = gathered(useRecordings(connection).told || []).find((one) => one.name === name);
+  const { last } = useAnswer(connection, "recordings", {}, PERIOD);
+  const about = gathered(last || []).find((one) => one.name === name);
   useEffect(() => void make(), []);
   const remove = () => (sure ? ask("remove_recording", { name }).then(() => setSure(false)) : setSure(true));
   const gone = problems?.length === 0;
