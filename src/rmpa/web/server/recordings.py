@@ -138,8 +138,9 @@ class RecordingFiles:
             if not making.users:
                 del self._makings[name]
                 await end_tasks(making.task)
-                self._idle.cancel()
-                self._idle.start(self.clear(limits.RECORDINGS_KEPT), "remove files of recordings")
+                if not self._makings:
+                    self._idle.cancel()
+                    self._idle.start(self.clear(limits.RECORDINGS_KEPT), "remove files of recordings")
         return response
 
     async def _follow(
