@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 import msgspec
 
-from rmpa.bridge.kept import Kept
 from rmpa.bridge.recordings import FilePart, ModuleRecordings
 from rmpa.cli.completion import completes, topics
 from rmpa.cli.main import LazyGroup
@@ -36,10 +35,12 @@ from rmpa.cli.options import (
 )
 from rmpa.cli.output import Table, begin_log, print_text, printable, size
 from rmpa.core.errors import ConfigError, RmpaError, StartError
+from rmpa.observe.operations import remove_recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from rmpa.bridge.kept import Kept
     from rmpa.cli.module import Module
     from rmpa.observe.control_client import ControlClient
     from rmpa.record.merge import MergeResult
@@ -193,6 +194,8 @@ def _write(paths: list[Path], output: Path, reference: str = "") -> MergeResult:
             write_bag(read_in_order([whole]), output)
         else:
             whole.replace(output)
+    except OSError as error:
+        raise _unwritten(output, error) from None
     finally:
         whole.unlink(missing_ok=True)
     return result
@@ -371,7 +374,6 @@ def _fetch(client: ControlClient, recording: str, folder: Path) -> dict[str, int
     fetched: dict[str, int] = {}
     for module, kept in parts:
         place = folder / module
-        place.mkdir(parents=True, exist_ok=True)
         for name in kept.files:
             for count in _fetch_file(client, module, recording, name, place / name):
                 done += count
@@ -387,15 +389,23 @@ def _fetch_file(client: ControlClient, module: str, recording: str, name: str, p
     """Append what is missing of a file; yields the bytes of each part."""
     if "/" in name or name.startswith("."):
         raise RmpaError(f"{module} names a file {printable(name)}", code="protocol-error")
-    with path.open("ab") as file:
-        while True:
-            offset = file.tell()
-            part = client.call("record", FilePart, what="read", module=module, id=recording, file=name, offset=offset)
-            data = base64.b64decode(part.data)
-            file.write(data)
-            yield len(data)
-            if not data or file.tell() >= part.size:
-                return
+    asked = {"what": "read", "module": module, "id": recording, "file": name}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab") as file:
+            while True:
+                part = client.call("record", FilePart, **asked, offset=file.tell())
+                data = base64.b64decode(part.data)
+                file.write(data)
+                yield len(data)
+                if not data or file.tell() >= part.size:
+                    return
+    except OSError as error:
+        raise _unwritten(path, error) from None
+
+
+def _unwritten(path: Path, error: OSError) -> RmpaError:
+    return RmpaError(f"{path} cannot be written: {error.strerror}; is the disk full?", code="directory-unusable")
 
 
 @json_verb(
@@ -444,17 +454,10 @@ def record_rm(recording: str, module: str, options: Options) -> int:
     Examples:
       rmpa record rm 20261129-121500-arm-alarm
     """
-    removed, problems = [], []
     with options.client(60.0) as client:
-        holders = [each.module for each in _all(client) if any(kept.id == recording for kept in each.kept)]
-        for name in holders if not module else [module]:
-            try:
-                client.call("record", Kept, what="remove", module=name, id=recording)
-                removed.append(name)
-            except RmpaError as error:
-                problems.append((name, str(error)))
+        removed, problems = remove_recording(client, recording, module)
     if not removed and not problems:
         raise RmpaError(f"no module has a recording {recording}; `rmpa record list` shows them", code="unknown-name")
-    rows = [*((name, "removed") for name in removed), *problems]
-    options.show({"removed": removed, "problems": dict(problems)}, Table("MODULE, STATE", rows))
+    rows = [*((name, "removed") for name in removed), *problems.items()]
+    options.show({"removed": removed, "problems": problems}, Table("MODULE, STATE", rows))
     return int(bool(problems))

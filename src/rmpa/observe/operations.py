@@ -11,10 +11,12 @@ import msgspec
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge import nodes as node_requests
+from rmpa.bridge.kept import Kept
 from rmpa.bridge.launched import ModuleResources
 from rmpa.bridge.log import LEVEL
 from rmpa.bridge.log_ring import ModuleLog
 from rmpa.bridge.params import transfer
+from rmpa.bridge.recordings import ModuleRecordings
 from rmpa.bridge.topics.rates import RATES
 from rmpa.config.rules import ROS2
 from rmpa.config.values import suggestion
@@ -380,3 +382,17 @@ class Ros2Params:
         asked = {"site": ROS2, "node": self.node, **args}
         text = _passed_on(self.client, "site", str, what=PARAM, args=asked)
         return json.loads(text) if text else None
+
+
+def remove_recording(client: ControlClient, recording: str, module: str = "") -> tuple[list[str], dict[str, str]]:
+    """Remove a recording at all linked modules that have it, or at one; return where, and by module why it is not."""
+    removed, problems = list[str](), dict[str, str]()
+    found = client.call("record", tuple[ModuleRecordings, ...], what="list")
+    holders = [each.module for each in found if any(kept.id == recording for kept in each.kept)]
+    for name in holders if not module else [module]:
+        try:
+            client.call("record", Kept, what="remove", module=name, id=recording)
+            removed.append(name)
+        except RmpaError as error:
+            problems[name] = str(error)
+    return removed, problems

@@ -54,8 +54,9 @@ _TITLES: Final = {
     405: "Method not allowed",
     413: "Too large",
     415: "Not an image",
-    429: "Too many streams",
+    429: "Too many at one time",
     500: "Internal error",
+    502: "Not made",
     503: "The agent does not answer",
     504: "No picture",
 }

@@ -211,3 +211,26 @@ PICTURE_WAIT: Final = 5.0
 ENCODERS: Final = 2
 # Bytes that the kernel holds of a stream beyond those on their way: the next picture is chosen late.
 STREAM_UNSENT: Final = 64 * KIB
+# [Web] Files of recordings that clients want at one time
+# At it: further ones get 429
+# Told in: the response
+RECORDINGS_WAITING: Final = 8
+# [Web] Time to make a file of a recording
+# At it: it is not made
+# Told in: the page
+RECORDING_TIME: Final = 900.0
+# [Web] Bytes of all files of recordings that are made for clients
+# At it: the present one is not made
+# Told in: the page
+# Why: Of some modules, whose rings have half a gigabyte, once in parts and once merged.
+RECORDING_BYTES: Final = 4096 * MIB
+# [Web] Bytes of the disk that such files leave free
+# At it: the present one is not made
+# Told in: the page
+# Why: The recorder of this module needs the disk more.
+RECORDING_FREE: Final = 256 * MIB
+# Recordings whose files are kept, and for how long after the last use of any.
+RECORDINGS_CACHED: Final = 3
+RECORDINGS_KEPT: Final = 600.0
+# Seconds between two looks at a process that makes such a file.
+RECORDING_LOOK: Final = 0.3

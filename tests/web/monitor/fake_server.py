@@ -49,6 +49,7 @@ from rmpa.web.monitor.state import StateBuilder, details, node_detail, node_key
 from rmpa.web.monitor.sticks import Sticks
 from rmpa.web.server.app import HEADERS
 from tests.web.monitor import wrapped
+from tests.web.monitor.recorded import Recordings
 from tests.web.monitor.test_sticks import Bus
 from tests.web.recorder import FakeHub, PageConnection, Recorded
 
@@ -283,6 +284,7 @@ class FakeServer:
         reports: Any = self.reports_of_nodes
         self._diagnostics = DiagnosticsFeed(reports, reports, lambda: None)
         self._reported = 0.0
+        self.recordings = Recordings()
         # Where the files of resources are, while it is served.
         self.folder = Path()
 
@@ -293,6 +295,7 @@ class FakeServer:
         app.router.add_get("/", self._index)
         app.router.add_post("/csp", self._report)
         app.router.add_static("/static", STATIC)
+        self.recordings.add_to(app)
         app.on_response_prepare.append(self._headers)
         app.cleanup_ctx.append(self._files)
         return app
@@ -384,6 +387,8 @@ class FakeServer:
         """
         self.asked.append(SimpleNamespace(what=what, args=args))
         try:
+            if what.endswith(("recording", "recordings")):
+                return self.recordings.answer(what, args)
             return self._answers[what] if what in self._answers else getattr(self, f"_answer_{what}")(args)
         except (AttributeError, LookupError):
             raise RmpaError(f"this server cannot answer {what}") from None

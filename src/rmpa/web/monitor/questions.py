@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
 import msgspec
 
+from rmpa.bridge.kept import recording_id
 from rmpa.bridge.nodes import NODE_INFO
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.identity import is_global_name, is_own, proxied_node, proxied_peer
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.control_client import ControlClient, choose_agent
-from rmpa.observe.operations import PeerParams, parameters_in
+from rmpa.observe.operations import PeerParams, parameters_in, remove_recording
 from rmpa.observe.snapshot import ModuleFacts
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.descriptor import SERVICE_TYPE
@@ -50,7 +51,8 @@ Args: TypeAlias = dict[str, Any]  # the edge: each question has its own
 QUESTIONS: Final = {
     **dict.fromkeys(("why", "agent", "contract", "node", "describe", "message", "past", "graph", "types"), ""),
     **dict.fromkeys(("driven", "log", "log_levels", "launches", "top"), ""),
-    **dict.fromkeys(("params", "param_names"), "view"),
+    **dict.fromkeys(("params", "param_names", "recordings"), "view"),
+    **dict.fromkeys(("keep_recording", "remove_recording"), "control"),
     **dict.fromkeys(
         ("set_param", "delete_param", "set_log_level", "invite", "call", "profile", "context", "configure"), "control"
     ),
@@ -222,6 +224,28 @@ class Answers:
         if found["problem"]:
             raise RmpaError(f"{found['module']}: {found['problem']}", code=found["code"])
         return found
+
+    async def _recordings(self, _args: Args) -> Any:
+        """What each module has kept, as far as the rules let a page see it, and what its recorder does."""
+        found = await self.ask_agent("record", what="list")
+        for module in found:
+            kept = module.get("kept", ())
+            module["kept"] = [each for each in kept if not self._denied(Access.RECORD, f"/{each['id']}")]
+            for key in ("messages", "size", "left_out"):  # of each topic
+                module.get("status", {}).pop(key, None)
+        return found
+
+    async def _keep_recording(self, args: Args) -> Any:
+        """Keep what the rings of all modules have; why each that cannot does not."""
+        why = _text(args, "why")[: limits.LOG_CHARACTERS]
+        self._hub.link.rules.check(Access.RECORD, f"/{recording_id(why, self._agent_name(), time.time_ns())}")
+        return await self.ask_agent("record", what="keep", why=why)
+
+    async def _remove_recording(self, args: Args) -> Any:
+        name = _text(args, "name")
+        self._hub.link.rules.check(Access.RECORD, f"/{name}")
+        _, problems = await self._in_thread(lambda client: remove_recording(client, name))
+        return problems
 
     async def _of_file(self, args: Args, do: Callable[..., Any], *keys: str) -> Any:
         file = _text(args, "file")

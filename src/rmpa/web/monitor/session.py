@@ -45,7 +45,7 @@ Tilt: TypeAlias = Annotated[float, Meta(ge=-1, le=1)]
 # What a page may have, as ``hello`` lists it.
 RIGHTS: Final = ("view", "control", "drive")
 _NO_TOKEN: Final = (
-    "this page may not read parameters",
+    "this page may not read parameters and recordings",
     "open it with a token: rmpa web --token-file FILE, or --control",
 )
 _NO_DRIVE: Final = "this page may not drive", "start rmpa web with --drive"

@@ -7,6 +7,7 @@ upgrades included, before its handler runs.
 from __future__ import annotations
 
 import asyncio
+import functools
 import html
 import itertools
 import logging
@@ -33,6 +34,7 @@ from rmpa.web.server.access import (
     host_name,
     is_loopback,
 )
+from rmpa.web.server.recordings import ROUTE
 from rmpa.web.server.video import PICTURES, VIEWER
 
 if TYPE_CHECKING:
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
 
     from rmpa.web.clients.clients import WebSocketClients
     from rmpa.web.server.agent_watch import AgentWatch
+    from rmpa.web.server.recordings import RecordingFiles
     from rmpa.web.server.video import VideoStreams
 
 _log = logging.getLogger(__name__)
@@ -124,6 +127,7 @@ class WebServer:
         ports: Further ports to listen at.
         tls: Serves HTTPS with its certificate; ``None``: HTTP.
         video: Serves pictures; ``None``: there are none.
+        recordings: Serves files of recordings, likewise.
     """
 
     # More than twelve fields: a route uses most of what holds for all of them.
@@ -136,6 +140,7 @@ class WebServer:
         ports: Sequence[int] = (),
         tls: ssl.SSLContext | None = None,
         video: VideoStreams | None = None,
+        recordings: RecordingFiles | None = None,
     ) -> None:
         self._watch = watch
         self._policy = policy
@@ -143,6 +148,7 @@ class WebServer:
         self._clients = sockets
         self._tls = tls
         self._video = video
+        self._recordings = recordings
         # Refusals, by reason; those of connections too.
         self.counters = Counters()
         self._refusals = RefusalLog(_log, self.counters)
@@ -171,7 +177,10 @@ class WebServer:
         if self._video is not None:
             app.router.add_get(VIEWER, self._video.page)
             for path in PICTURES:
-                app.router.add_get(path, self._pictures)
+                app.router.add_get(path, functools.partial(self._streamed, self._video))
+        if self._recordings is not None:
+            handler = functools.partial(self._streamed, self._recordings)
+            app.router.add_get(ROUTE, handler, allow_head=False)
         self._runner = runner = web.AppRunner(
             app,
             access_log_class=self._access_logger(),
@@ -220,10 +229,14 @@ class WebServer:
             await self._clients.close()
         if self._video is not None:
             self._video.close()
+        if self._recordings is not None:
+            await self._recordings.end()
         if self._runner is not None:
             await self._runner.cleanup()
         if self._table is not None:
             self._table.abort_all()
+        if self._recordings is not None:
+            await self._recordings.close()
         await self._watch.close()
 
     @web.middleware
@@ -344,9 +357,9 @@ class WebServer:
             return _response(api.problem(503, "the agent does not answer"))
         return web.Response(text="ok\n")
 
-    async def _pictures(self, request: web.Request) -> web.StreamResponse:
-        assert self._video is not None, "its routes are there"  # noqa: S101 - for the type checker
-        return await self._video.respond(request, _connection(request), lambda made: self._dress(request, made))
+    async def _streamed(self, source: VideoStreams | RecordingFiles, request: web.Request) -> web.StreamResponse:
+        made = await source.respond(request, _connection(request), functools.partial(self._dress, request))
+        return _response(made) if isinstance(made, api.RestResponse) else made
 
     async def _api(self, request: web.Request) -> web.Response:
         reading = await self._watch.reading(whole=True)

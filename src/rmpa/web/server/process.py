@@ -31,6 +31,7 @@ from rmpa.web.monitor.monitor import Monitor
 from rmpa.web.server.access import TOKEN_PARAMETER, AccessPolicy, is_loopback, own_names, token_from
 from rmpa.web.server.agent_watch import AgentFollower, AgentWatch, ControlReader
 from rmpa.web.server.app import WebServer
+from rmpa.web.server.recordings import RecordingFiles
 from rmpa.web.server.video import VideoStreams
 
 if TYPE_CHECKING:
@@ -353,10 +354,15 @@ async def serve(
     sockets = WebSocketClients(hub, name, setup.rights, priority, monitor, other_protocols())
     certificate = ServerCertificate(setup.files)
     video = VideoStreams(hub)
-    server = WebServer(watch, setup.policy, web.listen, sockets, web.ports, certificate.context, video)
+    place = state_dir(os.environ, setup.settings.state_dir or None)
+    files = module_dir(place, setup.module) / f"web-{web.port}" if place is not None else None
+    view, name_of = setup.rights.view, lambda: agent or monitor.mesh.agent
+    recordings = RecordingFiles(setup.rules, files, name_of, view=view)
+    server = WebServer(watch, setup.policy, web.listen, sockets, web.ports, certificate.context, video, recordings)
     try:
         async with hub:
             await server.start()
+            await recordings.clear()
             certificate.start()
             monitor.start()
             follower.start(hub.graph)

@@ -29,6 +29,7 @@ const PLACES = {
   alarms: ["Alarms", "a", "alarms.js", "Alarms"],
   diagnostics: ["Diagnostics", "i", "diagnostics.js", "Diagnostics"],
   log: ["Log", "l", "log.js", "Log"],
+  recordings: ["Recordings", "e", "recordings.js", "Recordings"],
   drive: ["Drive", "d", "drive.js", "DrivePage"],
   module: ["", "", "module.js", "ModulePage"],
   topic: ["", "", "topics.js", "TopicPage"],
@@ -36,12 +37,13 @@ const PLACES = {
   node: ["", "", "nodes.js", "NodePage"],
   resource: ["", "", "resources.js", "ResourcePage"],
   file: ["", "", "description.js", "DescriptionPage"],
+  recording: ["", "", "recordings.js", "RecordingPage"],
 };
 const PAGES = Object.entries(PLACES).flatMap(([page, [title, key]]) => (title ? [[page, title, key]] : []));
 const LAZY = Object.fromEntries(Object.entries(PLACES).map(([page, [, , ...where]]) => [page, where]));
 const LISTED = { topic: "topics", service: "services", node: "nodes", resource: "resources", module: "" };
 // Pages that are a part of another one.
-const WITHIN = { file: "resources" };
+const WITHIN = { file: "resources", recording: "recordings" };
 // What pages without a name look at.
 const LISTS = { diagnostics: [["diagnostics", ""]], panels: [["diagnostics", ""]], topics: [["rates", ""]] };
 // Pages on which a name chooses a part: what was filtered and opened there stays.

@@ -110,13 +110,14 @@ export function useAgain(on, period, key, ask) {
   }, [on, key]);
 }
 
-// The answer to a question, asked again every `period` seconds. Another `key` asks anew.
+// The answer to a question, asked again every `period` seconds; `last` is the last one if there is none now. Another
+// `key` asks anew.
 export function useAnswer(connection, what, args, period = 0, key = "") {
   const [state, set] = useState({});
   useAgain(connection.phase === "open", period, JSON.stringify([what, args, key]), (wanted) =>
     connection.ask(what, args).then(
-      (value) => wanted() && set({ value }),
-      (failure) => wanted() && set({ failure }),
+      (value) => wanted() && set({ value, last: value }),
+      (failure) => wanted() && set(({ last }) => ({ failure, last })),
     ),
   );
   return state;

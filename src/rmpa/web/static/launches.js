@@ -60,13 +60,12 @@ export function Launches({ state, connection, only, nodes }) {
   const [ordered, ask] = useAsk(connection);
   const [busy, setBusy] = useState("");
   const [log, setLog] = useState(null);
-  const told = useRef([]);
-  if (answer.value) told.current = answer.value;
-  const list = told.current
+  const { last: told = [] } = answer;
+  const list = told
     .flatMap(({ module, resources }) => resources.map((one) => ({ ...one, module, title: one.name })))
     .filter(({ module, file }) => !only || (module === only.module && file === only.file))
     .map((one) => ({ ...one, name: `${one.module}:${one.name}` }));
-  const problems = told.current.filter((each) => each.problem && !only);
+  const problems = told.filter((each) => each.problem && !only);
   const order = (what, one) => {
     if (what === "log") return setLog(one);
     setBusy(one.name);

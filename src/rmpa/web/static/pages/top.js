@@ -1,6 +1,6 @@
 // The processes of the nodes of all modules, the busiest first; asked for only while the page is open.
 
-import { html, useRef } from "../markup.js";
+import { html } from "../markup.js";
 import { bytes, percent } from "../format.js";
 import { Failure, Mark, Page, Panel, Since } from "../parts.js";
 import { Table, sorted, useFilter } from "../lists.js";
@@ -23,10 +23,8 @@ const COLUMNS = [
 export function Top({ state, connection }) {
   const own = section(state, "agent").name;
   const answer = useAnswer(connection, "top", {}, PERIOD);
-  const last = useRef({});
-  if (answer.value) last.current = answer.value;
   const filter = useFilter("node or module");
-  const told = Object.entries(last.current);
+  const told = Object.entries(answer.last || {});
   const all = told.flatMap(([module, processes]) =>
     Array.isArray(processes)
       ? processes.map((one) => ({ ...one, module, peer: module === own ? "" : module, name: `${module}:${one.node}` }))
