@@ -88,6 +88,7 @@ class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
         written: Bytes written to the disk.
         ring: Bytes of the ring, and how far it goes back, seconds.
         problem: Why nothing can be written; empty: all is well.
+        failed: What could not be kept, the latest by its name: why.
     """
 
     pid: int
@@ -99,6 +100,7 @@ class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
     written: int = 0
     ring: tuple[int, float] = (0, 0.0)
     problem: str = ""
+    failed: dict[str, str] = {}
 
 
 class Recorder:
@@ -121,6 +123,9 @@ class Recorder:
         self._node = Node("rmpa_record", master_uri=master_uri)
         self._module = ModuleRecord(name=agent)
         self._clocks: dict[str, str] = {}
+        # This machine's wall clock less the monotonic one when the other clocks were read, ns.
+        self._clocks_epoch = 0
+        self._failed: dict[str, str] = {}
         self._parameters = b""
         self._last: Snapshot | None = None
         self._kept_at: dict[str, float] = {}
@@ -168,12 +173,13 @@ class Recorder:
     def _begin(self, writer: SegmentWriter, now: int) -> None:
         """The beginning of a segment; called in the ring's thread."""
         writer.metadata(MODULE, msgspec.to_builtins(self._module))
-        if self._clocks:
+        if self._clocks and abs(_epoch() - self._clocks_epoch) < limits.CLOCK_STEP * _SECOND:  # else they are wrong
             writer.metadata(CLOCK, self._clocks)
         if self._parameters:
             writer.attachment("parameters.json", "application/json", self._parameters, now)
         for source, (first, raw) in list(self.capture.latched.items()):
-            writer.write(source, now, first, raw)
+            with contextlib.suppress(ValueError):  # it was counted as lost
+                writer.write(source, now, first, raw)
         if counts := {topic: n for topic, n in self._left_out_since().items() if n}:
             text = f"left out: {', '.join(f'{n} of {topic}' for topic, n in counts.items())}"
             event = Event("left_out", text, module=self._module.name, facts=dict(counts))
@@ -198,6 +204,7 @@ class Recorder:
                 self._module = ModuleRecord(
                     name=agent.name, guid=agent.guid, instance=agent.instance, host=agent.host, version=agent.version
                 )
+                self._clocks_epoch = _epoch()
                 self._clocks = {
                     peer.name: msgspec.json.encode(
                         ClockRecord(round(now.taken * 1e9), peer.link.clock_offset, peer.link.clock_error)
@@ -276,21 +283,27 @@ class Recorder:
             await asyncio.sleep(_REQUESTS)
 
     async def _kept(self, kept: Kept) -> None:
-        await asyncio.sleep(max(0.0, (kept.until - time.time_ns()) / _SECOND))
+        epoch = _epoch()  # from here on it does not matter whether the clock is set
+        since, until = ((at - epoch) / _SECOND for at in (kept.since, kept.until))
+        await asyncio.sleep(max(0.0, until - time.monotonic()))
         kept = msgspec.structs.replace(kept, module=self._module.name)
         try:
-            made = await asyncio.wrap_future(self.ring.call(self.ring.keep, kept))
-        except OSError as error:
-            _log.warning("! %s cannot be kept: %s [recording-stopped]", kept.id, error.strerror or error)
-            return
-        if made is None:
-            _log.warning("! %s: nothing of that time is here any more [recording-stopped]", kept.id)
-        else:
+            made = await asyncio.wrap_future(self.ring.call(self.ring.keep, kept, since, until))
+            why = "nothing of that time is here" + (f": {self.ring.problem}" if self.ring.problem else "")
+        except (OSError, RmpaError) as error:
+            made, why = None, f"{self._folder}: {getattr(error, 'strerror', None) or error}"
+        if made is not None:
             _log.info("= kept %s: %s, %.1f MB in %d files", made.id, made.why, made.size / _MB, len(made.files))
+            return
+        _log.warning("! %s is not kept: %s [recording-stopped]", kept.id, why)
+        self._failed[kept.id] = why
+        while len(self._failed) > limits.FAILED:
+            del self._failed[next(iter(self._failed))]
+        await asyncio.to_thread(self._write_status)
 
     def _write_status(self) -> None:
         segments = list(self.ring.segments)
-        back = (time.time_ns() - segments[0].first) / _SECOND if segments else 0.0
+        back = time.monotonic() - segments[0].began if segments else 0.0
         lost = dict(self.ring.lost)
         status = RecorderStatus(
             pid=os.getpid(),
@@ -302,12 +315,18 @@ class Recorder:
             written=self.ring.written,
             ring=(sum(one.size for one in segments), back),
             problem=self.ring.problem,
+            failed=dict(self._failed),
         )
         with contextlib.suppress(OSError):  # the disk is full: the log says so
             replace_file(self._folder / STATUS, msgspec.json.encode(status))
 
 
 _ARRAY: Final = MessageType(ARRAY_TYPE)
+
+
+def _epoch() -> int:
+    """The wall clock less the monotonic one, ns: it changes where the wall clock is set."""
+    return time.time_ns() - time.monotonic_ns()
 
 
 def _events(before: Snapshot | None, after: Snapshot) -> Iterator[Event]:

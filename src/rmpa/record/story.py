@@ -38,6 +38,7 @@ _LEVELS: Final = {
     "alarm": _WARN,
     "peer_lost": _BAD,
     "node_died": _BAD,
+    "clock_step": _WARN,
     "node_gone": _WARN,
     "contract": _WARN,
     "stop": _BAD,
