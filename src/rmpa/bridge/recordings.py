@@ -41,8 +41,8 @@ LIST: Final = "record.list"
 READ: Final = "record.read"
 REMOVE: Final = "record.remove"
 _SECOND: Final = 1_000_000_000
-# The name of what the recorder does, for permissions.
-_STATUS: Final = "/status"
+# For permissions: stands for all recordings, where a peer asks what the recorder does.
+_ANY: Final = "/*"
 _EARLIER: Final = "its agent is of an earlier release, which has no recordings; install this release there"
 
 
@@ -175,7 +175,7 @@ class Recordings(Part):
         gate, peer = self._bridge.context.gate, asker.link.name
         found = await asyncio.to_thread(self._here)
         kept = tuple(one for one in found.kept if not gate.why_not(Access.RECORD, peer, f"/{one.id}"))
-        why = gate.why_not(Access.RECORD, peer, _STATUS)  # it names the topics
+        why = gate.why_not(Access.RECORD, peer, _ANY)  # it names the topics
         if why and not kept:
             raise RmpaError(why, code="not-permitted")
         return msgspec.structs.replace(found, kept=kept, **({"status": {}, "problem": "", "code": ""} if why else {}))

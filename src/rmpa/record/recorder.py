@@ -66,6 +66,8 @@ _MB: Final = 1_000_000
 # Seconds between two looks for requests, and between two writings of the status.
 _REQUESTS: Final = 0.2
 _STATUS: Final = 5.0
+# So many seconds behind the end of what is to be kept the request for it comes at the most; what it notes belongs to it.
+_LATE: Final = 1.0
 # Seconds from one snapshot of the agent to the next, where its graph does not change.
 _PERIOD: Final = 5.0
 # Seconds between two readings of the parameters, and bytes of them that a segment repeats.
@@ -126,6 +128,8 @@ class Recorder:
         # This machine's wall clock less the monotonic one when the other clocks were read, ns.
         self._clocks_epoch = 0
         self._failed: dict[str, str] = {}
+        # By topic and name, what an alarm said last; empty: it is over.
+        self._alarms_said: dict[tuple[str, str], str] = {}
         self._parameters = b""
         self._last: Snapshot | None = None
         self._kept_at: dict[str, float] = {}
@@ -137,7 +141,8 @@ class Recorder:
             folder,
             self._begin,
             most_bytes=settings.megabytes * _MB,
-            most_seconds=settings.seconds or float("inf"),
+            # When what happened behind a reason is there, too, all of the time before it must still be.
+            most_seconds=(settings.seconds or float("inf")) + (settings.after or 0.0),
             fsync=settings.fsync,
             kept_bytes=settings.kept_megabytes * _MB,
         )
@@ -236,6 +241,10 @@ class Recorder:
         for status in _ARRAY.deserialize(raw).status:
             level = int(status.level)
             raised = level in (DiagnosticLevel.WARN, DiagnosticLevel.ERROR)
+            key, said = (source.topic, str(status.name)), str(status.message) if raised else ""
+            if self._alarms_said.get(key, "") == said:
+                continue  # some publish the state of their alarms all the time
+            self._alarms_said[key] = said
             facts: dict[str, Any] = {str(pair.key): str(pair.value) for pair in status.values}
             event = Event(ALARM if raised else "alarm_over", str(status.message), source.node, facts=facts)
             self.happened(self._judged(event))
@@ -284,11 +293,12 @@ class Recorder:
 
     async def _kept(self, kept: Kept) -> None:
         epoch = _epoch()  # from here on it does not matter whether the clock is set
+        self.happened(Event("kept", f"{kept.id}: {kept.why}", kept.asked_by))  # where nothing else happens, too
         since, until = ((at - epoch) / _SECOND for at in (kept.since, kept.until))
         await asyncio.sleep(max(0.0, until - time.monotonic()))
         kept = msgspec.structs.replace(kept, module=self._module.name)
         try:
-            made = await asyncio.wrap_future(self.ring.call(self.ring.keep, kept, since, until))
+            made = await asyncio.wrap_future(self.ring.call(self.ring.keep, kept, since, until + _LATE))
             why = "nothing of that time is here" + (f": {self.ring.problem}" if self.ring.problem else "")
         except (OSError, RmpaError) as error:
             made, why = None, f"{self._folder}: {getattr(error, 'strerror', None) or error}"
