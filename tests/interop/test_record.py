@@ -352,7 +352,7 @@ def test_a_member_needs_permission_to_have_recordings_kept_and_to_read_them(
         pytest.raises(RmpaError, match=refused),
     ):
         client.call("record", object, what="read", module="base", id=kept["id"], file=file, offset=0)
-    assert [one for one in recordings(base.agent).values() if "base" in one] == [["base", "joystick"]], "no more than before"
+    assert [one for one in recordings(base.agent).values() if "base" in one] == [["base", "joystick"]]
 
     (tmp_path / "base.toml").write_text(ALLOWED)
     assert base.agent.rmpa("reload")[0] == 0

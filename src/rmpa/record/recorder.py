@@ -66,7 +66,7 @@ _MB: Final = 1_000_000
 # Seconds between two looks for requests, and between two writings of the status.
 _REQUESTS: Final = 0.2
 _STATUS: Final = 5.0
-# So many seconds behind the end of what is to be kept the request for it comes at the most; what it notes belongs to it.
+# So many seconds behind the end of what is to be kept its request comes at the most; what it notes belongs to it.
 _LATE: Final = 1.0
 # Seconds from one snapshot of the agent to the next, where its graph does not change.
 _PERIOD: Final = 5.0
