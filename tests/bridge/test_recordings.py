@@ -15,7 +15,7 @@ import pytest
 
 from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.data.reception import LinkTime
-from rmpa.bridge.kept import KEPT, REQUESTS, Kept, take_requests, write_kept
+from rmpa.bridge.kept import KEPT, REQUESTS, Kept, end_request, read_requests, write_kept
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.bridge.recordings import KEEP, LIST, READ, REMOVE, Recordings
 from rmpa.config.peer_rules import PermissionRule
@@ -63,7 +63,13 @@ class World:
 
     async def requests(self) -> list[Kept]:
         """What the recorder is asked to keep."""
-        return await asyncio.to_thread(lambda: list(take_requests(self.folder)))
+        return await asyncio.to_thread(self._requests)
+
+    def _requests(self) -> list[Kept]:
+        found = list(read_requests(self.folder))
+        for one in found:
+            end_request(self.folder, one)
+        return found
 
     async def record(self, name: str, data: bytes = b"x" * 10) -> None:
         """Put a recording there."""
@@ -162,7 +168,12 @@ async def test_a_member_without_record_keeps_lists_reads_and_removes_nothing(tmp
     world = World(tmp_path, secured=True)
     await world.record("fall")
     kept = msgspec.to_builtins(Kept(id="other", since=0, until=1))
-    requests = (KEEP, {"kept": kept}), (READ, {"id": "fall", "file": "1.mcap"}), (REMOVE, {"id": "fall"}), (LIST, {})
+    requests: tuple[tuple[str, dict[str, Any]], ...] = (
+        (KEEP, {"kept": kept}),
+        (READ, {"id": "fall", "file": "1.mcap"}),
+        (REMOVE, {"id": "fall"}),
+        (LIST, {}),
+    )
     for what, args in requests:
         with pytest.raises(RmpaError, match="let base use the recording"):
             await world.ask(what, **args)

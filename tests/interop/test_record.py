@@ -18,6 +18,7 @@ import pytest
 from lab.bed.agents import Agent
 from lab.bed.namespaces import Lab
 from lab.bed.processes import eventually
+from rmpa.bridge.kept import Kept, request_keep
 from rmpa.core.errors import RmpaError
 from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.record.bag import read_any
@@ -178,6 +179,10 @@ def test_a_recorder_that_is_killed_has_lost_less_than_a_second(modules: ModuleFa
     talker = a.ros.rospy("talker", topic="/odom", rate=100, name="base")
     recorders(a.agent, "/odom")
     status = json.loads(a.agent.rmpa("record", "list", "--json")[1])[0]["status"]
+    now = time.time_ns()
+    asked = Kept(id="asked", why="just before the kill", since=now - 10 * 10**9, until=now + 4 * 10**9)
+    request_keep(folder_of(a), asked)
+    eventually(lambda: time.time_ns() > now + 10**9)  # it waits for the end of that time
     os.kill(status["pid"], signal.SIGKILL)
 
     def again() -> bool:
@@ -185,6 +190,7 @@ def test_a_recorder_that_is_killed_has_lost_less_than_a_second(modules: ModuleFa
         return bool(now) and now["pid"] != status["pid"] and now["messages"].get("/odom", 0) > 10
 
     eventually(again, LONG, what="another recorder")
+    eventually(lambda: "asked" in recordings(a.agent), LONG, what="what was asked of the one that was killed")
     path = tmp_path / "killed.mcap"
     keep(a, path)
     numbers = sequences(path, "/odom")

@@ -84,16 +84,26 @@ def request_keep(folder: Path, kept: Kept) -> None:
     replace_file(requests / f"{check_id(kept.id)}.json", msgspec.json.encode(kept))
 
 
-def take_requests(folder: Path) -> Iterator[Kept]:
-    """The requests to keep that wait in a folder; each is gone then."""
+def read_requests(folder: Path) -> Iterator[Kept]:
+    """The requests to keep that wait in a folder, until ``end_request``: what is killed meanwhile does them later."""
     for path in sorted((folder / REQUESTS).glob("*.json")):
         try:
             kept = msgspec.json.decode(path.read_bytes(), type=Kept)
         except (OSError, msgspec.DecodeError):
             kept = None
-        path.unlink(missing_ok=True)
         if kept is not None and kept.id == path.name.removesuffix(".json"):
             yield kept
+        else:
+            path.unlink(missing_ok=True)
+
+
+def end_request(folder: Path, kept: Kept) -> None:
+    """A request is done, or cannot be done.
+
+    Raises:
+        OSError: It cannot be removed.
+    """
+    (folder / REQUESTS / f"{kept.id}.json").unlink(missing_ok=True)
 
 
 def write_kept(folder: Path, kept: Kept, *, limit: int = 0) -> Kept:

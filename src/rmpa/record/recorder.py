@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.bridge.kept import KEPT, REQUESTS, Kept, recording_id, request_keep, take_requests
+from rmpa.bridge.kept import KEPT, REQUESTS, Kept, end_request, read_requests, recording_id, request_keep
 from rmpa.client import (
     AgentClient,
     AgentLost,
@@ -127,6 +127,7 @@ class Recorder:
         self._clocks: dict[str, str] = {}
         # This machine's wall clock less the monotonic one when the other clocks were read, ns.
         self._clocks_epoch = 0
+        self._keeping: set[str] = set()
         self._failed: dict[str, str] = {}
         # By topic and name, what an alarm said last; empty: it is over.
         self._alarms_said: dict[tuple[str, str], str] = {}
@@ -283,8 +284,10 @@ class Recorder:
         while True:
             changed = requests.stat().st_mtime_ns  # one call of the kernel: the folder is read when it has changed
             if changed != seen:
-                for kept in await asyncio.to_thread(lambda: list(take_requests(self._folder))):
-                    self._work.start(self._kept(kept), f"keep {kept.id}")
+                for kept in await asyncio.to_thread(lambda: list(read_requests(self._folder))):
+                    if kept.id not in self._keeping:
+                        self._keeping.add(kept.id)
+                        self._work.start(self._kept(kept), f"keep {kept.id}")
                 seen = changed
             if time.monotonic() - status >= _STATUS:
                 status = time.monotonic()
@@ -302,6 +305,9 @@ class Recorder:
             why = "nothing of that time is here" + (f": {self.ring.problem}" if self.ring.problem else "")
         except (OSError, RmpaError) as error:
             made, why = None, f"{self._folder}: {getattr(error, 'strerror', None) or error}"
+        with contextlib.suppress(OSError):
+            await asyncio.to_thread(end_request, self._folder, kept)
+            self._keeping.discard(kept.id)
         if made is not None:
             _log.info("= kept %s: %s, %.1f MB in %d files", made.id, made.why, made.size / _MB, len(made.files))
             return
