@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import os
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +15,7 @@ import pytest
 
 from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.data.reception import LinkTime
-from rmpa.bridge.kept import KEPT, REQUESTS, Kept, take_requests, write_kept
+from rmpa.bridge.kept import KEPT, REQUESTS, Kept, end_request, read_requests, write_kept
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.bridge.recordings import KEEP, LIST, READ, REMOVE, Recordings
 from rmpa.config.peer_rules import PermissionRule
@@ -61,7 +63,13 @@ class World:
 
     async def requests(self) -> list[Kept]:
         """What the recorder is asked to keep."""
-        return await asyncio.to_thread(lambda: list(take_requests(self.folder)))
+        return await asyncio.to_thread(self._requests)
+
+    def _requests(self) -> list[Kept]:
+        found = list(read_requests(self.folder))
+        for one in found:
+            end_request(self.folder, one)
+        return found
 
     async def record(self, name: str, data: bytes = b"x" * 10) -> None:
         """Put a recording there."""
@@ -103,6 +111,35 @@ async def test_a_peers_times_are_put_on_this_clock(tmp_path: Path) -> None:
     assert (found.since, found.until, found.asked_by) == (NOW - 5 * 10**9, NOW - 4 * 10**9, "base")
 
 
+async def test_how_long_ago_counts_when_clocks_were_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    world, hour, now = World(tmp_path), 3600 * 10**9, time.time_ns()
+    world.answer = UnreachableError("agent", "base", "try again")
+    asked = Kept(id="fall", why="it fell", since=now - 60 * 10**9, until=now)
+    await world.part.keep(asked)
+    world.answer, world.asked, wall = "", [], time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: wall() + hour)  # this module's clock, while the peer was away
+    world.part.link_up(world.peer)  # type: ignore[arg-type] # it has what is used
+    while not world.asked:
+        await asyncio.sleep(0)
+    await world.part.close()
+    sent = world.asked[0][1]
+    assert sent["now"] - now < 60 * 10**9, "by the clock as it was"
+    await world.requests()
+    world.peer.time = SimpleNamespace(ahead_ns=-hour)  # as the peer still knew it
+    assert await world.ask(KEEP, **sent) == ""
+    (found,) = await world.requests()
+    assert abs(found.until - (now + hour)) < 60 * 10**9
+    assert found.until - found.since == 60 * 10**9
+
+
+async def test_a_recorder_that_cannot_write_its_status_is_said(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    status = {"pid": os.getpid(), "at": time.time() - 60.0}
+    await asyncio.to_thread((world.folder / "status.json").write_bytes, msgspec.json.encode(status))
+    (told,) = [one for one in await world.part.list() if one.module == "arm"]
+    assert "wrote its status 60 s ago" in told.problem
+
+
 async def test_without_a_recorder_it_says_so(tmp_path: Path) -> None:
     world = World(tmp_path, folder=False)
     assert "no recorder has run here" in (await world.part.answer({"what": "keep"}))["arm"]
@@ -131,10 +168,15 @@ async def test_a_member_without_record_keeps_lists_reads_and_removes_nothing(tmp
     world = World(tmp_path, secured=True)
     await world.record("fall")
     kept = msgspec.to_builtins(Kept(id="other", since=0, until=1))
-    for what, args in ((KEEP, {"kept": kept}), (READ, {"id": "fall", "file": "1.mcap"}), (REMOVE, {"id": "fall"})):
+    requests: tuple[tuple[str, dict[str, Any]], ...] = (
+        (KEEP, {"kept": kept}),
+        (READ, {"id": "fall", "file": "1.mcap"}),
+        (REMOVE, {"id": "fall"}),
+        (LIST, {}),
+    )
+    for what, args in requests:
         with pytest.raises(RmpaError, match="let base use the recording"):
             await world.ask(what, **args)
-    assert (await world.ask(LIST)).kept == ()
     assert not await world.requests()
     assert [one.id for one in (await world.part.list())[0].kept] == ["fall"]
 

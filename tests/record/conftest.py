@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from rmpa.record.format import CLOCK, ClockRecord, ModuleRecord, RecordedSource, SegmentWriter
+from rmpa.record.format import CLOCK, TIME, ClockRecord, ModuleRecord, RecordedSource, SegmentWriter
 from rmpa.ros.types.messages import MessageType
 
 TEXT = MessageType("std_msgs/String")
@@ -29,28 +29,48 @@ def text(data: str) -> bytes:
     return TEXT.serialize(TEXT.given(None, {"data": data}))
 
 
+class HandClock:
+    """A machine's monotonic and wall clock, both set by a test."""
+
+    def __init__(self) -> None:
+        self.seconds, self.epoch = 1000.0, START - 1000 * SECOND
+
+    def now(self) -> float:
+        return self.seconds
+
+    def wall(self) -> int:
+        return round(self.seconds * SECOND) + self.epoch
+
+
 Record = Callable[..., Path]
 
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Record:
-    """Writes a recording of one module: what was said on each topic, and what it knew of others' clocks."""
+    """Writes a recording of one module: what was said on each topic, and what it knew of others' clocks.
+
+    ``epoch`` is its wall clock less the monotonic one, seconds.
+    """
 
     def write(
         module: str,
         said: dict[RecordedSource, Said],
         clocks: dict[str, tuple[float, float | None]] | None = None,
         name: str = "00000001.mcap",
+        epoch: float | None = None,
     ) -> Path:
         folder = tmp_path / module
         folder.mkdir(exist_ok=True)
         path = folder / name
         with path.open("wb") as file:
             writer = SegmentWriter(file, ModuleRecord(name=module))
-            if clocks:
-                known = {peer: ClockRecord(START, ahead, error) for peer, (ahead, error) in clocks.items()}
-                writer.metadata(CLOCK, {peer: msgspec.json.encode(one).decode() for peer, one in known.items()})
             lines = sorted((at, one, data) for one, each in said.items() for at, data in each)
+            if epoch is not None:
+                writer.metadata(TIME, {"boot": module, "epoch": str(round(epoch * SECOND))})
+            if clocks:
+                begin = START + round(lines[0][0] * SECOND) if lines else START
+                known = {peer: ClockRecord(begin, ahead, error) for peer, (ahead, error) in clocks.items()}
+                writer.metadata(CLOCK, {peer: msgspec.json.encode(one).decode() for peer, one in known.items()})
             for at, one, data in lines:
                 when = START + round(at * SECOND)
                 writer.write(one, when, when, text(data))

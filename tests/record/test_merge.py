@@ -9,10 +9,10 @@ import pytest
 from rmpa.core.errors import RmpaError
 from rmpa.record.bag import read_any, read_bag, write_bag
 from rmpa.record.diff import compare
-from rmpa.record.format import EVENT_SOURCE, Event, SegmentReader, event_bytes
+from rmpa.record.format import EVENT_SOURCE, TIME, Event, ModuleRecord, SegmentReader, SegmentWriter, event_bytes
 from rmpa.record.merge import Offset, merge, notes_of
 from rmpa.record.story import render, tell
-from tests.record.conftest import SECOND, START, Record, source, text
+from tests.record.conftest import SECOND, START, TEXT, Record, source, text
 
 SCAN, CMD = source("/scan", "/laser"), source("/cmd_vel", "/joy")
 
@@ -59,6 +59,55 @@ def test_copies_of_proxies_and_repeated_messages_are_left_out(tmp_path: Path, re
     path, result = merged(tmp_path, arm, base)
     assert [each[1:] for each in lines(path)] == [("arm", "a"), ("base", "s")]
     assert result.doubles == 1  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("reference", ["arm", "base"])
+@pytest.mark.parametrize("step", [3600.0, -3600.0])
+def test_a_clock_that_is_set_moves_nothing(tmp_path: Path, recording: Record, reference: str, step: float) -> None:
+    """The arm's clock is set by an hour; what both know of each other's is true each time."""
+    late, early = {"arm": (-0.01, 0.001)}, {"arm": (-0.01 - step, 0.001)}
+    arm = recording("arm", {SCAN: [(n - step, f"a{n}") for n in range(20)]}, {"base": (0.01 + step, 0.001)}, epoch=0)
+    last = {SCAN: [(n, f"a{n}") for n in range(20, 40)]}
+    recording("arm", last, {"base": (0.01, 0.001)}, name="00000002.mcap", epoch=step)
+    base = recording("base", {CMD: [(n + 0.5, f"b{n}") for n in range(20)]}, early, epoch=5)
+    recording("base", {CMD: [(n + 0.5, f"b{n}") for n in range(20, 40)]}, late, name="00000002.mcap", epoch=5)
+    path, result = merged(tmp_path, arm.parent, base.parent, reference=reference)
+    assert [said for _, _, said in lines(path)] == [f"{module}{n}" for n in range(40) for module in "ab"]
+    assert max(abs(one.ahead) for one in result.offsets.values()) == pytest.approx(0.01)  # type: ignore[attr-defined]
+    assert f"The clock of arm was set meanwhile ({step:+.3f} s)" in " ".join(notes_of(path))
+
+
+def test_a_latched_message_of_before_a_step_is_there_once(tmp_path: Path, recording: Record) -> None:
+    latched = source("/map", "/map_server", latching=True)
+    recording("arm", {latched: [(0.0, "map")]}, epoch=0)
+    with (tmp_path / "arm/00000002.mcap").open("wb") as file:
+        writer = SegmentWriter(file, ModuleRecord(name="arm"))
+        writer.metadata(TIME, {"boot": "arm", "epoch": f"{3600 * SECOND}"})
+        writer.write(latched, START + 3605 * SECOND, START, text("map"))
+        writer.finish()
+    path, result = merged(tmp_path, tmp_path / "arm")
+    assert lines(path) == [(3600.0, "arm", "map")]
+    assert result.doubles == 1  # type: ignore[attr-defined]
+
+
+def test_a_module_that_is_missing_is_named(tmp_path: Path, recording: Record) -> None:
+    arm = recording("arm", {SCAN: [(1.0, "a")]}, {"base": (0.0, 0.001), "leg": (0.0, 0.001)})
+    path, _ = merged(tmp_path, arm, recording("base", {CMD: [(1.5, "b")]}))
+    assert "Nothing of leg is here, which was linked" in " ".join(notes_of(path))
+
+
+def test_a_topic_that_changes_its_type_is_all_there(tmp_path: Path, recording: Record) -> None:
+    """Also a type that only its publisher knew."""
+    odd = SCAN._replace(type="odd_msgs/Odd", md5sum="f" * 32, definition="string data  # 90\udcb0\n")
+    arm = recording("arm", {SCAN: [(0.0, "a")], odd: [(1.0, "o"), (2.0, "p")]})
+    path, _ = merged(tmp_path, arm)
+    bag = tmp_path / "all.bag"
+    write_bag(read_any(path), bag)
+    for one in (path, bag):
+        found = [(m.source.type, m.source.md5sum, m.source.definition[:11], m.data[4:]) for m in read_any(one)]
+        first, then = (TEXT.name, TEXT.md5sum, TEXT.definition[:11]), (odd.type, odd.md5sum, "string data")
+        assert found == [(*first, b"a"), (*then, b"o"), (*then, b"p")]
+    assert odd.definition in {m.source.definition for m in read_any(path)}
 
 
 def test_two_merges_of_one_run_are_the_same_bytes(tmp_path: Path, recording: Record) -> None:
@@ -109,8 +158,6 @@ def test_a_story_says_what_happened(tmp_path: Path, recording: Record) -> None:
     steady = [(n / 10, "s") for n in range(30)] + [(6.0 + n / 10, "s") for n in range(10)]
     arm = recording("arm", {SCAN: steady, profile: [(0.0, "full"), (4.0, "small")]})
     events = tmp_path / "arm/00000002.mcap"
-    from rmpa.record.format import ModuleRecord, SegmentWriter
-
     with events.open("wb") as file:
         writer = SegmentWriter(file, ModuleRecord(name="arm"))
         at = START + 5 * SECOND

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-_ABOUT: Final = "recording.json"
+ABOUT: Final = "recording.json"
 KEPT: Final = "kept"
 REQUESTS: Final = "requests"
 _ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,80}")
@@ -84,16 +84,26 @@ def request_keep(folder: Path, kept: Kept) -> None:
     replace_file(requests / f"{check_id(kept.id)}.json", msgspec.json.encode(kept))
 
 
-def take_requests(folder: Path) -> Iterator[Kept]:
-    """The requests to keep that wait in a folder; each is gone then."""
+def read_requests(folder: Path) -> Iterator[Kept]:
+    """The requests to keep that wait in a folder, until ``end_request``: what is killed meanwhile does them later."""
     for path in sorted((folder / REQUESTS).glob("*.json")):
         try:
             kept = msgspec.json.decode(path.read_bytes(), type=Kept)
         except (OSError, msgspec.DecodeError):
             kept = None
-        path.unlink(missing_ok=True)
         if kept is not None and kept.id == path.name.removesuffix(".json"):
             yield kept
+        else:
+            path.unlink(missing_ok=True)
+
+
+def end_request(folder: Path, kept: Kept) -> None:
+    """A request is done, or cannot be done.
+
+    Raises:
+        OSError: It cannot be removed.
+    """
+    (folder / REQUESTS / f"{kept.id}.json").unlink(missing_ok=True)
 
 
 def write_kept(folder: Path, kept: Kept, *, limit: int = 0) -> Kept:
@@ -102,24 +112,25 @@ def write_kept(folder: Path, kept: Kept, *, limit: int = 0) -> Kept:
     Raises:
         OSError: It cannot be written.
     """
-    files = sorted(path for path in folder.iterdir() if path.name != _ABOUT and path.is_file())
+    files = sorted(path for path in folder.iterdir() if path.name != ABOUT and path.is_file())
     made = msgspec.structs.replace(
         kept, files=tuple(path.name for path in files), size=sum(path.stat().st_size for path in files)
     )
-    replace_file(folder / _ABOUT, msgspec.json.encode(made))
+    replace_file(folder / ABOUT, msgspec.json.encode(made))
     others = [one for one in read_kept(folder.parent) if one.id != made.id]
     total = made.size + sum(one.size for one in others)
-    for one in sorted((one for one in others if not one.by_hand), key=lambda each: each.since):
+    # The oldest by the numbers of their segments: the clock may have been set since.
+    for one in sorted((one for one in others if not one.by_hand), key=lambda each: each.files[-1:]):
         if not limit or total <= limit:
             break
         total -= one.size
-        shutil.rmtree(folder.parent / one.id)
+        shutil.rmtree(folder.parent / one.id, ignore_errors=True)
     return made
 
 
 def read_kept(folder: Path) -> Iterator[Kept]:
     """The recordings in a folder, in the order of their names; what is none of this release is left out."""
-    for about in sorted(folder.glob(f"*/{_ABOUT}")):
+    for about in sorted(folder.glob(f"*/{ABOUT}")):
         try:
             kept = msgspec.json.decode(about.read_bytes(), type=Kept)
         except (OSError, msgspec.DecodeError):

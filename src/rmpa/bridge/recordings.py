@@ -12,6 +12,7 @@ import logging
 import os
 import time
 from collections import deque
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -29,7 +30,6 @@ from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.sessions import PeerSession
@@ -41,6 +41,8 @@ LIST: Final = "record.list"
 READ: Final = "record.read"
 REMOVE: Final = "record.remove"
 _SECOND: Final = 1_000_000_000
+# For permissions: stands for all recordings, where a peer asks what the recorder does.
+_ANY: Final = "/*"
 _EARLIER: Final = "its agent is of an earlier release, which has no recordings; install this release there"
 
 
@@ -84,8 +86,9 @@ class Recordings(Part):
     def __init__(self, bridge: Bridge) -> None:
         self._bridge = bridge
         self._tasks = OwnedTasks()
-        # What was to be kept at all modules, with the names of those that have answered.
-        self._wanted: deque[tuple[Kept, set[str]]] = deque(maxlen=limits.KEEPS_WAITING)
+        # What was to be kept at all modules, with the wall clock of then less the monotonic one, ns, and the names of
+        # those that have answered.
+        self._wanted: deque[tuple[Kept, int, set[str]]] = deque(maxlen=limits.KEEPS_WAITING)
         needs = Needs((Access.RECORD,), "the recording's name")
         bridge.rpc.on_request(KEEP, self._keep, needs)
         bridge.rpc.on_request(READ, self._read, needs)
@@ -105,9 +108,11 @@ class Recordings(Part):
 
     def link_up(self, session: PeerSession) -> None:
         """Ask a peer that is back for what the others have kept meanwhile."""
-        for kept, done in self._wanted:
+        for kept, epoch, done in self._wanted:
             if session.link.name not in done:
-                self._tasks.start(self._ask_keep(session, kept, done), f"keep {kept.id} at {session.link.name}")
+                self._tasks.start(
+                    self._ask_keep(session, kept, epoch, done), f"keep {kept.id} at {session.link.name}"
+                )
 
     async def keep(self, kept: Kept) -> dict[str, str]:
         """Keep what the rings of this module and of all linked peers have of a time; the others when they are back.
@@ -119,11 +124,12 @@ class Recordings(Part):
             By module: empty where it is being kept, or why not.
         """
         done: set[str] = set()
-        self._wanted.append((kept, done))
+        epoch = time.time_ns() - time.monotonic_ns()
+        self._wanted.append((kept, epoch, done))
         own = self._bridge.context.settings.name
         found = {own: await self._keep_here(kept)}
         peers = [*self._bridge.sessions.linked()]
-        answers = await asyncio.gather(*(self._ask_keep(session, kept, done) for session in peers))
+        answers = await asyncio.gather(*(self._ask_keep(session, kept, epoch, done) for session in peers))
         return found | {session.link.name: why for session, why in zip(peers, answers, strict=True)}
 
     async def _keep_here(self, kept: Kept) -> str:
@@ -136,9 +142,10 @@ class Recordings(Part):
             return str(error)
         return ""
 
-    async def _ask_keep(self, session: PeerSession, kept: Kept, done: set[str]) -> str:
+    async def _ask_keep(self, session: PeerSession, kept: Kept, epoch: int, done: set[str]) -> str:
+        now = epoch + time.monotonic_ns()  # by the clock that the times of what to keep are of
         try:
-            why = await self._bridge.rpc.request(session, KEEP, {"kept": msgspec.to_builtins(kept)})
+            why = await self._bridge.rpc.request(session, KEEP, {"kept": msgspec.to_builtins(kept), "now": now})
         except PeerRefused as error:
             done.add(session.link.name)
             return _EARLIER if error.unknown else error.reason
@@ -150,7 +157,9 @@ class Recordings(Part):
     async def _keep(self, asker: PeerSession, args: dict[str, Any]) -> str:
         kept = msgspec.convert(args.get("kept"), Kept)
         self._check(asker, kept.id)
-        ahead = asker.time.ahead_ns  # its clock less this one
+        # How long ago counts: each clock may have been set meanwhile, and the offset between both be an old one.
+        now = args.get("now")
+        ahead = now - time.time_ns() if isinstance(now, int) else asker.time.ahead_ns
         moved = msgspec.structs.replace(
             kept, since=kept.since - ahead, until=kept.until - ahead, asked_by=kept.asked_by or asker.link.name
         )
@@ -165,9 +174,11 @@ class Recordings(Part):
     async def _list(self, asker: PeerSession, _args: dict[str, Any]) -> ModuleRecordings:
         gate, peer = self._bridge.context.gate, asker.link.name
         found = await asyncio.to_thread(self._here)
-        return msgspec.structs.replace(
-            found, kept=tuple(one for one in found.kept if not gate.why_not(Access.RECORD, peer, f"/{one.id}"))
-        )
+        kept = tuple(one for one in found.kept if not gate.why_not(Access.RECORD, peer, f"/{one.id}"))
+        why = gate.why_not(Access.RECORD, peer, _ANY)  # it names the topics
+        if why and not kept:
+            raise RmpaError(why, code="not-permitted")
+        return msgspec.structs.replace(found, kept=kept, **({"status": {}, "problem": "", "code": ""} if why else {}))
 
     def _here(self) -> ModuleRecordings:
         folder = self.folder
@@ -177,9 +188,12 @@ class Recordings(Part):
         status: dict[str, Any] = {}
         with contextlib.suppress(OSError, msgspec.DecodeError):  # no recorder has run
             status = msgspec.json.decode((folder / "status.json").read_bytes(), type=dict[str, Any])
-        if time.time() - float(status.get("at", 0.0)) > limits.RECORDER_SILENT:
+        problem = ""
+        if abs(silent := time.time() - float(status.get("at", 0.0))) > limits.RECORDER_SILENT:
+            if status and Path(f"/proc/{status.get('pid')}/status").exists():
+                problem = f"its recorder wrote its status {silent:.0f} s ago: the disk may be full or read-only"
             status = {}
-        return ModuleRecordings(module=name, kept=tuple(read_kept(folder / KEPT)), status=status)
+        return ModuleRecordings(module=name, kept=tuple(read_kept(folder / KEPT)), status=status, problem=problem)
 
     async def list(self) -> list[ModuleRecordings]:
         """The recordings of this module and of its peers."""
@@ -251,12 +265,12 @@ class Recordings(Part):
         return await self._bridge.rpc.request(sessions[0], request, inner, limits.LOG_ASK_TIMEOUT)
 
     def _made(self, args: Mapping[str, Any]) -> Kept:
-        """What to keep, by a recorder's own request or a person's words: ``why``, and ``seconds`` of the past."""
+        """What to keep, by a recorder's own request or a person's words: ``id``, ``why``, ``seconds`` of the past."""
         if isinstance(given := args.get("kept"), dict):
             return msgspec.convert(given, Kept)
         now, why = time.time_ns(), str(args.get("why", "")) or "by hand"
         seconds, own = args.get("seconds"), self._bridge.context.settings
         past = float(seconds) if isinstance(seconds, int | float) else own.record.seconds or 86_400.0
-        name = recording_id(why, own.name, now)
+        name = check_id(str(args.get("id", ""))) if args.get("id") else recording_id(why, own.name, now)
         since = now - round(past * _SECOND)
         return Kept(id=name, why=why, since=since, until=now, asked_by=own.name, by_hand=True)

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 import msgspec
 
+from rmpa.bridge.kept import recording_id
 from rmpa.bridge.recordings import FilePart, ModuleRecordings
 from rmpa.cli.completion import completes, topics
 from rmpa.cli.main import LazyGroup
@@ -313,31 +314,42 @@ def record_keep(why: str, seconds: float | None, output: Path | None, options: O
 
 def _keep(options: Options, why: str, seconds: float | None, output: Path | None) -> int:
     with options.client(60.0) as client:
-        before = {kept.id for each in _all(client) for kept in each.kept}
-        answers = client.call("record", dict[str, str], what="keep", why=why, seconds=seconds)
-        wanted = {module for module, problem in answers.items() if not problem}
-        name = _kept_name(client, wanted, before)
+        name = recording_id(why, client.agent().name, time.time_ns())
+        answers = client.call("record", dict[str, str], what="keep", id=name, why=why, seconds=seconds)
+        answers |= _outcome(client, name, {module for module, problem in answers.items() if not problem})
         rows = [(module, problem or "kept") for module, problem in answers.items()]
         options.show({"id": name, "modules": answers}, name, Table("MODULE, STATE", rows))
-        if output is not None and name:
+        if output is not None and not all(answers.values()):
             with tempfile.TemporaryDirectory() as folder:
                 _fetch(client, name, Path(folder))
                 result = _write([Path(folder)], output)
             print_text(_merged(output, result))
-    return int(not name or any(answers.values()))
+    return int(any(answers.values()))
 
 
-def _kept_name(client: ControlClient, modules: set[str], before: set[str], limit: float = 20.0) -> str:
-    """Wait until all modules have what was just kept; its name, or nothing."""
-    deadline, name = time.monotonic() + limit, ""
-    while modules and time.monotonic() < deadline:
-        found = {each.module: {kept.id for kept in each.kept} - before for each in _all(client)}
-        common = set().union(*(found.get(module, set()) for module in modules))
-        name = max(common, default=name)
-        if name and all(name in found.get(module, ()) for module in modules):
+def _outcome(client: ControlClient, name: str, modules: set[str], limit: float = 20.0) -> dict[str, str]:
+    """Wait until modules have a recording, or say why not: by module, empty where it has it."""
+    deadline, found = time.monotonic() + limit, dict[str, str]()
+    while True:
+        told = {each.module: each for each in _all(client) if each.module in modules}
+        for module, each in told.items():
+            if any(kept.id == name for kept in each.kept):
+                found[module] = ""
+            elif why := each.status.get("failed", {}).get(name):
+                found[module] = why
+        if found.keys() >= modules:
+            return found
+        if time.monotonic() > deadline:
             break
         time.sleep(0.1)
-    return name
+    for module in modules - found.keys():
+        state = told.get(module)
+        why = "it is not linked any more" if state is None else state.problem or str(state.status.get("problem", ""))
+        runs = state is not None and state.status
+        found[module] = (
+            f"not kept within {limit:.0f} s: {why or ('it is busy' if runs else 'no recorder runs there')}"
+        )
+    return found
 
 
 @agent_verb(
@@ -442,7 +454,8 @@ def _bound(error: float | None) -> str:
 def _merged(output: Path, result: MergeResult) -> str:
     doubles = f", {result.doubles:,} doubles left out" if result.doubles else ""
     damaged = "".join(f"; not read: {text}" for text in result.damaged)
-    return f"{output}: {result.messages:,} messages of {len(result.offsets)} modules{doubles}{damaged}"
+    text = f"{output}: {result.messages:,} messages of {len(result.offsets)} modules{doubles}{damaged}"
+    return "\n".join((text, *result.notes))
 
 
 @agent_verb(argument("recording", names), click.option("--module", default="", help="Only that of this module."))

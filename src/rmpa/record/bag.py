@@ -52,7 +52,7 @@ def write_bag(messages: Iterable[Recorded], path: Path) -> int:
                 connection = connections[source] = writer.add_connection(
                     source.topic,
                     _bag_type(source.type),
-                    msgdef=source.definition,
+                    msgdef=source.definition.encode("utf-8", "replace").decode(),  # the library has text alone
                     md5sum=source.md5sum,
                     callerid=node,
                     latching=int(source.latching),

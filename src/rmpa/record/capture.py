@@ -14,7 +14,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.core.identity import is_own, matches
 from rmpa.core.timers import TokenBucket
 from rmpa.record import limits
-from rmpa.record.format import RecordedSource
+from rmpa.record.format import STATIC, RecordedSource
 from rmpa.ros.http.rpc import call_api
 
 if TYPE_CHECKING:
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 # Seconds of its budget that a topic may write at once.
 _BURST: Final = 2.0
-# Its messages are repeated in each segment, whether its publishers latch or not.
-_STATIC: Final = "/tf_static"
 
 
 class _Taken:
@@ -173,7 +171,7 @@ class Capture:
         raw = bytes(data)
         if (listener := self._listeners.get(source.type)) is not None:
             listener(source, raw)
-        latches = source.latching or topic == _STATIC
+        latches = source.latching or topic == STATIC
         if not taken.room(len(raw), None if latches else thin, time.monotonic()):
             self.left_out[topic] += 1
             return

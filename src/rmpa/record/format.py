@@ -2,21 +2,25 @@
 
 A channel is one publisher of one topic. Its metadata has ``callerid``, ``latching``, ``md5sum`` and, in a file of
 several modules, ``module``. ``log_time`` is when this module received a message, ``publish_time`` when it first did:
-a latched message that a segment repeats has an earlier one. What happened besides messages are events: JSON in
-``std_msgs/String`` on ``EVENTS``. Metadata records: ``rmpa.module`` (``ModuleRecord``) and ``rmpa.clock``
-(``ClockRecord`` as JSON, by peer), once in each segment.
+a latched message that a segment repeats has another one. What happened besides messages are events: JSON in
+``std_msgs/String`` on ``EVENTS``. Metadata records: ``rmpa.module`` (``ModuleRecord``), ``rmpa.clock``
+(``ClockRecord`` as JSON, by peer) and ``rmpa.time`` (``boot``, the machine's run, and ``epoch``, the wall clock less
+the monotonic one, ns), once in each segment: a segment ends where its module's clock was set.
 """
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import logging
+import os
 import struct
+from functools import partial
 from typing import IO, TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, Footer, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Footer, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
@@ -25,7 +29,7 @@ from rmpa.record import limits
 from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
 _log = logging.getLogger(__name__)
@@ -33,13 +37,22 @@ _log = logging.getLogger(__name__)
 EVENTS: Final = "/rmpa/events"
 MODULE: Final = "rmpa.module"
 CLOCK: Final = "rmpa.clock"
+TIME: Final = "rmpa.time"
 MERGE: Final = "rmpa.merge"
+NOTES: Final = "rmpa.notes"
+# Its messages are repeated in each segment, whether its publishers latch or not.
+STATIC: Final = "/tf_static"
 SUFFIX: Final = ".mcap"
 # The end of the name of a segment that is being written.
 UNFINISHED: Final = ".part"
 _ENCODING, _SCHEMA = "ros1", "ros1msg"
 _TEXT: Final = MessageType("std_msgs/String")
 _LENGTH: Final = struct.Struct("<I")
+_SECOND: Final = 1_000_000_000
+# Above all times of the format.
+_TIMES: Final = 1 << 64
+# Definitions may have comments in any encoding, and their MD5 sums are of their bytes.
+_AS_IT_WAS: Final = "surrogateescape"
 
 
 class DamagedError(RmpaError):
@@ -171,8 +184,6 @@ class SegmentWriter:
         self._schemas: dict[tuple[str, str], int] = {}
         self._channels: dict[RecordedSource, int] = {}
         self._sequence = 0
-        # Of the messages so far; 0: there are none.
-        self.first = self.last = 0
         if module is not None:
             self.metadata(MODULE, msgspec.to_builtins(module))
 
@@ -185,14 +196,18 @@ class SegmentWriter:
         self._writer.add_attachment(at, at, name, media_type, data)
 
     def write(self, source: RecordedSource, log_time: int, publish_time: int, data: bytes) -> None:
-        """Write a message."""
+        """Write a message.
+
+        Raises:
+            ValueError: It cannot be written; the file is as it was.
+        """
+        if not (0 < log_time < _TIMES and 0 <= publish_time < _TIMES):
+            raise ValueError(f"{source.topic} has a time that is none: {log_time}, {publish_time}")
         channel = self._channels.get(source)
         if channel is None:
             channel = self._channels[source] = self._register(source)
         self._sequence = self._sequence + 1 & 0xFFFFFFFF
         self._writer.add_message(channel, log_time, data, publish_time, self._sequence)
-        self.first = min(self.first or log_time, log_time)
-        self.last = max(self.last, log_time)
 
     def flush(self) -> None:
         """Write what is in memory to the file; the kernel has it then."""
@@ -203,9 +218,13 @@ class SegmentWriter:
         self._writer.finish()  # type: ignore[no-untyped-call] # of the library
 
     def _register(self, source: RecordedSource) -> int:
+        for text in (source.topic, source.type, source.md5sum, source.node, source.module):
+            text.encode()  # what is no UTF-8 would damage the whole file
         key = source.type, source.md5sum
         if key not in self._schemas:
-            self._schemas[key] = self._writer.register_schema(source.type, _SCHEMA, source.definition.encode())
+            self._schemas[key] = self._writer.register_schema(
+                source.type, _SCHEMA, source.definition.encode("utf-8", _AS_IT_WAS)
+            )
         about = {"callerid": source.node, "latching": str(int(source.latching)), "md5sum": source.md5sum}
         if source.module:
             about["module"] = source.module
@@ -226,14 +245,19 @@ class SegmentReader:
         self.path = path
         self.module = ModuleRecord()
         self.clocks: dict[str, ClockRecord] = {}
-        self.merged: dict[str, str] = {}
+        # The machine's run, and its wall clock less the monotonic one, ns; ``None``: not known.
+        self.epoch: tuple[str, int] | None = None
+        # Of a merged recording: what limits it.
+        self.notes: tuple[str, ...] = ()
+        self.metadata: list[Metadata] = []
+        self.attachments: list[Attachment] = []
         # Whether the end of the file is missing; known after ``messages``.
         self.unfinished = False
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, RecordedSource] = {}
 
-    def head(self) -> tuple[int, set[RecordedSource]]:
-        """The time of the first message, and all sources; by the file's index, where it has one.
+    def head(self) -> tuple[int, int, set[RecordedSource]]:
+        """The times of the first and the last message, and all sources; by the file's index, where it has one.
 
         Raises:
             DamagedError: As for ``messages``.
@@ -246,14 +270,15 @@ class SegmentReader:
                         self._metadata(record)
                     self._schemas = dict(summary.schemas)
                     self._channels = {number: self._source(one) for number, one in summary.channels.items()}
-                    return summary.statistics.message_start_time, set(self._channels.values())
+                    told = summary.statistics
+                    return told.message_start_time, told.message_end_time, set(self._channels.values())
         except Exception as error:  # noqa: BLE001 - it has no index, as after a crash
             _log.debug("%s: %s", self.path, error)
-        first, sources = 0, set[RecordedSource]()
+        first, last, sources = 0, 0, set[RecordedSource]()
         for message in self.messages():
-            first = first or message.log_time
+            first, last = first or message.log_time, message.log_time
             sources.add(message.source)
-        return first, sources
+        return first, last, sources
 
     def messages(self) -> Iterator[Recorded]:
         """The messages in order of their log times; metadata is known after the first one.
@@ -280,7 +305,7 @@ class SegmentReader:
                         raise DamagedError(f"{self.path}: it is no recording: {error}") from None
                 self.unfinished = not ended
         except OSError as error:
-            raise DamagedError(f"{self.path}: {error.strerror or error}") from None
+            raise DamagedError(f"{self.path}: {error.strerror or error}") from error
         yield from _in_order(chunk)
 
     def _take(self, record: object) -> Recorded | None:
@@ -292,12 +317,15 @@ class SegmentReader:
         elif isinstance(record, Channel):
             self._channels.setdefault(record.id, self._source(record))
         elif isinstance(record, Metadata):
+            self.metadata.append(record)
             self._metadata(record)
+        elif isinstance(record, Attachment):
+            self.attachments.append(record)
         return None
 
     def _source(self, channel: Channel) -> RecordedSource:
         schema, about = self._schemas.get(channel.schema_id), channel.metadata
-        name, definition = (schema.name, schema.data.decode("utf-8", "replace")) if schema else ("", "")
+        name, definition = (schema.name, schema.data.decode("utf-8", _AS_IT_WAS)) if schema else ("", "")
         node, latching = about.get("callerid", ""), about.get("latching", "0") in ("1", "true")
         module = about.get("module", self.module.name)
         return RecordedSource(channel.topic, name, about.get("md5sum", ""), definition, node, latching, module)
@@ -310,9 +338,11 @@ class SegmentReader:
                 self.clocks |= {
                     peer: msgspec.json.decode(text, type=ClockRecord) for peer, text in record.metadata.items()
                 }
-            elif record.name == MERGE:
-                self.merged = dict(record.metadata)
-        except (msgspec.DecodeError, msgspec.ValidationError):
+            elif record.name == TIME:
+                self.epoch = record.metadata["boot"], int(record.metadata["epoch"])
+            elif record.name == NOTES:
+                self.notes = tuple(record.metadata["text"].splitlines())
+        except (msgspec.DecodeError, msgspec.ValidationError, KeyError, ValueError):
             pass  # of another release
 
 
@@ -325,9 +355,46 @@ def _log_time(message: Recorded) -> int:
     return message.log_time
 
 
-def read_in_order(paths: Iterable[Path]) -> Iterator[Recorded]:
-    """The messages of several files of one module, or of a merged one, in order of their log times."""
-    return heapq.merge(*(SegmentReader(path).messages() for path in paths), key=_log_time)
+# A segment's module, and its ``SegmentReader.epoch``.
+Epoch = tuple[str, tuple[str, int] | None]
+
+
+def clock_shifts(segments: Sequence[Epoch]) -> list[int]:
+    """What puts the times of segments, in order, on the clocks of their modules as they were set at last, ns."""
+    shifts, later = list[int](), dict[str, tuple[tuple[str, int] | None, int]]()
+    for module, epoch in reversed(segments):
+        after, shift = later.get(module, (None, 0))
+        if epoch is not None and after is not None:
+            step = after[1] - epoch[1]
+            if epoch[0] != after[0]:
+                shift = 0  # of another boot: what its monotonic clock says is not known
+            elif abs(step) >= limits.CLOCK_STEP * _SECOND:
+                shift += step
+        later[module] = epoch or after, shift
+        shifts.append(shift)
+    return shifts[::-1]
+
+
+def moved(message: Recorded, by: int) -> Recorded:
+    """A message with other times, by so many nanoseconds later."""
+    return message._replace(log_time=max(1, message.log_time + by), publish_time=max(1, message.publish_time + by))
+
+
+def read_in_order(paths: Sequence[Path]) -> Iterator[Recorded]:
+    """The messages of several files of one module, or of a merged one, in order of their log times.
+
+    Where the module's clock was set meanwhile, all times are by the clock as it was set at last.
+    """
+    readers = [SegmentReader(path) for path in paths]
+    for reader in readers if len(readers) > 1 else ():
+        with contextlib.suppress(DamagedError):
+            reader.head()
+    shifts = clock_shifts([(one.module.name, one.epoch) for one in readers])
+    streams = (
+        map(partial(moved, by=by), one.messages()) if by else one.messages()
+        for one, by in zip(readers, shifts, strict=True)
+    )
+    return heapq.merge(*streams, key=_log_time)
 
 
 def finish_file(path: Path) -> Path:
@@ -346,13 +413,22 @@ def finish_file(path: Path) -> Path:
     reader, done = SegmentReader(path), path.with_name(path.name.removesuffix(UNFINISHED))
     whole = done.with_name(f"{done.name}.new")
     found: list[Recorded] = list(reader.messages())
-    with whole.open("wb") as file:
-        writer = SegmentWriter(file, reader.module)
-        if reader.clocks:
-            writer.metadata(CLOCK, {name: msgspec.json.encode(one).decode() for name, one in reader.clocks.items()})
-        for message in found:
-            writer.write(*message)
-        writer.finish()
-    whole.replace(done)
+    about = path.stat()
+    try:
+        with whole.open("wb") as file:
+            writer = SegmentWriter(file, None)
+            for record in reader.metadata:
+                writer.metadata(record.name, record.metadata)
+            for one in reader.attachments:
+                writer.attachment(one.name, one.media_type, one.data, one.log_time)
+            for message in found:
+                writer.write(*message)
+            writer.finish()
+        os.utime(whole, ns=(about.st_atime_ns, about.st_mtime_ns))  # it is as old as it was
+        whole.replace(done)
+    except OSError:
+        with contextlib.suppress(OSError):
+            whole.unlink(missing_ok=True)
+        raise
     path.unlink()
     return done

@@ -21,6 +21,10 @@ CHUNK: Final = MIB
 # At it: it is not repeated
 # Told in: the recording's events
 LATCHED_MAX: Final = 8 * MIB
+# Seconds by which a clock was set at least, where segments say so: less is no step, but its steady correction.
+CLOCK_STEP: Final = 0.05
+# What could not be kept, by name, that the status has.
+FAILED: Final = 16
 # Seconds between two tries to write again on a full or read-only disk.
 RETRY: Final = 5.0
 # Least seconds between two recordings that are kept for the same reason.

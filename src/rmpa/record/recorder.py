@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.bridge.kept import KEPT, REQUESTS, Kept, recording_id, request_keep, take_requests
+from rmpa.bridge.kept import KEPT, REQUESTS, Kept, end_request, read_requests, recording_id, request_keep
 from rmpa.client import (
     AgentClient,
     AgentLost,
@@ -66,6 +66,8 @@ _MB: Final = 1_000_000
 # Seconds between two looks for requests, and between two writings of the status.
 _REQUESTS: Final = 0.2
 _STATUS: Final = 5.0
+# So many seconds behind the end of what is to be kept its request comes at the most; what it notes belongs to it.
+_LATE: Final = 1.0
 # Seconds from one snapshot of the agent to the next, where its graph does not change.
 _PERIOD: Final = 5.0
 # Seconds between two readings of the parameters, and bytes of them that a segment repeats.
@@ -88,6 +90,7 @@ class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
         written: Bytes written to the disk.
         ring: Bytes of the ring, and how far it goes back, seconds.
         problem: Why nothing can be written; empty: all is well.
+        failed: What could not be kept, the latest by its name: why.
     """
 
     pid: int
@@ -99,6 +102,7 @@ class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
     written: int = 0
     ring: tuple[int, float] = (0, 0.0)
     problem: str = ""
+    failed: dict[str, str] = {}
 
 
 class Recorder:
@@ -121,6 +125,12 @@ class Recorder:
         self._node = Node("rmpa_record", master_uri=master_uri)
         self._module = ModuleRecord(name=agent)
         self._clocks: dict[str, str] = {}
+        # This machine's wall clock less the monotonic one when the other clocks were read, ns.
+        self._clocks_epoch = 0
+        self._keeping: set[str] = set()
+        self._failed: dict[str, str] = {}
+        # By topic and name, what an alarm said last; empty: it is over.
+        self._alarms_said: dict[tuple[str, str], str] = {}
         self._parameters = b""
         self._last: Snapshot | None = None
         self._kept_at: dict[str, float] = {}
@@ -132,7 +142,8 @@ class Recorder:
             folder,
             self._begin,
             most_bytes=settings.megabytes * _MB,
-            most_seconds=settings.seconds or float("inf"),
+            # When what happened behind a reason is there, too, all of the time before it must still be.
+            most_seconds=(settings.seconds or float("inf")) + (settings.after or 0.0),
             fsync=settings.fsync,
             kept_bytes=settings.kept_megabytes * _MB,
         )
@@ -168,12 +179,13 @@ class Recorder:
     def _begin(self, writer: SegmentWriter, now: int) -> None:
         """The beginning of a segment; called in the ring's thread."""
         writer.metadata(MODULE, msgspec.to_builtins(self._module))
-        if self._clocks:
+        if self._clocks and abs(_epoch() - self._clocks_epoch) < limits.CLOCK_STEP * _SECOND:  # else they are wrong
             writer.metadata(CLOCK, self._clocks)
         if self._parameters:
             writer.attachment("parameters.json", "application/json", self._parameters, now)
         for source, (first, raw) in list(self.capture.latched.items()):
-            writer.write(source, now, first, raw)
+            with contextlib.suppress(ValueError):  # it was counted as lost
+                writer.write(source, now, first, raw)
         if counts := {topic: n for topic, n in self._left_out_since().items() if n}:
             text = f"left out: {', '.join(f'{n} of {topic}' for topic, n in counts.items())}"
             event = Event("left_out", text, module=self._module.name, facts=dict(counts))
@@ -198,6 +210,7 @@ class Recorder:
                 self._module = ModuleRecord(
                     name=agent.name, guid=agent.guid, instance=agent.instance, host=agent.host, version=agent.version
                 )
+                self._clocks_epoch = _epoch()
                 self._clocks = {
                     peer.name: msgspec.json.encode(
                         ClockRecord(round(now.taken * 1e9), peer.link.clock_offset, peer.link.clock_error)
@@ -229,6 +242,10 @@ class Recorder:
         for status in _ARRAY.deserialize(raw).status:
             level = int(status.level)
             raised = level in (DiagnosticLevel.WARN, DiagnosticLevel.ERROR)
+            key, said = (source.topic, str(status.name)), str(status.message) if raised else ""
+            if self._alarms_said.get(key, "") == said:
+                continue  # some publish the state of their alarms all the time
+            self._alarms_said[key] = said
             facts: dict[str, Any] = {str(pair.key): str(pair.value) for pair in status.values}
             event = Event(ALARM if raised else "alarm_over", str(status.message), source.node, facts=facts)
             self.happened(self._judged(event))
@@ -267,8 +284,10 @@ class Recorder:
         while True:
             changed = requests.stat().st_mtime_ns  # one call of the kernel: the folder is read when it has changed
             if changed != seen:
-                for kept in await asyncio.to_thread(lambda: list(take_requests(self._folder))):
-                    self._work.start(self._kept(kept), f"keep {kept.id}")
+                for kept in await asyncio.to_thread(lambda: list(read_requests(self._folder))):
+                    if kept.id not in self._keeping:
+                        self._keeping.add(kept.id)
+                        self._work.start(self._kept(kept), f"keep {kept.id}")
                 seen = changed
             if time.monotonic() - status >= _STATUS:
                 status = time.monotonic()
@@ -276,21 +295,31 @@ class Recorder:
             await asyncio.sleep(_REQUESTS)
 
     async def _kept(self, kept: Kept) -> None:
-        await asyncio.sleep(max(0.0, (kept.until - time.time_ns()) / _SECOND))
+        epoch = _epoch()  # from here on it does not matter whether the clock is set
+        self.happened(Event("kept", f"{kept.id}: {kept.why}", kept.asked_by))  # where nothing else happens, too
+        since, until = ((at - epoch) / _SECOND for at in (kept.since, kept.until))
+        await asyncio.sleep(max(0.0, until - time.monotonic()))
         kept = msgspec.structs.replace(kept, module=self._module.name)
         try:
-            made = await asyncio.wrap_future(self.ring.call(self.ring.keep, kept))
-        except OSError as error:
-            _log.warning("! %s cannot be kept: %s [recording-stopped]", kept.id, error.strerror or error)
-            return
-        if made is None:
-            _log.warning("! %s: nothing of that time is here any more [recording-stopped]", kept.id)
-        else:
+            made = await asyncio.wrap_future(self.ring.call(self.ring.keep, kept, since, until + _LATE))
+            why = "nothing of that time is here" + (f": {self.ring.problem}" if self.ring.problem else "")
+        except (OSError, RmpaError) as error:
+            made, why = None, f"{self._folder}: {getattr(error, 'strerror', None) or error}"
+        with contextlib.suppress(OSError):
+            await asyncio.to_thread(end_request, self._folder, kept)
+            self._keeping.discard(kept.id)
+        if made is not None:
             _log.info("= kept %s: %s, %.1f MB in %d files", made.id, made.why, made.size / _MB, len(made.files))
+            return
+        _log.warning("! %s is not kept: %s [recording-stopped]", kept.id, why)
+        self._failed[kept.id] = why
+        while len(self._failed) > limits.FAILED:
+            del self._failed[next(iter(self._failed))]
+        await asyncio.to_thread(self._write_status)
 
     def _write_status(self) -> None:
         segments = list(self.ring.segments)
-        back = (time.time_ns() - segments[0].first) / _SECOND if segments else 0.0
+        back = time.monotonic() - segments[0].began if segments else 0.0
         lost = dict(self.ring.lost)
         status = RecorderStatus(
             pid=os.getpid(),
@@ -302,12 +331,18 @@ class Recorder:
             written=self.ring.written,
             ring=(sum(one.size for one in segments), back),
             problem=self.ring.problem,
+            failed=dict(self._failed),
         )
         with contextlib.suppress(OSError):  # the disk is full: the log says so
             replace_file(self._folder / STATUS, msgspec.json.encode(status))
 
 
 _ARRAY: Final = MessageType(ARRAY_TYPE)
+
+
+def _epoch() -> int:
+    """The wall clock less the monotonic one, ns: it changes where the wall clock is set."""
+    return time.time_ns() - time.monotonic_ns()
 
 
 def _events(before: Snapshot | None, after: Snapshot) -> Iterator[Event]:

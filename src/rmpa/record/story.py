@@ -32,12 +32,15 @@ _LEAST: Final = 0.5
 # The periods of which the usual one is the median.
 _USUAL: Final = 64
 # Events that are no line of a story: what comes and goes in order.
-_QUIET: Final = ("topic_came", "topic_gone", "service_came", "service_gone", "note_over", "alarm_over", "peer_linked")
+_QUIET: Final = (
+    "topic_came", "topic_gone", "service_came", "service_gone", "note_over", "alarm_over", "peer_linked", "kept",
+)  # fmt: skip
 _WARN, _BAD, _INFO = "warn", "error", "info"
 _LEVELS: Final = {
     "alarm": _WARN,
     "peer_lost": _BAD,
     "node_died": _BAD,
+    "clock_step": _WARN,
     "node_gone": _WARN,
     "contract": _WARN,
     "stop": _BAD,
