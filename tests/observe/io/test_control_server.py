@@ -203,14 +203,6 @@ async def test_closing_ends_clients(server: ControlServer) -> None:
         assert await reader.read() == b""
 
 
-async def test_a_second_agent_of_one_name_is_refused(server: ControlServer, place: Path) -> None:
-    second = ControlServer(place, "base", {})
-    with pytest.raises(StartError, match="already runs on this machine"):
-        await second.start()
-    await second.close()
-    assert await call(server.path, "echo") == {}
-
-
 async def test_a_stale_socket_is_replaced(serve: Serve, place: Path) -> None:
     with socket.socket(socket.AF_UNIX) as left:
         left.bind(str(place / "base.sock"))
