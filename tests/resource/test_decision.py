@@ -110,11 +110,6 @@ def test_best_effort_serves_if_none_is_feasible() -> None:
     assert (decision.profile, decision.feasible) == ("fast", False)
 
 
-def test_the_least_hard_shortfall_comes_before_the_distance() -> None:
-    bounds = {"rate": bound(RATE, at_least=100, hard=True), "resolution": bound(RESOLUTION, at_least=1280, weight=50)}
-    assert decide(decider(), bounds).profile == "fast"
-
-
 def test_profiles_that_are_left_out_are_not_taken() -> None:
     bounds = {"rate": bound(RATE, at_least=30)}
     failed = {"fast": "failed 2 s ago"}

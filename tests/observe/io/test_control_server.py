@@ -253,15 +253,6 @@ async def test_another_kind_of_answer(serve: Serve) -> None:
         await asyncio.to_thread(snapshot_of, server.path)
 
 
-async def test_an_agent_that_does_not_answer(place: Path) -> None:
-    path = place / "base.sock"
-    with socket.socket(socket.AF_UNIX) as stopped:
-        stopped.bind(str(path))
-        stopped.listen()
-        with ControlClient(path, timeout=0.05) as client, pytest.raises(UnreachableError, match="in time"):
-            client.call("snapshot", object)
-
-
 @pytest.mark.parametrize(
     ("one", "other", "same"),
     [
