@@ -20,7 +20,6 @@ from rmpa.resource.quality import at_least, at_most
 from rmpa.resource.reconfigure import (
     DESCRIPTION_TYPE,
     checked,
-    config,
     description,
     entries,
     read_config,
@@ -295,13 +294,6 @@ def test_choices_are_an_expression_that_clients_evaluate() -> None:
     assert chosen == [
         ("(automatic)", "", "not chosen by hand"), ("slow", "slow", "it's \"slow\""), ("Automatic", "Automatic", ""),
     ]  # fmt: skip
-
-
-def test_a_config_comes_back() -> None:
-    values: dict[str, Any] = {"gain": 2.5, "echoes": 4, "beam": "narrow", "on": False, "profile": "slow"}
-    message = sent(CONFIG_TYPE, config(values))
-    assert read_config(message) == values
-    assert [(g.name, g.state, g.id, g.parent) for g in message.groups] == [("Default", True, 0, 0)]
 
 
 def test_a_number_out_of_range_is_clipped_as_its_servers_do() -> None:

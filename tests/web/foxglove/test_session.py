@@ -89,13 +89,6 @@ def test_the_warning_about_a_type_ends_with_its_last_topic(client: Client) -> No
     assert not client.of("advertise")
 
 
-def test_a_type_is_asked_for_once_for_all_topics_and_clients(client: Client) -> None:
-    client.graph(*(GraphTopic(f"/t{n}", ("std_msgs/String",), ("/n",)) for n in range(50)))
-    beside = Client(beside=client)
-    assert client.hub.types.asked == ["std_msgs/String"]
-    assert beside.of("advertise") == client.of("advertise")
-
-
 def test_many_channels_come_in_several_messages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "ADVERTISE_BYTES", 1000)
     client = Client()
