@@ -378,15 +378,6 @@ def test_windows_within_the_settling_time_do_not_count() -> None:
     assert [kind for kind, _, _ in alarms(one.window({"rate": 2.0}, 10.0))] == [AlarmKind.NON_ADAPTABLE]
 
 
-def test_a_profile_that_hung_is_in_its_cool_down_after_the_restart() -> None:
-    one = Loop()
-    one.reconsider("it starts", 0.0)
-    one.begin_cool_down("slow", "not applied within 5 s", 5.0)
-    again = restored([], "", one.cooling(6.0), 6.0)
-    assert applies(again.reconsider("it starts", 6.0)) == ["middle"]
-    assert {s.profile: s.excluded for s in again.explain(6.0)}["slow"] == "not applied within 5 s"
-
-
 def test_restored_cool_down_runs_to_its_end() -> None:
     one = started()
     one.require(at_least(30), 1.0)

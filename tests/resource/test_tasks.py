@@ -146,19 +146,23 @@ async def test_task_follows_its_rate_parameter(bench: Bench) -> None:
     assert bench.reported == []
 
 
-async def test_failing_task_is_restarted(bench: Bench) -> None:
+async def test_failing_task_is_restarted_and_each_failure_has_one_traceback(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
     count = Counter(4)
 
-    def fail_twice() -> None:
+    def fail_thrice() -> None:
         count()
-        if len(count.times) <= 2:
-            raise ValueError("no echo")
+        if len(count.times) <= 3:
+            raise ValueError("no echo" if len(count.times) <= 2 else "no battery")
 
-    bench.begin(fail_twice, rate=200)
+    bench.begin(fail_thrice, rate=200)
     assert (await bench.problem("failed")).endswith("failed: ValueError: no echo")
     await count.wait()
-    assert bench.kinds == ["failed", "failed"]
+    assert bench.kinds == ["failed"] * 3
     assert count.times[2] - count.times[1] > 0.15, "the second pause is longer"
+    traced = [record.exc_info[1] for record in caplog.records if record.exc_info]
+    assert [str(error) for error in traced] == ["no echo", "no battery"]
 
 
 async def test_a_task_can_end_at_its_first_failure(bench: Bench) -> None:
@@ -221,20 +225,6 @@ async def test_overruns_are_reported_once(bench: Bench) -> None:
         while bench.problems()[1]:
             await asyncio.sleep(0.1)
             bench.window_ended({})
-
-
-async def test_the_same_failure_has_one_traceback(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
-    count = Counter(5)
-
-    def plain() -> None:
-        count()
-        raise ValueError("no echo" if len(count.times) < 4 else "no battery")
-
-    bench.begin(plain, rate=200)
-    await count.wait()
-    await bench.deactivate()
-    traced = [record.exc_info[1] for record in caplog.records if record.exc_info]
-    assert [str(error) for error in traced] == ["no echo", "no battery"]
 
 
 async def test_a_task_on_an_input_gets_the_newest_messages(bench: Bench) -> None:

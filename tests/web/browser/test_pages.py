@@ -413,18 +413,6 @@ async def test_topics_that_carry_data_come_first_and_the_filter_looks_among_all(
     assert "/base/quality" not in await page.run("document.querySelector('main').innerText")
 
 
-async def test_a_parameter_that_another_node_changes_shows_by_itself(site: Site) -> None:
-    page = await site.open("params")
-    await page.wait_text("noetic")
-    site.server.params["/rosdistro"] = "melodic"
-    await page.wait_text("melodic")
-    await page.click("base")
-    await page.wait("document.querySelector('.kind').textContent === 'Of the core of base'")
-    await page.wait_text("melodic")
-    site.server.params["/rosdistro"] = "kinetic"
-    await page.wait_text("kinetic")
-
-
 FIELD = "document.querySelector('form.edit input')"
 
 
