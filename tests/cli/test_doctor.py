@@ -87,6 +87,14 @@ def test_a_core_port_that_somebody_else_has(loopback: Place) -> None:
     assert "Address already in use" in str(taken["text"])
 
 
+def test_the_program_that_shares_the_port_of_beacons_is_named(loopback: Place) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        other.bind(("", 20000 + os.getpid() % 20000))
+        (shared,) = [check for check in found(loopback).values() if "beacons" in str(check["text"])]
+    assert (shared["level"], f"(pid {os.getpid()})" in str(shared["text"])) == ("ok", True), shared
+
+
 @pytest.fixture
 def killed(loopback: Place) -> Place:
     """A machine on which an agent was killed."""

@@ -335,6 +335,7 @@ def test_restart_continues_with_profile_and_requirements() -> None:
     assert one.requirements.keys() == {"/client"}
     assert one.window({"rate": 40.0}, 5.0) == []
     assert applies(one.release("/client", 6.0)) == ["slow"]
+    assert one.release("/client", 6.5) == []
 
     assert applies(restored([at_least(15, hard=True)], "slow").reconsider("it starts", 0.0)) == ["middle"]
     assert applies(restored([], "fast").pin("middle", 0.0)) == ["middle"]

@@ -238,6 +238,19 @@ async def test_a_slow_client_gets_fewer_pictures_and_then_the_newest(camera: Cam
     await until(lambda: not video._transports)
 
 
+async def test_two_clients_share_a_subscription_and_an_encoded_picture(camera: Camera, hub: Hub) -> None:
+    await camera.publish("/raw", RAW, image())
+    await until(lambda: "/raw" in hub.graph.topics)
+    url = camera.url("/stream?topic=/raw&width=20")
+    async with camera.http.get(url) as first, camera.http.get(url) as second:
+        for each in (first, second):
+            await each.content.readline()
+            await part(each.content)
+        video = camera.server._video
+        assert video is not None
+        assert [each.users for each in video._cameras.values()] == [2]
+
+
 NOT_SHOWN = (
     ("/stream", 400, "'' is not a topic's name"),
     ("/stream?topic=/nothing", 404, "there is no topic /nothing"),
