@@ -187,9 +187,9 @@ class Machine(Place):
         return process
 
     def says(self, *arguments: str, code: int = 0, stdin: str = "", **environ: str) -> str:
-        """What a command says that ends; one that may go on to serve is a process of its own."""
+        """What a command says that ends; one that writes its log to a file descriptor is a process of its own."""
         with mock.patch.dict(self.environ, environ):
-            apart = arguments[0] in {"up", "web", "gateway"}
+            apart = arguments[0] in {"up", "gateway"}
             found, out, err = self.run_apart(*arguments) if apart else self.run(*arguments, stdin=stdin)
         assert found == code, out + err
         return out + err

@@ -255,10 +255,12 @@ def test_an_agent_that_does_not_answer_holds_nothing_up(place: Place, monkeypatc
         mute.bind(str(place.path / "base.sock"))
         mute.listen(100)
         code, out, err = place.run("bug-report", "-o", "folder")
+        told = json.loads(place.run("bug-report", "-o", "other", "--json")[1])["missing"]
     assert (code, err) == (1, "")
     missing = [line for line in out.splitlines() if line.startswith("missing: ")]
     assert len(missing) == 1, missing
     assert missing[0].startswith("missing: base/snapshot.json: no agent answers at ")
+    assert missing == [f"missing: {file}: {why}" for file, why in told.items()]
     folder = place.path / "folder"
     assert folder.stat().st_mode & 0o777 == 0o700
     assert {each.name for each in (folder / "base").iterdir()} == {"snapshot.json"}
@@ -282,14 +284,3 @@ def test_each_program_has_its_own_time_and_few_run_at_once(tmp_path: Path) -> No
     assert not missing
     assert files.pop("c.txt") == "exit code 3\nno\n"
     assert {int(text) for text in files.values()} <= {1, 2, 3, 4}
-
-
-def test_what_is_missing_is_on_the_screen(
-    place: Place, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    late = {"doctor.json": "it was ended after 120 s"}
-    monkeypatch.setattr(bug_report, "run_programs", lambda programs, _: (dict.fromkeys(programs, ""), late))
-    assert main(["bug-report", "-o", str(place.path / "folder")]) == 1
-    assert capsys.readouterr().out.splitlines()[-1] == "missing: doctor.json: it was ended after 120 s"
-    code, out, _ = place.run("bug-report", "-o", "other", "--json")
-    assert (code, json.loads(out)["missing"]) == (1, late)

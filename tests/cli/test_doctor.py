@@ -68,23 +68,6 @@ def test_an_agent_and_its_peers_are_looked_at(loopback: Place, agent: Callable[.
     assert not any(line.startswith("ok") for line in out.splitlines())
 
 
-@pytest.mark.parametrize(
-    ("variable", "value", "subject"),
-    [
-        ("ROS_MASTER_URI", "http://203.0.113.7:11311", "ROS_MASTER_URI"),
-        ("ROS_IP", "203.0.113.7", "ROS_IP"),
-        ("ROS_HOSTNAME", "no-such-host.invalid", "ROS_HOSTNAME"),
-        ("ROS_DOMAIN_ID", "1000", "ROS_DOMAIN_ID"),
-    ],
-)
-def test_what_would_mislead_nodes_fails(loopback: Place, variable: str, value: str, subject: str) -> None:
-    loopback.environ["ROS_IP"] = "127.0.0.1"
-    loopback.environ[variable] = value
-    if variable == "ROS_HOSTNAME":
-        del loopback.environ["ROS_IP"]
-    assert found(loopback, code=1)["ROS", subject]["level"] == "fail"
-
-
 def test_invalid_settings_are_reported_and_the_rest_is_checked(loopback: Place) -> None:
     (loopback.path / "bad.toml").write_text('[discovery]\ninterfaces = ["lo"]\n[core]\nprot = 1\n')
     loopback.environ["RMPA_INTERFACES"] = "lo"
@@ -102,6 +85,14 @@ def test_a_core_port_that_somebody_else_has(loopback: Place) -> None:
         taken = found(loopback, code=1)["port", str(port)]
     assert taken["level"] == "fail"
     assert "Address already in use" in str(taken["text"])
+
+
+def test_the_program_that_shares_the_port_of_beacons_is_named(loopback: Place) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        other.bind(("", 20000 + os.getpid() % 20000))
+        (shared,) = [check for check in found(loopback).values() if "beacons" in str(check["text"])]
+    assert (shared["level"], f"(pid {os.getpid()})" in str(shared["text"])) == ("ok", True), shared
 
 
 @pytest.fixture

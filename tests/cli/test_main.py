@@ -118,10 +118,9 @@ def test_completion_scripts(shell: str) -> None:
     assert "_RMPA_COMPLETE" in CliRunner().invoke(cli, ["completion", shell]).output
 
 
-@pytest.mark.parametrize("module", ["rmpa.agent.agent", "rmpa.cli.agent", "rmpa.cli.peer", "rmpa.cli.topic"])
-def test_heavy_packages_wait_until_they_are_needed(module: str) -> None:
+def test_heavy_packages_wait_until_they_are_needed() -> None:
     heavy = {"aiohttp", "rmpa.web", "rich", "numpy", "rosbags", "ruamel", "yaml", "matplotlib"}
-    assert loaded_by(f"import {module}").isdisjoint(heavy)
+    assert loaded_by("import rmpa.agent.agent, rmpa.cli.agent, rmpa.cli.peer, rmpa.cli.topic").isdisjoint(heavy)
 
 
 def test_help_imports_no_command() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 
 import click
 import msgspec
@@ -11,7 +10,7 @@ import pytest
 
 from rmpa.cli.graph import read_name
 from rmpa.cli.main import PlacedHelp, help_of
-from rmpa.cli.output import Painted, Table, duration, print_error, print_text, printable, size, warn
+from rmpa.cli.output import Painted, duration, print_error, print_text, printable, size, warn
 from rmpa.cli.topic import facts
 from rmpa.cli.values import fill_stamps, flatten, pick, read_values, shorten, to_text
 from rmpa.core import errors
@@ -156,17 +155,3 @@ def test_all_that_a_terminal_or_a_log_shows_says_where_pages_are(
     out, err = capsys.readouterr()
     for text in (*out.splitlines(), *err.splitlines(), logged, help_):
         assert f"/usr/share/doc/rmpa/{page}" in text
-
-
-def test_a_table_measures_its_columns_once(capsys: pytest.CaptureFixture[str]) -> None:
-    class Counting(list[list[str]]):
-        looks = 0
-
-        def __iter__(self) -> Iterator[list[str]]:
-            self.looks += 1
-            return super().__iter__()
-
-    rows = Counting(["/a", str(number)] for number in range(300))
-    print_text(Table("TOPIC, >MESSAGES", rows))
-    assert len(capsys.readouterr().out.splitlines()) == 301
-    assert rows.looks < 10, "not once for each row"

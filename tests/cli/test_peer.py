@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from rmpa.cli import peer
-from rmpa.cli.options import Selection, summary
+from rmpa.cli.options import Selection
 from rmpa.core.errors import RmpaError
 from rmpa.observe.snapshot import ModuleFacts, read_facts, reading
 from tests.cli.conftest import Place
@@ -95,7 +95,3 @@ def test_a_terminal_shows_the_first_of_many_unless_all_is_said(monkeypatch: pyte
     assert Selection().is_long(range(20_000))
     assert not Selection().is_long(range(100))
     assert not Selection(everything=True).is_long(range(20_000))
-
-
-def test_the_summary_names_the_most_frequent_first() -> None:
-    assert summary(3, "peers", ["relayed", "linked", "relayed"]) == "3 peers: 2 relayed, 1 linked"

@@ -48,24 +48,6 @@ def agent_options(*more: str) -> tuple[str, ...]:
     return ("up", "--name", "base", "--core-port", str(free_port()), "--multicast", "off", *more)
 
 
-def test_it_waits_for_an_agent_and_survives_its_end(place: Place) -> None:
-    port = free_port()
-    with running(place, "web", "--port", str(port)) as web:
-        assert web.stdout is not None
-        assert web.stdout.readline() == f"http://127.0.0.1:{port}/\n"
-        assert get(port, "/healthz")[0] == 503
-        assert "rmpa up" in get(port, "/api/v1/agent")[1]
-        with running(place, *agent_options(), end=signal.SIGKILL):
-            until(lambda: get(port, "/healthz")[0] == 200)
-            assert json.loads(get(port, "/api/v1/agent")[1])["name"] == "base"
-            assert "\nrmpa_up 1.0\n" in get(port, "/metrics")[1]
-        until(lambda: get(port, "/healthz")[0] == 503)
-        assert "\nrmpa_up 0.0\n" in get(port, "/metrics")[1]
-        with running(place, *agent_options()):
-            until(lambda: get(port, "/healthz")[0] == 200)
-    assert web.returncode == 0
-
-
 def test_it_outlives_an_agent_that_is_killed_and_the_next_one_takes_it_over(
     machines: Callable[[str], Machine],
 ) -> None:
@@ -91,6 +73,8 @@ def test_it_outlives_an_agent_that_is_killed_and_the_next_one_takes_it_over(
     connection = client.sock
     kill(agent)
     until(lambda: answer() == 503)
+    assert "rmpa up" in get(port, "/api/v1/agent")[1]
+    assert "\nrmpa_up 0.0\n" in get(port, "/metrics")[1]
     agent = machine.up(*words, RMPA_WEB_PORT=str(port))
     until(lambda: answer() == 200)
     assert client.sock is connection, "its client is connected all the time"

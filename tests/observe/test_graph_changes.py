@@ -7,7 +7,7 @@ import pytest
 
 from rmpa.observe import graph as graph_changes
 from rmpa.observe import limits
-from rmpa.observe.graph import GraphHistory, GraphRevision, GraphRows, ServiceRow, TopicRow
+from rmpa.observe.graph import GraphHistory, GraphRevision, GraphRows, TopicRow
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import Registrations
 
@@ -32,40 +32,6 @@ class _Graph:
 
     def ask(self, known: object) -> GraphRows:
         return self.history.rows_since(known, self.tables.state())
-
-
-def test_the_first_answer_has_the_whole_graph_and_the_next_one_what_has_changed() -> None:
-    graph = _Graph()
-    graph.publish("/a")
-    row = TopicRow("/a", "std_msgs/String", ("/talker",), ())
-    assert graph.ask(None) == GraphRows(whole=True, topics=(row,))
-    known = graph.history.revision
-    assert graph.ask(known) == GraphRows()
-
-    graph.publish("/b")
-    graph.tables.register(RegistrationKind.SUBSCRIBER, "/b", "/listener", _API, "std_msgs/String")
-    graph.tables.register(RegistrationKind.SERVICE, "/set", "/talker", _API, "rosrpc://127.0.0.1:8")
-    graph.tables.purge("/none", _API)
-    graph.note()
-    assert graph.ask(known) == GraphRows(
-        topics=(TopicRow("/b", "std_msgs/String", ("/talker",), ("/listener",)),),
-        services=(ServiceRow("/set", ("/talker",)),),
-    )
-    assert {row.name for row in graph.ask(known + 1).topics} == {"/b"}
-
-
-def test_what_is_gone_is_told_without_nodes() -> None:
-    graph = _Graph()
-    graph.publish("/a")
-    graph.tables.register(RegistrationKind.SERVICE, "/set", "/talker", _API, "rosrpc://127.0.0.1:8")
-    graph.note()
-    graph.ask(None)
-    known = graph.history.revision
-    graph.tables.purge("/talker", _API)
-    graph.note()
-    rows = graph.ask(known)
-    assert rows.topics == (TopicRow("/a", "std_msgs/String", (), ()),)
-    assert rows.services == (ServiceRow("/set", ()),)
 
 
 def test_nothing_is_kept_without_a_client_and_no_more_when_it_is_far_behind(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,19 +44,15 @@ def test_a_topic_that_is_relayed_by_rule_says_so() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wanted", "condition", "warned"),
+    ("changes", "warned"),
     [
-        ("direct", "reachable", True),
-        ("auto", "reachable", False),
-        ("direct", "measures", False),
-        ("direct", "transport", False),
+        ({"wanted": "direct", "condition": "reachable"}, True),
+        ({"wanted": "auto", "condition": "reachable"}, False),
+        ({"wanted": "direct", "condition": "measures"}, False),
+        ({"wanted": "direct", "condition": "transport"}, False),
+        ({"transport": "direct", "condition": "transport"}, True),  # and has to be relayed
     ],
 )
-def test_only_a_direct_contract_that_falls_back_is_warned_of(wanted: str, condition: str, warned: bool) -> None:
-    one = msgspec.structs.replace(VIEWER, **(RELAYED | {"wanted": wanted, "condition": condition}))
-    assert bool(misplaced(msgspec.structs.replace(DIRECT, subscribers=(one, VIEWER)))) is warned
-
-
-def test_a_subscriber_that_is_direct_and_has_to_be_relayed_is_warned_of() -> None:
-    one = msgspec.structs.replace(VIEWER, **(RELAYED | {"transport": "direct", "condition": "transport"}))
-    assert misplaced(msgspec.structs.replace(DIRECT, subscribers=(VIEWER, one))) == [one]
+def test_only_a_direct_contract_that_falls_back_is_warned_of(changes: dict[str, str], warned: bool) -> None:
+    one = msgspec.structs.replace(VIEWER, **(RELAYED | changes))
+    assert misplaced(msgspec.structs.replace(DIRECT, subscribers=(one, VIEWER))) == [one] * warned

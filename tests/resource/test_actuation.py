@@ -85,20 +85,6 @@ def test_numbers_are_the_same_within_a_tolerance(one: object, other: object, equ
     assert same(one, other) is equal
 
 
-async def test_a_profile_sets_its_values_at_the_node(core: RosCore) -> None:
-    resource = camera()
-    async with driver(core, frame_rate=25.0, gain=7.0) as cam, running(core, resource) as one:
-        assert cam.values["frame_rate"] == 10.0  # small is the cheapest; the node has it as a double
-        assert resource.parameters["fps"].value == 10
-        await until(lambda: resource.parameters["gain"].value == 7.0, "what no profile sets is taken over")
-        await choose(one, profile="full")
-        assert cam.values == {"frame_rate": 30.0, "gain": 7.0}
-        assert cam.calls == [{"frame_rate": 10.0}, {"frame_rate": 30.0}]
-        last = decision(one)["history"][-1]
-        assert (last["from"], last["to"], last["why"]) == ("small", "full", "full was chosen by hand")
-        assert 0 < last["took"] < 5
-
-
 async def test_a_value_that_the_node_clips_is_undone_and_the_next_profile_taken(core: RosCore) -> None:
     resource = camera()
     async with driver(core, frame_rate=25.0, gain=1.0) as cam, running(core, resource) as one:

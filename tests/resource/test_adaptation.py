@@ -3,16 +3,16 @@ from __future__ import annotations
 import random
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource.adaptation import Adaptation, CoolDown
-from rmpa.resource.decision import Alarm, AlarmKind, Decider
+from rmpa.resource.decision import AlarmKind, Decider
 from rmpa.resource.declare import AdaptationSettings, Profile
 from rmpa.resource.quality import MEASURED, Bound, Requirement
-from tests.resource.rig import bound
+from tests.resource.rig import Action, Apply, Clear, Raise, Reacted, Recorder, bound
 
 RATE, LATENCY = MEASURED["rate"], MEASURED["latency"]
 ATTRIBUTES = {"rate": RATE, "latency": LATENCY}
@@ -23,43 +23,6 @@ LIMP = Profile("limp", {"rate": 1.0, "latency": 0.5}, best_effort=True, cost=2)
 SETTINGS = AdaptationSettings(
     violations=2, windows=3, improvement=0.05, dwell=2.0, settle=0.0, cool_down=10.0, apply_timeout=5.0
 )
-
-
-class Apply(NamedTuple):
-    profile: str
-
-
-class Raise(NamedTuple):
-    alarm: Alarm
-
-
-class Clear(NamedTuple):
-    alarm: Alarm
-
-
-class Reacted(NamedTuple):
-    profile: str
-    reaction: float
-
-
-Action = Apply | Raise | Clear | Reacted
-
-
-class Recorder:
-    """A driver that lists what the loop tells it."""
-
-    def __init__(self) -> None:
-        self.told: list[Action] = []
-
-    def apply(self, profile: str, why: str) -> None:
-        assert why
-        self.told.append(Apply(profile))
-
-    def alarm(self, alarm: Alarm, *, cleared: bool) -> None:
-        self.told.append(Clear(alarm) if cleared else Raise(alarm))
-
-    def reacted(self, profile: str, reaction: float) -> None:
-        self.told.append(Reacted(profile, reaction))
 
 
 class Loop:
@@ -138,14 +101,6 @@ def test_a_request_is_translated_into_the_most_similar_profile() -> None:
     assert (one.profile, one.applying) == ("slow", "middle")
     assert one.applied("middle", 1.25) == [Reacted("middle", 0.25)]
     assert (one.profile, one.applying) == ("middle", "")
-
-
-def test_a_client_that_leaves_is_forgotten() -> None:
-    one = running(30)
-    assert one.profile == "fast"
-    assert applies(one.release("/client", 2.0)) == ["slow"]
-    finish(one, 2.0)
-    assert one.release("/client", 3.0) == []
 
 
 def test_a_request_expires() -> None:
@@ -279,11 +234,6 @@ def test_what_a_better_profile_waits_for_is_the_dwell_time() -> None:
     assert applies(one.window({"latency": 0.1}, 4.5)) == ["fast"]
 
 
-def test_a_barred_profile_is_left_at_once() -> None:
-    one = running(30)
-    assert applies(one.block({"fast": "battery low"}, 1.5)) == ["middle"]
-
-
 def test_a_choice_by_hand_holds_whatever_is_asked() -> None:
     one = running(30)
     assert applies(one.pin("slow", 2.0)) == ["slow"]
@@ -385,6 +335,7 @@ def test_restart_continues_with_profile_and_requirements() -> None:
     assert one.requirements.keys() == {"/client"}
     assert one.window({"rate": 40.0}, 5.0) == []
     assert applies(one.release("/client", 6.0)) == ["slow"]
+    assert one.release("/client", 6.5) == []
 
     assert applies(restored([at_least(15, hard=True)], "slow").reconsider("it starts", 0.0)) == ["middle"]
     assert applies(restored([], "fast").pin("middle", 0.0)) == ["middle"]
@@ -426,15 +377,6 @@ def test_windows_within_the_settling_time_do_not_count() -> None:
     assert [one.window({"rate": 2.0}, 7.0), one.window({"rate": 2.0}, 8.0)] == [[], []]
     assert one.window({"rate": 2.0}, 9.0) == []
     assert [kind for kind, _, _ in alarms(one.window({"rate": 2.0}, 10.0))] == [AlarmKind.NON_ADAPTABLE]
-
-
-def test_a_profile_that_hung_is_in_its_cool_down_after_the_restart() -> None:
-    one = Loop()
-    one.reconsider("it starts", 0.0)
-    one.begin_cool_down("slow", "not applied within 5 s", 5.0)
-    again = restored([], "", one.cooling(6.0), 6.0)
-    assert applies(again.reconsider("it starts", 6.0)) == ["middle"]
-    assert {s.profile: s.excluded for s in again.explain(6.0)}["slow"] == "not applied within 5 s"
 
 
 def test_restored_cool_down_runs_to_its_end() -> None:

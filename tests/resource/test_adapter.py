@@ -6,7 +6,6 @@ import time
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
-import msgspec
 import pytest
 
 from rmpa.core.errors import PeerRefused, UnreachableError
@@ -24,7 +23,7 @@ from rmpa.resource.runtime import RuntimePart
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import DiagnosticLevel
-from tests.resource.rig import ARRAY, ERROR, OK, WARN, bound, listen, pairs, status
+from tests.resource.rig import ARRAY, ERROR, OK, WARN, Recorder, bound, pairs, status
 from tests.waiting import until
 
 RATE, LATENCY = MEASURED["rate"], MEASURED["latency"]
@@ -33,16 +32,8 @@ FAST = Profile("fast", {"rate": 40.0})
 WANTED = bound(RATE, at_least=20, hard=True)
 
 
-class Silent:
-    def apply(self, profile: str, why: str) -> None: ...
-
-    def alarm(self, alarm: Alarm, *, cleared: bool) -> None: ...
-
-    def reacted(self, profile: str, reaction: float) -> None: ...
-
-
 def decided(*, runs: bool = True, rate: float = 20.0) -> Adaptation:
-    one = Adaptation(ATTRIBUTES, Decider("camera", ATTRIBUTES, [FAST]), AdaptationSettings(), Silent())
+    one = Adaptation(ATTRIBUTES, Decider("camera", ATTRIBUTES, [FAST]), AdaptationSettings(), Recorder())
     if runs:
         one.reconsider("it starts", 0.0)
         one.applied("fast", 0.0)
@@ -154,26 +145,6 @@ def say(publisher: Any, **values: str) -> None:
     publisher.publish(publisher.make({"status": [{"name": "client", "values": pairs}]}))
 
 
-async def test_client_is_served_and_answered(sonar: Sonar, node: Node) -> None:
-    responses = await node.subscribe("/sonar/responses", ARRAY)
-    profiles = await listen(node, "/sonar/profile")
-    await ask(node, noise="<= 5 cm", rate=">= 1 Hz")
-    await until(lambda: profiles and profiles[-1].data == "fine")
-    sonar.noise.observe(0.01)
-    told = await status(responses, lambda s: s.name == "/client" and "0.01 m" in pairs(s)["noise"])
-    assert (told.level, told.message) == (OK, "profile fine")
-    assert pairs(told)["noise"] == "wanted at most 0.05 m, given 0.01 m"
-    decisions = await listen(node, "/sonar/decision")
-    await until(lambda: decisions and msgspec.json.decode(decisions[-1].data)["profile"] == "fine")
-    said = msgspec.json.decode(decisions[-1].data)
-    assert (said["applying"], said["clients"]) == ("", ["/client"])
-    assert {term["attribute"] for term in said["scores"][0]["terms"]} == {"noise", "rate"}
-    assert [(score["profile"], score["distance"] < 0.1) for score in said["scores"]] == [
-        ("fine", True),
-        ("coarse", False),
-    ]
-
-
 async def test_violation_raises_an_alarm_and_changes_the_profile(sonar: Sonar, node: Node) -> None:
     alarms = await node.subscribe("/sonar/alarms", ARRAY)
     quality = await node.subscribe("/diagnostics", ARRAY)
@@ -217,15 +188,6 @@ async def test_invalid_requirement_is_answered_and_changes_nothing(sonar: Sonar,
     assert pairs(told)["noise"].startswith("wanted at most 0.05 m")
     say(publisher, noise="<= 6 cm")
     await status(responses, lambda s: s.name == "/client" and s.level == OK)
-
-
-async def test_dead_client_is_released(sonar: Sonar, core: RosCore) -> None:
-    async with Node("mortal", master_uri=core.uri) as node:
-        responses = await node.subscribe("/sonar/responses", ARRAY)
-        await ask(node, noise="<= 5 cm")
-        await status(responses, lambda s: s.name == "/mortal" and s.level == OK)
-        assert sonar.adapter.adaptation.requirements.keys() == {"/mortal"}
-    await until(lambda: not sonar.adapter.adaptation.requirements and sonar.current == "coarse")
 
 
 async def test_resource_client_requests_and_answers(sonar: Sonar, node: Node) -> None:

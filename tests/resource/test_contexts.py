@@ -132,23 +132,6 @@ async def test_parameters_are_set_and_published_together(lamp: Lamp, node: Node)
             await asyncio.sleep(0.02)
 
 
-async def test_profile_is_chosen_by_hand_and_released(lamp: Lamp, node: Node) -> None:
-    loop = lamp.member.adapter.adaptation
-    await until(lambda: loop.profile == "slow", "the cheapest does not run")
-    assert (await ask(node, profile="fast"))["profile"] == "fast"
-    assert loop.profile == lamp.profile == "fast"
-    with pytest.raises(PeerRefused, match="profile broken: it could not be applied: OSError: no such bulb; what was"):
-        await ask(node, profile="broken", context="away", red=7)
-    await until(lambda: loop.profile == "fast" and not loop.applying, "the one before does not come back")
-    assert loop.pinned == "fast"
-    assert lamp.red.value == 0
-    assert lamp.member.contexts.chosen == ""
-    with pytest.raises(PeerRefused, match="there is no profile 'fsat'; did you mean fast"):
-        await ask(node, profile="fsat")
-    assert (await ask(node, profile="automatic"))["profile"] == ""
-    await until(lambda: loop.profile == "slow", "it does not decide again")
-
-
 async def test_parameter_server_values_are_loaded(core: RosCore, node: Node) -> None:
     chosen = {"profile": "fast", "context": "away"}
     await node.set_param("/lamp", {"level": 20, "red": "much", "green": 4, "else": [1], **chosen})

@@ -20,7 +20,6 @@ from rmpa.resource.quality import at_least, at_most
 from rmpa.resource.reconfigure import (
     DESCRIPTION_TYPE,
     checked,
-    config,
     description,
     entries,
     read_config,
@@ -193,16 +192,6 @@ def test_invalid_declaration_is_refused(mistake: Callable[[Resource], object], s
     assert describe(one, "/sonar") == before
 
 
-def test_a_parameter_takes_what_its_type_allows() -> None:
-    gain, beam = sonar().parameters["gain"], sonar().parameters["beam"]
-    assert gain.check(3) == 3.0
-    for wrong in ("3", True, float("nan"), 11.0):
-        with pytest.raises(ConfigError):
-            gain.check(wrong)
-    with pytest.raises(ConfigError, match="did you mean narrow"):
-        beam.check("narow")
-
-
 def test_what_has_one_name_in_two_namespaces_is_measured_apart() -> None:
     mixer = Resource("mixer", role="sensing")
     for name in ("scan", "/left/scan"):
@@ -305,19 +294,6 @@ def test_choices_are_an_expression_that_clients_evaluate() -> None:
     assert chosen == [
         ("(automatic)", "", "not chosen by hand"), ("slow", "slow", "it's \"slow\""), ("Automatic", "Automatic", ""),
     ]  # fmt: skip
-
-
-def test_without_contexts_there_is_none_to_choose() -> None:
-    one = Resource("bare", role="sensing")
-    one.profile(offers={}, name="only")(lambda: None)
-    assert list(entries(one)) == ["profile"]
-
-
-def test_a_config_comes_back() -> None:
-    values: dict[str, Any] = {"gain": 2.5, "echoes": 4, "beam": "narrow", "on": False, "profile": "slow"}
-    message = sent(CONFIG_TYPE, config(values))
-    assert read_config(message) == values
-    assert [(g.name, g.state, g.id, g.parent) for g in message.groups] == [("Default", True, 0, 0)]
 
 
 def test_a_number_out_of_range_is_clipped_as_its_servers_do() -> None:

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
-from typing import Any
 
 from rmpa.resource import limits
 from rmpa.resource.adaptation import Adaptation
@@ -13,7 +12,7 @@ from rmpa.resource.node import ResourceNode
 from rmpa.resource.quality import MEASURED, Requirement
 from rmpa.resource.resource import Resource
 from rmpa.ros.core.embedded import RosCore
-from tests.resource.rig import bound
+from tests.resource.rig import Apply, Recorder, bound
 from tests.resource.test_actuation import running
 from tests.waiting import until
 
@@ -62,23 +61,15 @@ def test_profiles_are_compared_by_what_was_learnt_if_there_is_enough() -> None:
 
 
 def test_a_change_by_what_was_learnt_says_so() -> None:
-    reasons: list[tuple[str, str]] = []
-
-    class Out:
-        def apply(self, profile: str, why: str) -> None:
-            reasons.append((profile, why))
-
-        def alarm(self, *_: Any, **__: Any) -> None: ...
-
-        def reacted(self, *_: Any) -> None: ...
-
+    out = Recorder()
     decider = Decider("camera", ATTRIBUTES, [FAST, SLOW], learnt(limits.LEARNT_LEAST), by_learnt=True)
-    one = Adaptation(ATTRIBUTES, decider, AdaptationSettings(offers=OfferSource.LEARNT), Out())
+    one = Adaptation(ATTRIBUTES, decider, AdaptationSettings(offers=OfferSource.LEARNT), out)
     one.require(Requirement("/a", {"rate": WANTED}), 0.0)
-    assert reasons == [("slow", "/a asks for a quality")]
+    assert out.told == [Apply("slow", "/a asks for a quality")]
     one.applied("slow", 0.0)
     one.pin("fast", 1.0)
-    assert reasons[1] == ("fast", "fast was chosen by hand (learnt: fast has given rate 10 Hz, declared 40 Hz)")
+    why = "fast was chosen by hand (learnt: fast has given rate 10 Hz, declared 40 Hz)"
+    assert out.told[-1] == Apply("fast", why)
 
 
 async def test_what_was_learnt_is_kept_over_a_restart(core: RosCore, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import struct
+from typing import Any
 
 import pytest
 
@@ -22,6 +23,42 @@ def feed(quality: TopicQuality, times: list[float], *, late: float = 0.0, first:
         quality.message(stamped(first + number, now - late), now, WALL + round(now * 1e9))
 
 
+TIMED: dict[str, Any] = {"deadline": 0.15}
+NUMBERED: dict[str, Any] = {"stamped": True, "numbered": True}
+Feed = tuple[list[float], int]
+
+
+@pytest.mark.parametrize(
+    ("options", "feeds", "windows"),
+    [
+        # Streams with the number of their first message, each up to a window; the window's end, and what it has.
+        ({}, [([0.0, 0.1, 0.3, 0.4, 0.6], 0)], {0.6: {"period_sd": 0.05}}),
+        ({}, [([0.9], 0), ([1.4], 0)], {1.0: {}, 1.5: {"rate": 2.0}}),  # a period reaches over the border of two
+        (
+            TIMED,  # the rate falls as soon as messages stop
+            [([0.1, 0.2, 0.3], 0), ([], 0)],
+            {1.3: {"rate": 1.0}, 2.3: {"rate": 0.5, "deadline_misses": 1.0, "age": 2.0, "period_sd": None}},
+        ),
+        (TIMED, [([0.1, 0.2, 0.4, 0.5, 0.6], 0)], {0.6: {"deadline_misses": 0.25}}),
+        # Gaps in the numbers are losses, a restart is none, and numbers go round.
+        (
+            NUMBERED,
+            [([0.1, 0.2, 0.3], 5), ([0.4], 11), ([1.1, 1.2], 0)],
+            {0.35: {}, 1.0: {"loss": 0.75}, 2.0: {"loss": 0.0}},
+        ),
+        (NUMBERED, [([0.1], (1 << 32) - 1), ([0.2], 0)], {0.15: {}, 1.0: {"loss": 0.0}}),
+    ],
+)
+def test_what_a_window_has(
+    options: dict[str, Any], feeds: list[Feed], windows: dict[float, dict[str, float | None]]
+) -> None:
+    quality = TopicQuality(0.0, **options)
+    for (times, first), (end, wanted) in zip(feeds, windows.items(), strict=True):
+        feed(quality, times, first=first)
+        found = quality.window(end)
+        assert {name: found.get(name) for name in wanted} == pytest.approx(wanted)
+
+
 def test_a_steady_stream() -> None:
     quality = TopicQuality(0.0, stamped=True, numbered=True, deadline=0.15)
     feed(quality, [0.1 * n for n in range(1, 11)], late=0.02)
@@ -34,44 +71,12 @@ def test_a_steady_stream() -> None:
         "deadline_misses": 0.0,
         "loss": 0.0,
     }
-
-
-def test_the_deviation_of_the_period() -> None:
-    quality = TopicQuality(0.0)
-    feed(quality, [0.0, 0.1, 0.3, 0.4, 0.6])
-    assert quality.window(0.6)["period_sd"] == pytest.approx(0.05)
-
-
-def test_a_period_reaches_over_the_border_of_two_windows() -> None:
-    quality = TopicQuality(0.0)
-    feed(quality, [0.9])
-    quality.window(1.0)
-    feed(quality, [1.4])
-    assert quality.window(1.5)["rate"] == pytest.approx(2.0)
-
-
-def test_rate_falls_as_soon_as_messages_stop() -> None:
-    quality = TopicQuality(0.0, deadline=0.15)
-    feed(quality, [0.1, 0.2, 0.3])
-    assert quality.window(1.3)["rate"] == pytest.approx(1.0)
-    empty = quality.window(2.3)
-    assert empty["rate"] == pytest.approx(0.5)
-    assert empty["deadline_misses"] == 1.0
-    assert empty["age"] == pytest.approx(2.0)
-    assert "period_sd" not in empty
-
-
-def test_a_stream_that_never_began_has_no_rate() -> None:
+    quality.restart(2.0)  # under another profile everything begins anew
+    feed(quality, [2.1, 2.2, 2.3])
+    found = quality.window(2.3)
+    assert found["rate"] == pytest.approx(10.0)
+    assert found["deadline_misses"] == 0.0
     assert TopicQuality(0.0, stamped=True, deadline=1.0).window(1.0) == {"bandwidth": 0.0, "rate": 0.0}
-
-
-def test_gaps_in_the_numbers_are_losses_and_a_restart_is_none() -> None:
-    quality = TopicQuality(0.0, stamped=True, numbered=True)
-    feed(quality, [0.1, 0.2], first=5)
-    feed(quality, [0.3, 0.4], first=9)
-    assert quality.window(1.0)["loss"] == pytest.approx(2 / 6)
-    feed(quality, [1.1, 1.2], first=0)
-    assert quality.window(2.0)["loss"] == 0.0
 
 
 def test_each_publisher_has_its_own_numbers() -> None:
@@ -80,29 +85,6 @@ def test_each_publisher_has_its_own_numbers() -> None:
         for source, first in (("/left", 10), ("/right", 5000)):
             quality.message(stamped(first + number, 0.0), 0.1 * number, WALL, source)
     assert quality.window(1.0)["loss"] == 0.0
-
-
-def test_under_another_profile_everything_begins_anew() -> None:
-    quality = TopicQuality(0.0, deadline=0.15)
-    feed(quality, [0.1, 0.4, 0.8])
-    quality.restart(2.0)
-    feed(quality, [2.1, 2.2, 2.3])
-    found = quality.window(2.3)
-    assert found["rate"] == pytest.approx(10.0)
-    assert found["deadline_misses"] == 0.0
-
-
-def test_numbers_go_round() -> None:
-    quality = TopicQuality(0.0, stamped=True, numbered=True)
-    feed(quality, [0.1], first=(1 << 32) - 1)
-    feed(quality, [0.2], first=0)
-    assert quality.window(1.0)["loss"] == 0.0
-
-
-def test_misses_are_a_share() -> None:
-    quality = TopicQuality(0.0, deadline=0.15)
-    feed(quality, [0.1, 0.2, 0.4, 0.5, 0.6])
-    assert quality.window(0.6)["deadline_misses"] == pytest.approx(1 / 4)
 
 
 def test_what_has_no_stamp_has_no_latency() -> None:

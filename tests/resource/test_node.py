@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused
-from rmpa.resource.node import TRANSITIONS, ResourceNode, run_all
+from rmpa.resource.node import TRANSITIONS, ResourceNode
 from rmpa.resource.quality import at_most
 from rmpa.resource.resource import Resource
 from rmpa.resource.runtime import LifecycleState
@@ -136,19 +136,6 @@ def test_a_resource_without_a_profile_is_refused() -> None:
 
     with pytest.raises(ConfigError, match="it has no System Profile; declare one"):
         asyncio.run(make())
-
-
-async def test_resources_run_until_stopped(core: RosCore) -> None:
-    stop, ready = asyncio.Event(), asyncio.Event()
-    other = Resource("other", role="sensing")
-    other.profile(offers={}, name="plain")(lambda: None)
-    running = asyncio.create_task(run_all([echo(), other], core.uri, stop, ready.set))
-    async with asyncio.timeout(30):
-        await ready.wait()
-        assert {"/echo", "/other"} <= core.state().nodes.keys()
-        stop.set()
-        await running
-    assert not {"/echo", "/other"} & core.state().nodes.keys()
 
 
 class Loud:

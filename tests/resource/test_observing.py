@@ -9,12 +9,10 @@ from typing import Any
 from rmpa.resource import limits
 from rmpa.resource.description import read_description
 from rmpa.resource.measuring import TopicCounters
-from rmpa.resource.runtime import describe
 from rmpa.resource.sources import read_zones
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import ARRAY_TYPE
-from rmpa.ros.types.descriptor import Descriptor
 from tests.resource.rig import ARRAY, ERROR, OK, STALE, listen, pairs, status
 from tests.resource.test_actuation import running
 from tests.waiting import until
@@ -204,15 +202,3 @@ async def test_a_rule_raises_an_alarm_and_bars_a_profile(core: RosCore, node: No
         assert over.message == "over: the battery is nearly empty"
         await until(lambda: not one.adapter.decision()["scores"][0]["excluded"])
         await status(quality, lambda s: s.level == OK)
-
-
-def test_the_descriptor_says_what_is_wrapped() -> None:
-    text = (
-        IMAGE
-        + '[parameter.fps]\ndynamic = "frame_rate"\ndefault = 30\n[profile.slow]\nset = { fps = 5 }\noffers = {}'
-    )
-    said = Descriptor.parse(describe(described(text), "/camera").serialize())
-    assert said.file == "camera.resource.toml"
-    assert [(node.key, node.name, node.how) for node in said.nodes] == [("cam", "/cam", "attached")]
-    assert (said.parameters[0].binding, said.outputs[0].observed) == ("cam dynamic frame_rate", True)
-    assert said.profiles[1].sets == {"fps": 5}

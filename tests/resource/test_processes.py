@@ -145,16 +145,6 @@ async def test_a_node_that_cannot_start_fails_its_profile_with_the_end_of_its_lo
     assert "no_package no_node refused: there is no such executable" in cooling["p1"].why
 
 
-async def test_a_node_that_dies_is_an_alarm_and_adaptation_follows(make: Make, node: Node) -> None:
-    alarms = await node.subscribe("/cam/alarms", ARRAY)
-    one = make(described(("laser",), (), laser=()))
-    await one.start()
-    os.kill(await runs(one, "laser"), signal.SIGKILL)
-    await status(alarms, lambda each: each.level == WARN and "node /laser was ended by SIGKILL" in each.message)
-    await until(lambda: one.adapter.adaptation.profile == "p1")
-    assert "was ended by SIGKILL" in one.adapter.adaptation.cooling(0.0)["p0"].why
-
-
 async def test_a_node_that_always_runs_is_started_again_by_its_policy(make: Make, node: Node) -> None:
     alarms = await node.subscribe("/cam/alarms", ARRAY)
     one = make(described((), laser=(), once={"restart": "never"}))

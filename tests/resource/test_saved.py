@@ -85,16 +85,6 @@ def test_what_does_not_fit_any_more_is_left_out_and_reported(state: SavedState, 
     assert said in text
 
 
-def test_an_expiry_is_the_wall_clocks() -> None:
-    with pytest.raises(ConfigError):
-        SavedRequirement(client="/a", values=(("noise", "soft"),)).requirement(sonar().attributes, "sonar", 0.0, NOW)
-    forever = SavedRequirement(client="/a", values=(("noise", "<= 1 m"),)).requirement(
-        sonar().attributes, "sonar", 5.0, NOW
-    )
-    assert forever is not None
-    assert forever.expires is None
-
-
 @pytest.mark.parametrize(
     ("ahead", "left"),
     [(12, 12), (20, 20), (500, 20), (10**9, 20), (0, None), (-1, None), (-(10**9), None)],

@@ -1,7 +1,12 @@
-"""A snapshot with everything in it."""
+"""A snapshot with everything in it, and an agent that shows it."""
 
 from __future__ import annotations
 
+import threading
+
+import msgspec
+
+from rmpa.core.errors import UnreachableError
 from rmpa.core.facts import (
     BoundInfo,
     EventInfo,
@@ -15,6 +20,7 @@ from rmpa.core.facts import (
 )
 from rmpa.core.statistics import SampleSpread
 from rmpa.observe.snapshot import AgentInfo, PeerInfo, Snapshot
+from tests.waiting import DEADLINE
 
 SPREAD = SampleSpread(count=60, mean=0.1, sd=0.01, min=0.08, max=0.2, p50=0.1, p99=0.15)
 LATENCY = LatencyInfo(
@@ -101,3 +107,25 @@ FULL = Snapshot(
     notes=("port taken",),
     unreachable=(UnreachableInfo(node="/dead", uri="http://x:1/", problem="refused", ago=20.0),),
 )
+
+
+class Agent:
+    """An agent that answers with one snapshot, which a test can stop; counts the questions to it."""
+
+    def __init__(self, core_uri: str = AGENT.core_uri) -> None:
+        self.snapshot = msgspec.structs.replace(FULL, agent=msgspec.structs.replace(AGENT, core_uri=core_uri))
+        self.now = 0.0
+        self.up = True
+        self.asked = 0
+        self.may_answer = threading.Event()
+        self.may_answer.set()
+
+    def clock(self) -> float:
+        return self.now
+
+    def read(self) -> Snapshot:
+        self.asked += 1
+        assert self.may_answer.wait(DEADLINE)
+        if not self.up:
+            raise UnreachableError("agent", "its socket", "start one with `rmpa up`")
+        return self.snapshot

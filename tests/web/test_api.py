@@ -83,11 +83,6 @@ def test_a_path_that_is_too_long_is_not_read(monkeypatch: pytest.MonkeyPatch) ->
     assert (get("/topics/image").status, get("/topics").status) == (404, 200)
 
 
-def test_without_an_agent_it_says_so_and_what_to_do() -> None:
-    response = get("/snapshot", None)
-    assert (response.status, "rmpa up" in problem(response)) == (503, True)
-
-
 @given(st.text(max_size=40))
 def test_no_path_breaks_it(path: str) -> None:
     for prefix in ("", f"{API}/", f"{API}/topics/"):
@@ -215,14 +210,6 @@ def test_hostile_names_break_nothing() -> None:
     assert 'a"b\\c\nd' in shown
     assert len(shown) == 4
     assert max(map(len, shown)) == limits.METRIC_LABEL_CHARACTERS
-
-
-def test_a_scraper_that_asks_for_openmetrics_gets_it() -> None:
-    form = content_type("application/openmetrics-text;version=1.0.0")
-    assert form.startswith("application/openmetrics-text")
-    families = list(parse_openmetrics(exposition(EVERYTHING, form).decode()))  # type: ignore[no-untyped-call]
-    assert len(families) > 40
-    assert content_type("text/html").startswith("text/plain")
 
 
 # --- the dashboard ---

@@ -203,14 +203,6 @@ async def test_closing_ends_clients(server: ControlServer) -> None:
         assert await reader.read() == b""
 
 
-async def test_a_second_agent_of_one_name_is_refused(server: ControlServer, place: Path) -> None:
-    second = ControlServer(place, "base", {})
-    with pytest.raises(StartError, match="already runs on this machine"):
-        await second.start()
-    await second.close()
-    assert await call(server.path, "echo") == {}
-
-
 async def test_a_stale_socket_is_replaced(serve: Serve, place: Path) -> None:
     with socket.socket(socket.AF_UNIX) as left:
         left.bind(str(place / "base.sock"))
@@ -259,15 +251,6 @@ async def test_another_kind_of_answer(serve: Serve) -> None:
     server = await serve("base", {"snapshot": lambda _: 5})
     with pytest.raises(RemoteProtocolError, match="is it older"):
         await asyncio.to_thread(snapshot_of, server.path)
-
-
-async def test_an_agent_that_does_not_answer(place: Path) -> None:
-    path = place / "base.sock"
-    with socket.socket(socket.AF_UNIX) as stopped:
-        stopped.bind(str(path))
-        stopped.listen()
-        with ControlClient(path, timeout=0.05) as client, pytest.raises(UnreachableError, match="in time"):
-            client.call("snapshot", object)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rmpa.core.facts import Arrival, FilesInfo, LinkInfo, PublisherReport, RouteInfo, SubscriberTransport
 from rmpa.core.statistics import SampleSpread
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.check import Check, CheckLevel
+from rmpa.observe.check import CheckLevel
 from rmpa.observe.snapshot import PeerInfo, Snapshot
 from rmpa.observe.why.diagnosis import Diagnosis, TopicAtPublisher
 from rmpa.observe.why.stages import Ends, diagnose_topic, peer_stages
@@ -283,13 +283,6 @@ WARNINGS: dict[str, Case] = {
 }
 
 
-@pytest.mark.parametrize("case", WARNINGS.values(), ids=WARNINGS)
-def test_one_stage_of_a_flowing_topic_warns(case: Case) -> None:
-    found = one(case)
-    assert found.flows
-    assert len([stage for stage in found.stages if stage.level is CheckLevel.WARN]) == 1
-
-
 FLOWING: dict[str, Case] = {
     "a topic": Case(),
     "no node subscribes": Case(subscribers=(), readers=(), **route(state="idle")),
@@ -312,14 +305,6 @@ FLOWING: dict[str, Case] = {
     "relayed although direct is wanted": relayed(condition="caller_id", text="taken", wanted="direct"),
     "relayed by a rule": relayed(condition="transport", text='it is "relay"', wanted="direct"),
 }
-
-
-@pytest.mark.parametrize("case", FLOWING.values(), ids=FLOWING)
-def test_what_is_no_fault(case: Case) -> None:
-    found = one(case)
-    assert found.flows
-    assert found.failed is None
-    assert all(stage.level is not CheckLevel.FAIL for stage in found.stages)
 
 
 def test_each_publisher_has_its_diagnosis() -> None:
@@ -403,11 +388,3 @@ def test_any_answer_of_a_peer_is_judged(
         for stage in diagnosis.stages[:-1]:
             assert stage.level is not CheckLevel.FAIL
         assert msgspec.convert(msgspec.to_builtins(diagnosis), Diagnosis) == diagnosis
-
-
-def test_a_stage_is_short_as_json() -> None:
-    assert msgspec.to_builtins(Check("peer", CheckLevel.OK, "known")) == {
-        "name": "peer",
-        "verdict": "ok",
-        "text": "known",
-    }

@@ -183,6 +183,7 @@ async def test_the_page_shows_who_drives_what_and_each_page_may_stop_it(site: Si
     assert stick.holder != "other"
     stick.stop("10.0.0.99")
     await page.wait_text("does not obey this page any more")
+    await page.wait(f"!{TICK}.checked")
     await page.run(f"{TICK}.click()")
     await page.wait_text("This page")
     await page.wait("!document.querySelector('.banner')")  # it obeys again

@@ -41,7 +41,8 @@ PAGES = {
 
 async def violations(page: Chromium) -> list[str]:
     """What axe-core finds, each with the rule and the element."""
-    await page.run(AXE.read_text(encoding="utf-8") + "; true")
+    if not await page.run("!!window.axe"):
+        await page.run(AXE.read_text(encoding="utf-8") + "; true")
     found: list[Any] = await page.run(
         "axe.run(document).then((done) => done.violations.flatMap((rule) => rule.nodes.map((node) =>"
         " `${rule.id}: ${node.html.slice(0, 160)} ${node.failureSummary.slice(0, 200)}`)))"
@@ -72,8 +73,9 @@ async def test_a_page_shows_its_thing_and_is_accessible_in_both_colours_and_on_a
     assert (site.server.reports, page.errors) == ([], [])
 
 
-@pytest.mark.parametrize("scene", ["sick", "mute", "large", "knock", "ill", "killed"])
+@pytest.mark.parametrize("scene", ["sick", "mute", "large"])
 async def test_the_first_page_is_accessible_whatever_is_wrong(site: Site, scene: str) -> None:
+    """Further scenes are checked where they are tested."""
     page = await site.open("", scene)
     assert await violations(page) == []
     await page.look(360, 800, dark=False)
@@ -163,40 +165,6 @@ async def test_only_what_flows_moves_and_nothing_where_motion_is_to_be_reduced(s
                    " : (n = window.moved.length, setTimeout(rest, 500)); rest(); })")  # fmt: skip
 
 
-async def test_a_module_keeps_its_place_on_the_ring_when_others_come_and_go(site: Site) -> None:
-    page = await site.open()
-    modules = "[...document.querySelectorAll('[data-module]')]"
-    box = "((at) => `${Math.round(at.x)} ${Math.round(at.y)}`)(each.querySelector('circle').getBoundingClientRect())"
-    where = f"Object.fromEntries({modules}.map((each) => [each.dataset.module, {box}]))"
-    await receive(page, {"modules": {"arm": {"state": "up"}}})
-    await page.wait("document.querySelector('[data-module=arm]')")
-    before = await page.run(where)
-    assert len(before) == len(set(before.values())) == 5
-    await receive(page, {"modules": {"arm": None, "leg": {"state": "up"}}})
-    await page.wait("document.querySelector('[data-module=leg]')")
-    now = await page.run(where)
-    assert {**now, "arm": ""} == {**before, "leg": now["leg"], "arm": ""}
-    more = {f"m{number}": {"state": "up"} for number in range(7)}
-    await receive(page, {"modules": more})
-    await page.wait("document.querySelectorAll('[data-module]').length === 12")
-    assert len(set((await page.run(where)).values())) == 12
-
-
-async def test_only_what_changed_is_drawn_again(site: Site) -> None:
-    page = await site.open()
-    await page.run(
-        "window.drawn = []; new MutationObserver((all) => window.drawn.push(...all.map((each) => each.target.data)))"
-        ".observe(document.querySelector('.mandala'), {attributes: true, childList: true, subtree: true,"
-        " characterData: true}); true"
-    )
-    for number in range(10):
-        new = {f"/new{number}": {"type": "a/B"}}
-        await receive(page, {"modules": {"base": {"rtt": 0.01 + number}}, "topics": new})
-    await receive(page, {"flows": {"joystick>pc": {"rate": 12.0}}})
-    await page.wait("window.drawn.length > 0")
-    assert set(await page.run("window.drawn")) == {"12\u2009Hz"}
-
-
 async def test_the_first_page_is_small(site: Site) -> None:
     page = await site.open()
     sizes: dict[str, int] = await page.run(
@@ -212,6 +180,7 @@ async def test_names_and_values_of_others_are_text(site: Site) -> None:
     page = await site.open("topic/%2Fjoystick%2Fprofile")
     await page.click("On")
     await page.wait_text("<script>alert(1)</script>")
+    await page.wait_text("200 elements")
     evil = "<img src=x onerror='window.owned=1'>"
     patch = {"modules": {evil: {"state": "up"}}, "notes": ["<b id=owned>note</b>"]}
     await receive(page, patch)
@@ -242,34 +211,29 @@ async def test_live_values_poses_and_chosen_fields_are_drawn(site: Site) -> None
     assert (site.server.reports, page.errors) == ([], [])
 
 
-@pytest.mark.parametrize("address", ["topic/%2Fscan", "topic/%2Fcamera%2Fimage"])
-async def test_scans_and_pictures_are_drawn(site: Site, address: str) -> None:
-    page = await site.open(address, "sensors")
-    await page.click("On")
-    colours = (
-        "(() => { const view = document.querySelector('canvas.view, canvas.ground');"
-        " const data = view.getContext('2d').getImageData(0, 0, view.width, view.height).data;"
-        " return new Set(new Uint32Array(data.buffer)).size; })()"
-    )
-    await page.wait(f"{colours} > 5")
-    assert (site.server.reports, page.errors) == ([], [])
+COLOURS = """(() => { const view = document.querySelector('canvas.view, canvas.ground');
+  const data = view.getContext('2d').getImageData(0, 0, view.width, view.height).data;
+  return new Set(new Uint32Array(data.buffer)).size; })() > 5"""
 
 
-async def test_a_layer_of_a_map_that_stopped_says_how_old_it_is(site: Site) -> None:
+async def test_a_scan_is_drawn_and_says_how_old_it_is_when_it_stops(site: Site) -> None:
     page = await site.open("topic/%2Fscan", "sensors")
     await page.click("On")
     await page.wait("document.querySelector('.layers .about')?.innerText.includes('Hz')")
+    await page.wait(COLOURS)
     assert await page.run("document.querySelector('.layers .mark.idle')") is None
     site.server.publishes = False
     await page.wait("document.querySelector('.layers .mark.idle')")
     site.server.publishes = True
     await page.wait("!document.querySelector('.layers .mark.idle')")
+    assert (site.server.reports, page.errors) == ([], [])
 
 
-async def test_what_stopped_is_greyed_with_its_age_until_it_comes_again(site: Site) -> None:
+async def test_a_picture_is_drawn_and_greyed_with_its_age_when_it_stops(site: Site) -> None:
     page = await site.open("topic/%2Fcamera%2Fimage", "sensors")
     await page.click("On")
     await page.wait("document.querySelector('.beat')?.innerText.includes('Hz · ')")
+    await page.wait(COLOURS)
     assert await page.run("document.querySelector('.fresh.old')") is None
     site.server.publishes = False
     await page.wait("document.querySelector('.fresh.old .beat')?.innerText.includes('Nothing comes any more')")
@@ -281,6 +245,7 @@ async def test_what_stopped_is_greyed_with_its_age_until_it_comes_again(site: Si
     site.server.publishes = True
     await page.wait("document.querySelector('.fresh:not(.old) .beat')")
     assert "nothing comes" not in await page.run(live)
+    assert (site.server.reports, page.errors) == ([], [])
 
 
 async def test_a_raw_image_says_its_true_size_fits_its_place_and_offers_the_compressed_one(site: Site) -> None:
@@ -402,7 +367,7 @@ async def test_the_log_of_all_modules_is_one_and_each_filter_chooses_of_it(site:
     assert (site.server.reports, page.errors) == ([], [])
 
 
-async def test_a_log_on_hold_stands_still_and_goes_on_with_what_came_meanwhile(site: Site) -> None:
+async def test_a_log_is_asked_for_while_it_is_shown_and_not_on_hold(site: Site) -> None:
     page = await site.open("log")
     await page.wait(f"{LINES}.length > 3")
     await page.click("Hold")
@@ -413,16 +378,11 @@ async def test_a_log_on_hold_stands_still_and_goes_on_with_what_came_meanwhile(s
     assert [each.what for each in site.server.asked[asked:]].count("log") == 0
     await page.click("Go on")
     await page.wait_text("said meanwhile")
-
-
-async def test_a_page_that_shows_no_log_asks_for_none(site: Site) -> None:
-    page = await site.open("log")
-    await page.wait(f"{LINES}.length > 3")
     await page.run("location.hash = '#/topics'")
     await page.wait_text("/velocity_order")
     asked = len(site.server.asked)
     await page.run("new Promise((done) => setTimeout(done, 1500))")
-    assert "log" not in [each.what for each in site.server.asked[asked:]]
+    assert "log" not in [each.what for each in site.server.asked[asked:]], "no page shows it"
 
 
 async def test_a_node_shows_its_own_lines_and_its_level_is_set(site: Site) -> None:
@@ -453,38 +413,16 @@ async def test_topics_that_carry_data_come_first_and_the_filter_looks_among_all(
     assert "/base/quality" not in await page.run("document.querySelector('main').innerText")
 
 
-async def test_a_parameter_that_another_node_changes_shows_by_itself(site: Site) -> None:
-    page = await site.open("params")
-    await page.wait_text("noetic")
-    site.server.params["/rosdistro"] = "melodic"
-    await page.wait_text("melodic")
-    await page.click("base")
-    await page.wait("document.querySelector('.kind').textContent === 'Of the core of base'")
-    await page.wait_text("melodic")
-    site.server.params["/rosdistro"] = "kinetic"
-    await page.wait_text("kinetic")
-
-
 FIELD = "document.querySelector('form.edit input')"
 
 
-async def edit(page: Chromium, text: str, *, enter: bool = True) -> None:
+async def edit(page: Chromium, text: str) -> None:
     """Put a text in place of all that the field has which is edited, and press Enter."""
     await page.wait(FIELD)
     await page.run(
         f"{FIELD}.value = {json.dumps(text)}; {FIELD}.dispatchEvent(new Event('input', {{bubbles: true}}))"
     )
-    if enter:
-        await page.run(f"{FIELD}.form.requestSubmit()")
-
-
-async def test_an_edit_that_was_begun_is_kept_when_other_parameters_change(site: Site) -> None:
-    page = await site.open("params")
-    await page.click('"noetic"')
-    await edit(page, "half", enter=False)
-    site.server.params["/fresh"] = "come"
-    await page.wait_text("come")
-    assert await page.run(f"{FIELD}.value") == "half"
+    await page.run(f"{FIELD}.form.requestSubmit()")
 
 
 async def test_the_search_finds_nodes_parameters_and_resources(site: Site) -> None:
@@ -584,7 +522,9 @@ async def test_a_lost_connection_keeps_values_edits_and_rights(site: Site) -> No
     assert "read-only" not in text
     await page.run("window.WebSocket = window.Real; rmpa.retry()")
     await page.wait("!document.querySelector('.banner')")
-    assert await page.run(f"{FIELD}.value") == "half"
+    site.server.params["/fresh"] = "come"
+    await page.wait_text("come")
+    assert await page.run(f"{FIELD}.value") == "half", "whatever other parameters do"
     await edit(page, "melodic")
     await page.wait_text('"melodic"')
 

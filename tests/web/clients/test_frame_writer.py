@@ -6,9 +6,7 @@ import asyncio
 import contextlib
 import socket
 import struct
-import tracemalloc
 from collections.abc import AsyncIterator
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -87,19 +85,6 @@ async def test_frames_arrive_whole_and_in_order_at_a_slow_reader() -> None:
         assert transport.get_write_buffer_size() == 0
 
 
-async def test_what_waits_for_many_readers_is_kept_once() -> None:
-    async with connection(8) as made:
-        tracemalloc.start()
-        try:
-            for writer, _, _ in made:
-                writer.write(Opcode.BINARY, (b"head", PAYLOAD))
-            grown, _ = tracemalloc.get_traced_memory()
-        finally:
-            tracemalloc.stop()
-        assert all(writer.unsent > len(PAYLOAD) // 2 for writer, _, _ in made)
-        assert grown < len(PAYLOAD) // 4
-
-
 async def test_drain_waits_for_the_reader_and_for_nothing_else() -> None:
     async with connection() as [(writer, _, reader)]:
         await asyncio.wait_for(writer.drain(), DEADLINE)
@@ -151,19 +136,6 @@ async def test_nothing_is_written_to_a_connection_that_was_closed(by_close: bool
             await reader.read(len(PAYLOAD))
         assert len(reader.bytes) < len(PAYLOAD)
         await asyncio.wait_for(draining, DEADLINE)
-
-
-async def test_with_tls_the_transport_writes() -> None:
-    written: list[bytes] = []
-    transport: Any = SimpleNamespace(
-        get_extra_info=lambda name: name in ("socket", "sslcontext") or None,
-        get_write_buffer_size=lambda: 0,
-        is_closing=lambda: False,
-        write=lambda data: written.append(bytes(data)),
-    )
-    FrameWriter(transport, no_drain).write(Opcode.BINARY, (b"head", memoryview(PAYLOAD)))
-    assert b"".join(written) == frame_header(Opcode.BINARY, len(PAYLOAD) + 4) + b"head" + PAYLOAD
-    assert written[1] == PAYLOAD
 
 
 @pytest.mark.parametrize(
@@ -403,12 +375,6 @@ def test_messages_that_end_and_pongs_do_not() -> None:
         received += 6 + 125
         arrival.control_frame(125)
         assert not arrival.takes_too_long(received, now)
-
-
-def test_without_a_count_of_bytes_nothing_takes_too_long() -> None:
-    arrival = MessageArrival()
-    assert not arrival.takes_too_long(0, 0.0)
-    assert not arrival.takes_too_long(0, 2 * LONG)
 
 
 def test_a_frame_is_younger_than_the_last_ping_that_was_answered_before_it() -> None:

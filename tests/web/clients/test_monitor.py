@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import struct
-import threading
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -15,8 +14,6 @@ import aiohttp
 import msgspec
 import pytest
 
-from rmpa.core.errors import UnreachableError
-from rmpa.observe.snapshot import Snapshot
 from rmpa.resource.resource import Resource
 from rmpa.resource.runtime import describe
 from rmpa.ros.core.embedded import RosCore
@@ -29,31 +26,15 @@ from rmpa.web.hub.node_link import FULL, READ_ONLY, Rights
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.server.agent_watch import AgentWatch
-from tests.waiting import DEADLINE, until
+from tests.waiting import until
 from tests.web.clients.server import running_server
 from tests.web.hub.client import node
 from tests.web.monitor import page as monitor_page
 from tests.web.snapshots import FULL as SNAPSHOT
+from tests.web.snapshots import Agent
 
 TEXT = MessageType("std_msgs/String")
 TWIST = MessageType("geometry_msgs/Twist")
-
-
-class Agent:
-    """An agent that answers with one snapshot, or does not answer."""
-
-    def __init__(self, core_uri: str) -> None:
-        agent = msgspec.structs.replace(SNAPSHOT.agent, core_uri=core_uri)
-        self.snapshot = msgspec.structs.replace(SNAPSHOT, agent=agent)
-        self.answers = True
-        self.released = threading.Event()
-        self.released.set()
-
-    def read(self) -> Snapshot:
-        assert self.released.wait(DEADLINE)
-        if not self.answers:
-            raise UnreachableError("agent", "its socket", "start one with `rmpa up`")
-        return self.snapshot
 
 
 class Page(monitor_page.Page):
@@ -118,22 +99,22 @@ async def test_a_page_that_may_only_look_gets_the_state_then_its_changes_and_cha
 
 async def test_a_page_is_told_when_the_agent_is_silent_and_when_it_is_back(page: Page) -> None:
     await page.sees(lambda: page.state.get("reach", {}).get("ok"))
-    page.agent.answers = False
+    page.agent.up = False
     await page.sees(lambda: not page.state["reach"]["ok"])
     assert "rmpa up" in page.state["reach"]["remedy"]
     assert page.state["modules"]
-    page.agent.answers = True
+    page.agent.up = True
     await page.sees(lambda: page.state["reach"]["ok"])
 
 
 async def test_a_page_is_greeted_although_the_agent_hangs(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(web_limits, "SETTLE", 0.05)
     agent = Agent(core.uri)
-    agent.released.clear()
+    agent.may_answer.clear()
     async with page_of(core, agent=agent) as page:
         await page.sees(lambda: page.hello)
         assert page.hello["agent"] == ""
-        agent.released.set()
+        agent.may_answer.set()
         await page.sees(lambda: page.state.get("reach", {}).get("ok"))
 
 
@@ -236,16 +217,14 @@ async def test_a_setting_is_checked_and_the_page_is_told_what_the_resource_made_
     assert sent == [0.5, 5.0]
 
 
-async def test_pages_share_what_is_asked_of_the_agent_and_nothing_is_asked_without_pages(core: RosCore) -> None:
+async def test_nothing_is_asked_of_the_agent_without_pages(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "STATE_PERIOD", 0.1)
     agent = Agent(core.uri)
     watch = AgentWatch(agent.read)
     async with running_server(core, watch=watch) as server:
-        async with (
-            server.client(SUBPROTOCOL, path="/monitor") as one,
-            server.client(SUBPROTOCOL, path="/monitor") as other,
-        ):
-            for page in (Page(one.socket, agent), Page(other.socket, agent)):
-                await page.sees(lambda page=page: page.state.get("modules"))
+        async with server.client(SUBPROTOCOL, path="/monitor") as client:
+            page = Page(client.socket, agent)
+            await page.sees(lambda: page.state.get("modules"))
         await until(lambda: not server.sockets.connections)
         await asyncio.sleep(2 * limits.STATE_PERIOD)  # what was under way
         reads = watch.reads

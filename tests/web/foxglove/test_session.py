@@ -68,14 +68,6 @@ def test_an_id_is_never_used_again(client: Client) -> None:
     assert client.of("advertise")[-1]["channels"][0]["id"] == 2
 
 
-def test_a_graph_that_did_not_change_says_nothing(client: Client) -> None:
-    client.send({"op": "subscribeConnectionGraph"})
-    client.graph(CHATTER, SET_BOOL)
-    before = client.json
-    client.graph(CHATTER, SET_BOOL)
-    assert client.json == before
-
-
 def test_an_unknown_type_is_told_and_offered_once_it_is_known(client: Client) -> None:
     client.hub.types.missing["std_msgs/String"] = RmpaError("no definition; install its package")
     client.graph(CHATTER)
@@ -95,13 +87,6 @@ def test_the_warning_about_a_type_ends_with_its_last_topic(client: Client) -> No
     assert client.of("removeStatus")
     client.hub.types.on_learnt(MessageType("std_msgs/String"))
     assert not client.of("advertise")
-
-
-def test_a_type_is_asked_for_once_for_all_topics_and_clients(client: Client) -> None:
-    client.graph(*(GraphTopic(f"/t{n}", ("std_msgs/String",), ("/n",)) for n in range(50)))
-    beside = Client(beside=client)
-    assert client.hub.types.asked == ["std_msgs/String"]
-    assert beside.of("advertise") == client.of("advertise")
 
 
 def test_many_channels_come_in_several_messages(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -284,23 +269,6 @@ def test_the_type_of_a_service_is_searched_where_the_graph_does_not_say_it(clien
 
 
 # --- graph, assets ---
-
-
-def test_the_graph_comes_whole_and_then_by_its_changes(client: Client) -> None:
-    client.graph(CHATTER, SET_BOOL)
-    client.send({"op": "subscribeConnectionGraph"})
-    client.graph(GraphTopic("/chatter", ("std_msgs/String",), ("/talker",)))
-    first, second = client.of("connectionGraphUpdate")
-    assert first["publishedTopics"] == [{"name": "/chatter", "publisherIds": ["/talker"]}]
-    assert first["subscribedTopics"] == [{"name": "/chatter", "subscriberIds": ["/listener"]}]
-    assert first["advertisedServices"] == [{"name": "/set_bool", "providerIds": ["/server"]}]
-    assert (second["publishedTopics"], second["removedServices"]) == ([], ["/set_bool"])
-    assert second["subscribedTopics"] == [{"name": "/chatter", "subscriberIds": []}]
-    client.graph()
-    assert client.of("connectionGraphUpdate")[-1]["removedTopics"] == ["/chatter"]
-    client.send({"op": "unsubscribeConnectionGraph"})
-    client.graph(CHATTER)
-    assert len(client.of("connectionGraphUpdate")) == 3
 
 
 names = st.sampled_from(["/a", "/b", "/c"])

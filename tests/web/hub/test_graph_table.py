@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.observe import limits
-from rmpa.observe.graph import GraphHistory, GraphRows, ServiceRow, TopicRow
+from rmpa.observe.graph import GraphHistory, GraphRows, TopicRow
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import Registrations
 from rmpa.web.hub.graph import GraphTable, rows_of
@@ -28,12 +26,8 @@ _STEP = st.one_of(
 )  # fmt: skip
 
 
-def _table(forgotten: list[str] | None = None) -> GraphTable:
-    def forget(names: Iterable[str]) -> None:
-        if forgotten is not None:
-            forgotten.extend(names)
-
-    return GraphTable({name: (f"pkg/{name[1].upper()}", f"rosrpc://{name}") for name in _NAMES}, forget)
+def _table() -> GraphTable:
+    return GraphTable({name: (f"pkg/{name[1].upper()}", f"rosrpc://{name}") for name in _NAMES}, lambda _: None)
 
 
 def _read(tables: Registrations) -> GraphTable:
@@ -86,25 +80,6 @@ def test_changes_lead_to_the_graph_that_the_master_has(steps: list[tuple[str, st
                 assert list(table.topics) == sorted(table.topics)
                 assert list(table.services) == sorted(table.services)
                 assert table.nodes == read.nodes
-
-
-def test_equal_rows_change_nothing_and_other_providers_are_told() -> None:
-    forgotten: list[str] = []
-    table = _table(forgotten)
-    rows = GraphRows(
-        whole=True,
-        topics=(TopicRow("/t", "std_msgs/String", ("/b", "/a"), ()),),
-        services=(ServiceRow("/s", ("/a",)),),
-    )
-    assert table.update(rows)
-    assert table.topics["/t"].publishers == ("/a", "/b")
-    kept, forgotten[:] = table.topics, []
-    assert not table.update(rows)
-    assert table.topics is kept
-    assert not forgotten
-    assert table.update(GraphRows(services=(ServiceRow("/s", ("/b",)),)))
-    assert forgotten == ["/s"]
-    assert table.topics is kept
 
 
 def test_types_that_publishers_showed_stay_while_there_is_a_publisher() -> None:

@@ -91,17 +91,6 @@ def test_a_copy_stays_as_it_is_while_there_is_a_view_of_it() -> None:
             buffers.copy(data(b"a", size))[0] = 1
 
 
-def test_a_buffer_is_used_again_when_its_last_view_has_gone() -> None:
-    buffers = PayloadBuffers()
-    view = buffers.copy(data(b"a"))
-    del view
-    for size in (SIZE, SIZE // 2, SIZE):
-        assert buffers.copy(data(b"b", size)) == b"b" * size
-    assert buffers.bytes == SIZE
-    assert buffers.copy(data(b"c", 2 * SIZE)) == b"c" * 2 * SIZE
-    assert buffers.bytes == 3 * SIZE
-
-
 def test_the_bytes_that_are_kept_are_bounded() -> None:
     buffers = PayloadBuffers(10 * SIZE)
     used = [buffers.copy(data(b"a")) for _ in range(30)]

@@ -238,14 +238,6 @@ def test_a_page_that_has_not_drawn_its_pictures_gets_no_more_of_them(page: Page)
     assert came(5) == limits.UNSEEN_MAX + 3
 
 
-def test_a_connection_that_takes_nothing_gets_no_live_frames(page: Page) -> None:
-    page.send("watch", id=1, topic="/odom", how="value", rate=5)
-    page.page.unsent = 1
-    assert [page.message(value) for value in range(5)] == [[]] * 5
-    page.page.unsent = 0
-    assert [frame["value"]["x"] for frame in page.after(1.0)] == [4.0]
-
-
 def test_what_cannot_be_shown_ends_the_watch_with_its_reason_and_unwatching_without(page: Page) -> None:
     page.send("watch", id=1, topic="/odom", how="image", rate=5)
     (failed,) = page.message(1)

@@ -17,7 +17,6 @@ from rmpa.core.facts import RouteInfo, TopicInfo, UnreachableInfo
 from rmpa.core.limits import KIB
 from rmpa.observe.snapshot import PeerInfo, Snapshot
 from rmpa.trust.permissions import TrustStatus
-from rmpa.web import limits as web_limits
 from rmpa.web.monitor import limits, messages, questions, session
 from rmpa.web.monitor.messages import Tree, difference
 from rmpa.web.monitor.rates import RatesFeed
@@ -407,10 +406,6 @@ def test_the_page_says_the_bounds_of_the_code() -> None:
     assert len(rows) > 10
     for figure, unit, name in rows:
         assert getattr(limits, name) == float(figure.replace(",", "")) * (KIB if unit == " KiB" else 1), name
-
-
-def test_each_state_is_of_a_new_snapshot() -> None:
-    assert web_limits.WEB_SNAPSHOT_AGE < limits.STATE_PERIOD
 
 
 def test_the_page_has_each_question_and_message() -> None:

@@ -92,15 +92,6 @@ def test_one_page_of_all_modules_has_it_and_a_second_one_sees_who() -> None:
     assert mesh.holders() == ["10.0.0.2"] * 2
 
 
-def test_it_is_taken_over_by_one_press_and_the_first_one_hears_from_whom() -> None:
-    mesh = Mesh("base", "pc")
-    base, pc = mesh.sticks.values()
-    base.take("base", "10.0.0.1")
-    pc.take("pc", "10.0.0.2", over=True)
-    assert (base.holder, base.hold.ended) == (None, "the page of 10.0.0.2 at pc has taken the stick over")
-    assert pc.holder == "pc"
-
-
 def test_a_late_word_of_an_earlier_hold_changes_nothing() -> None:
     mesh = Mesh("base", "pc")
     base, pc = mesh.sticks.values()
@@ -114,15 +105,6 @@ def test_a_late_word_of_an_earlier_hold_changes_nothing() -> None:
     for word in late:
         word()
     assert (pc.holder, mesh.holders()) == ("pc", ["10.0.0.2"] * 2)
-
-
-def test_whoever_sees_it_may_stop_the_robot() -> None:
-    mesh = Mesh("base", "pc")
-    base, pc = mesh.sticks.values()
-    base.take("base", "10.0.0.1")
-    pc.stop("10.0.0.2")
-    assert mesh.holders() == ["", ""]
-    assert base.hold.ended == "the page of 10.0.0.2 at pc has stopped the robot"
 
 
 def test_it_is_free_some_time_after_the_holder_s_server_has_vanished() -> None:

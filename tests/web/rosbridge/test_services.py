@@ -347,11 +347,6 @@ def test_details_of_types(robot: Client) -> None:
     assert response["fieldnames"] == ["sum"]
 
 
-def test_the_answer_of_rosapi_in_cbor(robot: Client) -> None:
-    robot.send("call_service", service="/rosapi/services", compression="cbor")
-    assert robot.received()[0]["values"] == {"services": ["/add", "/unknown"]}
-
-
 def test_the_sums_of_rosapi_are_those_of_genmsg() -> None:
     lines = Path(__file__).with_name("rosapi.md5").read_text().splitlines()  # as Debian's genmsg computes them
     assert {name: ServiceType(name).md5sum for name in SERVICES.values()} == dict(map(str.split, lines))

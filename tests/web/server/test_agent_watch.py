@@ -29,7 +29,7 @@ from rmpa.web.server.agent_watch import AgentFollower, AgentWatch, ControlReader
 from tests.ros.node.peers import LATCHED
 from tests.waiting import DEADLINE, until
 from tests.web.hub.client import local_core, node
-from tests.web.snapshots import FULL
+from tests.web.snapshots import FULL, Agent
 
 
 def test_an_agent_that_hangs_is_waited_for_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,28 +65,10 @@ def test_an_agent_that_hangs_is_waited_for_once(tmp_path: Path, monkeypatch: pyt
     assert len(requests) == 3
 
 
-class Agent:
-    """An agent that a test can stop; counts the questions to it."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-        self.up = True
-        self.asked = 0
-        self.may_answer = threading.Event()
-        self.may_answer.set()
-
-    def read(self) -> Snapshot:
-        self.asked += 1
-        assert self.may_answer.wait(30)
-        if not self.up:
-            raise UnreachableError("agent", "here", "start it")
-        return FULL
-
-
 @pytest.fixture
 async def watched() -> AsyncIterator[tuple[Agent, AgentWatch]]:
     agent = Agent()
-    watch = AgentWatch(agent.read, lambda: agent.now)
+    watch = AgentWatch(agent.read, agent.clock)
     yield agent, watch
     await watch.close()
 
@@ -104,7 +86,7 @@ async def test_many_clients_cost_the_agent_one_question_and_one_that_leaves_take
     leaving.cancel()
     await asyncio.sleep(0)
     agent.may_answer.set()
-    assert all(reading.snapshot is FULL for reading in await asyncio.gather(*asking))
+    assert all(reading.snapshot is agent.snapshot for reading in await asyncio.gather(*asking))
     for later, asked in ((0.9, 1), (1, 2)):
         agent.now += limits.WEB_SNAPSHOT_AGE * later
         await watch.reading()
@@ -116,11 +98,11 @@ async def test_an_agent_that_is_away_is_asked_no_more_often_and_found_again(watc
     agent.up = False
     for _ in range(10):
         reading = await watch.reading()
-        assert (reading.snapshot, "start it" in reading.problem) == (None, True)
+        assert (reading.snapshot, "rmpa up" in reading.problem) == (None, True)
     assert agent.asked == 1
     agent.up = True
     agent.now += limits.WEB_SNAPSHOT_AGE
-    assert (await watch.reading()).snapshot is FULL
+    assert (await watch.reading()).snapshot is agent.snapshot
 
 
 async def test_all_of_a_large_graph_is_read_only_for_those_that_need_it() -> None:

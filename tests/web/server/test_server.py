@@ -11,13 +11,12 @@ from contextlib import asynccontextmanager
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from rmpa.core.errors import StartError, UnreachableError
-from rmpa.observe.snapshot import Snapshot
+from rmpa.core.errors import StartError
 from rmpa.web import limits
 from rmpa.web.server.access import AccessPolicy, own_names
 from rmpa.web.server.agent_watch import AgentWatch
 from rmpa.web.server.app import HEADERS, OPENER_POLICY, WebServer
-from tests.web.snapshots import FULL
+from tests.web.snapshots import Agent
 
 DEADLINE = 30.0
 TOKEN = "secret-" * 6
@@ -27,19 +26,13 @@ class Site:
     """The server under test, its agent, and a client."""
 
     def __init__(self, token: str = "", origins: frozenset[str] = frozenset()) -> None:
-        self.up = True
-        self.now = 0.0
-        watch = AgentWatch(self._read, self._later)
+        self.agent = Agent()
+        watch = AgentWatch(self.agent.read, self._later)
         self.server = WebServer(watch, AccessPolicy(0, own_names(("base",)), token, origins), "127.0.0.1")
 
-    def _read(self) -> Snapshot:
-        if not self.up:
-            raise UnreachableError("agent", "here", "start one with `rmpa up`")
-        return FULL
-
     def _later(self) -> float:
-        self.now += 1.0  # each look at the clock is later than a snapshot's age: nothing is shared
-        return self.now
+        self.agent.now += 1.0  # each look at the clock is later than a snapshot's age: nothing is shared
+        return self.agent.now
 
     async def connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         return await asyncio.open_connection("127.0.0.1", self.server.port, limit=2**24)
@@ -142,13 +135,13 @@ async def test_head_gives_the_headers_alone(site: Site) -> None:
 
 
 async def test_an_agent_that_is_away_is_said_so_and_comes_back(site: Site) -> None:
-    site.up = False
+    site.agent.up = False
     status, headers, body = await site.get("/api/v1/peers")
     assert (status, headers["Content-Type"]) == (503, "application/problem+json")
     assert "rmpa up" in detail(body)
     assert (await site.get("/healthz"))[0] == 503
     assert b"rmpa_up 0.0" in (await site.get("/metrics"))[2]
-    site.up = True
+    site.agent.up = True
     assert (await site.get("/api/v1/peers"))[0] == (await site.get("/healthz"))[0] == 200
     assert b"rmpa_up 1.0" in (await site.get("/metrics"))[2]
 
@@ -285,7 +278,7 @@ async def test_requests_without_end_in_a_row_are_cut_off(site: Site) -> None:
 
 
 async def test_a_taken_port_is_told(site: Site) -> None:
-    other = WebServer(AgentWatch(site._read), AccessPolicy(site.server.port, own_names(())), "127.0.0.1")
+    other = WebServer(AgentWatch(site.agent.read), AccessPolicy(site.server.port, own_names(())), "127.0.0.1")
     with pytest.raises(StartError, match="--port"):
         await other.start()
     await other.close()
