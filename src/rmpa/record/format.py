@@ -12,9 +12,13 @@ from __future__ import annotations
 import heapq
 import logging
 import struct
+from functools import partial
+from types import SimpleNamespace
 from typing import IO, TYPE_CHECKING, Final, NamedTuple
 
+import mcap.writer
 import msgspec
+import zstandard
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Footer, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
@@ -40,6 +44,9 @@ UNFINISHED: Final = ".part"
 _ENCODING, _SCHEMA = "ros1", "ros1msg"
 _TEXT: Final = MessageType("std_msgs/String")
 _LENGTH: Final = struct.Struct("<I")
+# The library compresses at zstd's level 3 and has no option for it. Of an image with noise in its low bits (922 KB)
+# that takes 6 ms and leaves 49 %; level 1 takes 1 ms and leaves 58 %.
+mcap.writer.zstandard = SimpleNamespace(compress=partial(zstandard.compress, level=1))  # type: ignore[attr-defined]
 
 
 class DamagedError(RmpaError):

@@ -68,6 +68,9 @@ _REQUESTS: Final = 0.2
 _STATUS: Final = 5.0
 # Seconds from one snapshot of the agent to the next, where its graph does not change.
 _PERIOD: Final = 5.0
+# Seconds between two looks whether the core is still the same: they were half of what an idle recorder cost, and what
+# is connected stays so while a core restarts.
+_MASTER: Final = 5.0
 # Seconds between two readings of the parameters, and bytes of them that a segment repeats.
 _PARAMETERS: Final = 30.0
 _PARAMETERS_MAX: Final = 1024 * 1024
@@ -119,6 +122,7 @@ class Recorder:
         self._folder = folder
         self._agent = agent
         self._node = Node("rmpa_record", master_uri=master_uri)
+        self._node.master_check = _MASTER
         self._module = ModuleRecord(name=agent)
         self._clocks: dict[str, str] = {}
         self._parameters = b""
