@@ -90,6 +90,7 @@ class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
         left_out: Messages above the budgets, or that the disk did not take, by topic.
         written: Bytes written to the disk.
         ring: Bytes of the ring, and how far it goes back, seconds.
+        bounds: The most bytes and seconds of the ring; ``None``: any.
         problem: Why nothing can be written; empty: all is well.
     """
 
@@ -101,6 +102,7 @@ class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
     left_out: dict[str, int] = {}
     written: int = 0
     ring: tuple[int, float] = (0, 0.0)
+    bounds: tuple[int, float | None] = (0, None)
     problem: str = ""
 
 
@@ -282,6 +284,7 @@ class Recorder:
     async def _kept(self, kept: Kept) -> None:
         await asyncio.sleep(max(0.0, (kept.until - time.time_ns()) / _SECOND))
         kept = msgspec.structs.replace(kept, module=self._module.name)
+        await asyncio.to_thread(self._write_status)  # what was left out until now is asked for with the recording
         try:
             made = await asyncio.wrap_future(self.ring.call(self.ring.keep, kept))
         except OSError as error:
@@ -305,6 +308,7 @@ class Recorder:
             left_out={t: n + lost.get(t, 0) for t, n in {**lost, **self._all_left_out()}.items()},
             written=self.ring.written,
             ring=(sum(one.size for one in segments), back),
+            bounds=(self._settings.megabytes * _MB, self._settings.seconds),
             problem=self.ring.problem,
         )
         with contextlib.suppress(OSError):  # the disk is full: the log says so

@@ -90,7 +90,7 @@ class RingThread(threading.Thread):
         super().__init__(name="recorder", daemon=True)
         self._folder, self._ring = folder, folder / "ring"
         self._begin = begin
-        self._most_bytes, self._most_ns = most_bytes, round(most_seconds * _SECOND)
+        self._most_bytes, self._most_ns = most_bytes, most_seconds * _SECOND  # infinite: all
         self._fsync = fsync
         self._kept_bytes = kept_bytes
         self._lock = threading.Condition()
