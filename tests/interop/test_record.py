@@ -87,9 +87,7 @@ def test_what_all_modules_kept_is_one_file_that_ros_reads(modules: ModuleFactory
     assert "/scan" in info
     assert "does not need any migrations" in a.ros.tool("rosbag", "check", str(bag))
     story = json.loads(a.agent.rmpa("story", str(path), "--json")[1])
-    assert (
-        any("/laser is there" in line["text"] or "/base is there" in line["text"] for line in story["lines"]) or True
-    )
+    assert story["lines"]
 
 
 @pytest.mark.long
@@ -176,7 +174,7 @@ def test_ctrl_c_ends_a_recording_by_hand_and_a_second_one_loses_nothing(
     recorders(a.agent, "/odom")
     for times in (1, 2):
         path, parts = tmp_path / f"{times}.mcap", tmp_path / f"{times}.mcap.parts"
-        words = [RMPA, "record", "-o", path, f"--{way}", "--json"]
+        words: list[str | Path] = [RMPA, "record", "-o", path, f"--{way}", "--json"]
         with Process(a.host.command(words), env={**a.agent.env, "RMPA_AGENT": "a"}) as command:
             eventually(partial(begun, command, parts), LONG, what="the command records")
             for _ in range(times):
@@ -214,7 +212,7 @@ def test_a_fetch_goes_on_after_a_cut_and_after_its_own_death(modules: ModuleFact
         return sum(path.stat().st_size for path in got.glob("*"))
 
     def fetching() -> Process:
-        words = [RMPA, "record", "fetch", "fall", "-o", got.parent]
+        words: list[str | Path] = [RMPA, "record", "fetch", "fall", "-o", got.parent]
         return Process(a.host.command(words), env={**a.agent.env, "RMPA_AGENT": "a"})
 
     with fetching() as command:
