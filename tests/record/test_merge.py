@@ -9,7 +9,7 @@ import pytest
 from rmpa.core.errors import RmpaError
 from rmpa.record.bag import read_any, read_bag, write_bag
 from rmpa.record.diff import compare
-from rmpa.record.format import EVENT_SOURCE, Event, SegmentReader, event_bytes
+from rmpa.record.format import EVENT_SOURCE, EVENTS, Event, ModuleRecord, SegmentReader, SegmentWriter, event_bytes
 from rmpa.record.merge import Offset, merge, notes_of
 from rmpa.record.story import render, tell
 from tests.record.conftest import SECOND, START, Record, source, text
@@ -59,6 +59,17 @@ def test_copies_of_proxies_and_repeated_messages_are_left_out(tmp_path: Path, re
     path, result = merged(tmp_path, arm, base)
     assert [each[1:] for each in lines(path)] == [("arm", "a"), ("base", "s")]
     assert result.doubles == 1  # type: ignore[attr-defined]
+
+
+def test_only_topics_that_are_wanted_and_events(tmp_path: Path, recording: Record) -> None:
+    arm = recording("arm", {SCAN: [(1.0, "s")], CMD: [(2.0, "c")], source("/tf"): [(3.0, "t")]})
+    with arm.with_name("00000002.mcap").open("wb") as file:
+        writer = SegmentWriter(file, ModuleRecord(name="arm"))
+        writer.write(EVENT_SOURCE, START, START, event_bytes(Event("note", "n")))
+        writer.finish()
+    with (tmp_path / "some.mcap").open("wb") as file:
+        merge([arm.parent], file, "", ("/cmd*", "/t?"))
+    assert [m.source.topic for m in read_any(tmp_path / "some.mcap")] == [EVENTS, "/cmd_vel", "/tf"]
 
 
 def test_two_merges_of_one_run_are_the_same_bytes(tmp_path: Path, recording: Record) -> None:
