@@ -6,6 +6,7 @@ import asyncio
 import base64
 import os
 import time
+import zlib
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -102,6 +103,17 @@ async def test_all_modules_keep_and_those_that_were_away_do_it_when_they_are_bac
     assert not world.asked, "it has answered"
 
 
+async def test_only_the_modules_that_are_named_keep_and_no_others_later(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    assert await world.part.answer({"what": "keep", "modules": ["base"]}) == {"base": ""}
+    assert not await world.requests()
+    world.asked.clear()
+    assert await world.part.answer({"what": "keep", "modules": ["arm"]}) == {"arm": ""}
+    world.part.link_up(world.peer)  # type: ignore[arg-type] # it has what is used
+    await world.part.close()
+    assert (len(await world.requests()), world.asked) == (1, [])
+
+
 async def test_a_peers_times_are_put_on_this_clock(tmp_path: Path) -> None:
     world = World(tmp_path)
     world.peer.time = SimpleNamespace(ahead_ns=5 * 10**9)
@@ -157,6 +169,9 @@ async def test_a_file_is_read_in_parts_and_nothing_beside_it(tmp_path: Path) -> 
         assert part.size == len(data)
         found += base64.b64decode(part.data)
     assert found == data
+    part = await world.ask(READ, id="fall", file="1.mcap", offset=1000, size=20, check=True)
+    assert (base64.b64decode(part.data), part.before) == (data[1000:1020], zlib.crc32(data[:1000]))
+    assert (await world.ask(READ, id="fall", file="1.mcap", offset=10**7, check=True)).before == zlib.crc32(data)
     for name, file in (("fall", "../../secret"), ("fall", "recording.json"), ("..", "secret"), ("none", "1.mcap")):
         with pytest.raises(RmpaError, match=r"no file|no recording|not the name"):
             await world.ask(READ, id=name, file=file, offset=0)

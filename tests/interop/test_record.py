@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import shutil
 import signal
 import subprocess
@@ -15,10 +16,10 @@ from typing import Any, Final
 
 import pytest
 
-from lab.bed.agents import Agent
+from lab.bed.agents import RMPA, Agent
 from lab.bed.namespaces import Lab
-from lab.bed.processes import eventually
-from rmpa.bridge.kept import Kept, request_keep
+from lab.bed.processes import Process, eventually
+from rmpa.bridge.kept import KEPT, Kept, request_keep, write_kept
 from rmpa.core.errors import RmpaError
 from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.record.bag import read_any
@@ -368,3 +369,105 @@ def test_a_member_needs_permission_to_have_recordings_kept_and_to_read_them(
     assert sequences(tmp_path / "both.mcap", "/odom")
     assert joystick.agent.rmpa("record", "rm", both["id"])[0] == 0
     assert both["id"] not in recordings(base.agent)
+
+
+RINGS: Final = '[record]\nenabled = true\nseconds = 20\nthin = "unlimited"\n'
+
+
+@pytest.mark.long
+def test_by_hand_of_the_mesh_is_what_all_modules_published_of_the_topics_that_are_wanted(
+    modules: ModuleFactory, tmp_path: Path
+) -> None:
+    a, b = modules("a", "b", fresh=True, config=RINGS)
+    a.ros.rospy("talker", topic="/odom", rate=50, name="base")
+    b.ros.rospy("talker", topic="/scan", rate=50, name="laser", source=2)
+    b.ros.rospy("talker", topic="/chatter", rate=50, name="chat", source=3)
+    recorders(a.agent, "/odom", "/scan", "/chatter")
+
+    def mesh(name: str, *words: str) -> tuple[int, str]:
+        return a.agent.rmpa("record", "-o", str(tmp_path / name), *words)
+
+    code, output = mesh("long.mcap", "--mesh", "--duration", "3600")
+    assert (code, "ring of" in output) == (2, True), output
+    assert mesh("both.mcap", "--mesh", "--here")[0] == mesh("both.mcap", "--mesh", "--peer", "b")[0] == 2
+    code, output = mesh("all.bag", "--mesh", "--duration", "3", "-t", "/odom", "-t", "/sc*", "--json")
+    answer = json.loads(output)
+    assert (code, answer["problems"], answer["left_out"], answer["modules"]) == (0, {}, {}, ["a", "b"])
+    assert {m.source.topic for m in read_any(tmp_path / "all.bag")} - {EVENTS} == {"/odom", "/scan"}
+    for topic in ("/odom", "/scan"):
+        numbers = sequences(tmp_path / "all.bag", topic)
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+        assert len(numbers) >= 150
+    code, output = mesh("b.mcap", "--peer", "b", "--peer", "none", "--duration", "1")
+    assert (code, "none is not recorded: it is not linked" in output) == (1, True), output
+    assert {m.source.module for m in read_any(tmp_path / "b.mcap")} == {"b"}
+    assert not recordings(a.agent), "it is in the files, and no module keeps it for ever"
+    assert {path.suffix for path in tmp_path.glob("*.*")} & {".parts", ".new"} == set()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("way", ["here", "mesh"])
+def test_ctrl_c_ends_a_recording_by_hand_and_a_second_one_loses_nothing(
+    way: str, modules: ModuleFactory, tmp_path: Path
+) -> None:
+    (a,) = modules("a", fresh=True, config=RINGS)
+    a.ros.rospy("talker", topic="/odom", rate=50, name="base")
+    recorders(a.agent, "/odom")
+    for times in (1, 2):
+        path, parts = tmp_path / f"{times}.mcap", tmp_path / f"{times}.mcap.parts"
+        words: list[str | Path] = [RMPA, "record", "-o", path, f"--{way}", "--json"]
+        with Process(a.host.command(words), env={**a.agent.env, "RMPA_AGENT": "a"}) as command:
+            eventually(partial(begun, command, parts), LONG, what="the command records")
+            for _ in range(times):
+                command.send(signal.SIGINT)
+            code = command.wait(LONG)
+        assert code == 0 or (times, code) == (2, 130), command.output
+        if path.exists():
+            assert sequences(path, "/odom")
+            assert not parts.exists()
+        elif parts.exists():
+            assert f"rmpa record merge {parts}" in command.output
+            assert sequences(parts, "/odom")
+        elif way == "mesh":
+            assert all(f"rmpa record fetch {name}" in command.output for name in recordings(a.agent))
+
+
+def begun(command: Process, parts: Path) -> bool:
+    """Whether a recording by hand has begun."""
+    return "it ends by itself" in command.output or any(parts.rglob("*.mcap"))
+
+
+@pytest.mark.long
+def test_a_fetch_goes_on_after_a_cut_and_after_its_own_death(modules: ModuleFactory, tmp_path: Path) -> None:
+    a, b = modules("a", "b", fresh=True)
+    data = random.Random(1).randbytes(6_000_000)
+    place = Path(b.agent.env["RMPA_STATE_DIR"]) / "b" / "record" / KEPT / "fall"
+    place.mkdir(parents=True)
+    for number in (1, 2):
+        (place / f"{number}.mcap").write_bytes(data)
+    write_kept(place, Kept(id="fall"))
+    b.host.shape("20mbit")
+    got = tmp_path / "fall" / "b"
+
+    def size() -> int:
+        return sum(path.stat().st_size for path in got.glob("*"))
+
+    def fetching() -> Process:
+        words: list[str | Path] = [RMPA, "record", "fetch", "fall", "-o", got.parent]
+        return Process(a.host.command(words), env={**a.agent.env, "RMPA_AGENT": "a"})
+
+    with fetching() as command:
+        eventually(lambda: size() > 1_000_000, LONG, what="a part of it")
+        command.kill()
+    killed = size()
+    with fetching() as command:
+        eventually(lambda: size() > killed + 1_000_000, LONG, what="more of it")
+        b.host.cut()
+        a.agent.wait_no_peer("b")
+        b.host.restore()
+        assert command.wait(2 * LONG) == 0, command.output
+    assert [path.read_bytes() == data for path in sorted(got.glob("*"))] == [True, True]
+    (got / "1.mcap").write_bytes(b"another file")
+    code, output = a.agent.rmpa("record", "fetch", "fall", "-o", str(got.parent))
+    assert (code, "is another file than that of fall" in output) == (1, True), output
+    assert (got / "1.mcap").read_bytes() == b"another file"

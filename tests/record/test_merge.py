@@ -9,7 +9,16 @@ import pytest
 from rmpa.core.errors import RmpaError
 from rmpa.record.bag import read_any, read_bag, write_bag
 from rmpa.record.diff import compare
-from rmpa.record.format import EVENT_SOURCE, TIME, Event, ModuleRecord, SegmentReader, SegmentWriter, event_bytes
+from rmpa.record.format import (
+    EVENT_SOURCE,
+    EVENTS,
+    TIME,
+    Event,
+    ModuleRecord,
+    SegmentReader,
+    SegmentWriter,
+    event_bytes,
+)
 from rmpa.record.merge import Offset, merge, notes_of
 from rmpa.record.story import render, tell
 from tests.record.conftest import SECOND, START, TEXT, Record, source, text
@@ -108,6 +117,17 @@ def test_a_topic_that_changes_its_type_is_all_there(tmp_path: Path, recording: R
         first, then = (TEXT.name, TEXT.md5sum, TEXT.definition[:11]), (odd.type, odd.md5sum, "string data")
         assert found == [(*first, b"a"), (*then, b"o"), (*then, b"p")]
     assert odd.definition in {m.source.definition for m in read_any(path)}
+
+
+def test_only_topics_that_are_wanted_and_events(tmp_path: Path, recording: Record) -> None:
+    arm = recording("arm", {SCAN: [(1.0, "s")], CMD: [(2.0, "c")], source("/tf"): [(3.0, "t")]})
+    with arm.with_name("00000002.mcap").open("wb") as file:
+        writer = SegmentWriter(file, ModuleRecord(name="arm"))
+        writer.write(EVENT_SOURCE, START, START, event_bytes(Event("note", "n")))
+        writer.finish()
+    with (tmp_path / "some.mcap").open("wb") as file:
+        merge([arm.parent], file, "", ("/cmd*", "/t?"))
+    assert [m.source.topic for m in read_any(tmp_path / "some.mcap")] == [EVENTS, "/cmd_vel", "/tf"]
 
 
 def test_two_merges_of_one_run_are_the_same_bytes(tmp_path: Path, recording: Record) -> None:

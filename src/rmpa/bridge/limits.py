@@ -308,6 +308,8 @@ LAUNCH_LOG_LINES: Final = 500
 LAUNCH_LOGS_MAX: Final = 16
 # [Recording] Bytes of a file of a recording that one request of another module gets
 RECORDING_PART: Final = 256 * 1024
+# Seconds that a module has to send it: a radio of 50 kbit/s needs four of them for the least part.
+RECORDING_TIMEOUT: Final = 20.0
 # [Recording] Requests to keep that wait for modules that are not linked
 # At it: the oldest is forgotten
 KEEPS_WAITING: Final = 64

@@ -11,9 +11,10 @@ import contextlib
 import logging
 import os
 import time
+import zlib
 from collections import deque
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import IO, TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -29,7 +30,7 @@ from rmpa.core.identity import is_meant
 from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.sessions import PeerSession
@@ -70,10 +71,20 @@ class FilePart(msgspec.Struct, frozen=True):
     Attributes:
         size: Of the whole file, bytes.
         data: The part, in base 64.
+        before: The CRC-32 of all bytes before the part, if it was asked for.
     """
 
     size: int
     data: str
+    before: int | None = None
+
+
+def _checksum(file: IO[bytes], count: int) -> int:
+    """The CRC-32 of the first ``count`` bytes of a file; of all, if it has fewer."""
+    found = 0
+    while count > 0 and (block := file.read(min(count, limits.RECORDING_PART))):
+        found, count = zlib.crc32(block, found), count - len(block)
+    return found
 
 
 class Recordings(Part):
@@ -114,21 +125,23 @@ class Recordings(Part):
                     self._ask_keep(session, kept, epoch, done), f"keep {kept.id} at {session.link.name}"
                 )
 
-    async def keep(self, kept: Kept) -> dict[str, str]:
+    async def keep(self, kept: Kept, only: Sequence[str] = ()) -> dict[str, str]:
         """Keep what the rings of this module and of all linked peers have of a time; the others when they are back.
 
         Args:
             kept: What to keep; its times are of this module's clock.
+            only: The names of the modules that keep it, and no others later; empty: all.
 
         Returns:
             By module: empty where it is being kept, or why not.
         """
         done: set[str] = set()
-        epoch = time.time_ns() - time.monotonic_ns()
-        self._wanted.append((kept, epoch, done))
         own = self._bridge.context.settings.name
-        found = {own: await self._keep_here(kept)}
-        peers = [*self._bridge.sessions.linked()]
+        epoch = time.time_ns() - time.monotonic_ns()
+        if not only:
+            self._wanted.append((kept, epoch, done))
+        found = {own: await self._keep_here(kept)} if not only or own in only else {}
+        peers = [each for each in self._bridge.sessions.linked() if not only or each.link.name in only]
         answers = await asyncio.gather(*(self._ask_keep(session, kept, epoch, done) for session in peers))
         return found | {session.link.name: why for session, why in zip(peers, answers, strict=True)}
 
@@ -218,15 +231,21 @@ class Recordings(Part):
         Raises:
             RmpaError: There is none, or it cannot be read.
         """
-        file, offset = str(args.get("file", "")), args.get("offset", 0)
+        file, offset, size = str(args.get("file", "")), args.get("offset", 0), args.get("size", limits.RECORDING_PART)
         kept = find_kept(self._kept(), name)
-        if file not in kept.files or not isinstance(offset, int) or offset < 0:
+        if (
+            file not in kept.files
+            or not isinstance(offset, int)
+            or not isinstance(size, int)
+            or min(offset, size) < 0
+        ):
             raise RmpaError(f"{name} has no file {file[:80]!r}", code="unknown-name")
         try:
             with (self._kept() / name / file).open("rb") as opened:
-                size = os.fstat(opened.fileno()).st_size
+                before = _checksum(opened, offset) if args.get("check") else None
                 opened.seek(offset)
-                return FilePart(size, base64.b64encode(opened.read(limits.RECORDING_PART)).decode())
+                data = opened.read(min(size, limits.RECORDING_PART))
+                return FilePart(os.fstat(opened.fileno()).st_size, base64.b64encode(data).decode(), before)
         except OSError as error:
             raise RmpaError(f"{name}/{file}: {error.strerror}", code="recording-damaged") from None
 
@@ -250,7 +269,8 @@ class Recordings(Part):
         if what == "list":
             return await self.list()
         if what == "keep":
-            return await self.keep(self._made(args))
+            only = args.get("modules", ())
+            return await self.keep(self._made(args), [str(each) for each in only] if isinstance(only, list) else ())
         request = {"read": READ, "remove": REMOVE}.get(what)
         if request is None:
             raise RmpaError(f"{what!r} is no question about recordings", code="unknown-name")
@@ -261,8 +281,8 @@ class Recordings(Part):
         sessions = [s for s in self._bridge.sessions.linked() if is_meant(module, s.link.name, str(s.link.guid))]
         if not sessions:
             raise RmpaError(f"{module} is not linked; `rmpa peer list` shows why", code="peer-unlinked")
-        inner = {key: args[key] for key in ("id", "file", "offset") if key in args}
-        return await self._bridge.rpc.request(sessions[0], request, inner, limits.LOG_ASK_TIMEOUT)
+        inner = {key: args[key] for key in ("id", "file", "offset", "size", "check") if key in args}
+        return await self._bridge.rpc.request(sessions[0], request, inner, limits.RECORDING_TIMEOUT)
 
     def _made(self, args: Mapping[str, Any]) -> Kept:
         """What to keep, by a recorder's own request or a person's words: ``id``, ``why``, ``seconds`` of the past."""

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import base64
-import contextlib
 import logging
 import os
 import signal
 import sys
-import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,9 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 import msgspec
 
-from rmpa.bridge.kept import recording_id
-from rmpa.bridge.recordings import FilePart, ModuleRecordings
-from rmpa.cli.completion import completes, topics
+from rmpa.cli.completion import completes, peers, topics
 from rmpa.cli.main import LazyGroup
 from rmpa.cli.module import check_record, find_module
 from rmpa.cli.options import (
@@ -34,7 +29,23 @@ from rmpa.cli.options import (
     json_option,
     json_verb,
 )
-from rmpa.cli.output import Table, begin_log, print_text, printable, size
+from rmpa.cli.output import Table, begin_log, size
+from rmpa.cli.recordings import (
+    BAG,
+    CALL,
+    MB,
+    PROGRESS,
+    all_recordings,
+    end_line,
+    fetch,
+    join,
+    keep,
+    merged,
+    parts_folder,
+    parts_of,
+    record_mesh,
+    say,
+)
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.observe.operations import remove_recording
 
@@ -42,16 +53,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from rmpa.bridge.kept import Kept
+    from rmpa.bridge.recordings import ModuleRecordings
     from rmpa.cli.module import Module
-    from rmpa.observe.control_client import ControlClient
-    from rmpa.record.merge import MergeResult
 
 _log = logging.getLogger("rmpa.record")
 _SECOND: Final = 1_000_000_000
-_BAG: Final = ".bag"
-_MB: Final = 1_000_000
-# Seconds between two lines of progress.
-_PROGRESS: Final = 0.5
 
 
 @click.group(cls=LazyGroup, path="record", invoke_without_command=True, help=None)
@@ -70,7 +76,15 @@ _PROGRESS: Final = 0.5
 @click.option("--duration", type=FiniteRange(0.1), metavar="SECONDS", help="Stop after so long. [default: at Ctrl-C]")
 @click.option("--size", "megabytes", type=FiniteRange(0.1), metavar="MB", help="Stop after so many MB of messages.")
 @flag("--here", help="Record what nodes of other modules publish, too: it crosses the network.")
-@flag("--mesh", help="Let each module record its own nodes, then fetch and merge them.")
+@flag("--mesh", help="Let all modules record their own nodes by their recorders, then fetch and merge that.")
+@click.option(
+    "--peer",
+    "peers",
+    multiple=True,
+    metavar="NAME",
+    shell_complete=completes(peers),
+    help="As --mesh, of these modules alone.",
+)
 @config_option
 @json_option
 @agent_option
@@ -89,7 +103,7 @@ def record(context: click.Context, /, config: str | None, as_json: bool, agent: 
       rmpa record -o run.mcap                     all topics of this module, into a file
       rmpa record -o run.bag -t '/scan' -t '/tf*' --duration 60
       rmpa record -o run.mcap --here              with what other modules publish
-      rmpa record -o run.mcap --mesh --duration 60   each module its own, fetched and merged at the end
+      rmpa record -o run.mcap --mesh --duration 60   what the recorders of all modules have of it, fetched at the end
       rmpa record keep "it fell over" -o fall.mcap   what all modules have of the last minutes, as one file
     """
     if context.invoked_subcommand is not None:
@@ -98,15 +112,18 @@ def record(context: click.Context, /, config: str | None, as_json: bool, agent: 
     options = Options(as_json, agent)
     module = find_module(agent, {"config": config}, os.environ, "--agent")
     if given["output"] is None:
-        if any(given[key] for key in ("globs", "duration", "megabytes", "here", "mesh")):
+        if any(given[key] for key in ("globs", "duration", "megabytes", "here", "mesh", "peers")):
             raise ConfigError("-o", "these options are for a recording into a file", "add -o FILE.mcap or FILE.bag")
         return _ring(module)
-    if given["output"].suffix not in (_BAG, ".mcap"):
-        raise ConfigError("-o", f"{given['output']} is neither .mcap nor .bag", "name the file so")
     if given["output"].exists():
         raise ConfigError("-o", f"{given['output']} exists", "name another file")
-    if given["mesh"]:
-        return _of_the_mesh(options, given)
+    if given["mesh"] or given["peers"]:
+        if given["here"]:
+            text = "--here gathers over the network while it records, --mesh and --peer at the end"
+            raise ConfigError("--here", text, "use one of them")
+        if given["mesh"] and given["peers"]:
+            raise ConfigError("--peer", "--mesh is all modules", "use one of them")
+        return record_mesh(options, _file(given["output"]), given)
     return _by_hand(module, options, given)
 
 
@@ -141,6 +158,17 @@ async def _until_signal(run: Callable[[asyncio.Event], Any]) -> None:
     await run(stop)
 
 
+def _file(path: Path) -> Path:
+    """A file that a recording goes to.
+
+    Raises:
+        ConfigError: Its name does not say as what.
+    """
+    if path.suffix not in (BAG, ".mcap"):
+        raise ConfigError("-o", f"{path} is neither .mcap nor .bag", "name the file so")
+    return path
+
+
 def _by_hand(module: Module, options: Options, given: dict[str, Any]) -> int:
     """Record into a file: segments beside it, which are joined at the end."""
     from rmpa.record.recorder import record_file
@@ -151,17 +179,17 @@ def _by_hand(module: Module, options: Options, given: dict[str, Any]) -> int:
 
     def progress(seconds: float, messages: int, total: int) -> bool:
         nonlocal shown
-        if sys.stderr.isatty() and seconds - shown >= _PROGRESS:
+        if seconds - shown >= PROGRESS:
             shown = seconds
-            click.echo(f"\r{seconds:6.1f} s  {messages:,} messages  {size(total)}   ", err=True, nl=False)
-        return bool(given["megabytes"]) and total >= given["megabytes"] * _MB
+            say(f"{seconds:6.1f} s  {messages:,} messages  {size(total)}")
+        return bool(given["megabytes"]) and total >= given["megabytes"] * MB
 
-    output: Path = given["output"]
-    with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as parts:
+    output = _file(given["output"])
+    with parts_folder(output) as parts:
         counts = asyncio.run(
             record_file(
                 wanted,
-                Path(parts),
+                parts,
                 module.name,
                 _core_of(module),
                 progress,
@@ -169,9 +197,8 @@ def _by_hand(module: Module, options: Options, given: dict[str, Any]) -> int:
                 everything=given["here"],
             )
         )
-        if sys.stderr.isatty():
-            click.echo("", err=True)
-        result = _write([Path(parts)], output)
+        end_line()
+        result = join([parts], output)
     options.show(
         {"file": str(output), "messages": result.messages, "topics": counts},
         f"{output}: {result.messages:,} messages of {len(counts)} topics, {size(output.stat().st_size)}",
@@ -179,46 +206,10 @@ def _by_hand(module: Module, options: Options, given: dict[str, Any]) -> int:
     return 0 if result.messages else 1
 
 
-def _write(paths: list[Path], output: Path, reference: str = "") -> MergeResult:
-    """Merge recordings into one file, MCAP or bag."""
-    from rmpa.record.bag import write_bag
-    from rmpa.record.format import read_in_order
-    from rmpa.record.merge import merge
-
-    if output.exists():
-        raise ConfigError("-o", f"{output} exists", "name another file")
-    whole = output.with_name(f".{output.name}.new")
-    try:
-        with whole.open("wb") as file:
-            result = merge(paths, file, reference)
-        if output.suffix == _BAG:
-            write_bag(read_in_order([whole]), output)
-        else:
-            whole.replace(output)
-    except OSError as error:
-        raise _unwritten(output, error) from None
-    finally:
-        whole.unlink(missing_ok=True)
-    return result
-
-
-def _of_the_mesh(options: Options, given: dict[str, Any]) -> int:
-    """Wait, then keep what all modules have of that time."""
-    began = time.time()
-    with contextlib.suppress(KeyboardInterrupt):
-        time.sleep(given["duration"] or 86_400.0)
-    seconds = time.time() - began
-    return _keep(options, f"by hand for {seconds:.0f} s", seconds, given["output"])
-
-
-def _all(client: ControlClient) -> list[ModuleRecordings]:
-    return list(client.call("record", tuple[ModuleRecordings, ...], what="list"))
-
-
 def names(_ctx: click.Context, _: str) -> Iterator[str]:
     """The names of recordings, for completion."""
     with Options(False).client() as client:
-        yield from dict.fromkeys(kept.id for each in _all(client) for kept in each.kept)
+        yield from dict.fromkeys(kept.id for each in all_recordings(client) for kept in each.kept)
 
 
 @agent_verb()
@@ -231,8 +222,8 @@ def record_list(options: Options) -> int:
       rmpa record list
       rmpa record list --json | jq -r '.[].kept[].id'
     """
-    with options.client(60.0) as client:
-        found = _all(client)
+    with options.client(CALL) as client:
+        found = all_recordings(client)
     recorders = [
         (each.module, *(_state(each)), each.problem or str(each.status.get("problem", "")) or "-") for each in found
     ]
@@ -269,10 +260,8 @@ def record_info(recording: str, options: Options) -> int:
     Examples:
       rmpa record info 20261129-121500-arm-alarm
     """
-    with options.client(60.0) as client:
-        parts = [(each.module, kept) for each in _all(client) for kept in each.kept if kept.id == recording]
-    if not parts:
-        raise RmpaError(f"no module has a recording {recording}; `rmpa record list` shows them", code="unknown-name")
+    with options.client(CALL) as client:
+        parts = parts_of(client, recording)
     rows = [
         (
             module,
@@ -309,47 +298,22 @@ def record_keep(why: str, seconds: float | None, output: Path | None, options: O
       rmpa record keep
       rmpa record keep "the arm hit the table" --seconds 60 -o hit.mcap
     """
-    return _keep(options, why, seconds, output)
-
-
-def _keep(options: Options, why: str, seconds: float | None, output: Path | None) -> int:
-    with options.client(60.0) as client:
-        name = recording_id(why, client.agent().name, time.time_ns())
-        answers = client.call("record", dict[str, str], what="keep", id=name, why=why, seconds=seconds)
-        answers |= _outcome(client, name, {module for module, problem in answers.items() if not problem})
+    if output is not None and _file(output).exists():
+        raise ConfigError("-o", f"{output} exists", "name another file")
+    with options.client(CALL) as client:
+        name, answers = keep(client, why, seconds)
         rows = [(module, problem or "kept") for module, problem in answers.items()]
-        options.show({"id": name, "modules": answers}, name, Table("MODULE, STATE", rows))
-        if output is not None and not all(answers.values()):
-            with tempfile.TemporaryDirectory() as folder:
-                _fetch(client, name, Path(folder))
-                result = _write([Path(folder)], output)
-            print_text(_merged(output, result))
-    return int(any(answers.values()))
-
-
-def _outcome(client: ControlClient, name: str, modules: set[str], limit: float = 20.0) -> dict[str, str]:
-    """Wait until modules have a recording, or say why not: by module, empty where it has it."""
-    deadline, found = time.monotonic() + limit, dict[str, str]()
-    while True:
-        told = {each.module: each for each in _all(client) if each.module in modules}
-        for module, each in told.items():
-            if any(kept.id == name for kept in each.kept):
-                found[module] = ""
-            elif why := each.status.get("failed", {}).get(name):
-                found[module] = why
-        if found.keys() >= modules:
-            return found
-        if time.monotonic() > deadline:
-            break
-        time.sleep(0.1)
-    for module in modules - found.keys():
-        state = told.get(module)
-        why = "it is not linked any more" if state is None else state.problem or str(state.status.get("problem", ""))
-        runs = state is not None and state.status
-        found[module] = (
-            f"not kept within {limit:.0f} s: {why or ('it is busy' if runs else 'no recorder runs there')}"
-        )
-    return found
+        about: dict[str, Any] = {"id": name, "modules": answers}
+        lines: list[str] = []
+        if output is not None and name:
+            with parts_folder(output) as folder:
+                fetched = fetch(client, name, folder)
+                result = join([folder], output)
+            about |= {"file": str(output), "messages": result.messages}
+            lines = [merged(output, result), *(f"! {one.module}: {one.problem}" for one in fetched if one.problem)]
+            answers |= {one.module: one.problem for one in fetched if one.problem}
+    options.show(about, name, Table("MODULE, STATE", rows), *lines)
+    return int(not name or any(answers.values()))
 
 
 @agent_verb(
@@ -361,6 +325,9 @@ def _outcome(client: ControlClient, name: str, modules: set[str], limit: float =
 def record_fetch(recording: str, output: Path | None, options: Options) -> int:
     """Fetch a RECORDING from all modules that have it, a folder each; what is there already is not fetched again.
 
+    A module whose link is lost meanwhile is waited for, a minute long. The same command goes on where one was ended.
+    Commands do not wait for it: it takes half of the way at the most.
+
     ---
 
     Examples:
@@ -368,56 +335,21 @@ def record_fetch(recording: str, output: Path | None, options: Options) -> int:
       rmpa record fetch 20261129-121500-arm-alarm -o fall
     """
     folder = output or Path(recording)
-    with options.client(60.0) as client:
-        fetched = _fetch(client, recording, folder)
-    options.show(
-        {"folder": str(folder), "modules": fetched},
-        Table("MODULE, >FETCHED", [(module, size(count)) for module, count in fetched.items()]),
-        f"merge it: rmpa record merge {folder} -o {recording}.mcap",
-    )
-    return 0
-
-
-def _fetch(client: ControlClient, recording: str, folder: Path) -> dict[str, int]:
-    parts = [(each.module, kept) for each in _all(client) for kept in each.kept if kept.id == recording]
-    if not parts:
-        raise RmpaError(f"no module has a recording {recording}; `rmpa record list` shows them", code="unknown-name")
-    total, done = sum(kept.size for _, kept in parts), 0
-    fetched: dict[str, int] = {}
-    for module, kept in parts:
-        place = folder / module
-        for name in kept.files:
-            for count in _fetch_file(client, module, recording, name, place / name):
-                done += count
-                fetched[module] = fetched.get(module, 0) + count
-                if sys.stderr.isatty():
-                    click.echo(f"\r{module}: {100 * done // max(total, 1)} % of {size(total)}  ", err=True, nl=False)
-    if sys.stderr.isatty():
-        click.echo("", err=True)
-    return fetched
-
-
-def _fetch_file(client: ControlClient, module: str, recording: str, name: str, path: Path) -> Iterator[int]:
-    """Append what is missing of a file; yields the bytes of each part."""
-    if "/" in name or name.startswith("."):
-        raise RmpaError(f"{module} names a file {printable(name)}", code="protocol-error")
-    asked = {"what": "read", "module": module, "id": recording, "file": name}
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("ab") as file:
-            while True:
-                part = client.call("record", FilePart, **asked, offset=file.tell())
-                data = base64.b64decode(part.data)
-                file.write(data)
-                yield len(data)
-                if not data or file.tell() >= part.size:
-                    return
-    except OSError as error:
-        raise _unwritten(path, error) from None
-
-
-def _unwritten(path: Path, error: OSError) -> RmpaError:
-    return RmpaError(f"{path} cannot be written: {error.strerror}; is the disk full?", code="directory-unusable")
+        with options.client(CALL) as client:
+            fetched = fetch(client, recording, folder)
+    except KeyboardInterrupt:
+        click.echo(f"\nnot all is in {folder}: the same command goes on from there", err=True)
+        raise
+    problems = {one.module: one.problem for one in fetched if one.problem}
+    options.show(
+        {"folder": str(folder), "modules": {one.module: one.size for one in fetched}, "problems": problems},
+        Table("MODULE, >SIZE, PROBLEM", [(one.module, size(one.size), one.problem or "-") for one in fetched]),
+        "not all is there: the same command goes on from there"
+        if problems
+        else f"merge it: rmpa record merge {folder} -o {recording}.mcap",
+    )
+    return int(bool(problems))
 
 
 @json_verb(
@@ -437,25 +369,18 @@ def record_merge(recordings: tuple[Path, ...], output: Path, reference: str, opt
       rmpa record merge arm.mcap base.mcap --clock base -o both.bag
     """
     check_record("rmpa record")
-    result = _write(list(recordings), output, reference)
+    result = join(list(recordings), _file(output), reference)
     about = msgspec.to_builtins({**result._asdict(), "offsets": {k: v._asdict() for k, v in result.offsets.items()}})
     rows = [
         (name, "the clock" if name == result.reference else f"{1e3 * one.ahead:+.3f} ms", _bound(one.error))
         for name, one in result.offsets.items()
     ]
-    options.show({"file": str(output), **about}, _merged(output, result), Table("MODULE, >AHEAD, >±", rows))
+    options.show({"file": str(output), **about}, merged(output, result), Table("MODULE, >AHEAD, >±", rows))
     return int(bool(result.damaged))
 
 
 def _bound(error: float | None) -> str:
     return "not known" if error is None else f"{1e3 * error:.3f} ms"
-
-
-def _merged(output: Path, result: MergeResult) -> str:
-    doubles = f", {result.doubles:,} doubles left out" if result.doubles else ""
-    damaged = "".join(f"; not read: {text}" for text in result.damaged)
-    text = f"{output}: {result.messages:,} messages of {len(result.offsets)} modules{doubles}{damaged}"
-    return "\n".join((text, *result.notes))
 
 
 @agent_verb(argument("recording", names), click.option("--module", default="", help="Only that of this module."))
@@ -467,7 +392,7 @@ def record_rm(recording: str, module: str, options: Options) -> int:
     Examples:
       rmpa record rm 20261129-121500-arm-alarm
     """
-    with options.client(60.0) as client:
+    with options.client(CALL) as client:
         removed, problems = remove_recording(client, recording, module)
     if not removed and not problems:
         raise RmpaError(f"no module has a recording {recording}; `rmpa record list` shows them", code="unknown-name")

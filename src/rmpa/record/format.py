@@ -16,9 +16,12 @@ import logging
 import os
 import struct
 from functools import partial
+from types import SimpleNamespace
 from typing import IO, TYPE_CHECKING, Final, NamedTuple
 
+import mcap.writer
 import msgspec
+import zstandard
 from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Chunk, Footer, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
@@ -53,6 +56,9 @@ _SECOND: Final = 1_000_000_000
 _TIMES: Final = 1 << 64
 # Definitions may have comments in any encoding, and their MD5 sums are of their bytes.
 _AS_IT_WAS: Final = "surrogateescape"
+# The library compresses at zstd's level 3 and has no option for it. Of an image with noise in its low bits (922 KB)
+# that takes 6 ms and leaves 49 %; level 1 takes 1 ms and leaves 58 %.
+vars(mcap.writer)["zstandard"] = SimpleNamespace(compress=partial(zstandard.compress, level=1))
 
 
 class DamagedError(RmpaError):

@@ -16,7 +16,7 @@ from typing import IO, TYPE_CHECKING, Final, NamedTuple
 import msgspec
 
 from rmpa.core.errors import RmpaError
-from rmpa.core.identity import OWN_NODE
+from rmpa.core.identity import OWN_NODE, matches
 from rmpa.record.format import (
     EVENTS,
     MERGE,
@@ -112,13 +112,14 @@ class _Clock:
         return round(self.known[max(0, at - 1)][1] * _SECOND)
 
 
-def merge(paths: Sequence[Path], file: IO[bytes], reference: str = "") -> MergeResult:
+def merge(paths: Sequence[Path], file: IO[bytes], reference: str = "", topics: Sequence[str] = ()) -> MergeResult:
     """Write one recording of several.
 
     Args:
         paths: Recordings: files, or folders of segments; of any modules.
         file: The result, open for writing.
         reference: The module whose clock the times are put on; empty: the first by name that knows most others.
+        topics: The topics that are wanted, as globs, beside events; empty: all.
 
     Raises:
         RmpaError: There is no such module, or nothing can be read.
@@ -150,7 +151,15 @@ def merge(paths: Sequence[Path], file: IO[bytes], reference: str = "") -> MergeR
     count = doubles = 0
     seen: dict[RecordedSource, bytes] = {}
     streams = (_timed(head, clocks[head.module]) for head in heads)
+    wanted = {
+        source.topic
+        for head in heads
+        for source in head.sources
+        if source.topic == EVENTS or not topics or any(matches(glob, source.topic) for glob in topics)
+    }
     for message in heapq.merge(*streams, key=_order):
+        if message.source.topic not in wanted:
+            continue
         if _is_double(message, nodes, seen):
             doubles += 1
             continue

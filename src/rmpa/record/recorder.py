@@ -70,6 +70,9 @@ _STATUS: Final = 5.0
 _LATE: Final = 1.0
 # Seconds from one snapshot of the agent to the next, where its graph does not change.
 _PERIOD: Final = 5.0
+# Seconds between two looks whether the core is still the same: they were half of what an idle recorder cost, and what
+# is connected stays so while a core restarts.
+_MASTER: Final = 5.0
 # Seconds between two readings of the parameters, and bytes of them that a segment repeats.
 _PARAMETERS: Final = 30.0
 _PARAMETERS_MAX: Final = 1024 * 1024
@@ -89,6 +92,7 @@ class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
         left_out: Messages above the budgets, or that the disk did not take, by topic.
         written: Bytes written to the disk.
         ring: Bytes of the ring, and how far it goes back, seconds.
+        bounds: The most bytes and seconds of the ring; ``None``: any.
         problem: Why nothing can be written; empty: all is well.
         failed: What could not be kept, the latest by its name: why.
     """
@@ -101,6 +105,7 @@ class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
     left_out: dict[str, int] = {}
     written: int = 0
     ring: tuple[int, float] = (0, 0.0)
+    bounds: tuple[int, float | None] = (0, None)
     problem: str = ""
     failed: dict[str, str] = {}
 
@@ -123,6 +128,7 @@ class Recorder:
         self._folder = folder
         self._agent = agent
         self._node = Node("rmpa_record", master_uri=master_uri)
+        self._node.master_check = _MASTER
         self._module = ModuleRecord(name=agent)
         self._clocks: dict[str, str] = {}
         # This machine's wall clock less the monotonic one when the other clocks were read, ns.
@@ -300,6 +306,7 @@ class Recorder:
         since, until = ((at - epoch) / _SECOND for at in (kept.since, kept.until))
         await asyncio.sleep(max(0.0, until - time.monotonic()))
         kept = msgspec.structs.replace(kept, module=self._module.name)
+        await asyncio.to_thread(self._write_status)  # what was left out until now is asked for with the recording
         try:
             made = await asyncio.wrap_future(self.ring.call(self.ring.keep, kept, since, until + _LATE))
             why = "nothing of that time is here" + (f": {self.ring.problem}" if self.ring.problem else "")
@@ -330,6 +337,7 @@ class Recorder:
             left_out={t: n + lost.get(t, 0) for t, n in {**lost, **self._all_left_out()}.items()},
             written=self.ring.written,
             ring=(sum(one.size for one in segments), back),
+            bounds=(self._settings.megabytes * _MB, self._settings.seconds),
             problem=self.ring.problem,
             failed=dict(self._failed),
         )

@@ -25,11 +25,13 @@ inline uint32_t crc32(const uint8_t* data, size_t size) {
   return static_cast<uint32_t>(crc.checksum());
 }
 
-// Bodies of one size: the same bytes as payload.py makes.
+// Bodies of one size: the same bytes as payload.py makes; or, with noise, as a camera's: half of them is noise.
 class Pattern {
  public:
-  explicit Pattern(size_t size) : size_(std::max(size, kHeader)), bytes_(size_ - kHeader + kPeriod) {
-    for (uint64_t i = 0; i < bytes_.size(); ++i) bytes_[i] = static_cast<uint8_t>(i * i + (i >> 8));
+  explicit Pattern(size_t size, bool noise = false)
+      : size_(std::max(size, kHeader)), bytes_(size_ - kHeader + kPeriod) {
+    for (uint64_t i = 0; i < bytes_.size(); ++i)
+      bytes_[i] = static_cast<uint8_t>(noise ? i / 3600 + (random() & 7) : i * i + (i >> 8));
   }
   void fill(std::vector<uint8_t>& data, uint32_t source, uint32_t sequence) const {
     data.resize(size_);

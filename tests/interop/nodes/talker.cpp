@@ -13,7 +13,7 @@ int main(int argc, char** argv) {
   while (ros::ok() && publisher.getNumSubscribers() < options.number("wait", 0))
     std::this_thread::sleep_for(std::chrono::milliseconds(5));
   payload::say("connected", "\"subscribers\": " + std::to_string(publisher.getNumSubscribers()));
-  payload::Pattern pattern(size_t(options.number("size", 64)));
+  payload::Pattern pattern(size_t(options.number("size", 64)), options.flag("noise"));
   const double rate = options.number("rate", 10);
   const uint64_t count = uint64_t(options.number("count", 0));
   const uint32_t source = uint32_t(options.number("source", 1));

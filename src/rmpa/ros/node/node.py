@@ -101,6 +101,7 @@ class Node(MasterClient):
 
     Attributes:
         stopped: Set when the node is closed.
+        master_check: Seconds between two looks at the master; ``None``: ``NODE_MASTER_CHECK``.
     """
 
     def __init__(
@@ -121,6 +122,7 @@ class Node(MasterClient):
             name = f"{name}_{os.getpid()}_{time.time_ns() // 1_000_000}"
         self.environment = environment
         self.stopped = asyncio.Event()
+        self.master_check: float | None = None
         self._on_shutdown = on_shutdown
         self._on_param_update = on_param_update
         self._signals = (signal.SIGINT, signal.SIGTERM) if handle_signals else ()
@@ -534,7 +536,7 @@ class Node(MasterClient):
 
     async def _watch_master(self) -> None:
         while True:
-            await asyncio.sleep(NODE_MASTER_CHECK)
+            await asyncio.sleep(self.master_check or NODE_MASTER_CHECK)
             if not (self._entries or self._followed):
                 continue
             try:
