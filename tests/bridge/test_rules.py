@@ -343,7 +343,7 @@ _WHAT = ("publish", "want", "deliver") * 2 + (
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(_WHAT), st.integers(0, 11)), max_size=50))
 def test_after_reloads_exactly_the_last_rules_hold(steps: list[tuple[str, int]]) -> None:
     world = World()

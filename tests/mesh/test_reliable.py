@@ -284,4 +284,4 @@ class EveryInterleaving(RuleBasedStateMachine):
 
 
 TestEveryInterleaving = EveryInterleaving.TestCase
-TestEveryInterleaving.settings = settings(max_examples=200, stateful_step_count=50, deadline=None)
+TestEveryInterleaving.settings = settings(max_examples=120, stateful_step_count=50, deadline=None)

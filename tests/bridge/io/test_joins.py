@@ -11,12 +11,13 @@ from rmpa.bridge import limits
 from rmpa.mesh import limits as mesh_limits
 from tests.bridge.io.nodes import Speaker
 from tests.bridge.io.test_two_bridges import numbers, play
+from tests.simulation.scenario import FACTOR
 
 if TYPE_CHECKING:
     from tests.bridge.io.nodes import Listener
     from tests.bridge.io.two_bridges import World
 
-SEEDS = range(12)
+SEEDS = range(4 * FACTOR)
 BIG = 3000
 
 

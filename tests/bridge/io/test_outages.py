@@ -13,8 +13,7 @@ from rmpa.bridge.data.route_sender import ReliableRouteSender
 from rmpa.bridge.messages import Source
 from rmpa.core.contract import ContractRule, History, Reliability
 from rmpa.mesh import limits as mesh_limits
-from tests.bridge.io.two_bridges import World, made_up
-from tests.bridge.io.virtual import VirtualLoop, run
+from tests.bridge.io import two_bridges
 from tests.simulation.scenario import FACTOR
 
 if TYPE_CHECKING:
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.messages import TopicOffer
     from tests.bridge.io.nodes import Listener, Speaker
-    from tests.bridge.io.two_bridges import Side
+    from tests.bridge.io.two_bridges import Side, World
 
 SURE = Source("/sure", "/one")
 PERIOD = 0.05
@@ -30,15 +29,7 @@ PERIOD = 0.05
 
 def play(seed: int, scene: Callable[[World], Coroutine[object, object, None]], **values: object) -> None:
     """Play one scene of a world whose topic /sure is reliable."""
-    loop = VirtualLoop()
-    rule = ContractRule(("/sure",), (), {"reliability": Reliability.RELIABLE, **values})
-
-    async def main() -> None:
-        async with World(seed, (rule,)) as world:
-            await scene(world)
-
-    with made_up(loop):
-        run(main(), loop)
+    two_bridges.play(seed, scene, [ContractRule(("/sure",), (), {"reliability": Reliability.RELIABLE, **values})])
 
 
 def lost_at_receiver(side: Side) -> int:
@@ -236,7 +227,7 @@ def test_losses_of_an_outage_are_reported_without_further_messages() -> None:
     play(6, scene, outage=600.0, depth=100)
 
 
-@pytest.mark.parametrize("block", range(5 * FACTOR))
+@pytest.mark.parametrize("block", range(3 * FACTOR))
 def test_many_outages_within_the_window(block: int) -> None:
     async def scene(world: World) -> None:
         speaker, listener = await begin(world)
@@ -249,7 +240,7 @@ def test_many_outages_within_the_window(block: int) -> None:
         await settled(world)
         accounted(world, speaker, listener)
 
-    for seed in range(block * 5, block * 5 + 5):
+    for seed in range(block * 4, block * 4 + 4):
         window = (5.0, 30.0, 120.0)[seed % 3]
         play(seed, scene, outage=window, depth=(20, 1000, 100_000, 50)[seed % 4])
 
