@@ -11,8 +11,8 @@ import pytest
 
 ROOT: Final = Path(__file__).parents[2]
 ROWS: Final = {
-    "trap": ("ros-traps.md", [str(n) for n in range(1, 44) for n in ((n, "16a") if n == 16 else (n,))]),
-    "complaint": ("complaints.md", [str(n) for n in range(1, 29)]),
+    "trap": ("ros-traps.md", [*map(str, range(1, 17)), "16a", *map(str, range(17, 44))]),
+    "complaint": ("complaints.md", [*map(str, range(1, 29))]),
 }
 """Of each mark of tests: the document, and its rows."""
 _TEST: Final = re.compile(r"(?m)^(?:@pytest\.mark\.(trap|complaint)\((.*)\)|(?:async )?def (test_\w+))")

@@ -7,20 +7,17 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from collections.abc import Awaitable, Callable
+from typing import Any
 
 import pytest
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Want
 from rmpa.bridge.messages import Source
+from tests.simulation.direct_modules import SubscriberModule
 from tests.simulation.direct_scenario import DirectScenario
 from tests.simulation.scenario import FACTOR
-
-if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
-
-    from tests.simulation.direct_modules import SubscriberModule
 
 BLOCK = 9
 CHATTER = Source("/chatter", "/talker")

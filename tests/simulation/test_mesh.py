@@ -6,18 +6,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import pytest
 
 from rmpa.mesh import limits
+from tests.simulation.mesh_peer import MeshPeer
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.network import Weather
 from tests.simulation.rests_scenario import RestsScenario
 from tests.simulation.scenario import FACTOR
-
-if TYPE_CHECKING:
-    from tests.simulation.mesh_peer import MeshPeer
 
 pytestmark = pytest.mark.timeout(300)  # seconds of computing, beside parts of the suite that compute too
 

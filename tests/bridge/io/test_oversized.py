@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import pytest
 
+from rmpa.bridge.data.reception import ImportFlow
 from rmpa.bridge.messages import Notification, Source, encode
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.ros import limits
 from tests.bridge.io.two_bridges import World, play
-
-if TYPE_CHECKING:
-    from rmpa.bridge.data.reception import ImportFlow
 
 BIG = Source("/big", "/one")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -12,12 +11,9 @@ from rmpa.config.settings import Settings, TrustSettings
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import ContractRule, Priority, Reliability
 from rmpa.trust.permissions import Permissions
-from tests.bridge.io.two_bridges import World, play
+from tests.bridge.io.nodes import Listener, Speaker
+from tests.bridge.io.two_bridges import Side, World, play
 from tests.simulation.scenario import FACTOR
-
-if TYPE_CHECKING:
-    from tests.bridge.io.nodes import Listener, Speaker
-    from tests.bridge.io.two_bridges import Side
 
 TOPICS = ("/plain", "/sure", "/urgent")
 RULES = (

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import random
+from collections.abc import Callable, Coroutine
 from functools import partial
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -16,14 +17,9 @@ from rmpa.core.contract import Contract, ContractRule, Durability, Priority, Rel
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import Frame, FrameKind
 from tests.bridge.io import two_bridges
+from tests.bridge.io.nodes import Listener, Speaker
+from tests.bridge.io.two_bridges import World
 from tests.simulation.scenario import FACTOR
-
-if TYPE_CHECKING:
-    import random
-    from collections.abc import Callable, Coroutine
-
-    from tests.bridge.io.nodes import Listener, Speaker
-    from tests.bridge.io.two_bridges import World
 
 SIZES = (10, 60, 200, 1500)
 TOPICS = ("/plain", "/sure", "/kept", "/urgent", "/slow")

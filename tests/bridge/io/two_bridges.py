@@ -4,29 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import random
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from types import MappingProxyType, SimpleNamespace
-from typing import TYPE_CHECKING, Final, Self, cast
+from typing import Final, Self, cast
 from unittest import mock
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.bridge import Bridge
+from rmpa.bridge.sessions import PeerSession
 from rmpa.config.settings import Settings
 from rmpa.core import limits as core_limits
+from rmpa.core.contract import ContractRule
 from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits as mesh_limits
+from rmpa.mesh.io.link import PeerLink
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.publication import Publication
 from tests.bridge.io.links import LinkEnd
 from tests.bridge.io.nodes import Core, Listener, Node, PublisherConnection, Speaker, stages
 from tests.bridge.io.virtual import VirtualLoop, run
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterable, Iterator, Sequence
-
-    from rmpa.bridge.sessions import PeerSession
-    from rmpa.core.contract import ContractRule
-    from rmpa.mesh.io.link import PeerLink
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.publication import Publication
 
 SMALL_LIMITS: Final = MappingProxyType(
     {
