@@ -34,6 +34,23 @@ def numbers(machine: ReliableSender, most: int | None = None) -> list[int]:
 # --- the receiver ---------------------------------------------------------------------------------------------
 
 
+def test_lost_lane_is_replayed_from_the_acknowledgement() -> None:
+    machine = sender(depth=4)
+    fill(machine, 4)
+    taken(machine)
+    machine.acknowledged(1)
+    machine.offer(payload(4), 0)
+    machine.offer(payload(5), 0)
+    machine.rewind()
+    assert machine.overflowed == 1
+    assert numbers(machine, 1) == [2]
+    machine.acknowledged(4)  # it was on its way, over the other lane
+    assert numbers(machine) == [4, 5]
+    machine.suspend()
+    machine.rewind()
+    assert taken(machine) == []
+
+
 def test_without_a_first_sequence_no_gap_is_claimed() -> None:
     receiver = ReliableReceiver()
     assert receiver.gap(500, 7) == 0
@@ -217,4 +234,4 @@ class EveryInterleaving(RuleBasedStateMachine):
 
 
 TestEveryInterleaving = EveryInterleaving.TestCase
-TestEveryInterleaving.settings = settings(max_examples=120, stateful_step_count=50, deadline=None)
+TestEveryInterleaving.settings = settings(max_examples=200, stateful_step_count=50, deadline=None)

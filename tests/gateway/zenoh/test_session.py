@@ -116,24 +116,6 @@ async def test_queries_are_answered_refused_left_without_an_answer_and_not_asked
     kept.pop().finish()  # it came, and ended by its time-out
 
 
-async def test_all_complete_asks_each_server(net: ZenohBed) -> None:
-    servers = [await net.session(), await net.session()]
-    client = await net.session()
-
-    def serve(number: int) -> None:
-        def answer(query: ArrivedQuery) -> None:
-            query.reply("s", b"%d" % number)
-            query.finish()
-
-        servers[number].queryable("s", answer)
-
-    for number in range(2):
-        serve(number)
-    await ready(client, *servers)
-    assert len(await client.get("s")) == 1
-    assert {r.payload for r in await client.get("s", all_complete=True)} == {b"0", b"1"}
-
-
 async def test_a_session_that_cannot_be_opened_says_where_why_and_what_to_do(net: ZenohBed) -> None:
     port = free_port()
     with pytest.raises(StartError, match=rf"zenoh tcp/127\.0\.0\.1:{port}: .*connect.*; .*--connect") as refused:

@@ -156,6 +156,21 @@ async def test_rest_of_a_torn_message_is_not_sent() -> None:
 # --- fences -------------------------------------------------------------------------------------------------------
 
 
+async def test_both_lanes_end_with_the_link() -> None:
+    async with linked_pair() as (one, other):
+        link = one.link(other)
+        one.mesh.peer_gone(other.identity.guid)
+        other.mesh.peer_gone(one.identity.guid)
+        link.close("maintenance")
+        await until(lambda: not one.mesh.connections() and not other.mesh.connections(), "all connections are closed")
+        assert one.downs == [(link, "maintenance")]
+        assert not one.lanes_lost, "the whole link is gone, and that is what is told"
+        assert link.express.ended
+        assert link.bulk.ended
+        assert link.bulk.send(1, 1, 0, b"x") == link.express.send(1, 1, 0, b"x") == 0
+        assert link.bulk.outbox.waiting(1) == 0
+
+
 @pytest.mark.parametrize("way", ["express", "bulk"])
 async def test_fence_is_answered_after_all_messages_before_it(way: str) -> None:
     async with linked_pair() as (one, other):

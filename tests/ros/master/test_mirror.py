@@ -94,6 +94,17 @@ def test_other_type_of_a_topic_is_a_change(pair: Pair) -> None:
     assert pair.graph.state() == pair.master.registrations.state()
 
 
+def test_a_provider_that_a_look_from_before_saw_does_not_take_ours(pair: Pair) -> None:
+    pair.theirs("registerService", "/n", "/srv", "rosrpc://h:9", THEIRS)
+    seen, survey = pair.mirror.asked, pair.survey()
+    pair.theirs("unregisterService", "/n", "/srv", "rosrpc://h:9")
+    pair.call("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:10", OURS)
+    pair.flush()
+    pair.mirror.update(survey, seen)
+    assert pair.graph.state().services == {"/srv": {"/rmpa/b/n": "rosrpc://h:10"}}
+    assert pair.look() == []
+
+
 def test_ours_counts_at_once_and_a_look_from_before_takes_nothing_back(pair: Pair) -> None:
     pair.theirs("registerSubscriber", "/s", "/t", STRING, THEIRS)
     pair.look()
@@ -147,6 +158,17 @@ def test_nodes_of_a_former_master_stay_until_they_die_or_return(pair: Pair) -> N
     pair.look()
     assert pair.graph.at(RegistrationKind.PUBLISHER, "/t") == {}
     assert pair.graph.state().nodes == {"/returns": "http://127.0.0.1:4/"}
+
+
+def test_local_provider_replaces_our_service_for_good(pair: Pair) -> None:
+    pair.call("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:9", OURS)
+    pair.flush()
+    pair.look()
+    pair.theirs("registerService", "/local", "/srv", "rosrpc://h:10", THEIRS)
+    pair.changes()
+    assert pair.look() == []
+    assert pair.changes() == {("-", "/srv", "/rmpa/b/n"), ("+", "/srv", "/local")}
+    assert pair.graph.state().services == {"/srv": {"/local": "rosrpc://h:10"}}
 
 
 def test_what_the_master_does_not_take_is_none(pair: Pair) -> None:

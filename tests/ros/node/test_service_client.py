@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from rmpa.core.errors import LocalProtocolError, PeerRefused, UnreachableError
+from rmpa.core.errors import LocalProtocolError, UnreachableError
 from rmpa.ros.node import service_client as module
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed, probe
 from rmpa.ros.wire.tcpros import ServiceDescription, encode_header, error_header, server_header
@@ -124,19 +124,6 @@ async def test_unrequested_bytes_break_the_protocol(server: Server) -> None:
     connection, link = await server.serve()
     await link.send(b"\x01\x00\x00\x00\x00")
     await until(lambda: connection.closed)
-
-
-async def test_refusals(server: Server) -> None:
-    with pytest.raises(PeerRefused, match="service /add: its server refused: no such service"):
-        await server.serve({"error": "no such service"})
-    with pytest.raises(PeerRefused, match="'md5sum' is missing"):
-        await server.serve({"callerid": "/server"})
-    opening = asyncio.create_task(ServiceConnection.open(server.uri, "/add", "/c", md5sum="0" * 32))
-    link = await server.accept()
-    await link.header()
-    await link.send(encode_header(server_header("/server", ADD)))
-    with pytest.raises(PeerRefused, match=f"the server of /add has md5sum .{MD5}., not"):
-        await opening
 
 
 async def test_nobody_there(server: Server) -> None:
