@@ -64,7 +64,7 @@ tests: $(STAMP)  ## all tests, several files at a time; some of them: make tests
 	$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),scripts/run-tests $(BIN)/python)
 
 test-long: $(STAMP)  ## more seeds of the simulated networks and fuzz targets than `make tests` has, and tests marked `long`
-	RMPA_SIMULATION_SEEDS=8 FUZZ_MUTATIONS=20000 $(BIN)/python -m pytest -n auto --timeout 3600 tests/simulation tests/bridge/io tests/fuzz
+	RMPA_SIMULATION_SEEDS=16 FUZZ_MUTATIONS=20000 $(BIN)/python -m pytest -n auto --timeout 3600 tests/simulation tests/bridge/io tests/fuzz
 	$(APT) scripts/install-ros --images
 	$(BIN)/python -m pytest -m long --timeout 3600
 

@@ -4,33 +4,28 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
+from collections.abc import Callable, Collection, Iterator
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple, cast
 
 from rmpa.bridge.context import BridgeContext, Names, ServiceRules
-from rmpa.bridge.data.export import ExportFlow
-from rmpa.bridge.messages import Source
+from rmpa.bridge.data.export import ExportFlow, ExportRoute
+from rmpa.bridge.data.route import RouteBegin
+from rmpa.bridge.messages import Description, Message, Origin, RouteOpened, Source
 from rmpa.bridge.peer import PeerRun, PeerState
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
 from rmpa.bridge.services import books
+from rmpa.bridge.services.bodies import LocalService
+from rmpa.bridge.services.books import RemoteService
 from rmpa.bridge.topics import exports as topic_exports
 from rmpa.bridge.topics import imports as topic_imports
+from rmpa.bridge.topics.exports import LocalSource
+from rmpa.bridge.topics.import_route import RemoteTopic
 from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.settings import LimitSettings, ServiceSettings, Settings
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, Contracts
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator
-
-    from rmpa.bridge.data.export import ExportRoute
-    from rmpa.bridge.data.route import RouteBegin
-    from rmpa.bridge.messages import Description, Message, Origin, RouteOpened
-    from rmpa.bridge.services.bodies import LocalService
-    from rmpa.bridge.services.books import RemoteService
-    from rmpa.bridge.topics.exports import LocalSource
-    from rmpa.bridge.topics.import_route import RemoteTopic
-    from rmpa.ros.wire.tcpros import ServiceDescription
+from rmpa.ros.wire.tcpros import ServiceDescription
 
 
 class Send(NamedTuple):

@@ -17,7 +17,7 @@ import pytest
 from rmpa.bridge import launched, limits
 from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.launch import LAUNCH, Launcher
-from rmpa.bridge.launch_files import circles, is_name, list_files
+from rmpa.bridge.launch_files import is_name, list_files
 from rmpa.bridge.launched import LaunchedResource, ModuleResources
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.config.peer_rules import PermissionRule
@@ -247,21 +247,10 @@ async def test_in_an_open_mesh_nothing_is_started_unless_the_settings_allow_it(m
 @pytest.mark.parametrize(
     "name",
     [
-        "../cam",
-        "/etc/passwd",
-        "cam\0",
-        "cam\n",
-        "cam.resource.toml",
-        "-h",
-        "a b",
-        "$(id)",
-        "",
-        "x" * 65,
-        None,
-        7,
+        "../cam", "/etc/passwd", "cam\0", "cam\n", "cam.resource.toml", "-h", "a b", "$(id)", "", "x" * 65, None, 7,
         ["cam"],
     ],
-)
+)  # fmt: skip
 async def test_only_a_plain_name_is_taken(make: Callable[..., Module], name: Any) -> None:
     module = make(PermissionRule(("*",), names={"launch": ("/**",)}))
     module.file("cam.resource.toml")
@@ -318,12 +307,12 @@ async def test_without_a_folder_there_is_nothing_to_start(make: Callable[..., Mo
     assert "cannot be read" in (await make(folder="/nowhere/at/all").do("start", "cam")).problem
 
 
-async def test_ten_thousand_requests_start_nothing_and_are_logged_once(
+async def test_thousands_of_requests_start_nothing_and_are_logged_once(
     make: Callable[..., Module], caplog: pytest.LogCaptureFixture
 ) -> None:
     module = make(MAY)
     module.file("cam.resource.toml")
-    for number in range(10_000):
+    for number in range(3_000):
         with pytest.raises(RmpaError):
             await module.ask("start", f"n{number}", asker="eve")
     assert not module.part._launched
@@ -353,16 +342,6 @@ async def test_all_modules_are_asked_and_each_problem_is_told(make: Callable[...
     assert "did you mean arm?" in (await module.do("start", "hand", module="arn")).problem
     assert (await module.do("list", module="base")).resources[0].name == "cam"
     assert "is no question" in (await module.do("format", "cam")).problem
-
-
-def test_circles_are_found() -> None:
-    rules = {
-        "a": StartRule(after=("b",)),
-        "b": StartRule(after=("c", "d")),
-        "c": StartRule(after=("b",)),
-        "d": StartRule(),
-    }
-    assert circles(rules) == {"b": "b after c after b", "c": "c after b after c"}
 
 
 def test_a_table_that_cannot_be_read_is_said(tmp_path: Path) -> None:

@@ -271,64 +271,26 @@ OPENED = (
 @pytest.mark.parametrize(
     "term",
     [
-        '"depth":0',
-        '"depth":100001',
-        '"depth":1e3',
-        '"depth":null',
-        '"deadline":0',
-        '"deadline":-1.5',
-        '"deadline":0.0009',
-        '"deadline":86401',
-        '"deadline":1e999',
-        '"deadline":NaN',
-        '"deadline":Infinity',
-        '"deadline":"1"',
-        '"lifespan":0',
-        '"liveliness_lease":-0.0',
-        '"liveliness_lease":1e99',
-        '"max_rate":0',
-        '"max_rate":0.0009',
-        '"max_rate":1e7',
-        '"max_rate":NaN',
-        '"max_rate":true',
-        '"outage":0.9',
-        '"outage":86401',
-        '"outage":NaN',
-        '"outage":null',
-        '"outage":"5 min"',
-        '"reliability":"sometimes"',
-        '"durability":0',
-        '"history":"RELIABLE"',
-        '"liveliness":null',
-        '"priority":"urgent"',
+        '"depth":0', '"depth":100001', '"depth":1e3', '"depth":null', '"deadline":0', '"deadline":-1.5',
+        '"deadline":0.0009', '"deadline":86401', '"deadline":1e999', '"deadline":NaN', '"deadline":Infinity',
+        '"deadline":"1"', '"lifespan":0', '"liveliness_lease":-0.0', '"liveliness_lease":1e99', '"max_rate":0',
+        '"max_rate":0.0009', '"max_rate":1e7', '"max_rate":NaN', '"max_rate":true', '"outage":0.9',
+        '"outage":86401', '"outage":NaN', '"outage":null', '"outage":"5 min"', '"reliability":"sometimes"',
+        '"durability":0', '"history":"RELIABLE"', '"liveliness":null', '"priority":"urgent"',
     ],
-)
+)  # fmt: skip
 def test_a_contract_that_no_file_could_have_is_the_peers_error(beginning: bytes, term: str) -> None:
     with pytest.raises(RemoteProtocolError):
         decode(beginning + b',"contract":{' + term.encode() + b"}}")
 
 
-def test_a_release_that_knows_no_outage_goes_on_with_the_usual_one() -> None:
-    message = decode(OPEN + b',"contract":{"reliability":"reliable"}}')
-    assert isinstance(message, OpenRoute)
-    assert message.contract.resume_window == core_limits.RESUME_WINDOW
-
-
 @pytest.mark.parametrize(
     "term",
     [
-        '"depth":1',
-        '"depth":100000',
-        '"deadline":0.001',
-        '"deadline":86400',
-        '"lifespan":null',
-        '"max_rate":0.001',
-        '"max_rate":1e6',
-        '"outage":1',
-        '"outage":86400',
-        '"later_version":1e999',
+        '"depth":1', '"depth":100000', '"deadline":0.001', '"deadline":86400', '"lifespan":null',
+        '"max_rate":0.001', '"max_rate":1e6', '"outage":1', '"outage":86400', '"later_version":1e999',
     ],
-)
+)  # fmt: skip
 def test_a_contract_at_its_bounds_is_taken(term: str) -> None:
     message = decode(OPEN + b',"contract":{' + term.encode() + b"}}")
     assert isinstance(message, OpenRoute)
@@ -338,17 +300,12 @@ def test_a_contract_at_its_bounds_is_taken(term: str) -> None:
 @pytest.mark.parametrize(
     "numbers",
     [
-        OPEN + b',"epoch":-1',
-        OPEN + b',"epoch":4294967296',
-        OPEN + b',"epoch":1,"after":-1',
-        OPEN + b',"epoch":1,"after":4294967296',
-        OPEN + b',"epoch":1,"after":1e999',
-        OPENED + b',"epoch":4294967296',
-        OPENED + b',"epoch":1,"first":-1',
-        OPENED + b',"epoch":1,"first":4294967296',
-        OPENED + b',"epoch":null',
+        OPEN + b',"epoch":-1', OPEN + b',"epoch":4294967296', OPEN + b',"epoch":1,"after":-1',
+        OPEN + b',"epoch":1,"after":4294967296', OPEN + b',"epoch":1,"after":1e999',
+        OPENED + b',"epoch":4294967296', OPENED + b',"epoch":1,"first":-1',
+        OPENED + b',"epoch":1,"first":4294967296', OPENED + b',"epoch":null',
     ],
-)
+)  # fmt: skip
 def test_numberings_have_32_bits(numbers: bytes) -> None:
     with pytest.raises(RemoteProtocolError):
         decode(numbers + b"}")
@@ -357,27 +314,28 @@ def test_numberings_have_32_bits(numbers: bytes) -> None:
 OF_BEFORE_TRANSPORTS = DEFAULT.replace(b',"transport":"relay"', b"")
 
 
-def test_a_peer_of_before_transports_relays() -> None:
-    assert b"transport" not in OF_BEFORE_TRANSPORTS
-    message = decode(OPEN + b"," + OF_BEFORE_TRANSPORTS + b"}")
-    assert isinstance(message, OpenRoute)
-    assert message.contract.transport is Transport.RELAY
-    assert combine(Contract(transport=Transport.DIRECT), message.contract).transport is Transport.RELAY
+LATER = DEFAULT.replace(b'"transport"', b'"outage":60.0,"term_of_a_later_version":[1,{"a":"b"}],"transport"')
 
 
-def test_a_peer_of_before_a_term_reads_the_others() -> None:
-    new = b'"outage":60.0,"term_of_a_later_version":[1,{"a":"b"}],"transport"'
-    later = DEFAULT.replace(b'"transport"', new)
-    assert decode(OPEN + b"," + later + b"}") == OpenRoute(1, "/a", "/b", Contract(outage=60.0))
+@pytest.mark.parametrize(
+    ("terms", "contract"),
+    [
+        pytest.param(b"", Contract(), id="before contracts"),
+        pytest.param(b',"contract":{"reliability":"reliable"}', Contract(Reliability.RELIABLE), id="before outages"),
+        pytest.param(b"," + OF_BEFORE_TRANSPORTS, Contract(), id="before transports"),
+        pytest.param(b"," + LATER, Contract(outage=60.0), id="with a later term"),
+    ],
+)
+def test_a_peer_of_another_release_is_understood(terms: bytes, contract: Contract) -> None:
+    message = decode(OPEN + terms + b"}")
+    assert message == OpenRoute(1, "/a", "/b", contract, epoch=0, after=0)
+    assert combine(Contract(transport=Transport.DIRECT), contract).transport is Transport.RELAY
+    assert contract.resume_window == (60.0 if terms.endswith(LATER) else core_limits.RESUME_WINDOW)
 
 
 def test_an_unknown_transport_is_the_peers_error() -> None:
     with pytest.raises(RemoteProtocolError, match=r"Invalid enum value 'drect' - at `\$.contract.transport`"):
         decode(OPEN + b',"contract":{"transport":"drect"}}')
-
-
-def test_a_peer_of_before_contracts_gets_the_default_one() -> None:
-    assert decode(OPEN + b"}") == OpenRoute(1, "/a", "/b", Contract(), epoch=0, after=0)
 
 
 def test_a_message_beyond_the_limit_is_not_parsed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,34 +6,27 @@ from hypothesis import strategies as st
 
 from rmpa.bridge.context import Names, PeerNames
 from rmpa.config.peer_rules import PeerRule
+from rmpa.core.identity import Guid, Identity, proxied_node, proxy_name, proxy_prefix
 
 ROBOT = PeerRule(
     "robot*",
     "/{peer}",
     (
-        ("/scan", "/laser"),
-        ("/tf", "/tf"),
-        ("/arm/gripper", "/hand"),
-        ("/arm/**", "/{peer}/left/**"),
+        ("/scan", "/laser"), ("/tf", "/tf"), ("/arm/gripper", "/hand"), ("/arm/**", "/{peer}/left/**"),
     ),
     (("/goals/{peer}", "/goal"), ("/shared/**", "/**")),
-)
+)  # fmt: skip
 NAMES = st.from_regex(r"(/[a-c]{1,2}){1,4}", fullmatch=True)
 
 
 @pytest.mark.parametrize(
     ("wire", "local"),
     [
-        ("/odom", "/robot1/odom"),
-        ("/tf", "/tf"),
-        ("/tf_static", "/robot1/tf_static"),
-        ("/arm/gripper", "/hand"),
-        ("/arm/gripper/state", "/robot1/left/gripper/state"),
-        ("/arm", "/robot1/left"),
-        ("/army", "/robot1/army"),
+        ("/odom", "/robot1/odom"), ("/tf", "/tf"), ("/tf_static", "/robot1/tf_static"), ("/arm/gripper", "/hand"),
+        ("/arm/gripper/state", "/robot1/left/gripper/state"), ("/arm", "/robot1/left"), ("/army", "/robot1/army"),
         ("/scan", "/laser"),
     ],
-)
+)  # fmt: skip
 def test_their_names_here(wire: str, local: str) -> None:
     assert Names((ROBOT,)).of("robot1").local_name(wire) == local
 
@@ -41,16 +34,11 @@ def test_their_names_here(wire: str, local: str) -> None:
 @pytest.mark.parametrize(
     ("local", "wire"),
     [
-        ("/robot1/cmd_vel", "/cmd_vel"),
-        ("/robot1", "/robot1"),
-        ("/robot12/cmd_vel", "/robot12/cmd_vel"),
-        ("/map", "/map"),
-        ("/goals/robot1", "/goal"),
-        ("/goals/robot2", "/goals/robot2"),
-        ("/shared/a/b", "/a/b"),
-        ("/shared", "/shared"),
+        ("/robot1/cmd_vel", "/cmd_vel"), ("/robot1", "/robot1"), ("/robot12/cmd_vel", "/robot12/cmd_vel"),
+        ("/map", "/map"), ("/goals/robot1", "/goal"), ("/goals/robot2", "/goals/robot2"),
+        ("/shared/a/b", "/a/b"), ("/shared", "/shared"),
     ],
-)
+)  # fmt: skip
 def test_our_names_there(local: str, wire: str) -> None:
     assert Names((ROBOT,)).of("robot1").wire_name(local) == wire
 
@@ -75,3 +63,24 @@ def test_a_prefix_leads_there_and_back(name: str) -> None:
     names = PeerNames("r", (PeerRule("r", "/{peer}"),))
     assert names.wire_name(names.local_name(name)) == name
     assert names.local_name(name) == "/r" + name
+
+
+BASE = Identity(Guid.of("10.0.0.1", 40001), bytes(16), "base")
+
+
+def test_a_proxy_tells_whom_it_stands_for() -> None:
+    prefix = proxy_prefix(BASE, ())
+    assert prefix == "/rmpa/base"
+    assert proxy_name(prefix, "/ns/driver") == "/rmpa/base/ns/driver"
+    assert proxied_node("/rmpa/base/ns/driver") == ("base", "/ns/driver")
+
+
+def test_two_peers_of_one_name_have_proxies_apart() -> None:
+    prefix = proxy_prefix(BASE, {"/rmpa/base"})
+    assert prefix == "/rmpa/base_10_0_0_1_40001"
+    assert proxied_node(proxy_name(prefix, "/driver")) == ("base_10_0_0_1_40001", "/driver")
+
+
+@pytest.mark.parametrize("name", ["/driver", "/rmpa", "/rmpa/base", "/rmpanel/base/driver"])
+def test_a_node_of_this_module_stands_for_itself(name: str) -> None:
+    assert proxied_node(name) is None

@@ -1,8 +1,8 @@
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import islice
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -11,8 +11,6 @@ from hypothesis import strategies as st
 from rmpa.bridge import limits
 from rmpa.bridge.context import Names
 from rmpa.bridge.messages import Advertise, AdvertiseServices, ServiceOffer, Source, TopicOffer
-from rmpa.bridge.peer import PeerRun
-from rmpa.bridge.peer_offers import Heard, ImportBook
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.topics.exports import LocalSource
@@ -31,14 +29,10 @@ from tests.bridge.recorder import (
 )
 from tests.bridge.services.test_rules import rules
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-
 # What peers are told of an offer book: portions, names, limits, and when.
 
 
-ONE, TWO = LocalService("/n", "rosrpc://127.0.0.1:1"), LocalService("/n", "rosrpc://127.0.0.1:2")
+ONE = LocalService("/n", "rosrpc://127.0.0.1:1")
 
 
 def book(limit: int = 1000, *peers: PeerRule) -> ServiceExports:
@@ -106,24 +100,6 @@ def test_the_rule_that_decides_is_told_to_whom_asks(topic: str) -> None:
 
 
 # How advertisements of one peer are split, and what is taken of them.
-
-
-def heard(*entries: str) -> Heard[str, Any, str]:
-    made: Heard[str, Any, str] = Heard(session=PeerRun(peer=1, name="far"))
-    made.entries.update(dict.fromkeys(entries, 1))
-    return made
-
-
-def changes(
-    made: Heard[str, Any, str], *added: str, removed: tuple[str, ...] = (), full: bool = False, more: bool = False
-) -> list[tuple[str, str | None]]:
-    message = AdvertiseServices(tuple(ServiceOffer(name, "/n") for name in added), removed, full, more)
-    book: Any = SimpleNamespace(_peers={1: made}, _ready=lambda _: None)
-    return [(wire, offer and offer.service) for wire, offer in ImportBook.changes(book, 1, message)]
-
-
-def test_removals_go_first() -> None:
-    assert changes(heard(), "/a", "/b", removed=("/gone",)) == [("/gone", None), ("/a", "/a"), ("/b", "/b")]
 
 
 def test_a_bounded_number_of_refused_offers_is_remembered(monkeypatch: Any) -> None:
@@ -286,24 +262,6 @@ def test_the_services_limits_are_reloaded() -> None:
 def reload_services(made: ServiceImports, nodes: int, *denied: str) -> Iterator[list[Any]]:
     settings = ServiceSettings(deny=tuple(f"{node}/*" for node in denied))
     return made.apply_rules(rules(settings), LimitSettings(nodes=nodes))
-
-
-def test_a_freed_place_costs_no_pass_over_all_waiting_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = services(nodes=8, count=1000)
-    for number in range(200):
-        made.advertised(1, provided(f"/s{number}", node=f"/n{number}"))
-    chosen: list[str] = []
-    choose = made.book._choose
-
-    def counted(service: str) -> None:
-        chosen.append(service)
-        choose(service)
-
-    monkeypatch.setattr(made.book, "_choose", counted)
-    actions = made.advertised(1, provided(removed=tuple(f"/s{number}" for number in range(8))))
-    assert [one.service for one in actions if isinstance(one, Provide)] == [f"/s{n}" for n in range(8, 16)]
-    assert chosen == [f"/s{number}" for number in range(8, 16)]
-    assert len(made.refused_nodes(1)) == 184
 
 
 _services_come_or_go = st.tuples(st.booleans(), st.integers(0, 5), st.integers(0, 1), st.integers(1, 2))

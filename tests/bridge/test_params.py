@@ -2,14 +2,16 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
+from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
 from datetime import datetime
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import pytest
 
 from rmpa.bridge import limits
+from rmpa.bridge.bridge import Bridge
 from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.messages import decode
@@ -19,24 +21,17 @@ from rmpa.bridge.params.owner import read_text, write_text
 from rmpa.bridge.params.transfer import follow_rules, key_problem, replaced, why_not_follow, why_not_get, why_not_set
 from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.rpc import PeerRpc
+from rmpa.bridge.sessions import PeerSession
 from rmpa.config.peer_rules import Effect, PermissionRule
 from rmpa.config.rules import FollowRule
 from rmpa.config.settings import ParamSettings, Settings, TimeSettings, TrustSettings
 from rmpa.core.errors import LimitExceeded, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.statistics import Counters
 from rmpa.ros.master.api import MasterApi
-from rmpa.ros.master.parameters import leaves
+from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 from rmpa.trust.permissions import Permissions
 from tests.bridge.services.test_calls import Wire
 from tests.waiting import until
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
-    from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.sessions import PeerSession
-    from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
-
 
 # What peers may do with parameters, by name.
 
@@ -53,9 +48,7 @@ SETTINGS = Settings(
 @pytest.mark.parametrize(
     ("key", "get", "put", "follow"),
     [
-        ("/open/a", "", "", ""),
-        ("/open", "", "", ""),
-        ("/opened", "remote_get", "remote_set", "remote_get"),
+        ("/open/a", "", "", ""), ("/open", "", "", ""), ("/opened", "remote_get", "remote_set", "remote_get"),
         ("/", "remote_get", "the root", "the root"),
         ("/roslaunch/uris", "remote_get", "roslaunch's own", "remote_get"),
         ("/run_id", "remote_get", "names the run", "remote_get"),
@@ -63,7 +56,7 @@ SETTINGS = Settings(
         ("/followed", "", "followed from arm:/x", "followed from arm:/x"),
         ("/followed/deep", "", "followed from arm:/x", "followed from arm:/x"),
     ],
-)
+)  # fmt: skip
 def test_policy(key: str, get: str, put: str, follow: str) -> None:
     for why, expected in (
         (why_not_get(SETTINGS, key), get),
@@ -92,27 +85,15 @@ def test_names_that_are_none(key: object) -> None:
     assert key_problem(key)
 
 
-def test_leaves() -> None:
-    value: XmlRpcValue = {"a": 1, "b": {"c": [1], "d": {}}, "e": {"f": "x"}}
-    root: XmlRpcValue = {"a": 1}
-    assert list(leaves("/x", value)) == [("/x/a", 1), ("/x/b/c", [1]), ("/x/e/f", "x")]
-    assert list(leaves("/", root)) == [("/a", 1)]
-    assert list(leaves("/x", 5)) == [("/x", 5)]
-
-
 @pytest.mark.parametrize(
     ("names", "at", "present", "lost"),
     [
-        (["/a/b"], "/a", {"b": 1}, []),
-        (["/a/b"], "/a", {"b": {"x": 1, "y": {"z": 2}}}, ["/a/b/x", "/a/b/y/z"]),
-        (["/a/b/c"], "/a", {"b": 7, "d": 8}, ["/a/b"]),
-        (["/a/b"], "/a", 7, ["/a"]),
-        (["/a"], "/a", {"b": 1}, ["/a/b"]),
-        (["/a/new/x"], "/a", {"b": 1}, []),
-        (["/x/y", "/b"], "/", {"x": 1, "b": {"c": 2}}, ["/x", "/b/c"]),
-        (["/a"], "/a", None, []),
+        (["/a/b"], "/a", {"b": 1}, []), (["/a/b"], "/a", {"b": {"x": 1, "y": {"z": 2}}}, ["/a/b/x", "/a/b/y/z"]),
+        (["/a/b/c"], "/a", {"b": 7, "d": 8}, ["/a/b"]), (["/a/b"], "/a", 7, ["/a"]),
+        (["/a"], "/a", {"b": 1}, ["/a/b"]), (["/a/new/x"], "/a", {"b": 1}, []),
+        (["/x/y", "/b"], "/", {"x": 1, "b": {"c": 2}}, ["/x", "/b/c"]), (["/a"], "/a", None, []),
     ],
-)
+)  # fmt: skip
 def test_what_is_lost_when_a_value_takes_the_place_of_a_namespace_or_the_other_way_round(
     names: list[str], at: str, present: XmlRpcValue, lost: list[str]
 ) -> None:
@@ -402,17 +383,6 @@ async def test_a_large_value_does_not_replace_one_that_was_told_after_it() -> No
     assert pad.core.get("/base/robot_description") == "small"
 
 
-async def test_a_lost_lane_fails_what_waits() -> None:
-    base, pad, args = await owner_and_peer()
-    cast("Any", pad.links[1].link).bulk.slow = True
-    asked = asyncio.create_task(pad.ask(transfer.SET, args))
-    await until(lambda: pad.asks._links[1].waiting)
-    pad.asks.lane_lost(pad.links[1])
-    with pytest.raises(UnreachableError, match="its connection for large messages has just ended"):
-        await asked
-    assert base.core.get("/x") is None
-
-
 async def test_a_followed_parameter_is_as_over_there() -> None:
     base, pad = Side("base"), Side("pad", follows(DESCRIPTION, ARM))
     base.core.set("/robot_description", "one")
@@ -634,13 +604,10 @@ ALL = ParamSettings(remote_get=("/**",), remote_set=("/**",))
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("/motors/limit", {"": 5}),
-        ("/motors/limit/", {"": 5}),
-        ("/motors", {"limit/": 5}),
-        ("/", {"motors/limit": 5}),
-        ("/", {"motors/limit/": 5}),
+        ("/motors/limit", {"": 5}), ("/motors/limit/", {"": 5}), ("/motors", {"limit/": 5}),
+        ("/", {"motors/limit": 5}), ("/", {"motors/limit/": 5}),
     ],
-)
+)  # fmt: skip
 async def test_a_slash_at_the_end_does_not_pass_a_deny(denied: str, key: str, value: XmlRpcValue) -> None:
     owner, peer = linked(ALL, denying(denied))
     owner.core.set("/motors/limit", 1)

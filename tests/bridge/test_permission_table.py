@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import ast
 import importlib
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import rmpa
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from rmpa.bridge.policy import Needs
+from rmpa.bridge.policy import Needs
 
 SOURCE: Final = Path(rmpa.__file__).parent
 PAGE: Final = Path(__file__).parents[2] / "docs" / "reference" / "security.md"

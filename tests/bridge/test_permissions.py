@@ -3,7 +3,8 @@ from __future__ import annotations
 import json
 import random
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -13,7 +14,6 @@ from rmpa.bridge.context import Names
 from rmpa.bridge.messages import (
     Advertise,
     AdvertiseServices,
-    Description,
     OpenRoute,
     OpenService,
     RouteClosed,
@@ -36,29 +36,20 @@ from rmpa.core.statistics import Counters
 from rmpa.ros.wire.tcpros import ServiceDescription
 from rmpa.trust.permissions import Permissions
 from tests.bridge.recorder import (
-    Disconnect,
     EndRoute,
     Exports,
     Imports,
     PeerServiceRules,
-    RemoveRoute,
     Send,
     ServiceExports,
     ServiceImports,
 )
 from tests.bridge.test_relay import Map
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-
 # Permissions in the plans of topics and services: what is offered, shown, opened and closed by them.
 
 
 TYPE = "a/B"
-
-
-ABOUT = Description(TYPE, "5a9ea5f83505693b71e785041e67a8bb", "", False)
 
 
 def allow(modules: str = "*", **names: str) -> PermissionRule:
@@ -137,27 +128,6 @@ def test_who_asks_for_what_it_may_not_have_learns_no_more_than_of_what_is_not_th
         answers.append(found[1].replace(topic, "NAME"))
     assert answers[0] == answers[1]
     assert here.counters["permission.subscribe"] >= 2
-
-
-def test_a_reload_closes_the_routes_of_those_that_may_not_have_them_any_more_and_of_no_others() -> None:
-    here = Secured(allow(subscribe="/odom /tf"))
-    here.publishes("/odom", "/tf")
-    for peer in (1, 2):
-        for route, topic in ((1, "/odom"), (2, "/tf")):
-            here.exports.opened(peer, OpenRoute(route, topic, "/n", Contract()))
-    for topic in ("/odom", "/tf"):
-        here.exports.described(Source(topic, "/n"), ABOUT)
-    actions = here.reload(allow("joystick", subscribe="/**"), allow("arm", subscribe="/tf"))
-    assert closed(actions) == {2: "the permissions there do not let arm subscribe to /odom"}
-    assert [(a.source.topic, a.peer) for a in actions if isinstance(a, RemoveRoute)] == [("/odom", 2)]
-    assert not any(isinstance(action, Disconnect) for action in actions), "joystick goes on"
-    again = OpenRoute(9, "/odom", "/n", Contract())
-    assert closed(here.exports.opened(2, again)), "before it is told that it is gone"
-    here.tell()
-    assert here.told(2) == ["/tf"]
-    here.reload(allow(subscribe="/**"))
-    here.tell()
-    assert here.told(2) == ["/odom", "/tf"], "and what is allowed again is offered again"
 
 
 def test_an_action_crosses_with_all_of_its_topics_or_not_at_all() -> None:
@@ -302,12 +272,6 @@ def test_a_relay_and_the_origin_are_judged_both(caplog: pytest.LogCaptureFixture
     assert counters.as_dict() == {"permission.publish": 1, "permission.relay": 1}
     assert "trust.relays does not have spy" in caplog.text
     assert "leg may not publish /arm/state by way of relay" in caplog.text
-
-
-def test_the_other_side_is_told_the_outcome_and_no_rule() -> None:
-    gate = PermissionGate(Permissions(TrustSettings(rules=(allow("x*", call="/secret/**"),))))
-    assert gate.why_not(Access.CALL, "arm", "/secret/go") == "the permissions there do not let arm call /secret/go"
-    assert gate.why_not(Access.CALL, "x1", "/secret/go") == ""
 
 
 MODULES = ("arm", "arm2", "joystick", "laptop7", "base")

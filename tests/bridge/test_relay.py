@@ -5,8 +5,9 @@ from __future__ import annotations
 import itertools
 import random
 from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import pytest
@@ -34,9 +35,6 @@ from tests.bridge.recorder import (
     Warn,
     Withdraw,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 TYPE = "std_msgs/String"
 

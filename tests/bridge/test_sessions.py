@@ -4,8 +4,9 @@ import asyncio
 import errno
 import re
 import socket
+from collections.abc import Callable, Coroutine, Iterable, Sequence
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import psutil
 import pytest
@@ -23,20 +24,15 @@ from rmpa.config.settings import TrustSettings
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.statistics import Counters
 from rmpa.mesh import limits as mesh_limits
+from rmpa.mesh.io.link import PeerLink
+from rmpa.ros.core.external import Core
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node import listeners as shared_listener
+from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.wire.xmlrpc import RosReply
 from rmpa.trust.permissions import Permissions
 from tests.bridge.io.virtual import VirtualLoop, run
 from tests.bridge.recorder import context
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterable, Sequence
-
-    from rmpa.mesh.io.link import PeerLink
-    from rmpa.ros.core.external import Core
-    from rmpa.ros.node.slave_node import SlaveNode
-    from rmpa.ros.wire.xmlrpc import RosReply
-
 
 # When a session begins, waits for its peer, goes on and ends.
 
@@ -193,12 +189,10 @@ def test_a_module_at_the_address_of_another_ends_its_session_in_a_plain_mesh_alo
 @pytest.mark.parametrize(
     ("silent", "crashed", "outages", "grace"),
     [
-        (True, False, (), GRACE),
-        (True, True, (), AWAY_GRACE),
-        (False, False, (), 0.0),
+        (True, False, (), GRACE), (True, True, (), AWAY_GRACE), (False, False, (), 0.0),
         (True, False, (3.0, 9.0), 9.0),
     ],
-)
+)  # fmt: skip
 def test_a_session_ends_with_its_grace_or_what_is_kept(
     silent: bool, crashed: bool, outages: tuple[float, ...], grace: float
 ) -> None:
@@ -213,19 +207,6 @@ def test_a_session_ends_with_its_grace_or_what_is_kept(
         made.link()
 
     assert play(scene, *outages) == ["up 1", "down", "grace over", "gone", "up 2"]
-
-
-def test_another_run_of_the_peer_ends_the_session_that_waits() -> None:
-    async def scene(made: Scene) -> None:
-        made.sessions.link_down(made.link(1))
-        await asyncio.sleep(GRACE + 1.0)
-        link = made.link(2)
-        assert made.states() == [PeerState.LINKED]
-        [session] = made.sessions.linked()
-        assert made.sessions.of(link) is session
-        assert made.sessions.get(1) is None
-
-    assert play(scene, 9.0) == ["up 1", "down", "grace over", "gone", "up 2"]
 
 
 # Proxies are there while something holds them.

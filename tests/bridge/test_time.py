@@ -6,13 +6,11 @@ from typing import Any
 
 import pytest
 
-from rmpa.bridge.context import Names
 from rmpa.bridge.messages import Advertise, Mismatch, Source, TopicOffer
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.settings import TimeSettings
-from rmpa.core.contract import Contracts
 from tests.bridge.recorder import Exports, Imports, Publish, Retract, Send, Warn
 
 CLOCK = "rosgraph_msgs/Clock"
@@ -82,11 +80,3 @@ def test_a_clock_of_this_module_is_in_the_way() -> None:
         isinstance(action, Warn) and "a node of this module publishes /clock" in action.text for action in actions
     )
     assert Publish(1, FIRST, CLOCK) in machine.local_type("/clock", None)
-
-
-def test_other_rules_at_once() -> None:
-    machine = imports("sim", "sim", "base")
-    advertise(machine, 1, FIRST)
-    advertise(machine, 2, SECOND)
-    actions = [a for some in machine.apply_rules(policy("base"), Contracts(), Names(), 0.0) for a in some]
-    assert actions == [Retract(1, FIRST), Publish(2, SECOND, CLOCK)]

@@ -63,14 +63,6 @@ def test_what_one_site_may_have_is_offered_and_refused_to_the_others() -> None:
     assert not into(rules, "/scan", "yard").allowed
 
 
-def test_what_one_site_may_not_have_is_offered_to_the_others() -> None:
-    rules = CrossingRules((CrossingRule(sites=("cloud",), crossing=Crossing.IN),))
-    assert out(rules, "/scan").addressed
-    assert out(rules, "/scan").allowed
-    assert rules.refusal("cloud", "arm", "/scan").endswith("lets it not go out to cloud")
-    assert rules.refusal("yard", "arm", "/scan") == ""
-
-
 def test_a_source_is_for_all_sites_unless_a_rule_treats_one_of_them_otherwise() -> None:
     everyone = CrossingRule(crossing=Crossing.OUT)
     assert not out(CrossingRules(), "/scan").addressed

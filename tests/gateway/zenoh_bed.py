@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import socket
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator
 
 import pytest
 
 from rmpa.gateway.zenoh.config import ZenohConfig
 from rmpa.gateway.zenoh.session import OpenSession, open_session
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
 
 pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 

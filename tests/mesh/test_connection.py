@@ -5,11 +5,10 @@ from __future__ import annotations
 import pytest
 
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
-from rmpa.core.identity import Guid, Identity
+from rmpa.core.identity import Guid
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionState
 from rmpa.mesh.frames import Frame, FrameKind, Hello, Refusal, Refuse, pack_data_header
-from rmpa.runtime import limits as runtime_limits
 from tests.mesh.worlds import ACCEPTOR, DIALLER, HIGH, LOW, AnyRoute, Side, Time, deliver, exchange, pass_time
 
 
@@ -34,44 +33,6 @@ def test_handshake_control_data_and_bye_in_pieces(time: Time, chunk: int) -> Non
     assert dialler.last() == ("closed", "shutting down")
 
 
-def test_a_peer_that_says_much_at_once_leaves_others_their_turn(acceptor: Side, dialler: Side, time: Time) -> None:
-    said = [b'{"op":"x","n":%d}' % number for number in range(2 * limits.FRAMES_AT_ONCE + 1)]
-    wire = memoryview(b"".join(map(dialler.pack_control, said)))
-    before = len(acceptor.events)
-    for turn in range(3):
-        consumed, wanted = acceptor.receive(wire, time.now)
-        assert wanted == (-1 if turn < 2 else 0)
-        wire = wire[consumed:]
-        assert len(acceptor.events) - before == min((turn + 1) * limits.FRAMES_AT_ONCE, len(said))
-    assert not wire
-    assert [payload for _, payload in acceptor.events[before:]] == said
-
-
-def test_data_arrives_as_a_view_without_a_copy(acceptor: Side, time: Time) -> None:
-    seen: list[memoryview] = []
-    acceptor.routes = AnyRoute(lambda _r, _s, _t, view: seen.append(view))
-    whole = bytearray(pack_data_header(3, 1, 1, 1) + b"abc")
-    acceptor.receive(memoryview(whole), time.now)
-    whole[24] = ord("X")
-    assert bytes(seen[0]) == b"Xbc"
-
-
-def test_a_refusal_reaches_the_dialler_and_both_end(time: Time) -> None:
-    dialler = Side(DIALLER, LOW, time)
-    refuse = Refuse(Refusal.BUSY, "come later")
-    acceptor = Side(ACCEPTOR, HIGH, time, verdict=refuse)
-    deliver(dialler.take_output(), acceptor, time.now)
-    assert acceptor.last() == ("refused", refuse, True)
-    assert acceptor.state is ConnectionState.CLOSING
-    deliver(acceptor.take_output(), dialler, time.now)
-    assert dialler.events == [
-        ("refused", refuse, False),
-        ("closed", "? refused: busy: come later"),
-    ]
-    acceptor.lost("the other side closed the connection")
-    assert acceptor.last() == ("closed", "refused: busy: come later")
-
-
 def with_byte(data: bytes, offset: int, value: int) -> bytes:
     return data[:offset] + bytes([value]) + data[offset + 1 :]
 
@@ -79,12 +40,10 @@ def with_byte(data: bytes, offset: int, value: int) -> bytes:
 @pytest.mark.parametrize(
     ("offset", "value", "code"),
     [
-        (0, 0x58, Refusal.MALFORMED),
-        (4, 2, Refusal.VERSION),
-        (44, 60, Refusal.MALFORMED),
+        (0, 0x58, Refusal.MALFORMED), (4, 2, Refusal.VERSION), (44, 60, Refusal.MALFORMED),
         (45, 0x2F, Refusal.MALFORMED),
     ],
-)
+)  # fmt: skip
 def test_an_unreadable_hello_is_refused_with_its_code(time: Time, offset: int, value: int, code: Refusal) -> None:
     acceptor = Side(ACCEPTOR, HIGH, time)
     payload = Hello.of(LOW, lease=1.0, expected=None).serialize()
@@ -148,14 +107,6 @@ def test_after_a_pause_beyond_the_lease_nothing_is_acted_on_until_the_peer_answe
     assert told == [False, True, False], "the peer was stopped as well, and its link stands"
 
 
-def test_bytes_within_a_half_read_frame_renew_the_lease(dialler: Side, time: Time) -> None:
-    for _ in range(10):
-        time.now += 0.9
-        dialler.heard(time.now)
-        dialler.handle_timer(time.now)
-    assert dialler.state is ConnectionState.UP
-
-
 @pytest.mark.parametrize("role", [DIALLER, ACCEPTOR])
 def test_a_handshake_that_takes_too_long(time: Time, role: str) -> None:
     mine = Side(role, LOW, time)
@@ -165,34 +116,11 @@ def test_a_handshake_that_takes_too_long(time: Time, role: str) -> None:
     assert "handshake" in mine.seen("closed")[0][1]
 
 
-def test_frames_are_ignored_while_closing(dialler: Side, acceptor: Side, time: Time) -> None:
-    dialler.close("done", time.now)
-    dialler.close("again", time.now)
-    deliver(acceptor.pack_control(b"{}") + b"\xff" * 40, dialler, time.now)
-    assert not dialler.seen("control")
-    time.now += runtime_limits.DRAIN_TIMEOUT
-    dialler.handle_timer(time.now)
-    assert dialler.last() == ("closed", "done")
-
-
 def test_the_driver_loses_the_connection(dialler: Side) -> None:
     dialler.lost("reset by peer")
     dialler.lost("twice")
     assert dialler.last() == ("closed", "reset by peer")
     assert len(dialler.seen("closed")) == 1
-
-
-def test_close_within_the_data_callback_stops_reading(acceptor: Side, time: Time) -> None:
-    got: list[int] = []
-
-    def on_data(_route: int, sequence: int, _stamp: int, _view: memoryview) -> None:
-        got.append(sequence)
-        acceptor.lost("closed by its user")
-
-    acceptor.routes = AnyRoute(on_data)
-    both = pack_data_header(0, 1, 1, 0) + pack_data_header(0, 1, 2, 0)
-    assert acceptor.receive(memoryview(both), time.now) == (len(both), 0)
-    assert got == [1]
 
 
 def test_answers_out_of_turn_are_our_own_fault(time: Time) -> None:
@@ -224,11 +152,6 @@ def test_the_clock_offset_is_within_its_bound(offset_ns: int) -> None:
     offset, error = estimate
     assert error < 0.0041
     assert abs(offset - offset_ns / 1e9) <= error + 1e-9
-
-
-def test_identity_of_the_other_side_comes_with_the_hello(dialler: Side) -> None:
-    assert dialler.remote is not None
-    assert dialler.remote.identity == Identity(HIGH.guid, HIGH.instance, "high", 0)
 
 
 @pytest.mark.parametrize("one_way", [0.05, 0.6, 1.4])

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given
@@ -10,17 +9,15 @@ from hypothesis import strategies as st
 from rmpa import __version__
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
-from rmpa.core.identity import Guid
+from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits
-from rmpa.mesh.connection import ConnectionState
 from rmpa.mesh.frames import (
     PAYLOAD_MAX,
     WHOLE,
     Frame,
     FrameKind,
     Hello,
-    Lane,
     Refusal,
     Refuse,
     check_header,
@@ -31,11 +28,7 @@ from rmpa.mesh.frames import (
     parse_text,
     pong,
 )
-from tests.mesh.worlds import HIGH, LOW, AnyRoute, Side, Time, deliver, exchange, pair, pass_time
-
-if TYPE_CHECKING:
-    from rmpa.core.identity import Identity
-
+from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, pass_time
 
 # Frames: golden bytes, whole, byte by byte, malformed, any.
 
@@ -104,17 +97,11 @@ def test_only_data_comes_in_fragments(kind: FrameKind, flags: int) -> None:
 @pytest.mark.parametrize(
     ("payload", "flags", "problem"),
     [
-        (b"", WHOLE, "without data"),
-        (b"", FIRST, "without data"),
-        (b"", 0, "without data"),
-        (b"", LAST, "without data"),
-        (b"", ABORT, "aborts"),
-        (b"", FIRST | ABORT, "aborts"),
-        (b"", WHOLE | ABORT, "aborts"),
-        (b"x", LAST | ABORT, "aborts"),
-        (b"x", WHOLE | ABORT, "aborts"),
+        (b"", WHOLE, "without data"), (b"", FIRST, "without data"), (b"", 0, "without data"),
+        (b"", LAST, "without data"), (b"", ABORT, "aborts"), (b"", FIRST | ABORT, "aborts"),
+        (b"", WHOLE | ABORT, "aborts"), (b"x", LAST | ABORT, "aborts"), (b"x", WHOLE | ABORT, "aborts"),
     ],
-)
+)  # fmt: skip
 def test_a_fragment_that_cannot_be(payload: bytes, flags: int, problem: str) -> None:
     with pytest.raises(RemoteProtocolError, match=problem):
         Frame.parse(Frame(FrameKind.DATA, payload, flags=flags).serialize())
@@ -252,18 +239,6 @@ def test_refused(hello: Hello, linked: Identity | None, code: Refusal, advice: s
     assert advice in verdict.text
 
 
-@pytest.mark.parametrize("dialled", [False, True])
-@pytest.mark.parametrize("alive", [False, True])
-def test_bulk_lane_is_accepted_beside_its_express_lane(dialled: bool, alive: bool) -> None:
-    for one, other in ((LOW, HIGH), (HIGH, LOW)):
-        bulk = replace(hello_of(one), lane=Lane.BULK)
-        assert judge(bulk, other, one, dialled=dialled, alive=alive) is None
-        assert judge(bulk, other, one, dialled=dialled, alive=alive, full=True) is None
-        ghost = judge(bulk, other, replace(one, instance=b"g" * 16), dialled=dialled, alive=alive)
-        assert ghost is not None
-        assert ghost.code == Refusal.NO_EXPRESS
-
-
 def test_a_full_mesh_refuses_strangers_alone() -> None:
     verdict = judge(hello_of(LOW), HIGH, full=True)
     assert verdict is not None
@@ -328,20 +303,6 @@ def test_any_hello_survives(
 # Messages in parts, marks between them, and how a bulk lane's machine differs.
 
 
-def fragments(route: int, sequence: int, payload: bytes, sizes: list[int]) -> list[bytes]:
-    """The frames of one message, cut at these sizes and one more for the rest."""
-    pieces = []
-    for size in sizes:
-        pieces.append(payload[:size])
-        payload = payload[size:]
-    pieces.append(payload)
-    frames = []
-    for number, piece in enumerate(pieces):
-        flags = FIRST * (number == 0) | LAST * (number == len(pieces) - 1)
-        frames.append(Frame(FrameKind.DATA, piece, route, sequence, 99, flags).serialize())
-    return frames
-
-
 @pytest.mark.parametrize("flags", [FIRST, 0, LAST, WHOLE])
 @pytest.mark.parametrize("chunk", [1000, 65_536, 131_073])
 def test_a_large_frame_is_handed_on_while_it_arrives(acceptor: Side, time: Time, flags: int, chunk: int) -> None:
@@ -362,40 +323,6 @@ def test_a_large_frame_is_handed_on_while_it_arrives(acceptor: Side, time: Time,
     assert acceptor.last() == ("control", b"{}"), "the next frame begins behind it"
 
 
-def test_short_frame_is_delivered_whole(acceptor: Side, time: Time) -> None:
-    payload = bytes(core_limits.CUT_THROUGH_BYTES)
-    deliver(pack_data_header(len(payload), 7, 1, 99) + payload, acceptor, time.now, 50_000)
-    assert acceptor.data == [(7, 1, 99, payload)]
-    assert acceptor.parts == []
-
-
-def test_an_abort_is_handed_on_as_a_part_without_bytes(acceptor: Side, time: Time) -> None:
-    frames = fragments(7, 1, bytes(900), [300, 300])
-    abort = Frame(FrameKind.DATA, b"", 7, 1, 99, LAST | ABORT).serialize()
-    deliver(frames[0] + frames[1] + abort, acceptor, time.now, 11)
-    assert [(flags, len(part)) for _, _, _, flags, part in acceptor.parts] == [
-        (FIRST, 300),
-        (0, 300),
-        (LAST | ABORT, 0),
-    ]
-    assert acceptor.messages() == []
-
-
-def test_closing_from_within_a_part_stops_the_reading(acceptor: Side, time: Time) -> None:
-    got: list[int] = []
-
-    def on_part(_route: int, _sequence: int, _stamp: int, _flags: int, part: memoryview) -> None:
-        got.append(len(part))
-        acceptor.lost("closed by its user")
-
-    acceptor.routes = AnyRoute(lambda *_: acceptor.data.append((0, 0, 0, b"")), on_part)
-    wire = pack_data_header(200_000, 1, 1, 0) + bytes(200_000) + pack_data_header(1, 1, 2, 0) + b"x"
-    acceptor.receive(memoryview(wire[:150_000]), time.now)
-    acceptor.receive(memoryview(wire[150_000:]), time.now)
-    assert got == [150_000 - 24]
-    assert acceptor.data == []
-
-
 def test_half_read_frame_renews_the_lease_only_with_bytes(acceptor: Side, time: Time) -> None:
     acceptor.receive(memoryview(pack_data_header(200_000, 1, 1, 0) + bytes(1000)), time.now)
     for _ in range(5):
@@ -405,40 +332,3 @@ def test_half_read_frame_renews_the_lease_only_with_bytes(acceptor: Side, time: 
     assert not acceptor.seen("closed")
     pass_time(acceptor, time, 1.0)
     assert acceptor.last()[0] == "closed"
-
-
-@pytest.mark.parametrize("kind", [FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED])
-@pytest.mark.parametrize("chunk", [1, 24, 1 << 20])
-def test_marks_come_in_the_order_of_the_messages(
-    dialler: Side, acceptor: Side, time: Time, kind: FrameKind, chunk: int
-) -> None:
-    said: list[object] = []
-    for link in (dialler, acceptor):
-        link.routes = AnyRoute(lambda _r, sequence, _t, _v: said.append(sequence))
-    mark = Frame(kind, route=7, sequence=0xFFFFFFFF).serialize()
-    wire = pack_data_header(1, 7, 1, 0) + b"x" + mark + pack_data_header(1, 7, 2, 0) + b"x"
-    for link in (dialler, acceptor):
-        said.clear()
-        link.events = said  # type: ignore[assignment]
-        deliver(wire, link, time.now, chunk)
-        assert said == [1, ("mark", kind, 7, 0xFFFFFFFF), 2]
-        assert not link.output, "who answers a fence is the driver's business"
-
-
-def test_bulk_lane_has_its_own_lease(time: Time) -> None:
-    dialler, acceptor = pair(time, lane=Lane.BULK)
-    hello, welcome = acceptor.remote, dialler.remote
-    assert hello is not None
-    assert welcome is not None
-    assert hello.lane == welcome.lane == acceptor.lane == Lane.BULK
-    assert hello.lease == welcome.lease == limits.BULK_LEASE
-    pings = 0
-    begin = time.now
-    while time.now < begin + 100.0:
-        time.now = min(t for s in (dialler, acceptor) if (t := s.next_timer()) is not None)
-        for mine in (dialler, acceptor):
-            mine.handle_timer(time.now)
-            pings += bool(mine.output)
-        exchange(dialler, acceptor, time)
-    assert dialler.state is acceptor.state is ConnectionState.UP
-    assert pings <= 100 * 2.1, "a bulk lane's keepalives are seldom"

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import random
-from dataclasses import replace
 
 import pytest
 
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionState
 from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.keepalive import ACCEPTOR_KEEPALIVE_FACTOR, WAKE_PINGS, rest_lease
-from tests.mesh.worlds import ACCEPTOR, DIALLER, HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time
+from rmpa.mesh.keepalive import ACCEPTOR_KEEPALIVE_FACTOR, rest_lease
+from tests.mesh.worlds import Side, Time, deliver, exchange, pair, pass_time
 
 
 def run(one: Side, other: Side, time: Time, seconds: float) -> int:
@@ -40,58 +39,6 @@ def rest(one: Side, other: Side, time: Time) -> None:
         each.need(time.now, needed=False)
     exchange(one, other, time)
     assert resting(one, other) == [True, True]
-
-
-def test_silence_is_worth_a_check_at_the_pace_of_the_link(dialler: Side, acceptor: Side, time: Time) -> None:
-    """In use within a second, at rest before the long lease ends, and soon when it is needed again."""
-    assert dialler.keepalive.quiet_after == limits.GHOST_QUIET < limits.EXPRESS_LEASE
-    rest(dialler, acceptor, time)
-    assert limits.IDLE_KEEPALIVE_INTERVAL < dialler.keepalive.quiet_after < limits.IDLE_LEASE
-    dialler.need(time.now, needed=True)  # and no answer comes
-    assert dialler.keepalive.quiet_after == limits.GHOST_QUIET
-
-
-@pytest.mark.parametrize("peers", [3, 13])
-def test_an_agent_wakes_once_for_the_keepalives_of_all_its_resting_links(peers: int) -> None:
-    """The other sides' agents have times of their own; what they send is not counted here."""
-    rng, time = random.Random(peers), Time()
-    links = []
-    for number in range(peers):
-        far = replace(HIGH, instance=rng.randbytes(16))
-        ours, theirs = (LOW, far) if number % 2 else (far, LOW)
-        dialler = Side(DIALLER, ours, time, expected=theirs.guid)
-        acceptor = Side(ACCEPTOR, theirs, time)
-        deliver(dialler.take_output(), acceptor, time.now)
-        exchange(dialler, acceptor, time)
-        rest(dialler, acceptor, time)
-        links.append((dialler, acceptor) if number % 2 else (acceptor, dialler))
-        time.now += rng.random() / peers
-    run_all(links, time, 20.0)
-    fired, pings = run_all(links, time, 600.0)
-    assert len(fired) <= 600 / limits.IDLE_KEEPALIVE_INTERVAL + 1
-    assert pings <= peers * 2 * (600 / limits.IDLE_KEEPALIVE_INTERVAL + 1), "a ping and its pong, one way each"
-    assert all(each.state is ConnectionState.UP for pair_ in links for each in pair_)
-
-
-def run_all(links: list[tuple[Side, Side]], time: Time, seconds: float) -> tuple[set[int], int]:
-    """Let all links run; return the milliseconds at which timers of the first sides fired, and how often any sent."""
-    end, sent = time.now + seconds, 0
-    fired: set[int] = set()
-    machines = [(pair_, each) for pair_ in links for each in pair_]
-    while True:
-        due, (pair_, each) = min(
-            (((t if (t := m[1].next_timer()) is not None else end + 1), m) for m in machines), key=lambda x: x[0]
-        )
-        if due > end:
-            time.now = end
-            return fired, sent
-        time.now = max(time.now, due)
-        each.handle_timer(time.now)
-        if each is pair_[0]:
-            fired.add(round(time.now * 1000))
-        if each.output:
-            sent += 2
-        exchange(*pair_, time)
 
 
 @pytest.mark.parametrize(
@@ -126,24 +73,6 @@ def test_a_link_at_rest_takes_the_pace_of_a_mesh_that_grows_and_shrinks(
     run(dialler, acceptor, time, 60.0)
     assert dialler.keepalive.remote_lease == acceptor.keepalive.remote_lease == limits.IDLE_LEASE
     assert few - 2 <= run(dialler, acceptor, time, 600.0) <= few + 2
-
-
-@pytest.mark.parametrize("who", [0, 1])
-def test_the_clock_is_measured_anew_as_soon_as_a_rest_ends(time: Time, who: int) -> None:
-    both = pair(time)
-    rest(*both, time)
-    run(*both, time, 604.0)
-    heard = {each: len(each.events) for each in both}
-    stale = [each.clock.estimate(time.now) for each in both]
-    both[who].need(time.now, needed=True)
-    run(*both, time, 0.2)
-    for each, before in zip(both, stale, strict=True):
-        now = each.clock.estimate(time.now)
-        assert now is not None
-        assert before is not None
-        assert now[1] < before[1] / 3, "the old one is of seconds ago"
-        pongs = [event for event in each.events[heard[each] :] if event[0] == "pong"]
-        assert len(pongs) >= WAKE_PINGS, "one of several is quick even on a busy path"
 
 
 def test_a_suspend_of_this_machine_is_not_the_peers_silence_and_the_next_use_asks_it(

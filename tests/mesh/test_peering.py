@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from ipaddress import IPv4Address
 
 import pytest
 
@@ -12,10 +11,9 @@ from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FULL, Hello, Refusal, Refuse
-from rmpa.mesh.peering import DIAL_FALLBACK, LINK_STABLE, PURSUITS_PER_SECOND, REFUSED_RETRY, Peering, PeeringOutput
+from rmpa.mesh.peering import LINK_STABLE, REFUSED_RETRY, Peering, PeeringOutput
 from tests.mesh.worlds import HIGH, LOW
 
-DUAL = replace(HIGH, addresses=(IPv4Address("192.168.0.2"),))
 AGAIN = Identity(Guid.of("10.0.0.2", 40002, 2), b"A" * 16, "high")
 
 
@@ -70,32 +68,6 @@ def test_a_needed_peer_that_fell_silent_is_dialled_by_short_attempts() -> None:
     assert not any(briefly for _, (_, briefly) in dialled_after_silence(1, needed=False))
 
 
-def test_many_peers_that_fall_silent_share_the_attempts() -> None:
-    made = dialled_after_silence(64)
-    first = {guid: at for at, (guid, _) in reversed(made)}
-    assert len(first) == 64
-    assert max(first.values()) < 1.0
-    assert len(made) < limits.PURSUIT * PURSUITS_PER_SECOND
-
-
-def test_all_addresses_are_dialled_before_a_pause() -> None:
-    low = of(LOW)
-    low.peer_found(DUAL, 0.0, source="172.16.0.2")
-    now, seen = 0.0, []
-    for _ in range(3):
-        while not (made := [o for o in low.take() if o[0] == "dial"]):
-            due = low.next_timer()
-            assert due is not None
-            now = max(now, due)
-            low.handle_timer(now)
-        seen.append((round(now, 3), [host for host, _ in made[0][2]]))
-        low.dial_failed(DUAL.guid, "no answer anywhere", now)
-    everywhere = ["172.16.0.2", "10.0.0.2", "192.168.0.2"]
-    assert seen == [(0.0, everywhere), (0.1, everywhere), (0.3, everywhere)]
-    (status,) = low.peers()
-    assert (status.state, status.last_error, status.attempts) == ("waiting", "no answer anywhere", 3)
-
-
 def test_retries_for_ever_with_a_cap() -> None:
     low = of(LOW)
     low.peer_found(HIGH, 0.0)
@@ -139,22 +111,6 @@ def test_unannounced_peer_is_forgotten_after_its_link() -> None:
             assert output[0] == "dial"
             low.dial_failed(output[1], "refused", now)
     assert now <= 10.0 + limits.FORGET_UNANNOUNCED
-    assert low.peers() == []
-
-
-def test_gone_stops_dialling_but_not_a_live_link() -> None:
-    low = of(LOW)
-    low.peer_found(HIGH, 0.0)
-    low.take()
-    low.peer_gone(HIGH.guid)
-    assert low.next_timer() is None
-    low.dial_failed(HIGH.guid, "refused", 1.0)
-    assert low.peers() == []
-    low.link_up(1, HIGH, 2.0, dialled=False)
-    low.peer_gone(HIGH.guid)
-    assert low.take() == [("up", 1)]
-    low.link_down(1, "lost", 4.0)
-    assert low.next_timer() is None
     assert low.peers() == []
 
 
@@ -224,78 +180,6 @@ def test_own_identity_is_no_peer() -> None:
     assert low.peers() == []
 
 
-class Crossing:
-    """Both dial at once; what is in flight is delivered in an order that the test chooses.
-
-    Link ids are 1 for the lower's call and 2 for the higher's, on both sides. What one side sends on one
-    connection stays in order, as TCP keeps it.
-    """
-
-    def __init__(self) -> None:
-        self.sides = {"low": of(LOW), "high": of(HIGH)}
-        self.who = {"low": LOW, "high": HIGH}
-        self.wires: dict[tuple[int, str], list[Refuse | str]] = {(1, "high"): ["hello"], (2, "low"): ["hello"]}
-        self.used: dict[str, int | None] = {"low": None, "high": None}
-        self.sides["low"].peer_found(HIGH, 0.0)
-        self.sides["high"].peer_found(LOW, -DIAL_FALLBACK)
-        self.sides["high"].handle_timer(0.0)
-        for side in self.sides.values():
-            assert len(dials(side.take())) == 1
-
-    def choices(self) -> list[tuple[int, str]]:
-        return sorted(k for k, queue in self.wires.items() if queue)
-
-    def deliver(self, wire: tuple[int, str]) -> None:
-        link, me = wire
-        what = self.wires[wire].pop(0)
-        peering, other = self.sides[me], "low" if me == "high" else "high"
-        theirs = self.who[other]
-        if isinstance(what, Refuse):
-            peering.dial_refused(theirs.guid, what, 0.0)
-        elif what == "hello":
-            verdict = peering.judge(Hello.of(theirs, lease=1.0, expected=self.who[me].guid), 0.0)
-            self.send(link, other, verdict if verdict is not None else "welcome")
-            if verdict is None:
-                peering.link_up(link, theirs, 0.0, dialled=False)
-        elif what == "welcome":
-            peering.link_up(link, theirs, 0.0, dialled=True, endpoint=theirs.guid.endpoint)
-        else:
-            peering.link_down(link, "bye", 0.0)
-        self.act(me, other)
-
-    def act(self, me: str, other: str) -> None:
-        for output in self.sides[me].take():
-            if output[0] == "close":
-                self.send(output[1], other, "bye")
-            elif output[0] == "up":
-                assert self.used[me] is None, "one link at a time"
-                self.used[me] = output[1]
-            elif output[0] == "down":
-                assert self.used[me] == output[1]
-                self.used[me] = None
-            else:
-                assert output[0] != "dial", "nothing more to dial"
-
-    def send(self, link: int, to: str, what: Refuse | str) -> None:
-        self.wires.setdefault((link, to), []).append(what)
-
-
-def test_lower_guids_link_stays_in_any_order() -> None:
-    todo: list[list[tuple[int, str]]] = [[]]
-    ends = 0
-    while todo:
-        path = todo.pop()
-        world = Crossing()
-        for wire in path:
-            world.deliver(wire)
-        choices = world.choices()
-        todo.extend([*path, choice] for choice in choices)
-        if not choices:
-            ends += 1
-            assert world.used == {"low": 1, "high": 1}, path
-    assert ends >= 6
-
-
 # --- peers that nobody has linked yet, of which many may be invented ---------------------------------------------
 
 
@@ -350,17 +234,6 @@ class Network:
         return [status.identity.name for status in self.peering.peers() if status.state == "linked"]
 
 
-@pytest.mark.parametrize("count", [100, 160])
-def test_silent_peers_share_one_dial_rate(count: int) -> None:
-    network = Network()
-    network.find(*map(stranger, range(count)))
-    first = network.run(60.0) + limits.DIAL_STRANGERS_BURST
-    assert first <= limits.DIAL_STRANGERS_BURST + 60 * limits.DIAL_STRANGERS_RATE + 1
-    assert {guid for _, guid in network.dialled} == {stranger(n).guid for n in range(count)}, "each had its turn"
-    # And they are dialled for ever, as seldom as there are many of them.
-    assert 30 * limits.DIAL_STRANGERS_RATE <= network.run(60.0) <= 60 * limits.DIAL_STRANGERS_RATE + 1
-
-
 def test_bound_does_not_slow_down_a_few_silent_peers() -> None:
     network = Network()
     network.find(*map(stranger, range(10)))
@@ -396,19 +269,6 @@ def test_forged_peers_do_not_starve_a_waiting_one() -> None:
     assert network.linked() == ["high"]
 
 
-def test_a_stranger_that_leaves_the_line_is_not_dialled() -> None:
-    peering = of(LOW)
-    crowd = [stranger(number) for number in range(limits.DIAL_STRANGERS_BURST + 2)]
-    for identity in crowd:
-        peering.peer_found(identity, 0.0)
-    *_, gone, kept = crowd
-    assert len(dials(peering.take())) == limits.DIAL_STRANGERS_BURST
-    peering.peer_gone(gone.guid)
-    peering.handle_timer(1.0)
-    assert dials(peering.take()) == [kept.guid.endpoint]
-    assert peering.next_timer() is None
-
-
 def full_mesh(monkeypatch: pytest.MonkeyPatch) -> Peering:
     """A module of a mesh of four that is full."""
     monkeypatch.setattr(limits, "MODULES_MAX", 4)
@@ -439,14 +299,3 @@ def test_a_full_mesh_neither_dials_nor_accepts_one_more_until_discovery_has_give
     peering.peer_gone(stranger(2).guid)
     assert peering.judge(hello_of(stranger(4)), 4.0) is None
     assert until_dial(peering, 4.0)[0] < 4.0 + REFUSED_RETRY
-
-
-def test_a_module_for_which_there_is_no_place_says_so_once() -> None:
-    peering = of(LOW)
-    for number in (1, 2):
-        peering.peer_found(stranger(number), 0.0)
-        peering.dial_refused(stranger(number).guid, FULL, 0.1, stranger(number).guid.endpoint)
-    assert [output for output in peering.take() if output[0] == "refused"] == [("refused", stranger(1), FULL)]
-    assert peering.left_out
-    peering.link_up(1, stranger(1), 1.0, dialled=True, endpoint=stranger(1).guid.endpoint)
-    assert not peering.left_out

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import time
-
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
@@ -34,6 +31,9 @@ def numbers(machine: ReliableSender, most: int | None = None) -> list[int]:
 # --- the sender -----------------------------------------------------------------------------------------------
 
 
+# --- the receiver ---------------------------------------------------------------------------------------------
+
+
 def test_lost_lane_is_replayed_from_the_acknowledgement() -> None:
     machine = sender(depth=4)
     fill(machine, 4)
@@ -49,34 +49,6 @@ def test_lost_lane_is_replayed_from_the_acknowledgement() -> None:
     machine.suspend()
     machine.rewind()
     assert taken(machine) == []
-
-
-def cost(waiting: int, *, dropping: bool) -> float:
-    """Seconds of this process for 2000 messages, with so many others waiting, half of them in flight."""
-    depth = waiting + 10 * (not dropping)
-    machine = sender(depth=depth, max_bytes=1 << 30, window=depth, window_bytes=1 << 30)
-    fill(machine, waiting)
-    taken(machine, waiting // 2)
-    gc.disable()  # the tests before have left it much to look at
-    try:
-        started = time.process_time()
-        for number in range(2000):
-            machine.offer(b"x", 0)
-            if not dropping:
-                machine.take()
-                machine.acknowledged(number + 1)
-        return time.process_time() - started
-    finally:
-        gc.enable()
-
-
-@pytest.mark.parametrize("dropping", [False, True])
-def test_a_message_costs_the_same_however_many_wait(dropping: bool) -> None:
-    few, many = (min(cost(waiting, dropping=dropping) for _ in range(5)) for waiting in (10, 20_000))
-    assert many < 10 * few + 0.01
-
-
-# --- the receiver ---------------------------------------------------------------------------------------------
 
 
 def test_without_a_first_sequence_no_gap_is_claimed() -> None:
@@ -126,28 +98,6 @@ def parked(
     fill(machine, count)
     taken(machine)
     return machine, table.park(key, machine, until)
-
-
-def test_a_parked_sender_is_suspended_and_given_back() -> None:
-    table: ResumeTable[str] = ResumeTable()
-    machine, gone = parked(table, "a")
-    assert gone == []
-    assert (len(table), table.pending_bytes, machine.take()) == (1, 8, None)
-    assert table.claim("b") is None
-    assert table.claim("a") is machine
-    assert table.claim("a") is None
-    assert (len(table), table.pending_bytes, table.next_timer()) == (0, 0, None)
-
-
-def test_parking_again_begins_a_new_time() -> None:
-    table: ResumeTable[str] = ResumeTable()
-    parked(table, "a", until=40.0)
-    parked(table, "b", until=41.0)
-    machine, gone = parked(table, "a", until=42.0)
-    assert gone == []
-    assert (len(table), table.pending_bytes) == (2, 16)
-    assert table.expire(41.5) == ["b"]
-    assert table.claim("a") is machine
 
 
 def test_the_number_of_those_that_keep_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

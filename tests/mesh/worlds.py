@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.connection import ConnectionProtocol, DataHandler
-from rmpa.mesh.frames import Lane
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rmpa.mesh.frames import FrameKind, Hello, Refuse
+from rmpa.mesh.frames import FrameKind, Hello, Lane, Refuse
 
 LOW = Identity(Guid.of("10.0.0.1", 40001, 1), b"L" * 16, "low")
 HIGH = Identity(Guid.of("10.0.0.2", 40002, 1), b"H" * 16, "high")

@@ -3,13 +3,9 @@ from __future__ import annotations
 import pytest
 
 from rmpa.core.errors import ConfigError
-from rmpa.ros.environment import RosEnvironment, host_of, is_loopback, parse_value
+from rmpa.ros.environment import RosEnvironment, parse_value
 
 ADDRESSES = ["127.0.0.1", "192.168.1.7", "10.0.0.2"]
-
-
-def test_defaults_are_first_outer_address_and_usual_master() -> None:
-    assert RosEnvironment.read({}, [], ADDRESSES) == RosEnvironment("http://localhost:11311", "192.168.1.7")
 
 
 def test_without_a_network_it_is_loopback() -> None:
@@ -85,29 +81,11 @@ def test_remapping_arguments() -> None:
 @pytest.mark.parametrize(
     ("text", "value"),
     [
-        ("1", 1),
-        ("-7", -7),
-        ("1.5", 1.5),
-        ("1e3", 1000.0),
-        ("99999999999", 99999999999.0),
-        ("true", True),
-        ("False", False),
-        ("[1, 2]", [1, 2]),
-        ('{"a": 1}', {"a": 1}),
-        ('"7"', "7"),
-        ("[broken", "[broken"),
-        ("hello", "hello"),
-        ("", ""),
+        ("1", 1), ("-7", -7), ("1.5", 1.5), ("1e3", 1000.0), ("99999999999", 99999999999.0), ("true", True),
+        ("False", False), ("[1, 2]", [1, 2]), ('{"a": 1}', {"a": 1}), ('"7"', "7"), ("[broken", "[broken"),
+        ("hello", "hello"), ("", ""),
     ],
-)
+)  # fmt: skip
 def test_values_of_parameters(text: str, value: object) -> None:
     assert parse_value(text) == value
     assert type(parse_value(text)) is type(value)
-
-
-def test_hosts() -> None:
-    assert host_of("http://127.0.0.1:1/") == "127.0.0.1"
-    assert host_of("nonsense") == ""
-    assert is_loopback("127.1.2.3")
-    assert is_loopback("localhost")
-    assert not is_loopback("127.evil.org")

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 from unittest import mock
 
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Lane
+from rmpa.mesh.io.link import Connection, PeerLink
 from tests.simulation.mesh_peer import MeshPeer
 from tests.simulation.scenario import Outcome, Scenario
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from rmpa.mesh.io.link import Connection, PeerLink
-    from tests.simulation.sockets import SimSocket
+from tests.simulation.sockets import SimSocket
 
 _MANY = 10
 _SLOWER = 5

@@ -8,25 +8,21 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import random
+from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Final, cast
+from typing import Final, cast
 
 from rmpa.bridge.bridge import Bridge
 from rmpa.config.settings import Settings
 from rmpa.core.contract import ContractRule, Reliability
 from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits as mesh_limits
-from tests.bridge.io.nodes import Core
+from rmpa.ros.core.embedded import RosCore
+from tests.bridge.io.links import LinkEnd
+from tests.bridge.io.nodes import Core, Listener, Speaker
 from tests.bridge.io.two_bridges import Side, World, made_up
 from tests.bridge.io.virtual import VirtualLoop, run
-
-if TYPE_CHECKING:
-    import random
-    from collections.abc import Iterable, Sequence
-
-    from rmpa.ros.core.embedded import RosCore
-    from tests.bridge.io.links import LinkEnd
-    from tests.bridge.io.nodes import Listener, Speaker
 
 PERIOD: Final = 0.02
 SURE: Final = ContractRule(("/sure", "/map"), (), {"reliability": Reliability.RELIABLE, "depth": 5000})

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
 
 from rmpa.mesh import limits
+from tests.simulation.mesh_peer import MeshPeer
 from tests.simulation.mesh_scenario import MeshScenario
-
-if TYPE_CHECKING:
-    from tests.simulation.mesh_peer import MeshPeer
 
 
 class RestsScenario(MeshScenario):

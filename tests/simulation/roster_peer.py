@@ -5,15 +5,12 @@ from __future__ import annotations
 import random
 from dataclasses import replace
 from ipaddress import IPv4Address
-from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery.beacon import Beacon
 from rmpa.discovery.membership import MembershipProtocol, PeerEvent
-
-if TYPE_CHECKING:
-    from tests.simulation.network import Address, Network
+from tests.simulation.network import Address, Network
 
 
 class RosterPeer:

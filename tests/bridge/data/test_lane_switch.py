@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,9 +9,7 @@ from hypothesis import strategies as st
 from rmpa.bridge.data.route import BULK, EXPRESS, LaneSwitch
 from rmpa.core.contract import Contract, Priority
 from rmpa.mesh import limits
-
-if TYPE_CHECKING:
-    from rmpa.mesh.frames import Lane
+from rmpa.mesh.frames import Lane
 
 SMALL = limits.EXPRESS_MESSAGE_MAX
 LARGE = SMALL + 1
@@ -24,14 +20,10 @@ REST = limits.EXPRESS_AGAIN_AFTER
 @pytest.mark.parametrize(
     ("priority", "large", "target"),
     [
-        (Priority.HIGH, False, EXPRESS),
-        (Priority.HIGH, True, EXPRESS),
-        (Priority.NORMAL, False, EXPRESS),
-        (Priority.NORMAL, True, BULK),
-        (Priority.LOW, False, BULK),
-        (Priority.LOW, True, BULK),
+        (Priority.HIGH, False, EXPRESS), (Priority.HIGH, True, EXPRESS), (Priority.NORMAL, False, EXPRESS),
+        (Priority.NORMAL, True, BULK), (Priority.LOW, False, BULK), (Priority.LOW, True, BULK),
     ],
-)
+)  # fmt: skip
 def test_a_route_begins_behind_the_word_that_opens_it(priority: Priority, large: bool, target: Lane) -> None:
     switch = LaneSwitch(Contract(priority=priority), large=large)
     assert (switch.lane, switch.target, switch.fencing) == (EXPRESS, target, False)

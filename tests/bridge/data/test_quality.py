@@ -68,7 +68,7 @@ def test_latencies_before_a_clock_step_are_dropped() -> None:
     assert s.latency.last == pytest.approx(0.001)
 
 
-_RATES = (1, 50, 400, 512, 1_000, 13_000, 100_000)
+_RATES = (1, 50, 512, 13_000, 100_000)
 
 
 @pytest.mark.parametrize(
@@ -131,29 +131,6 @@ class Timer:
         self.watch.last = now
 
 
-def test_deadline_is_missed_once_a_period() -> None:
-    watch = QosWatch(Contract(deadline=0.25), 10.0)
-    assert watch.next_timer() == 10.25
-    watch.last = 10.125
-    assert watch.next_timer() == 10.375
-    assert watch.handle_timer(10.25) == []
-    assert watch.handle_timer(10.375) == [
-        QosEvent(QosEventKind.DEADLINE_MISSED, 1, "no message for 250 ms; deadline 250 ms", 10.375)
-    ]
-    assert watch.next_timer() == 10.625
-    assert watch.handle_timer(10.5) == []
-    assert watch.handle_timer(10.625) == [
-        QosEvent(QosEventKind.DEADLINE_MISSED, 1, "no message for 500 ms; deadline 250 ms", 10.625)
-    ]
-    late = QosEvent(QosEventKind.DEADLINE_MISSED, 3, "no message for 1.25 s; deadline 250 ms", 11.375)
-    assert watch.handle_timer(11.375) == [late]
-    assert list(watch.recent) == [QosEvent(QosEventKind.DEADLINE_MISSED, 5, late.text, 11.375)]
-    assert watch.counts == {QosEventKind.DEADLINE_MISSED: 5}
-    watch.last = 11.5
-    assert watch.handle_timer(11.75)[0].count == 1
-    assert [event.count for event in watch.recent] == [5, 1]  # another gap is another event
-
-
 @given(TICKS, EIGHTHS, st.data())
 def test_late_timers_report_only_real_misses(arrivals: list[float], deadline: float, data: st.DataObject) -> None:
     watch = QosWatch(Contract(deadline=deadline), 0.0)
@@ -204,26 +181,7 @@ def test_miss_hidden_by_rounding_is_reported_next() -> None:
     assert watch.next_timer() == 1e6 + 3 * 0.1
 
 
-MANUAL = Contract(liveliness=Liveliness.MANUAL_BY_TOPIC, liveliness_lease=2.0)
-
-
 AUTOMATIC = Contract(liveliness_lease=2.0)
-
-
-def test_a_silent_source_is_lost_and_comes_back() -> None:
-    watch = QosWatch(MANUAL, 0.0)
-    watch.last = 1.0
-    assert watch.next_timer() == 3.0
-    assert watch.handle_timer(3.0) == [
-        QosEvent(QosEventKind.LIVELINESS_LOST, 1, "no message for 2 s; lease 2 s", 3.0)
-    ]
-    assert watch.handle_timer(3.25) == []
-    assert watch.next_timer() == 3.25 + limits.WATCH_LOOK
-    watch.last = 3.375
-    assert watch.handle_timer(3.5) == [QosEvent(QosEventKind.LIVELINESS_RESTORED, 1, "alive again after 500 ms", 3.5)]
-    assert watch._lost_since is None
-    assert watch.next_timer() == 5.375
-    assert watch.counts == {QosEventKind.LIVELINESS_LOST: 1, QosEventKind.LIVELINESS_RESTORED: 1}
 
 
 @given(TICKS, st.integers(4, 16).map(lambda eighths: eighths / 8))

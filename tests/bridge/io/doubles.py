@@ -6,21 +6,18 @@ import asyncio
 import heapq
 import itertools
 from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import Any, Final, cast
 from unittest import mock
 
 from rmpa.bridge.data.export import ExportFlow, ExportRoute
+from rmpa.bridge.data.route_sender import RouteSender
 from rmpa.bridge.messages import Source
 from rmpa.bridge.peer import PeerRun
+from rmpa.core.contract import Contract
 from rmpa.core.outbox import QueuedMessage
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from rmpa.bridge.data.route_sender import RouteSender
-    from rmpa.core.contract import Contract
 
 WALL: Final = 1_700_000_000_000_000_000
 """The wall clock, in ns, when the other one says 0."""

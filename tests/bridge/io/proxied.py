@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import asyncio
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from rmpa.bridge.data.quality import QosEventKind
+from rmpa.bridge.data.reception import ImportFlow
+from rmpa.bridge.messages import RouteOpened, Source
 from rmpa.bridge.proxies import PeerProxies, ProxyNodes
 from rmpa.bridge.sessions import PeerSession
 from rmpa.bridge.topics.import_route import ImportRoute, RemoteTopic
 from rmpa.core.statistics import Counters
-
-if TYPE_CHECKING:
-    from rmpa.bridge.data.reception import ImportFlow
-    from rmpa.bridge.messages import RouteOpened, Source
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.publication import Publication
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.publication import Publication
 
 
 class Proxied:

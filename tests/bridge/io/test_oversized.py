@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import pytest
 
+from rmpa.bridge.data.reception import ImportFlow
 from rmpa.bridge.messages import Notification, Source, encode
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.ros import limits
-from tests.bridge.io.two_bridges import World, made_up
-from tests.bridge.io.virtual import VirtualLoop, run
-
-if TYPE_CHECKING:
-    from rmpa.bridge.data.reception import ImportFlow
+from tests.bridge.io.two_bridges import World, play
 
 BIG = Source("/big", "/one")
 
@@ -56,14 +51,7 @@ def test_both_ends_say_it_and_smaller_ones_go_on(
         await world.rest(0.2)
         assert (there(world).oversized, there(world).oversized_bytes) == (1, 5000)
 
-    loop = VirtualLoop()
-
-    async def main() -> None:
-        async with World(1) as world:
-            await scene(world)
-
-    with made_up(loop):
-        run(main(), loop)
+    play(1, scene)
     texts = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert any("/big from /one: a message of 2000 bytes is left out, at most 1000 cross" in text for text in texts)
     assert any("a: /big from /one: its messages of 2000 bytes are too long to cross" in text for text in texts)
@@ -78,18 +66,15 @@ def test_both_ends_say_it_and_smaller_ones_go_on(
     ],
 )
 def test_half_of_the_news_is_the_peers_error(args: dict[str, object]) -> None:
-    async def main() -> None:
-        async with World(1) as world:
-            b = world.sides[1]
-            world.link()
-            await world.rest(0.5)
-            assert b.link is not None
-            with pytest.raises(RemoteProtocolError):
-                b.link.receive(Frame(FrameKind.CONTROL, encode(Notification("message.oversized", args))))
-            unknown = {"topic": "/none", "node": "/one", "count": 1, "size": 9}
-            b.link.receive(Frame(FrameKind.CONTROL, encode(Notification("message.oversized", unknown))))
-            assert b.bridge.counters["message.oversized_there"] == 0
+    async def scene(world: World) -> None:
+        b = world.sides[1]
+        world.link()
+        await world.rest(0.5)
+        assert b.link is not None
+        with pytest.raises(RemoteProtocolError):
+            b.link.receive(Frame(FrameKind.CONTROL, encode(Notification("message.oversized", args))))
+        unknown = {"topic": "/none", "node": "/one", "count": 1, "size": 9}
+        b.link.receive(Frame(FrameKind.CONTROL, encode(Notification("message.oversized", unknown))))
+        assert b.bridge.counters["message.oversized_there"] == 0
 
-    loop = VirtualLoop()
-    with made_up(loop):
-        run(main(), loop)
+    play(1, scene)

@@ -4,29 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import random
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from types import MappingProxyType, SimpleNamespace
-from typing import TYPE_CHECKING, Final, Self, cast
+from typing import Final, Self, cast
 from unittest import mock
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.bridge import Bridge
+from rmpa.bridge.sessions import PeerSession
 from rmpa.config.settings import Settings
 from rmpa.core import limits as core_limits
+from rmpa.core.contract import ContractRule
 from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits as mesh_limits
+from rmpa.mesh.io.link import PeerLink
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.publication import Publication
 from tests.bridge.io.links import LinkEnd
 from tests.bridge.io.nodes import Core, Listener, Node, PublisherConnection, Speaker, stages
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from rmpa.bridge.sessions import PeerSession
-    from rmpa.core.contract import ContractRule
-    from rmpa.mesh.io.link import PeerLink
-    from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.publication import Publication
-    from tests.bridge.io.virtual import VirtualLoop
+from tests.bridge.io.virtual import VirtualLoop, run
 
 SMALL_LIMITS: Final = MappingProxyType(
     {
@@ -332,3 +329,31 @@ def made_up(loop: VirtualLoop) -> Iterator[None]:
             wall = SimpleNamespace(time_ns=loop.time_ns)
             stack.enter_context(mock.patch(f"rmpa.bridge.data.{flow}.time", wall))
         yield
+
+
+def play(
+    seed: int,
+    scene: Callable[[World], Coroutine[object, object, None]],
+    rules: Iterable[ContractRule] = (),
+    *,
+    clocks: bool = False,
+    kept: Iterable[str] = (),
+) -> None:
+    """Play one scene of a world to its end.
+
+    Args:
+        seed: Of all chance.
+        scene: What happens.
+        rules: Contracts, of both sides.
+        clocks: Whether the sides know each other's clock.
+        kept: Topics whose messages may come again.
+    """
+    loop = VirtualLoop()
+
+    async def main() -> None:
+        async with World(seed, rules, clocks=clocks) as world:
+            world.kept.update(kept)
+            await scene(world)
+
+    with made_up(loop):
+        run(main(), loop)

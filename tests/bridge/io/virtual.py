@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import selectors
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Coroutine
+from collections.abc import Coroutine
 
 WALL = 1_700_000_000_000_000_000
 """The wall clock, in ns, when the loop's says 0."""

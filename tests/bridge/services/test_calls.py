@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import AsyncIterator, Callable
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import pytest
 from hypothesis import given, settings
@@ -21,13 +22,7 @@ from rmpa.ros import limits as ros_limits
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import ServiceDescription
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
-    from rmpa.ros.node.service_server import ServiceCall
-    from rmpa.runtime.tls import Buffer
-
+from rmpa.runtime.tls import Buffer
 
 # Calls over a route: every byte arrives, in whichever size; whoever will get no answer is told so at once.
 
@@ -448,22 +443,6 @@ async def desk() -> AsyncIterator[Desk]:
     made.pool.close("the test ends")
     await made.pool.closed()
     await node.close()
-
-
-async def test_the_server_says_what_it_is_and_its_connection_stays_for_a_call(desk: Desk) -> None:
-    told = await desk.pool.describe()
-    assert (told.type, told.md5sum) == ("a/Add", MD5)
-    desk.call(b"1")
-    await desk.until(calls=1)
-    assert desk.pool.size == len(desk.endpoint._clients) == 1
-    desk.calls[0].reply(True, b"one")
-    await desk.until(answers=1)
-    desk.call(b"2")
-    await desk.until(calls=2)
-    assert len(desk.endpoint._clients) == 1, "an idle connection is used again"
-    desk.calls[1].fail("it sticks")
-    await desk.until(answers=2)
-    assert desk.answers == {b"1": (True, b"one"), b"2": (False, b"it sticks")}
 
 
 async def test_calls_are_made_at_once_as_far_as_may_be_and_the_rest_waits(

@@ -15,7 +15,6 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.config import limits as config_limits
-from rmpa.config.settings import ServiceSettings
 from rmpa.ros.wire.tcpros import ServiceDescription
 from tests.bridge.recorder import EndRoute, Probe, Send, ServerGone, ServeRoute, ServiceExports
 from tests.bridge.services.test_rules import rules
@@ -55,26 +54,12 @@ def test_a_server_at_another_address_is_told_again_and_its_routes_end(exports: S
     requests = opened(exports)
     again = LocalService("/adder", "rosrpc://127.0.0.1:7")
     assert exports.graph("/add", again) == [
-        EndRoute(1, requests),
-        Send(1, ServiceClosed(ROUTE, "/add: its server has restarted")),
-        ServerGone("/add"),
-    ]
+        EndRoute(1, requests), Send(1, ServiceClosed(ROUTE, "/add: its server has restarted")), ServerGone("/add"),
+    ]  # fmt: skip
     assert told(exports) == [AdvertiseServices((ServiceOffer("/add", "/adder"),))]
     assert exports.opened(1, OpenService(ROUTE, "/add")) == [Probe("/add", again)]
     assert exports.described("/add", ADD, ABOUT) == [], "the answer of the one before"
     assert exports.refused("/add", ADD, "no answer") == [], "its late end fails no call of the next one"
-
-
-def test_what_policy_keeps_home_is_not_told_and_not_opened() -> None:
-    made = ServiceExports(rules(ServiceSettings(deny=("/add",))))
-    made.graph("/add", ADD)
-    made.graph("/n/get_loggers", ADD)
-    assert made.link_up(1, "base") == [Send(1, AdvertiseServices(full=True))]
-    (answer,) = made.opened(1, OpenService(ROUTE, "/add"))
-    assert isinstance(answer, Send)
-    assert isinstance(answer.message, ServiceClosed)
-    assert "policy keeps it home" in answer.message.reason
-    assert made.seen == {"/add": ADD, "/n/get_loggers": ADD}
 
 
 def test_a_service_is_opened_at_once_when_its_server_is_known(exports: ServiceExports) -> None:

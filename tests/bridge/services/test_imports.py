@@ -22,7 +22,7 @@ from tests.bridge.recorder import EndedService, ForgetAbout, OpenedService, Prov
 from tests.bridge.services.test_rules import apply_rules, rules
 
 if TYPE_CHECKING:
-    from rmpa.bridge.policy import PolicyDecision
+    pass
 
 MD5 = "6a2e34150c00229791cc89ff309fff21"
 ROUTE = limits.SERVICE_ROUTES + 1
@@ -64,10 +64,8 @@ def test_a_local_service_always_comes_first(imports: ServiceImports) -> None:
     opened(imports)
     reason = "/mine of this module provides it itself"
     assert imports.local("/add", "/mine") == [
-        Send(1, CloseService(ROUTE)),
-        EndedService(1, "/add", ROUTE, reason),
-        Withdraw(1, "/add", "/n", reason),
-    ]
+        Send(1, CloseService(ROUTE)), EndedService(1, "/add", ROUTE, reason), Withdraw(1, "/add", "/n", reason),
+    ]  # fmt: skip
     assert hidden(imports, 1) == reason
     assert imports.local("/add", None) == [Provide(1, "/add", "/n")]
     assert imports.local("/other", "/mine") == []
@@ -151,35 +149,3 @@ def test_two_of_one_peer_that_would_have_one_name_here() -> None:
     assert made.advertised(1, offer("/a", "/b", full=True)) == [Provide(1, "/b", "/n")]
     second = [remote for _, remote in made if not remote.shown]
     assert "has this name here already" in made.hidden(second[0])
-
-
-def test_a_name_that_all_modules_have_costs_one_judgement_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Modules of one kind have the same names: judging all claims for each new one would be quadratic.
-    judged = []
-    known = rules()
-    made = ServiceImports(known)
-    original = known.judge
-
-    def judge(service: str, node: str) -> PolicyDecision:
-        judged.append(node)
-        return original(service, node)
-
-    monkeypatch.setattr(known, "judge", judge)
-    peers = 200
-    for number in range(1, peers + 1):
-        made.link_up(number, f"arm{number}", rank=number)
-        made.advertised(number, offer("/start", full=True))
-    assert made.shown("/start") is made.get(1, "/start")
-    assert len(judged) <= 2 * peers
-    judged.clear()
-    assert made.gone(2) == [], "it was not shown"
-    assert judged == []
-    assert made.gone(1)[-1] == Provide(3, "/start", "/n")
-    assert hidden(made, peers, "/start") == "arm3 provides it too, and is shown: its GUID is lower"
-    made.local("/start", "/mine")
-    judged.clear()
-    made.link_up(peers + 1, "leg", rank=peers + 1)
-    assert made.advertised(peers + 1, offer("/start", full=True)) == []
-    assert hidden(made, peers + 1, "/start") == "/mine of this module provides it itself"
-    assert judged == []
-    assert made.shown("/start") is None

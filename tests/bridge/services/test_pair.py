@@ -224,19 +224,9 @@ class World:
 
 
 _STEPS = [
-    "server",
-    "stop",
-    "own",
-    "want",
-    "release",
-    "change_rules",
-    "link",
-    "cut",
-    "forget",
-    "answer",
-    "deliver",
+    "server", "stop", "own", "want", "release", "change_rules", "link", "cut", "forget", "answer", "deliver",
     "time",
-]
+]  # fmt: skip
 
 
 @settings(max_examples=120, deadline=None)

@@ -46,23 +46,6 @@ def test_each_decision_names_its_rule(
     assert rule in decision.rule
 
 
-def test_rules_of_one_peer_come_on_top() -> None:
-    peers = (PeerRule("robot*", prefix="/robot1", policy=PolicySettings(deny=("/robot1/stop",))),)
-    names, policy = Names(peers), Policy(PolicySettings(), peers)
-    assert names.of("robot_7").local_name("/stop") == "/robot1/stop"
-    assert names.of("robot_7").wire_name("/robot1/go") == "/go"
-    assert names.of("base").local_name("/stop") == "/stop"
-    assert not policy.judge_for("robot_7", "/robot1/stop", wire="/stop").allowed
-    assert policy.judge_for("base", "/robot1/stop", wire="/robot1/stop").allowed
-
-
-def test_the_first_rule_that_fits_says_how_long_a_call_may_take() -> None:
-    made = rules(
-        ServiceSettings(timeout=5.0, rules=(ServiceRule(("/plan/**",), 300.0), ServiceRule(("/plan/quick",), 1.0)))
-    )
-    assert [made.timeout(service) for service in ("/add", "/plan/path", "/plan/quick")] == [5.0, 300.0, 300.0]
-
-
 def test_the_first_rule_that_says_a_transport_gives_it() -> None:
     said = (
         ServiceRule(("/plan/**",), 300.0),

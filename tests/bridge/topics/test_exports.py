@@ -2,9 +2,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import msgspec
 import pytest
-from msgspec import UNSET
 
 from rmpa.bridge.context import Names
 from rmpa.bridge.messages import (
@@ -17,11 +15,11 @@ from rmpa.bridge.messages import (
     Source,
     TopicOffer,
 )
-from rmpa.bridge.policy import Policy, PolicyDecision
+from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.settings import LimitSettings
-from rmpa.core.contract import Contract, ContractRule, Contracts, Durability, Priority, Reliability, Transport
+from rmpa.core.contract import Contract, ContractRule, Contracts, Reliability, Transport
 from tests.bridge.recorder import AddRoute, Connect, Disconnect, Exports, RemoveRoute, Send, Warn
 
 CMD = Source("/cmd", "/joy")
@@ -71,30 +69,12 @@ def test_a_new_link_is_told_all_that_policy_lets_cross(exports: Exports) -> None
     ]
 
 
-def test_one_connection_on_demand_serves_all_subscribers(offering: Exports) -> None:
-    offering.link_up(2)
-    assert offering.opened(1, OpenRoute(7, "/cmd", "/joy")) == [Connect(CMD, JOY.uri)]
-    assert offering.opened(2, OpenRoute(9, "/cmd", "/joy")) == []
-    assert offering.described(CMD, ABOUT) == [
-        Send(1, RouteOpened(7, ABOUT, epoch=1)),
-        AddRoute(CMD, 1, 7, Contract(), 1),
-        Send(2, RouteOpened(9, ABOUT, epoch=1)),
-        AddRoute(CMD, 2, 9, Contract(), 1),
-    ]
-    assert offering.flowing(CMD) == (1, 2)
-    assert offering.closed(1, CloseRoute(7)) == [RemoveRoute(CMD, 1, 7)]
-    assert offering.closed(2, CloseRoute(9)) == [RemoveRoute(CMD, 2, 9), Disconnect(CMD)]
-    assert offering.flowing(CMD) == ()
-
-
 def test_a_lost_publisher_closes_every_route_and_forgets_them(offering: Exports) -> None:
     offering.opened(1, OpenRoute(7, "/cmd", "/joy"))
     offering.described(CMD, ABOUT)
     assert offering.lost(CMD, "it closed the connection") == [
-        RemoveRoute(CMD, 1, 7),
-        Disconnect(CMD),
-        Send(1, RouteClosed(7, "it closed the connection")),
-    ]
+        RemoveRoute(CMD, 1, 7), Disconnect(CMD), Send(1, RouteClosed(7, "it closed the connection")),
+    ]  # fmt: skip
     assert offering.lost(CMD, "it closed the connection") == []
     assert offering.closed(1, CloseRoute(7)) == []
     assert offering.opened(1, OpenRoute(7, "/cmd", "/joy")) == [Connect(CMD, JOY.uri)]
@@ -131,32 +111,6 @@ def test_the_number_of_routes_is_bounded() -> None:
     assert isinstance(action.message, RouteClosed)
 
 
-def many(count: int) -> dict[Source, LocalSource]:
-    return {Source(f"/t{index:04}", "/n"): JOY for index in range(count)}
-
-
-def test_a_change_costs_what_changed_and_not_what_there_is(exports: Exports) -> None:
-    """The judge is asked about the changed source alone, and the peers' messages hold nothing else."""
-    exports.link_up(1)
-    graph(exports, many(2000))
-    asked: list[str] = []
-    policy = exports.out.context.policy
-    judge = policy.judge
-
-    def counting(topic: str, type_name: str, node: str) -> PolicyDecision:
-        asked.append(topic)
-        return judge(topic, type_name, node)
-
-    policy.judge = counting  # type: ignore[method-assign]
-    assert exports.graph("/t0001", {"/n": JOY}) == []
-    assert exports.graph("/t0001", {}) == []
-    assert exports.graph("/t0001", {"/m": JOY}) == []
-    assert exports.advertise() == [
-        Send(1, Advertise(added=(TopicOffer("/t0001", "/m", JOY.type),), removed=(Source("/t0001", "/n"),)))
-    ]
-    assert asked == ["/t0001"]
-
-
 # --- contracts, and links that come back --------------------------------------------------------------------------
 
 RELIABLE = Contract(reliability=Reliability.RELIABLE)
@@ -175,28 +129,6 @@ def flowing(offering: Exports) -> Exports:
     return offering
 
 
-def test_the_stronger_of_both_sides_words_holds_and_both_are_told() -> None:
-    rules = Contracts(
-        (ContractRule(("/cmd",), (), {"depth": 5, "lifespan": 2.0, "durability": Durability.TRANSIENT_LOCAL}),)
-    )
-    exports = Exports(Policy(PolicySettings()), rules)
-    graph(exports, {CMD: JOY})
-    exports.link_up(1)
-    asked = Contract(reliability=Reliability.RELIABLE, depth=3, lifespan=1.0, priority=Priority.HIGH)
-    exports.opened(1, OpenRoute(7, "/cmd", "/joy", asked))
-    holds = Contract(
-        reliability=Reliability.RELIABLE,
-        durability=Durability.TRANSIENT_LOCAL,
-        depth=5,
-        lifespan=1.0,
-        priority=Priority.HIGH,
-    )
-    about = msgspec.structs.replace(ABOUT, latching=True)  # so that the proxy keeps messages for late subscribers
-    assert exports.described(CMD, ABOUT) == [Send(1, RouteOpened(7, about, holds, 1)), AddRoute(CMD, 1, 7, holds, 1)]
-    assert exports.contract(CMD, 1) == holds
-    assert exports.description(CMD) == ABOUT
-
-
 def test_another_transport_alone_leaves_routes_open(flowing: Exports) -> None:
     policy, asked = Policy(PolicySettings()), Contract(reliability=Reliability.RELIABLE, transport=Transport.AUTO)
     flowing.link_up(2)
@@ -206,33 +138,6 @@ def test_another_transport_alone_leaves_routes_open(flowing: Exports) -> None:
     assert [flowing.contract(CMD, peer) for peer in (1, 2)] == [RELIABLE, asked]
     slower = Contracts((ContractRule((), (), {"max_rate": 5.0}),), Transport.AUTO)
     assert [type(message) for message in sends(flowing.apply_rules(policy, slower, Names()))] == [RouteClosed] * 2
-
-
-@pytest.mark.parametrize("instance", ["first", "second"])
-def test_another_run_of_a_peer_is_told_once_that_messages_may_be_lost(exports: Exports, instance: str) -> None:
-    graph(exports, {CMD: JOY})
-    for number, run, unknown in (
-        (1, "first", UNSET),
-        (2, instance, instance == "second" or UNSET),
-        (3, "third", UNSET),
-    ):
-        exports.link_up(number, "b", run)
-        actions = exports.opened(number, SURE) + exports.described(CMD, ABOUT)
-        messages = [action.message for action in actions if isinstance(action, Send)]
-        assert [one.unknown for one in messages if isinstance(one, RouteOpened)] == [unknown]
-        if number == 1:
-            exports.link_away(number)
-        exports.link_down(number)
-
-
-def test_the_last_message_of_a_publisher_that_has_gone_is_told() -> None:
-    exports = Exports(Policy(PolicySettings()), last=1)
-    graph(exports, {CMD: JOY})
-    exports.link_up(1)
-    exports.opened(1, SURE)
-    exports.described(CMD, ABOUT)
-    ended = graph(exports, {})
-    assert Send(1, RouteClosed(7, "the node has gone", 1)) in ended
 
 
 def test_what_the_peer_asked_for_again_is_claimed(flowing: Exports) -> None:

@@ -4,11 +4,9 @@ from typing import Any
 
 import pytest
 
-from rmpa.bridge import limits
 from rmpa.bridge.context import Names
 from rmpa.bridge.messages import (
     Advertise,
-    CloseRoute,
     Description,
     Mismatch,
     OpenRoute,
@@ -20,7 +18,7 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.policy import Policy
 from rmpa.config.peer_rules import PolicySettings
 from rmpa.core.contract import Contract, ContractRule, Contracts, Reliability, Transport
-from tests.bridge.recorder import Describe, Detach, Imports, Publish, Retract, Send, Warn
+from tests.bridge.recorder import Detach, Imports, Publish, Retract, Send, Warn
 
 CMD = Source("/cmd", "/joy")
 OFFER = TopicOffer("/cmd", "/joy", "sensor_msgs/Joy")
@@ -38,24 +36,6 @@ def state(imports: Imports, peer: int = 1) -> str:
     entry = imports.entry(peer, CMD)
     found: str = entry.state
     return found
-
-
-def test_the_way_of_a_route(imports: Imports) -> None:
-    imports.advertised(1, Advertise(added=(OFFER,)))
-    assert imports.demand(1, CMD, 0.0, wanted=True) == [Send(1, OpenRoute(1, "/cmd", "/joy"))]
-    assert imports.demand(1, CMD, 0.0, wanted=True) == []
-    assert imports.opened(1, RouteOpened(1, ABOUT), 0.0) == [Describe(1, CMD, 1, ABOUT, Contract())]
-    assert imports.demand(1, CMD, 10.0, wanted=False) == []
-    assert state(imports) == "lingering"
-    assert imports.next_timer() == 10.0 + limits.ROUTE_LINGER
-    assert imports.handle_timer(10.5) == []
-    assert imports.demand(1, CMD, 10.6, wanted=True) == []
-    assert state(imports) == "open"
-    assert imports.next_timer() is None
-    imports.demand(1, CMD, 20.0, wanted=False)
-    assert imports.handle_timer(20.0 + limits.ROUTE_LINGER) == [Send(1, CloseRoute(1)), Detach(1, CMD, 1)]
-    assert state(imports) == "idle"
-    assert imports.demand(1, CMD, 30.0, wanted=True) == [Send(1, OpenRoute(2, "/cmd", "/joy"))]
 
 
 def test_a_closed_route_is_asked_for_again_with_a_growing_delay(imports: Imports) -> None:
@@ -104,23 +84,6 @@ def test_a_publisher_with_another_type_than_offered_is_not_described(imports: Im
     assert state(imports) == "waiting"
 
 
-def many(count: int) -> tuple[TopicOffer, ...]:
-    return tuple(TopicOffer(f"/t{index:04}", "/n", "a/B") for index in range(count))
-
-
-def test_many_timers_are_dealt_with_a_few_at_a_time(imports: Imports) -> None:
-    imports.advertised(1, Advertise(added=many(50)))
-    for route, offer in enumerate(many(50), 1):
-        imports.demand(1, offer.source, 0.0, wanted=True)
-        imports.closed(1, RouteClosed(route, "it closed the connection"), 0.0)
-    rounds = 0
-    while (due := imports.next_timer()) is not None and due <= 6.0:
-        assert len(imports.handle_timer(6.0)) <= 48
-        rounds += 1
-    assert rounds > 3
-    assert {entry.state for entry in imports} == {"opening"}
-
-
 # --- contracts, and links that come back --------------------------------------------------------------------------
 
 SURE = Contract(reliability=Reliability.RELIABLE)
@@ -166,37 +129,3 @@ def test_another_transport_alone_leaves_routes_open(flowing: Imports) -> None:
     assert applied(Contracts((rule,), Transport.DIRECT)) == []
     (asked,) = opens(applied(Contracts((changed,), Transport.DIRECT)))
     assert asked.contract == Contract(reliability=Reliability.RELIABLE, depth=5, transport=Transport.DIRECT)
-
-
-def test_only_what_is_reliable_and_listened_to_waits_for_its_peer(flowing: Imports) -> None:
-    flowing.advertised(1, Advertise(added=(TopicOffer("/idle", "/base", "a/B"),)))
-    assert flowing.link_away(1) == (
-        [
-            Detach(1, CMD, 1, keep=True),
-            Detach(1, ODOM.source, 2, missed=True),
-            Retract(1, ODOM.source),
-            Retract(1, Source("/idle", "/base")),
-        ],
-        True,
-    )
-    assert state(flowing) == "waiting"
-    assert flowing.next_timer() is None, "nobody is there to be asked"
-    flowing.link_down(1)
-    assert flowing.get(1, CMD) is None
-
-
-def test_what_is_latched_waits_for_a_silent_peer_while_somebody_listens(imports: Imports) -> None:
-    latched = Description("sensor_msgs/Joy", ABOUT.md5, "Header header\n", True)
-    plain = Description("a/B", ABOUT.md5, "", False)
-    imports.advertised(1, Advertise(added=(OFFER, ODOM)))
-    for route, (source, about) in enumerate(((CMD, latched), (ODOM.source, plain)), start=1):
-        imports.demand(1, source, 0.0, wanted=True)
-        imports.opened(1, RouteOpened(route, about), 0.0)
-    imports.link_away(1, briefly=True)
-    assert imports.waits_for(1)
-    assert imports.link_away(1) == ([Retract(1, ODOM.source)], True)
-    imports.link_up(1)
-    assert opens(imports.advertised(1, Advertise(added=(OFFER,)), 10.0)) == [OpenRoute(1, "/cmd", "/joy")]
-    imports.opened(1, RouteOpened(1, latched), 10.0)
-    # A link that somebody closed is not expected back.
-    assert imports.link_away(1) == ([Detach(1, CMD, 1, missed=True), Retract(1, CMD)], False)

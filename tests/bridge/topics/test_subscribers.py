@@ -1,9 +1,10 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import pytest
 
@@ -21,33 +22,19 @@ from rmpa.bridge.messages import (
     Source,
     TopicOffer,
 )
-from rmpa.bridge.peer import PeerRun
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
-from rmpa.bridge.topics import exports as topic_exports
+from rmpa.bridge.sessions import PeerSession
 from rmpa.bridge.topics import local as module
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.bridge.topics.local import (
-    LocalSubscriptions,
     RemoteSubscribers,
     audience,
-    compares_names,
-    is_watched,
 )
 from rmpa.bridge.topics.reports import Mismatches
 from rmpa.config.peer_rules import PermissionRule, PolicySettings
 from rmpa.config.settings import TrustSettings
-from rmpa.ros.node.publication import Publication
 from rmpa.trust.permissions import Permissions
-from tests.bridge.io.doubles import Link
-from tests.bridge.recorder import Exports, Imports, Out, Send, context
-from tests.ros.node.peers import STRING
-from tests.waiting import until
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rmpa.bridge.sessions import PeerSession
-
+from tests.bridge.recorder import Exports, Imports, Send
 
 # Who listens is told to the peer that publishes; whom a peer tells of is connected to our publisher.
 
@@ -174,16 +161,6 @@ async def test_listeners_are_told_once_the_route_is_open_and_when_they_change(wo
     assert await world.changed(GOAL, "/server") == [Audience(2, ("/server",))]
 
 
-async def test_of_several_changes_at_once_the_last_is_told(world: World) -> None:
-    world.imports.advertised(1, Advertise(added=(GOAL_OFFER,)))
-    world.imports.demand(1, GOAL, 0.0, wanted=True)
-    world.imports.opened(1, RouteOpened(1, Description(TYPE, MD5, "", False)), 0.0)
-    for listeners in (("/one",), ("/one", "/two"), ("/two",)):
-        world.change(GOAL, *listeners)
-    await asyncio.sleep(0)
-    assert world.sent == [Audience(1, ("/two",))]
-
-
 # --- the peer's listeners ---------------------------------------------------------------------------------------
 
 
@@ -229,110 +206,11 @@ def test_listeners_behind_a_relay_are_named_only_if_both_may(world: World) -> No
         assert secured.told(7, "/own", "/rmpa/arm/server", "/rmpa/leg/server") == expected
 
 
-# Subscriptions to local publishers, whose routes end with them.
-
-
-SOURCE = Source("/chatter", "/talker")
-
-
-SOURCE_NAMES = ("/chatter", "/talker")
-
-
-SUBSCRIBER = "http://talker:1/"
-
-
-class Subscribed:
-    """A module that sends ``/chatter`` to one peer, over a link that is only noted."""
-
-    def __init__(self) -> None:
-        self.publications = [Publication("/chatter", "/talker", STRING)]
-        self.link, self.out = Link(), cast("Any", Out(context()))
-        self.exports = topic_exports.Exports(self.out)
-        shared: Any = SimpleNamespace(
-            core=SimpleNamespace(call=lambda *_: None, suspect=lambda _: None),
-            node=SimpleNamespace(uri="http://agent:1/", next_number=lambda: 1),
-            rng=lambda: 0.5,
-            sessions={1: SimpleNamespace(link=self.link, linked=False)},
-        )
-        losses = SimpleNamespace(tell_oversized=lambda *_: None)
-        topics: Any = SimpleNamespace(exports=self.exports, losses=losses, look=lambda _: None)
-        self.out.outbound = LocalSubscriptions(shared, topics, lambda *_: self.publications[-1])
-
-    async def flows(self) -> None:
-        """It flows on route 7."""
-        self.exports.put(SOURCE, LocalSource("std_msgs/String", SUBSCRIBER))
-        self.exports.link_up(PeerRun(peer=1))
-        self.exports.opened(1, OpenRoute(7, *SOURCE_NAMES))
-        await until(lambda: self.exports.senders(1))
-
-    async def ends(self) -> None:
-        """Its publisher ends, and what it has sent is waited for."""
-        self.publications[0].withdraw()
-        await until(lambda: self.link.fences)
-
-
-async def test_a_route_that_is_opened_while_the_end_of_the_last_one_is_told_has_data() -> None:
-    """The peer that waited for this one may open it while the end of the last one is told."""
-    scene = Subscribed()
-    exports = scene.exports
-
-    def send(peer: int, message: object) -> None:
-        if isinstance(message, RouteClosed):
-            scene.publications.append(Publication("/chatter", "/talker", STRING))
-            exports.opened(peer, OpenRoute(8, *SOURCE_NAMES))
-
-    scene.out.send = send
-    await scene.flows()
-    await scene.ends()
-    exports.senders(1)[0].fenced(scene.link.fences.popleft()[1])
-    await until(lambda: exports.route(1, 8) is not None and exports.senders(1))
-    assert [sender.route for sender in exports.senders(1)] == [8]
-    exports.closed(1, CloseRoute(8))
-    scene.out.outbound.close()
-
-
-async def test_a_peer_may_close_the_last_route_while_the_end_of_its_publisher_is_waited_for() -> None:
-    scene = Subscribed()
-    await scene.flows()
-    await scene.ends()
-    scene.exports.closed(1, CloseRoute(7))
-    assert not scene.exports.flows
-    scene.out.outbound.close()
-
-
-@pytest.mark.parametrize(
-    ("type_name", "watched"),
-    [
-        ("move_base_msgs/MoveBaseActionGoal", True),
-        ("actionlib_msgs/GoalID", True),
-        ("actionlib_msgs/GoalStatusArray", False),
-        ("move_base_msgs/MoveBaseActionResult", False),
-        ("move_base_msgs/MoveBaseGoal", False),
-        ("other_msgs/GoalID", False),
-        ("*", False),
-    ],
-)
-def test_publishers_of_goals_and_cancellations_look_at_who_listens(type_name: str, watched: bool) -> None:
-    assert is_watched(type_name) is watched
-
-
 def test_nodes_are_named_once_in_order_and_nobody_else() -> None:
     caller_ids = ("/b", "/a", "/b", "/rmpa", "/rmpa/peer/node", "no name", "", "/line\nfeed", "/" + "x" * 2000)
     # What stands for other modules is named where we relay: nothing else of theirs listens to a proxy.
     assert audience(caller_ids) == ("/a", "/b", "/rmpa/peer/node")
     assert len(audience(f"/n{number}" for number in range(1000))) == limits.AUDIENCE_MAX
-
-
-def test_all_topics_of_an_action_compare_names() -> None:
-    of_actions = {
-        "actionlib/TestActionGoal",
-        "actionlib_msgs/GoalID",
-        "actionlib_msgs/GoalStatusArray",
-        "actionlib/TestActionFeedback",
-        "actionlib/TestActionResult",
-    }
-    assert all(compares_names(name) for name in of_actions)
-    assert not compares_names("std_msgs/String")
 
 
 # What a mismatch of definitions says here, and what the agent at the other end hears of it.

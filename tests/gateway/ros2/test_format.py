@@ -62,27 +62,15 @@ def test_data_of_a_topic_goes_by_its_name_type_and_hash_and_types_have_two_names
 @pytest.mark.parametrize(
     "key",
     [
-        "",
-        "@ros2_lv",
-        "@ros2_lv/0/ff/3/3/NN/%/%",
-        "ros2_lv/0/ff/3/3/NN/%/%/talker",
-        "@ros2_lv/0/ff/3/3/XX/%/%/talker",
-        "@ros2_lv/x/ff/3/3/NN/%/%/talker",
-        "@ros2_lv/-1/ff/3/3/NN/%/%/talker",
-        "@ros2_lv/²/ff/3/3/NN/%/%/talker",
-        "@ros2_lv/0/ff/99999999999999999999999/3/NN/%/%/talker",
-        "@ros2_lv/0/ff/3/3/NN/%/%/%",
-        "@ros2_lv/0/ff/3/3/NN/%/%/a%b",
-        "@ros2_lv/0/ff/3/3/NN//%/talker",
-        "@ros2_lv/0/*/3/3/NN/%/%/talker",
-        "@ros2_lv/0/ff/3/3/MP/%/%/talker",
-        CHATTER_TOKEN.replace("dds_", "other"),
-        CHATTER_TOKEN.replace("String_", "_"),
-        CHATTER_TOKEN.replace("::,10:,:,:,,", "::,ten:,:,:,,"),
-        CHATTER_TOKEN.replace("::,10:,:,:,,", "::"),
-        "@ros2_lv/0/ff/3/3/NN/%/%/" + "a" * limits.KEY_MAX,
+        "", "@ros2_lv", "@ros2_lv/0/ff/3/3/NN/%/%", "ros2_lv/0/ff/3/3/NN/%/%/talker",
+        "@ros2_lv/0/ff/3/3/XX/%/%/talker", "@ros2_lv/x/ff/3/3/NN/%/%/talker", "@ros2_lv/-1/ff/3/3/NN/%/%/talker",
+        "@ros2_lv/²/ff/3/3/NN/%/%/talker", "@ros2_lv/0/ff/99999999999999999999999/3/NN/%/%/talker",
+        "@ros2_lv/0/ff/3/3/NN/%/%/%", "@ros2_lv/0/ff/3/3/NN/%/%/a%b", "@ros2_lv/0/ff/3/3/NN//%/talker",
+        "@ros2_lv/0/*/3/3/NN/%/%/talker", "@ros2_lv/0/ff/3/3/MP/%/%/talker", CHATTER_TOKEN.replace("dds_", "other"),
+        CHATTER_TOKEN.replace("String_", "_"), CHATTER_TOKEN.replace("::,10:,:,:,,", "::,ten:,:,:,,"),
+        CHATTER_TOKEN.replace("::,10:,:,:,,", "::"), "@ros2_lv/0/ff/3/3/NN/%/%/" + "a" * limits.KEY_MAX,
     ],
-)
+)  # fmt: skip
 def test_what_is_no_token_is_refused(key: str) -> None:
     with pytest.raises(RemoteProtocolError):
         parse_token(key)
@@ -197,7 +185,7 @@ def test_what_is_not_of_this_graph_is_ignored_and_counted() -> None:
         before = graph.ignored[reason]
         assert graph.change(key, alive=True) is None
         assert graph.ignored[reason] == before + 1, key
-        assert graph.change(key, alive=False) is None
+        assert graph.change(key, alive=False) is None  # fmt: skip
     assert graph.change(publisher(zid="cd"), alive=True) is None
     assert graph.ignored.total() == 6, "this gateway's own tokens are nothing to tell of"
     assert graph.change(publisher(node="/rmpad/talker"), alive=True) is not None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
 
 import pytest
 
@@ -14,9 +14,6 @@ from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.definitions import known_types
 from rmpa.ros.types.installed import ServiceType, known_services
 from rmpa.ros.types.messages import MessageType
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 JAZZY = Ros2Types("jazzy")
 DIFFER = {
@@ -42,33 +39,6 @@ def test_the_ros1_form_of_ros2s_types_is_noetics_where_both_have_the_type() -> N
 
 def pairs(mapping: TypeMapping | None = None) -> Ros2Pairs:
     return Ros2Pairs(Ros2Types("jazzy"), mapping or TypeMapping(), MessageType)
-
-
-def test_a_type_that_only_ros2_has_can_be_subscribed_to_in_ros1() -> None:
-    made = pairs()
-    name = "geometry_msgs/msg/VelocityStamped"
-    conversion = made.incoming(name, JAZZY.type_hash(name))
-    assert conversion is not None
-    assert conversion.ros1.name == "geometry_msgs/VelocityStamped"
-    store = JAZZY.store
-    header = store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](3, 4), "map")
-    vector = store.types["geometry_msgs/msg/Vector3"]
-    twist = store.types["geometry_msgs/msg/Twist"](vector(1.0, 2.0, 3.0), vector(4.0, 5.0, 6.0))
-    raw = bytes(store.serialize_cdr(store.types[name](header, "body", "odom", twist), name))
-    got: Any = conversion.ros1.deserialize(conversion.to_ros1(raw))
-    assert (got.body_frame_id, got.header.seq, got.header.frame_id) == ("body", 0, "map")
-
-
-def test_a_learnt_type_makes_the_same_type_of_ros2_known() -> None:
-    made = pairs()
-    kind = MessageType.learn("arm_msgs/Grip", "float64 width\nstring[] fingers")
-    assert made.ros2_type("arm_msgs/Grip") is None
-    learnt = made.learn(kind)
-    assert made.ros2_type("arm_msgs/Grip") == learnt
-    conversion = made.incoming(*learnt)
-    assert conversion is not None
-    assert conversion.ros1 is kind
-    assert made.outgoing(kind) is made.outgoing(kind)
 
 
 def test_a_type_of_this_machine_makes_the_same_type_of_ros2_known() -> None:
@@ -218,26 +188,6 @@ def test_a_request_without_fields_has_the_five_bytes_of_ros2_and_a_response_its_
     kind = made.ros1.response
     cdr = made.response.to_ros2(kind.serialize(kind.make({"success": True, "message": "ok"})))
     assert cdr == b"\x00\x01\x00\x00" + b"\x01\x00\x00\x00" + b"\x03\x00\x00\x00ok\x00"
-
-
-def test_a_service_under_another_name_has_that_names_hash(jazzy: Ros2Types) -> None:
-    definition = "int64 a\nint64 b\n---\nint64 sum\n"
-    made = ServicePair(
-        ServiceType("robot_srvs/Add", definition), TypePair("example_interfaces/srv/AddTwoInts"), jazzy
-    )
-    assert made.type_hash == PUBLISHED["rospy_tutorials/AddTwoInts"]
-
-
-def test_a_rule_renames_the_fields_of_a_service(jazzy: Ros2Types) -> None:
-    ros1 = ServiceType("robot_srvs/Sum", "int64 left\nint64 right\n---\nint64 all\n")
-    pair("rospy_tutorials/AddTwoInts", jazzy)  # its type is known from here on
-    rule = TypePair(
-        "example_interfaces/srv/AddTwoInts", {"request": {"left": "a", "right": "b"}, "response": {"all": "sum"}}
-    )
-    made = ServicePair(ros1, rule, jazzy)
-    raw = made.request.to_ros2(ros1.request.serialize(ros1.request.make({"left": 5, "right": -6})))
-    read: Any = jazzy.store.deserialize_cdr(raw, "example_interfaces/srv/AddTwoInts_Request")
-    assert (read.a, read.b) == (5, -6)
 
 
 def test_a_rule_with_fields_of_an_unknown_type_is_refused_with_what_to_do(jazzy: Ros2Types) -> None:

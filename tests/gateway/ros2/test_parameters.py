@@ -103,16 +103,9 @@ async def test_a_program_that_may_not_call_and_a_node_without_parameters_are_tol
 @pytest.mark.parametrize(
     ("value", "present", "kind"),
     [
-        (None, 4, 0),
-        (1, 3, 3),
-        (1, 2, 2),
-        (True, 3, 1),
-        ([], 0, 9),
-        ([], 7, 7),
-        ([1], 5, 5),
-        ([1, 2.5], 0, 8),
+        (None, 4, 0), (1, 3, 3), (1, 2, 2), (True, 3, 1), ([], 0, 9), ([], 7, 7), ([1], 5, 5), ([1, 2.5], 0, 8),
         (["a"], 0, 9),
     ],
-)
+)  # fmt: skip
 def test_the_type_of_a_value(value: Any, present: int, kind: int) -> None:
     assert _kind(value, present) == kind

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from rmpa.gateway.ros2.half.branches import FoxyWaitSet, handle_of, look_at_events, make_wait_set
+from rmpa.gateway.ros2.half.branches import handle_of, look_at_events
 from rmpa.gateway.ros2.half.taker import Taker
 from rmpa.gateway.ros2.half.waits import GraphGuard, Waits
 
@@ -85,11 +85,8 @@ def test_a_wait_set_of_humble_waits_for_all_but_publishers(humble: Any) -> None:
     assert HumbleWaitSet.made == [(2, 2, 0, 1, 1, 0, "context")]
     for _ in range(2):
         assert [(each.kind, each.handle.pointer) for each in waits.wait(0.1)] == [
-            ("MS", 12),
-            ("MS", 14),
-            ("SC", 13),
-            ("SS", 11),
-        ]
+            ("MS", 12), ("MS", 14), ("SC", 13), ("SS", 11),
+        ]  # fmt: skip
     assert not waits.graph_changed
 
 
@@ -101,15 +98,11 @@ def test_a_wait_set_of_foxy_is_made_by_functions() -> None:
     waits = Waits(foxy, SimpleNamespace(handle=Capsule("context", 1)), endpoints[:1], wake, guard())
     assert waits.wait(0.5) == endpoints[:1]
     assert foxy.calls == [
-        ("get_zero_initialized_wait_set",),
-        ("wait_set_init", "wait set", 1, 2, 0, 0, 0, 0, "context"),
-        ("wait_set_clear_entities", "wait set"),
-        ("wait_set_add_entity", "subscription", "wait set", "MS 10"),
-        ("wait_set_add_entity", "guard_condition", "wait set", "wake"),
-        ("wait", "wait set", 500_000_000),
-        ("get_ready_entities", "guard_condition", "wait set"),
-        ("get_ready_entities", "subscription", "wait set"),
-    ]
+        ("get_zero_initialized_wait_set",), ("wait_set_init", "wait set", 1, 2, 0, 0, 0, 0, "context"),
+        ("wait_set_clear_entities", "wait set"), ("wait_set_add_entity", "subscription", "wait set", "MS 10"),
+        ("wait_set_add_entity", "guard_condition", "wait set", "wake"), ("wait", "wait set", 500_000_000),
+        ("get_ready_entities", "guard_condition", "wait set"), ("get_ready_entities", "subscription", "wait set"),
+    ]  # fmt: skip
 
 
 def test_handles_of_foxy_take_and_send_by_functions() -> None:
@@ -163,9 +156,3 @@ def test_events_of_foxy_have_its_wait_set() -> None:
     look_at_events(foxy, SimpleNamespace(handle=Capsule("context", 1)), [SimpleNamespace(event_handlers=[Handler()])])
     assert told == ["data"]
     assert foxy.calls[-1][0] in {"wait", "destroy_wait_set"}
-
-
-def test_the_class_of_wait_sets_decides(humble: Any) -> None:
-    context = SimpleNamespace(handle=Capsule("context", 1))
-    assert isinstance(make_wait_set(humble, (0,) * 6, context), HumbleWaitSet)
-    assert isinstance(make_wait_set(Foxy(), (0,) * 6, context), FoxyWaitSet)

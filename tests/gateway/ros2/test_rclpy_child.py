@@ -5,9 +5,9 @@ from __future__ import annotations
 import ast
 import asyncio
 import sys
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -16,22 +16,14 @@ from rmpa.gateway.ros2 import half
 from rmpa.gateway.ros2.format import (
     EntityKind,
     Ros2Attachment,
-    Ros2Durability,
     Ros2Endpoint,
-    Ros2Liveliness,
     Ros2Node,
     Ros2Qos,
-    Ros2Reliability,
-    qos_fields,
-    qos_of_fields,
 )
 from rmpa.gateway.ros2.graph import gid_of
 from rmpa.gateway.ros2.rclpy_session import RclpySession
 from rmpa.gateway.ros2.ros2 import pythons
 from rmpa.gateway.zenoh.threads import ZenohQos
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
 
 STAND_IN = """
 import json, os, socket, struct, sys
@@ -76,22 +68,6 @@ def test_it_is_of_the_grammar_of_python_3_8_and_imports_nothing_of_ours(file: Pa
     named = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
     named |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     assert not {name for name in named if name.startswith(("rmpa", "numpy", "msgspec"))}
-
-
-@pytest.mark.parametrize(
-    "qos",
-    [
-        Ros2Qos(),
-        Ros2Qos(Ros2Reliability.BEST_EFFORT, Ros2Durability.TRANSIENT_LOCAL, depth=3),
-        Ros2Qos(deadline=5, lifespan=6, lease=7, liveliness=Ros2Liveliness.MANUAL_BY_TOPIC),
-    ],
-)
-def test_a_qos_survives_the_pipe(qos: Ros2Qos) -> None:
-    assert qos_of_fields(qos_fields(qos)) == qos
-
-
-def test_a_qos_with_unknown_words_is_the_default() -> None:
-    assert qos_of_fields({"reliability": "PERHAPS", "depth": "many", "history": None}) == Ros2Qos()
 
 
 def test_the_python_is_the_chosen_one_or_each_of_the_path(tmp_path: Path) -> None:

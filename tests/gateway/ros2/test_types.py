@@ -6,7 +6,7 @@ import contextlib
 import struct
 import time
 import tracemalloc
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -24,9 +24,6 @@ from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.ros2.type_descriptions import respond, response
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 @pytest.fixture(scope="module")
 def jazzy() -> Ros2Types:
@@ -37,20 +34,6 @@ def test_humble_has_no_hash() -> None:
     humble = Ros2Types("humble")
     assert humble.type_hash("std_msgs/msg/String") == NO_HASH
     assert humble.service_hash(ServiceType("std_srvs/Trigger")) == NO_HASH
-
-
-def test_a_type_that_ros1_defines_has_the_hash_of_its_port(jazzy: Ros2Types) -> None:
-    """A type that rosbags knows, under another name, has the fields and so all but the name of the known one."""
-    kind = MessageType.learn("my_msgs/Odometry", MessageType("nav_msgs/Odometry").definition)
-    jazzy.learn(kind.specifications)
-    assert jazzy.store.fielddefs["my_msgs/msg/Odometry"] == jazzy.store.fielddefs["nav_msgs/msg/Odometry"]
-    assert jazzy.type_hash("my_msgs/msg/Odometry") != jazzy.type_hash("nav_msgs/msg/Odometry")
-
-
-def test_known_types_are_not_replaced_by_ros1s(jazzy: Ros2Types) -> None:
-    before = jazzy.type_hash("sensor_msgs/msg/Range")
-    jazzy.learn(MessageType("sensor_msgs/Range").specifications)
-    assert jazzy.type_hash("sensor_msgs/msg/Range") == before
 
 
 def test_names_and_an_unknown_distribution_is_refused_with_the_known_ones() -> None:
@@ -90,18 +73,6 @@ def test_a_request_is_cdr_of_two_strings_and_a_flag() -> None:
     assert type_request("a/msg/B", "RIHS01_x") == (
         b"\0\1\0\0" + b"\x08\0\0\0a/msg/B\0" + b"\x09\0\0\0RIHS01_x\0" + b"\0"
     )
-
-
-def test_a_described_type_has_the_hash_that_its_publisher_says() -> None:
-    types = theirs("float64[4] speed\nstring[] names\ntime when\nbool on\nbyte raw")
-    fields = parse_type_response(response(types, WHEELS))
-    pairs = Ros2Pairs(Ros2Types("jazzy"), TypeMapping(), MessageType)
-    pairs.described(WHEELS, types.type_hash(WHEELS), fields)
-    conversion = pairs.incoming(WHEELS, types.type_hash(WHEELS))
-    assert conversion is not None
-    assert [f"{field} {field.name}" for field in conversion.ros1.fields] == [
-        "float64[4] speed", "string[] names", "time when", "bool on", "byte raw",
-    ]  # fmt: skip
 
 
 def test_another_version_of_a_known_type_is_converted_by_its_own_fields() -> None:
@@ -308,7 +279,7 @@ def test_a_length_that_the_message_does_not_have_allocates_nothing(count: int) -
                     convert(head + struct.pack("<I", count) + bytes(8))
                 assert tracemalloc.get_traced_memory()[1] < 1_000_000
             finally:
-                tracemalloc.stop()
+                tracemalloc.stop()  # fmt: skip
 
 
 def test_no_name_of_a_type_gets_into_the_code_of_a_conversion(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -341,4 +312,4 @@ def test_a_mapping_file_is_data_and_its_errors_name_it(tmp_path: Path) -> None:
         file.write_text(text)
         with contextlib.suppress(RmpaError):
             TypeMapping().read(file)
-        assert not (tmp_path / "owned").exists()
+        assert not (tmp_path / "owned").exists()  # fmt: skip

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rmpa.gateway.ros2 import types as type_description
-
-if TYPE_CHECKING:
-    from rmpa.gateway.ros2.types import Ros2Field, Ros2Types
+from rmpa.gateway.ros2.types import Ros2Field, Ros2Types
 
 IDS = {name: number for number, name in type_description._BASES.items() if number not in (13, 21)}
 PACKAGE = "type_description_interfaces/msg/"

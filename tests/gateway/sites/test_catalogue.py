@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from rmpa.gateway import limits
 from rmpa.gateway.rules import SourceKind
-from rmpa.gateway.sites.catalogue import CatalogueChange, Leader, SiteCatalogue, SiteHistory
+from rmpa.gateway.sites.catalogue import CatalogueChange, Leader, SiteCatalogue
 from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource
 
 FOUND, RENEWED, GONE = CatalogueChange.FOUND, CatalogueChange.RENEWED, CatalogueChange.GONE
@@ -59,41 +59,6 @@ def test_a_module_that_is_killed_is_gone_within_a_fifth_of_a_second_with_its_sou
     catalogue.handle_timer(due)
     assert told(catalogue) == [(GONE, each) for each in (*also, gone)]
     assert catalogue.modules("cloud") == left
-
-
-@pytest.mark.parametrize("order", [EVERYTHING, EVERYTHING[::-1]])
-def test_another_gateway_that_takes_over_takes_nothing_down(
-    order: tuple[SiteGateway | SiteModule | SiteSource, ...],
-) -> None:
-    catalogue = with_everything()
-    for number, item in enumerate(order):
-        if item is not SECOND:
-            catalogue.token(item.token(), 10.0 + number / 1000, alive=False)
-    catalogue.handle_timer(10.0 + limits.LEADER_PATIENCE)
-    assert told(catalogue) == []
-    for back in (ARM, BASE, SCAN, STOP):
-        catalogue.token(back.token(), 10.0 + limits.LEADER_PATIENCE + 0.1, alive=True)
-    catalogue.handle_timer(20.0)
-    assert set(told(catalogue)) == {(RENEWED, item) for item in (ARM, BASE, SCAN, STOP)}
-
-
-def test_a_site_that_does_not_come_back_is_gone_after_the_grace() -> None:
-    catalogue = with_everything()
-    catalogue.all_tokens(10.0, alive=False)
-    catalogue.handle_timer(10.0 + limits.SITE_GRACE)
-    changes = told(catalogue)
-    assert {item for change, item in changes if change is GONE} == {ARM, BASE, SCAN, STOP}
-    assert changes.index((GONE, SCAN)) < changes.index((GONE, ARM))
-    assert (catalogue.sites, catalogue.next_timer()) == ((), None)
-
-
-def test_a_short_break_of_the_link_takes_nothing_down() -> None:
-    catalogue = with_everything()
-    catalogue.all_tokens(10.0, alive=False)
-    catalogue.all_tokens(10.4, alive=True)
-    catalogue.handle_timer(100.0)
-    assert GONE not in {change for change, _ in told(catalogue)}
-    assert catalogue.sources(ARM) == [SCAN]
 
 
 def test_tokens_of_this_site_are_not_another_sites_and_those_that_are_none_are_counted() -> None:
@@ -171,38 +136,6 @@ def test_events_say_what_the_tokens_say_in_any_order(changes: list[tuple[SiteSou
     assert catalogue.next_timer() is None
 
 
-def test_history() -> None:
-    now = 0.0
-    history = SiteHistory(lambda: now)
-    history.seen(["yard", "hall"])
-    now = 5.0
-    history.seen(["hall"])
-    now = 7.0
-    history.seen(["hall"])
-    assert history.away == ("yard",)
-    assert (history.since_ago("yard"), history.since_ago("hall"), history.since_ago("moon")) == (2.0, 7.0, None)
-
-
-def test_what_a_site_had_is_remembered_while_it_is_away() -> None:
-    now = 0.0
-    history = SiteHistory(lambda: now)
-    arm = SiteModule("yard", "arm", "0" * 32)
-    scan, old, last = (SiteSource(arm, SourceKind.TOPIC, "a/B", "/n", name) for name in ("/scan", "/old", "/last"))
-    for source in (scan, old, last):
-        history.source(source, there=True)
-    history.seen(["yard"])
-    assert history.had("/scan") == (), "it is there"
-    history.source(old, there=False)
-    now = 9.0
-    history.source(last, there=False)  # withdrawn by a gateway that ends
-    history.seen([])
-    assert [history.had(name) for name in ("/scan", "/last", "/old")] == [(("yard", "arm"),), (("yard", "arm"),), ()]
-    history.source(last, there=True)
-    history.seen(["yard"])
-    history.seen([])
-    assert [history.had(name) for name in ("/scan", "/last")] == [(), (("yard", "arm"),)]
-
-
 # --- Which gateway leads --------------------------------------------------------------------------------------------
 
 PATIENCE = 1.0
@@ -225,18 +158,6 @@ def test_the_lowest_rank_leads_and_of_equal_ones_the_lowest_instance() -> None:
         assert not leads(leader)
         assert leader.leader == other
         assert leader.next_timer() is None
-
-
-def test_the_next_one_takes_over_after_its_patience_and_other_sites_and_its_own_token_do_not_count() -> None:
-    leader = Leader(gateway(2), PATIENCE, 0.0)
-    leader.seen(gateway(1), 0.5)
-    leader.gone(gateway(1), 3.0)
-    for other in (gateway(1, 3, "elsewhere"), gateway(2)):
-        leader.seen(other, 3.1)
-    leader.handle_timer(3.9)
-    assert not leads(leader)
-    leader.handle_timer(4.0)
-    assert leads(leader)
 
 
 def test_of_gateways_that_hear_each_other_at_most_one_leads() -> None:

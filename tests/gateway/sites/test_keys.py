@@ -86,24 +86,16 @@ def test_what_a_later_version_announces_is_ignored(more: str) -> None:
 @pytest.mark.parametrize(
     "key",
     [
-        "",
-        "rmpa/1/home",
-        f"rmpa/2/home/arm/up/{RUN}",
-        f"rmpa/1/ho-me/arm/up/{RUN}",
-        f"rmpa/1/home/4rm/up/{RUN}",
-        f"rmpa/1/{'s' * 64}/arm/up/{RUN}",
-        f"rmpa/1/home/arm/up/{RUN[:-1]}",
-        f"rmpa/1/home/arm/up/{RUN.upper()}",
-        f"rmpa/1/home/-gateway/first/{RUN}",
-        f"rmpa/1/home/-gateway/1000/{RUN}",
-        f"rmpa/1/home/-gateway/²/{RUN}",
+        "", "rmpa/1/home", f"rmpa/2/home/arm/up/{RUN}", f"rmpa/1/ho-me/arm/up/{RUN}", f"rmpa/1/home/4rm/up/{RUN}",
+        f"rmpa/1/{'s' * 64}/arm/up/{RUN}", f"rmpa/1/home/arm/up/{RUN[:-1]}", f"rmpa/1/home/arm/up/{RUN.upper()}",
+        f"rmpa/1/home/-gateway/first/{RUN}", f"rmpa/1/home/-gateway/1000/{RUN}", f"rmpa/1/home/-gateway/²/{RUN}",
         f"rmpa/1/home/arm/up/{RUN}/t/std_msgs/%node/%topic",
         f"rmpa/1/home/arm/to/{RUN}/ya-rd/t/std_msgs%String/%node/%topic",
         f"rmpa/1/home/arm/up/{RUN}/t/std_msgs%String/node/%topic",
         f"rmpa/1/home/arm/up/{RUN}/t/std_msgs%String/%node/%to pic",
         f"rmpa/1/home/arm/up/{RUN}/t/std_msgs%String/%node/%{'a' * limits.KEY_MAX}",
     ],
-)
+)  # fmt: skip
 def test_what_is_no_token_is_refused(key: str) -> None:
     with pytest.raises(RemoteProtocolError):
         parse_token(key)
@@ -130,14 +122,11 @@ def test_golden_bytes() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "problem"),
     [
-        (b"\x01\x01\x07", b"\x02\x01\x07", "version 2"),
-        (b"/talker", b"talker/", "no global name"),
-        (b"/talker", b"/t\xff\xfeker", "not UTF-8"),
-        (b"\x02\x09", b"\x00\x09", "passed 0 sites"),
-        (b"\x02\x09", b"\xff\x09", "passed 255 sites"),
-        (b"cloud", b"cl-ud", "names the site"),
+        (b"\x01\x01\x07", b"\x02\x01\x07", "version 2"), (b"/talker", b"talker/", "no global name"),
+        (b"/talker", b"/t\xff\xfeker", "not UTF-8"), (b"\x02\x09", b"\x00\x09", "passed 0 sites"),
+        (b"\x02\x09", b"\xff\x09", "passed 255 sites"), (b"cloud", b"cl-ud", "names the site"),
     ],
-)
+)  # fmt: skip
 def test_what_ros_does_not_allow_is_refused(old: bytes, new: bytes, problem: str) -> None:
     with pytest.raises(RemoteProtocolError, match=problem):
         AttachmentReader().read(GOLDEN.replace(old, new, 1))

@@ -58,22 +58,6 @@ class Imports(SiteImports):
         super().__init__(CrossingRules(rules), lambda old, new: self.told.append((old, new)))
 
 
-def tokens(exports: SiteExports) -> set[str]:
-    return {each.token() for each in exports.modules} | {each.announced.token() for each in exports.entries}
-
-
-def test_a_module_is_announced_before_its_first_source_and_withdrawn_after_its_last() -> None:
-    exports = Exports()
-    one, two = mesh_source("/one"), mesh_source("/two")
-    for source in (one, two):
-        exports.changed(source, there=True)
-    for source in (one, two):
-        exports.changed(source, there=False)
-    told = [(isinstance(item, SiteExport), there) for item, there in exports.told]
-    assert told == [(False, True), (True, True), (True, True), (True, False), (True, False), (False, False)]
-    assert tokens(exports) == set()
-
-
 def test_what_stays_home_by_a_rule_or_a_name_that_no_key_can_hold_is_told() -> None:
     exports = Exports(CrossingRule(names=("/secret",), crossing=Crossing.IN))
     stay = {
@@ -124,47 +108,13 @@ def test_what_permissions_let_no_site_have_is_offered_to_none_and_the_rest_to_th
     exports.changed(mesh_source("/dock", kind=S, type_name="*"), there=True)
     exports.changed(mesh_source("/off", kind=S, type_name="*"), there=True)
     assert {(each.source.name, each.announced.to) for each in exports.entries} == {
-        ("/map", "yard"),
-        ("/all", "yard"),
-        ("/all", "hall"),
-        ("/open", ""),
-        ("/hall/plan", "hall"),
+        ("/map", "yard"), ("/all", "yard"), ("/all", "hall"), ("/open", ""), ("/hall/plan", "hall"),
         ("/dock", "yard"),
-    }
+    }  # fmt: skip
     assert {source.name: why for source, why in exports.refusals()} == {
         "/secret": "no [[permission]] lets yard subscribe to /secret",  # nor any other that is there
         "/off": "no [[permission]] lets any other site call /off",
     }
-
-
-def test_what_rules_let_out_to_some_sites_is_announced_to_each_of_them_alone() -> None:
-    rules = (
-        CrossingRule(sites=("yard*",), rate=2.0),
-        CrossingRule(sites=("hall",)),
-        CrossingRule(sites=("*",), crossing=Crossing.NONE),
-    )
-    exports = Exports(*rules)
-    exports.changed(mesh_source("/scan"), there=True)
-    assert exports.entries == []
-    assert "no site that may have it was here yet" in next(why for _, why in exports.refusals())
-    exports.sites_seen(["hall", "street", "yard1"])
-    exports.changed(mesh_source("/stop", kind=S, type_name="*"), there=True)
-    assert [(each.source.name, each.announced.to, each.rate) for each in exports.entries] == [
-        ("/scan", "hall", None),
-        ("/scan", "yard1", 2.0),
-        ("/stop", "hall", None),
-        ("/stop", "yard1", 2.0),
-    ]
-    assert [source.name for source, _ in exports.offered()] == ["/scan", "/stop"]
-    assert list(exports.refusals()) == []
-    exports.told.clear()
-    exports.sites_seen(["street"])
-    assert exports.told == [], "a site that is away for a while keeps what is addressed to it"
-    exports.sites_seen(["yard2"])
-    assert [item.announced.to for item, _ in exports.told if isinstance(item, SiteExport)] == ["yard2", "yard2"]
-    for source, _ in list(exports.offered()):
-        exports.changed(source, there=False)
-    assert tokens(exports) == set()
 
 
 def test_sites_that_were_away_for_long_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -175,21 +125,6 @@ def test_sites_that_were_away_for_long_are_forgotten(monkeypatch: pytest.MonkeyP
     for site in ("yard1", "yard2", "yard3"):
         exports.sites_seen([site])
     assert [each.announced.to for each in exports.entries] == ["yard3"]
-
-
-def test_another_run_of_a_module_replaces_its_tokens() -> None:
-    exports = Exports()
-    exports.changed(mesh_source("/one"), there=True)
-    before = tokens(exports)
-    exports.changed(replace(mesh_source("/one"), instance="f" * 32), there=True)
-    assert (len(tokens(exports)), before & tokens(exports)) == (2, set())
-
-
-def test_a_source_is_shown_under_the_name_of_the_rule() -> None:
-    imports = Imports(CrossingRule(name="/{site}{name}"))
-    imports.found(announced("/scan"))
-    source = ForeignSource(T, "cloud", "arm", "/node", "/cloud/scan", "std_msgs/String")
-    assert [(old, new and new.source) for old, new in imports.told] == [(None, source)]
 
 
 def test_of_two_types_under_one_name_the_first_is_shown_and_the_other_told() -> None:
@@ -203,25 +138,6 @@ def test_of_two_types_under_one_name_the_first_is_shown_and_the_other_told() -> 
     imports.gone(first)
     assert [entry.announced for entry in imports.entries] == [second]
     assert list(imports.refusals()) == []
-
-
-def test_a_source_of_this_site_goes_before_those_of_others() -> None:
-    imports = Imports()
-    imports.found(announced("/scan"))
-    own = mesh_source("/scan", type_name="std_msgs/Bool")
-    imports.own_changed(own, there=True)
-    assert imports.entries == []
-    assert "of this site" in next(why for _, why in imports.refusals())
-    imports.own_changed(own, there=False)
-    assert len(imports.entries) == 1
-
-
-def test_one_service_has_one_server() -> None:
-    imports = Imports()
-    for module in ("arm", "base"):
-        imports.found(announced("/stop", module, kind=S, type_name="std_srvs/Trigger"))
-    assert len(imports.entries) == 1
-    assert "already" in next(why for _, why in imports.refusals())
 
 
 def test_a_new_run_of_a_module_continues_its_sources() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator
 
 import pytest
 
@@ -18,9 +18,6 @@ from rmpa.gateway.zenoh.threads import ZenohQos
 from tests.gateway.memory_graph import MemoryGraph
 from tests.gateway.memory_zenoh import MemoryPublisher, MemoryZenoh, eventually
 from tests.gateway.sites.site_bed import MD5, SiteBed, described, site_bed, site_context
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
 
 
 @pytest.fixture

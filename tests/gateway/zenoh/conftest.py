@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator
 
 import pytest
 
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from rmpa.gateway.zenoh.session import OpenSession
-    from tests.gateway.zenoh_bed import ZenohBed
+from rmpa.gateway.zenoh.session import OpenSession
+from tests.gateway.zenoh_bed import ZenohBed
 
 
 @pytest.fixture

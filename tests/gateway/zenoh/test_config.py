@@ -6,8 +6,9 @@ import asyncio
 import json
 import socket
 import time
+from collections.abc import AsyncIterator, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -15,21 +16,14 @@ from rmpa.config.peer_rules import Effect, PermissionRule
 from rmpa.config.rules import GatewaySettings
 from rmpa.config.settings import Settings
 from rmpa.core.errors import StartError
-from rmpa.gateway import limits
 from rmpa.gateway.zenoh import config as trust
-from rmpa.gateway.zenoh.config import MeshCertificates, SocketTuning, gateway_config, zenohd_config, zenohd_entries
+from rmpa.gateway.zenoh.config import MeshCertificates, SocketTuning, gateway_config, zenohd_config
+from rmpa.gateway.zenoh.queries import ArrivedQuery
 from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.trust.certificates import DenyList
 from tests.gateway.memory_zenoh import eventually
 from tests.gateway.zenoh_fleet import Fleet
 from tests.trust.io.member_files import SecuredMesh
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
-    from pathlib import Path
-
-    from rmpa.gateway.zenoh.queries import ArrivedQuery
-    from tests.gateway.zenoh_bed import ZenohBed
 
 FILES = MeshCertificates("ca.crt", "module.crt", "module.key")
 
@@ -95,16 +89,6 @@ def test_insecure_lets_everything_connect() -> None:
     assert "transport/link/tls" not in gateway_config(settings, None).entries()
 
 
-def test_the_file_for_zenohd_has_the_same_entries_nested() -> None:
-    config = gateway_config(GatewaySettings(listen=("tls/0.0.0.0:7447",)), FILES)
-    nested = zenohd_entries(config)
-    assert nested["mode"] == "router"
-    transport = nested["transport"]
-    assert isinstance(transport, dict)
-    assert transport["link"]["tls"]["listen_certificate"] == "module.crt"
-    assert transport["link"]["tx"]["lease"] == round(limits.LEASE * 1000)
-
-
 UNSENT = 20_000
 
 
@@ -135,12 +119,6 @@ def test_other_endpoints_leave_it_alone(ends: tuple[socket.socket, socket.socket
     before = unsent(ours)
     assert SocketTuning(UNSENT).look([odd.format(endpoint.rpartition(":")[2])]) == 0
     assert unsent(ours) == before
-
-
-async def test_each_connection_of_a_session_is_found(net: ZenohBed) -> None:
-    session = await net.session()
-    await eventually(lambda: session.endpoints)
-    assert SocketTuning(UNSENT).look(session.endpoints) == 1
 
 
 zenoh = pytest.importorskip("zenoh")

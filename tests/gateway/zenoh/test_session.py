@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import pytest
 
 from rmpa.core.errors import StartError
 from rmpa.gateway.zenoh.config import ZenohConfig
+from rmpa.gateway.zenoh.queries import ArrivedQuery
 from rmpa.gateway.zenoh.session import OpenSession, open_session
-from rmpa.gateway.zenoh.threads import QueuedPublisher, ZenohPriority, ZenohQos
+from rmpa.gateway.zenoh.threads import QueuedPublisher, ZenohPriority, ZenohQos, ZenohSample
 from tests.gateway.memory_zenoh import eventually
 from tests.gateway.zenoh_bed import ZenohBed, free_port
-
-if TYPE_CHECKING:
-    from rmpa.gateway.zenoh.queries import ArrivedQuery
-    from rmpa.gateway.zenoh.threads import ZenohSample
 
 pytest.importorskip("zenoh")
 
@@ -57,17 +52,6 @@ async def test_a_burst_arrives_whole_and_in_order_with_key_and_attachment_also_f
     publisher.close()
     await eventually(lambda: len(got) == 1500)
     assert publisher.put(b"late") == 1
-
-
-async def test_matching_tells_when_subscribers_come_and_go_and_begins_with_what_is(pair: Pair) -> None:
-    sender, receiver = pair
-    matching: list[bool] = []
-    sender.publisher("t/x", ZenohQos(cache=1), matching.append)
-    await eventually(lambda: matching == [False])
-    subscription = receiver.subscribe("t/**", lambda _: None)
-    await eventually(lambda: matching == [False, True])
-    subscription.close()
-    await eventually(lambda: matching == [False, True, False])
 
 
 async def test_a_late_subscriber_gets_what_the_cache_keeps_and_an_early_one_gets_it_once(pair: Pair) -> None:
@@ -130,37 +114,6 @@ async def test_queries_are_answered_refused_left_without_an_answer_and_not_asked
     assert await client.get("elsewhere") == []
     assert await client.get("s/y", b"hang", timeout=0.3) == []
     kept.pop().finish()  # it came, and ended by its time-out
-
-
-async def test_all_complete_asks_each_server(net: ZenohBed) -> None:
-    servers = [await net.session(), await net.session()]
-    client = await net.session()
-
-    def serve(number: int) -> None:
-        def answer(query: ArrivedQuery) -> None:
-            query.reply("s", b"%d" % number)
-            query.finish()
-
-        servers[number].queryable("s", answer)
-
-    for number in range(2):
-        serve(number)
-    await ready(client, *servers)
-    assert len(await client.get("s")) == 1
-    assert {r.payload for r in await client.get("s", all_complete=True)} == {b"0", b"1"}
-
-
-async def test_nothing_is_called_after_close(pair: Pair) -> None:
-    sender, receiver = pair
-    got: list[bytes] = []
-    other: list[bytes] = []
-    closed = receiver.subscribe("t/x", lambda sample: got.append(sample.payload))
-    receiver.subscribe("t/x", lambda sample: other.append(sample.payload))
-    publisher = await matched(sender)
-    closed.close()
-    publisher.put(b"x")
-    await eventually(lambda: other)
-    assert got == []
 
 
 async def test_a_session_that_cannot_be_opened_says_where_why_and_what_to_do(net: ZenohBed) -> None:

@@ -7,9 +7,9 @@ import socket
 import ssl
 import tempfile
 import time
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rmpa.runtime.loop import SystemClock
 from rmpa.trust.certificates import sign
@@ -19,10 +19,6 @@ from rmpa.trust.store import CERTIFICATE, KEY, MemberFiles, TrustStore
 from tests.mesh.io.meshes import Peer, introduce
 from tests.trust.authority import Authority, new_key
 from tests.trust.io.member_files import KEYS, pem_of
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
 
 _FOLDERS = tempfile.TemporaryDirectory(prefix="rmpa-test-")
 """Removed when the process ends: the garbage collector may run in an event loop, which may not block."""

@@ -8,12 +8,12 @@ import errno
 import fcntl
 import gc
 import socket
-import struct
 import sys
 import weakref
+from collections.abc import Iterator
 from dataclasses import replace
 from ipaddress import IPv4Address
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 
 import pytest
 
@@ -33,16 +33,11 @@ from rmpa.mesh.io.dial import (
     may_use_bbr,
     repeats_quickly,
 )
-from rmpa.mesh.io.link import PeerLink
+from rmpa.mesh.io.link import Connection, PeerLink
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import DESCRIPTORS
-from tests.mesh.io.meshes import DEADLINE, Peer, linked_pair, peers, raw, until
+from tests.mesh.io.meshes import Peer, linked_pair, peers, raw, until
 from tests.runtime.descriptors_left import descriptors_left
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from rmpa.mesh.io.link import Connection
 
 _SIOCOUTQNSD = 0x894B  # linux/sockios.h: bytes that were not sent yet
 
@@ -74,86 +69,6 @@ async def test_of_several_addresses_whichever_answers_is_used(monkeypatch: pytes
         await stranger.wait_closed()
         await one.mesh.close()
         await other.mesh.close()
-
-
-async def test_link_that_ends_during_its_redial_leaks_no_socket(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """The race of addresses ends after the silent link and its socket were closed."""
-    async with linked_pair(lanes=False) as (one, other):
-        link = one.link(other)
-        racing, ended = asyncio.Event(), asyncio.Event()
-        sockets: list[socket.socket] = []
-        redial = one.mesh.dialler.dial
-
-        async def late(*args: Any, **options: Any) -> tuple[socket.socket, tuple[str, int]]:
-            racing.set()
-            await ended.wait()
-            sock, endpoint = await redial(*args, **options)
-            sockets.append(sock)
-            return sock, endpoint
-
-        with monkeypatch.context() as patched:
-            patched.setattr(one.mesh.dialler, "dial", late)
-            patched.setattr(PeerLink, "alive", False)
-            one.mesh.redial(link)
-            task = link.redial
-            assert task is not None
-            await racing.wait()
-        link.abort("the cable is out")
-        await until(lambda: bool(one.downs) and link.connection.sock.fileno() < 0, "its end")
-        ended.set()
-        async with asyncio.timeout(DEADLINE):
-            await asyncio.wait([task])
-        assert task.exception() is None
-        assert [sock.fileno() for sock in sockets] == [-1]
-        assert not any("failed" in record.message for record in caplog.records)
-        await until(lambda: one.linked(other) and other.linked(one), "the peers' machine dials again")
-
-
-async def test_link_that_ends_during_a_bulk_dial_leaks_no_socket(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    async with peers(2, found=False) as made:
-        one, other = sorted(made, key=lambda peer: peer.identity.guid)
-        connected, ended = asyncio.Event(), asyncio.Event()
-        sockets: list[socket.socket] = []
-        connect = one.mesh.dialler.connect
-
-        async def late(endpoint: tuple[str, int], lane: Lane, within: float = 2.0) -> socket.socket:
-            sock = await connect(endpoint, lane, within)
-            if lane is Lane.BULK and not sockets:
-                sockets.append(sock)
-                connected.set()
-                await ended.wait()
-            return sock
-
-        monkeypatch.setattr(one.mesh.dialler, "connect", late)
-        one.mesh.peer_found(other.identity)
-        await until(lambda: one.linked(other), "a link")
-        one.link(other).bulk._on_wanted()
-        await connected.wait()
-        one.link(other).abort("the cable is out")
-        await until(lambda: bool(one.downs), "its end")
-        ended.set()
-        await until(lambda: sockets[0].fileno() < 0, "the late socket is closed")
-        assert sockets[0] not in [each.sock for each in one.mesh.connections()], "nobody waits for it"
-        await until(lambda: one.both_lanes(other) and other.both_lanes(one), "the next link has both lanes")
-
-
-async def test_a_dial_that_fails_of_a_bug_is_logged(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    async with peers(2, found=False) as made:
-        one, other = sorted(made, key=lambda peer: peer.identity.guid)
-
-        async def fails(*_: object, **__: object) -> tuple[socket.socket, tuple[str, int]]:
-            raise KeyError("as asked")
-
-        monkeypatch.setattr(one.mesh.dialler, "dial", fails)
-        one.mesh.peer_found(other.identity)
-        await until(lambda: any(r.exc_info for r in caplog.records), "a line in the log")
-        assert not one.mesh._tasks
 
 
 async def test_a_restarted_peer_has_the_link_at_rest_of_its_former_run_checked() -> None:
@@ -266,21 +181,6 @@ def test_without_bbr_the_window_follows_the_rate() -> None:
         assert BULK_WINDOW_MIN <= bound <= BULK_WINDOW_MAX
 
 
-async def test_a_bye_says_why() -> None:
-    async with peers(2) as (one, other):
-        # A bulk lane that is still being dialled would be refused behind the bye, and counted.
-        await until(lambda: one.both_lanes(other) and other.both_lanes(one), "both lanes")
-        one.mesh.peer_gone(other.identity.guid)
-        other.mesh.peer_gone(one.identity.guid)
-        assert one.linked(other)
-        one.link(other).close("maintenance")
-        await until(lambda: bool(one.downs) and bool(other.downs), "both down")
-        assert one.downs[0][1] == "maintenance"
-        assert other.downs[0][1] == "peer0 left: maintenance"
-        assert not one.mesh.peers()
-        assert one.mesh.counters.as_dict() == {"link.down": 1}
-
-
 async def test_what_waits_for_a_link_that_ends_is_counted() -> None:
     async with linked_pair(lanes=False) as (one, other):
         lane = one.link(other).express
@@ -368,16 +268,6 @@ async def test_a_killed_agent_is_a_crash() -> None:
         assert how(other)[0] is False, "it gave up the link itself"
 
 
-async def test_a_reset_is_a_crash_with_bytes_unread() -> None:
-    async with peers(1) as (one,):
-        sock, _ = await raw(one, STRANGER, lease=60.0)
-        await until(lambda: bool(one.ups), "a link")
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        sock.close()
-        await until(lambda: bool(one.downs), "reset")
-        assert how(one) == (True, True)
-
-
 async def test_a_peer_that_breaks_the_protocol_has_not_crashed() -> None:
     async with peers(1) as (one,):
         sock, _ = await raw(one, STRANGER, lease=60.0)
@@ -385,37 +275,6 @@ async def test_a_peer_that_breaks_the_protocol_has_not_crashed() -> None:
         await asyncio.get_running_loop().sock_sendall(sock, b"\xff" * 64)
         await until(lambda: bool(one.downs), "closed")
         assert how(one) == (False, False)
-
-
-async def test_the_end_of_the_bulk_lane_is_not_that_of_the_link() -> None:
-    async with linked_pair() as (one, other):
-        bulk = one.link(other).bulk_connection
-        assert bulk is not None
-        bulk.lost("a test")
-        await until(lambda: bool(other.lanes_lost), "lost")
-        await until(lambda: one.both_lanes(other) and other.both_lanes(one), "a new one")
-        assert (one.downs, other.downs) == ([], [])
-        assert not one.link(other).crashed
-
-
-@pytest.mark.parametrize(
-    ("number", "crashed"),
-    [
-        (errno.ECONNRESET, True),
-        (errno.EPIPE, True),
-        (errno.ETIMEDOUT, False),
-        (errno.EHOSTUNREACH, False),
-        (errno.ENETUNREACH, False),
-        (errno.ENETDOWN, False),
-        (errno.ECONNABORTED, False),
-    ],
-)
-async def test_each_error_of_a_socket_says_whether_the_host_is_still_there(number: int, *, crashed: bool) -> None:
-    async with linked_pair() as (one, other):
-        connection = one.link(other).connection
-        connection._lost(OSError(number, "made up"))
-        await until(lambda: bool(one.downs), "down")
-        assert how(one)[0] is crashed
 
 
 @pytest.mark.parametrize(("instance", "silent"), [(b"s", True), (b"t", False)])

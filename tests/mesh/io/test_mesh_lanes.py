@@ -5,23 +5,18 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import socket
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import pytest
 
 from rmpa.config.settings import LaneSettings
 from rmpa.core.identity import Guid, Identity
-from rmpa.core.outbox import FIRST, LAST
-from rmpa.mesh.frames import Frame, FrameKind, Lane, pack_data_header, unpack_header
+from rmpa.mesh.frames import Frame, FrameKind, Lane, pack_data_header
 from rmpa.mesh.io.dial import BULK_UNSENT_BYTES, EXPRESS_UNSENT_BYTES, LINK_UNACKED
+from rmpa.mesh.io.lane import LaneSender
+from rmpa.mesh.io.link import Connection, PeerLink
 from tests.mesh.io.meshes import DEADLINE, Peer, linked_pair, peers, raw, until
-
-if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
-
-    from rmpa.mesh.io.lane import LaneSender
-    from rmpa.mesh.io.link import Connection, PeerLink
 
 HAND_MADE = Identity(Guid.of("127.0.0.1", 9), b"h" * 16, "hand_made")
 
@@ -67,17 +62,6 @@ async def test_the_sockets_of_both_lanes_have_their_options(
             assert not peer.mesh.counters["link.option_refused"]
 
 
-async def test_failed_dial_of_a_bulk_lane_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with peers(2, found=False) as made:
-        one, other = sorted(made, key=lambda peer: peer.identity.guid)
-        hold_bulk(one, fails=3)
-        one.mesh.peer_found(other.identity)
-        await until(lambda: one.both_lanes(other) and other.both_lanes(one), "both lanes after all")
-        assert one.mesh.counters["link.bulk_failed"] == 3
-        assert len(one.ups) == 1
-        assert not one.lanes_lost
-
-
 def hold_bulk(peer: Peer, *, fails: int = 0, until_set: asyncio.Event | None = None) -> None:
     """Let dials of bulk lanes fail, or wait."""
     real: Callable[..., Awaitable[socket.socket]] = peer.mesh.dialler.connect
@@ -110,21 +94,6 @@ async def test_each_route_has_its_own_bound_and_drops_its_own() -> None:
         assert other.messages(9) == [(0, b"other")]
         assert one.link(other).info().dropped == 3
         assert [link.info().dropped for link in one.mesh.links()] == [3]
-
-
-async def test_closed_route_drops_what_waits() -> None:
-    async with linked_pair() as (one, other):
-        link = one.link(other)
-        link.bulk.send(7, 0, 0, bytes(32 << 20))
-        for number in range(5):
-            link.bulk.send(8, number, 0, b"x")
-        assert link.close_route(8) == 5
-        assert link.close_route(8) == 0
-        assert link.close_route(7) == 1
-        link.bulk.send(9, 1, 0, b"next")
-        await until(lambda: bool(other.messages(9)), "what came behind")
-        assert other.data == [(9, 1, 0, b"next")]
-        assert link.queue_bytes < 1 << 20
 
 
 # --- the bulk lane falls alone ------------------------------------------------------------------------------------
@@ -184,6 +153,9 @@ async def test_rest_of_a_torn_message_is_not_sent() -> None:
         assert len(one.lanes_lost) == len(other.lanes_lost) == 1, "nor did its pieces disturb the new one"
 
 
+# --- fences -------------------------------------------------------------------------------------------------------
+
+
 async def test_both_lanes_end_with_the_link() -> None:
     async with linked_pair() as (one, other):
         link = one.link(other)
@@ -197,68 +169,6 @@ async def test_both_lanes_end_with_the_link() -> None:
         assert link.bulk.ended
         assert link.bulk.send(1, 1, 0, b"x") == link.express.send(1, 1, 0, b"x") == 0
         assert link.bulk.outbox.waiting(1) == 0
-
-
-# --- a bulk lane in place of another ------------------------------------------------------------------------------
-
-
-async def test_new_bulk_lane_replaces_a_stuck_one() -> None:
-    """The peer gave its connection up without this side noticing: perhaps a router forgot it."""
-    async with peers(1) as (one,):
-        express, _ = await raw(one, HAND_MADE, lease=60.0)
-        stuck, answer = await raw(one, HAND_MADE, lease=60.0, lane=Lane.BULK)
-        assert answer.kind is FrameKind.WELCOME
-        await until(lambda: bool(one.ups) and one.ups[0].bulk_connection is not None, "both lanes")
-        link = one.ups[0]
-        old = bulk_of(link)
-        for route in range(7, 11):
-            link.bulk.send(route, 1, 0, large(route, 3_000_000))
-            link.bulk.send(route, 2, 0, large(route, 100_000))
-        assert link.queue_bytes > 6_000_000
-        fresh, answer = await raw(one, HAND_MADE, lease=60.0, lane=Lane.BULK)
-        assert answer.kind is FrameKind.WELCOME
-        await until(lambda: link.bulk_connection not in (None, old), "replaced")
-        assert one.lanes_lost == [link]
-        got = await read_messages(fresh, lambda found: {(route, 2) for route in range(7, 11)} <= set(found))
-        for (route, number), payload in got.items():
-            assert payload == large(route, 100_000 if number == 2 else 3_000_000)
-        await until(lambda: len(one.mesh.connections()) == 2, "the old one is closed")
-        assert link.connection.up
-        assert not one.downs
-        for sock in (express, stuck, fresh):
-            sock.close()
-        await until(lambda: not one.mesh.connections(), "closed")
-
-
-async def read_messages(
-    sock: socket.socket, enough: Callable[[dict[tuple[int, int], bytes]], bool]
-) -> dict[tuple[int, int], bytes]:
-    """Whole messages by route and number, of a lane on which nothing but data and keepalives may come."""
-    loop = asyncio.get_running_loop()
-    found: dict[tuple[int, int], bytes] = {}
-    begun: dict[int, bytes] = {}
-    kept = b""
-    async with asyncio.timeout(DEADLINE):
-        while not enough(found):
-            chunk = await loop.sock_recv(sock, 1 << 20)
-            assert chunk, "the new connection is closed"
-            kept += chunk
-            while len(kept) >= 24:
-                length, kind, flags, _, route, number, _ = unpack_header(kept, 0)
-                assert kind in (FrameKind.DATA, FrameKind.PING, FrameKind.PONG), FrameKind(kind).name
-                if len(kept) < 24 + length:
-                    break
-                part, kept = kept[24 : 24 + length], kept[24 + length :]
-                if kind != FrameKind.DATA:
-                    continue
-                assert bool(flags & FIRST) == (route not in begun)
-                begun[route] = begun.get(route, b"") + part
-                if flags & LAST:
-                    found[route, number] = begun.pop(route)
-    return found
-
-
-# --- fences -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("way", ["express", "bulk"])
@@ -339,23 +249,6 @@ async def test_acknowledgements_overtake_data() -> None:
 
 
 # --- a lane on demand ---------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("dialler", [True, False])
-async def test_first_message_for_the_lane_dials_it_from_either_side(*, dialler: bool) -> None:
-    async with peers(2) as made:
-        one, other = sorted(made, key=lambda peer: peer.identity.guid, reverse=not dialler)
-        await until(lambda: one.linked(other) and other.linked(one), "a link")
-        link = one.link(other)
-        assert link.bulk_connection is None
-        sent = [(7, number, 0, large(number, 200_000)) for number in range(2)]
-        for message in sent:
-            link.bulk.send(*message)
-        await until(lambda: len(other.data) == len(sent), "they come over the new lane")
-        assert bulk_of(link).dialled is dialler
-        assert other.data == sent
-        assert not one.lanes_lost
-        assert not other.lanes_lost
 
 
 async def test_what_a_peer_asks_waits_after_a_stop_until_the_link_is_proven() -> None:

@@ -9,9 +9,10 @@ import socket
 import ssl
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import pytest
+
+from rmpa.mesh.peering import Peer as KnownPeer
 
 pytest.importorskip("cryptography")
 
@@ -30,9 +31,6 @@ from rmpa.trust.store import ALPN_LINK, join_context
 from tests.mesh.io.members import Member, meshes
 from tests.mesh.io.meshes import DEADLINE, Peer, introduce, until
 from tests.trust.authority import Authority
-
-if TYPE_CHECKING:
-    from rmpa.mesh.peering import Peer as KnownPeer
 
 DAY = 86_400.0
 

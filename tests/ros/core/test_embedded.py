@@ -13,7 +13,6 @@ from rmpa.ros.core import liveness
 from rmpa.ros.core import liveness as identify
 from rmpa.ros.core.embedded import AGGREGATED, LOG, RosCore
 from rmpa.ros.http.rpc import call, call_api
-from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription
@@ -61,37 +60,6 @@ async def test_a_port_in_use(core: RosCore) -> None:
         await RosCore(port=core.port).start()
 
 
-async def test_changes_are_reported_before_the_reply_leaves(core: RosCore) -> None:
-    seen: list[GraphChange] = []
-    core.on_change(seen.append)
-    await call(core.uri, "registerPublisher", "/p", "/t", STRING, "http://127.0.0.1:1/")
-    assert seen == [GraphChange(RegistrationKind.PUBLISHER, True, "/t", "/p", "http://127.0.0.1:1/", STRING)]
-    assert core.state().publishers == {"/t": {"/p": "http://127.0.0.1:1/"}}
-
-
-async def test_failing_or_registering_listener_does_no_harm(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
-    async with Slave() as slave:
-        core.call("registerSubscriber", "/s", "/t", STRING, slave.uri)
-
-        def fails(_change: GraphChange) -> None:
-            raise KeyError("as asked")
-
-        def joins(change: GraphChange) -> None:
-            if change.node == "/p":
-                core.call("registerPublisher", "/proxy", "/t", STRING, "http://127.0.0.1:2/")
-
-        core.on_change(fails)
-        core.on_change(joins)
-        core.call("registerPublisher", "/p", "/t", STRING, "http://127.0.0.1:1/")
-        await until(lambda: bool(slave.calls))
-        # The last list that a subscriber hears is the one with both.
-        assert slave.calls[-1] == (
-            "publisherUpdate",
-            ["/master", "/t", ["http://127.0.0.1:1/", "http://127.0.0.1:2/"]],
-        )
-    assert "a listener failed" in caplog.text
-
-
 @pytest.mark.trap(31)
 async def test_notifications_never_wait_in_the_reply_and_one_goes_at_a_time(core: RosCore) -> None:
     """A node that holds its lock while it registers would wait for itself."""
@@ -120,17 +88,6 @@ async def test_silent_node_is_notified_again(core: RosCore, monkeypatch: pytest.
         slave.go.set()
         await until(lambda: core.counters["notify.sent"] == 1)
         await until(lambda: waiting(core) == 0)
-
-
-async def test_parameter_updates_are_in_order(core: RosCore) -> None:
-    async with Slave() as slave:
-        slave.go.clear()
-        core.call("subscribeParam", "/s", slave.uri, "/p")
-        for number in range(20):
-            core.call("setParam", "/x", "/p", number)
-        slave.go.set()
-        await until(lambda: len(slave.calls) == 20)
-        assert [params[2] for _, params in slave.calls] == list(range(20))
 
 
 async def test_what_waits_for_a_slow_node_is_bounded(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,21 +144,6 @@ async def test_node_without_get_name_is_identified_by_its_header(monkeypatch: py
     await node.close()
 
 
-async def test_a_dead_node_is_purged_when_suspected(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rmpa.ros.core.liveness.NODE_RECHECK_DELAY", 0.01)
-    async with Slave() as subscriber:
-        async with Slave() as dead:
-            core.call("registerPublisher", "/dead", "/t", STRING, dead.uri)
-        core.call("registerSubscriber", "/s", "/t", STRING, subscriber.uri)
-        core.suspect("/dead")
-        core.suspect("/dead")
-        core.suspect("/nobody")
-        await until(lambda: bool(subscriber.calls))
-        assert subscriber.calls == [("publisherUpdate", ["/master", "/t", []])]
-        assert core.state().nodes == {"/s": subscriber.uri}
-        assert core.counters["node.dead"] == 1
-
-
 def lists_of(slave: Slave) -> list[XmlRpcValue]:
     """The lists of publishers that a slave was told."""
     return [publishers for _, publishers in slave.updates]
@@ -222,37 +164,12 @@ async def test_a_publisher_that_is_soon_back_is_told_twice(core: RosCore, monkey
         await until(lambda: lists_of(subscriber) == [[uri], [], [uri], [uri]])
 
 
-async def test_a_publisher_that_is_back_later_is_told_once(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rmpa.ros.core.embedded.PUBLISHERS_AGAIN", 0.0)
-    monkeypatch.setattr("rmpa.ros.core.embedded.WITHDRAWN_LATELY", -1.0)
-    uri = "http://127.0.0.1:1/"
-    async with Slave() as subscriber:
-        core.call("registerSubscriber", "/s", "/t", STRING, subscriber.uri)
-        for method in ("registerPublisher", "unregisterPublisher", "registerPublisher"):
-            params = (STRING, uri) if method == "registerPublisher" else (uri,)
-            core.call(method, "/p", "/t", *params)
-        core.call("registerPublisher", "/q", "/u", STRING, uri)
-        core.call("registerSubscriber", "/s", "/u", STRING, subscriber.uri)
-        core.call("registerPublisher", "/r", "/u", STRING, "http://127.0.0.1:2/")
-        await until(lambda: len(subscriber.calls) == 2)
-        assert lists_of(subscriber)[0] == [uri]
-        assert core._returned._timer is None
-
-
 async def test_withdrawn_publishers_are_forgotten(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rmpa.ros.core.embedded.WITHDRAWN_KEPT", 10)
     for number in range(100):
         core.call("registerPublisher", "/p", f"/t{number}", STRING, "http://127.0.0.1:1/")
         core.call("unregisterPublisher", "/p", f"/t{number}", "http://127.0.0.1:1/")
     assert len(core._returned._withdrawn) == 10
-
-
-async def test_a_live_node_survives_suspicion(core: RosCore) -> None:
-    async with Slave() as alive:
-        core.call("registerPublisher", "/alive", "/t", STRING, alive.uri)
-        core.suspect("/alive")
-        await until(lambda: not core.liveness._checks)
-        assert core.state().nodes == {"/alive": alive.uri}
 
 
 async def test_a_node_that_came_back_meanwhile_is_not_purged(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:

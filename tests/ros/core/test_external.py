@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import errno
 import socket
-import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any, Final
@@ -230,31 +229,6 @@ async def test_dead_node_is_hidden_and_shown_again_if_alive(monkeypatch: pytest.
             await until(lambda: core.publishers("/t"))
 
 
-async def test_the_end_waits_for_a_look_under_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thread cannot be cancelled, and the look has a socket open."""
-    began, go = threading.Event(), threading.Event()
-    seen: list[socket.socket] = []
-
-    def look() -> set[int]:
-        with socket.socket() as sock:
-            seen.append(sock)
-            began.set()
-            assert go.wait(20.0)
-        return set()
-
-    monkeypatch.setattr(liveness, "ask_listening_ports", look)
-    looking = Liveness(nodes=dict, on_dead=lambda _node, _api: None)
-    looking.start()
-    assert await asyncio.to_thread(began.wait, 20.0)
-    closing = asyncio.ensure_future(looking.close())
-    await asyncio.sleep(0)
-    await asyncio.sleep(0)
-    assert not closing.done()
-    go.set()
-    await closing
-    assert seen[0].fileno() < 0
-
-
 AT = "http://10.9.9.9:1234/"
 
 
@@ -282,16 +256,6 @@ async def test_why_a_node_cannot_be_reached(
     monkeypatch.setattr(liveness, "connect", connect)
     assert await liveness.try_connect("http://10.9.9.9:1234/") == text
     assert not await liveness.refuses("http://10.9.9.9:1234/")
-
-
-async def test_an_address_that_is_none_cannot_be_reached() -> None:
-    assert "a ROS URI looks like" in await liveness.try_connect("http://nowhere/")
-
-
-async def test_a_refusal_is_no_outage() -> None:
-    with pytest.raises(ConnectionRefusedError):
-        await liveness.try_connect("http://127.0.0.1:9/")
-    assert await liveness.refuses("http://127.0.0.1:9/")
 
 
 class Bed:

@@ -23,7 +23,7 @@ from rmpa.core.errors import StartError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.core import state
 from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.core.state import CORE_STATE_GATHER, CORE_STATE_SHARE, StoredState, parse, serialize
+from rmpa.ros.core.state import StoredState, parse, serialize
 from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import NodeRecord
@@ -84,21 +84,6 @@ async def test_running_nodes_are_restored_and_notified(path: Path) -> None:
             assert hearer.updates[-1] == ("/chatter", [talker.uri])
             assert "2 of 2 nodes of the last run are restored" in core.restored()
             assert str(path) in core.restored()
-
-
-async def test_who_is_gone_or_has_another_name_is_not_shown(path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    async with Slave("/moved") as moved:
-        async with Slave("/dead") as dead, running(path) as core:
-            await moved.publish(core, "/a")
-            await dead.publish(core, "/b")
-        moved.name = "/stranger"
-        caplog.set_level("INFO")
-        async with running(path) as core:
-            assert core.state().publishers == {}
-            assert core.restored().endswith("0 of 2 nodes of the last run are restored, 2 are gone")
-            assert "/moved, of the run before, is not there any more" in caplog.text
-            await until(lambda: saved(core))
-        assert content(path).nodes == {}
 
 
 async def test_changes_without_a_core_come_from_the_nodes_lists(path: Path) -> None:
@@ -222,19 +207,6 @@ async def test_simulated_time_survives_only_with_a_node_of_it(
             assert core.call("hasParam", "/x", "/use_sim_time").value is left
 
 
-async def test_a_graph_that_does_not_change_writes_nothing(path: Path) -> None:
-    async with Slave("/node") as node, running(path) as core:
-        await node.publish(core, "/a")
-        await until(lambda: saved(core))
-        before = path.stat()
-        await call(core.uri, "registerPublisher", "/node", "/a", STRING, node.uri)
-        await call(core.uri, "getSystemState", "/x")
-        assert saved(core)
-        core.call("setParam", "/x", "/run_id", core.call("getParam", "/x", "/run_id").value)
-        await until(lambda: saved(core))
-        assert path.stat() == before
-
-
 async def test_the_file_is_for_its_user_alone(path: Path) -> None:
     async with running(path) as core:
         await until(lambda: saved(core))
@@ -261,18 +233,6 @@ async def test_unusable_place_is_reported_and_used_when_usable(
         await until(lambda: not core.notes())
     async with running(path) as core:
         assert core.call("getParam", "/x", "/a").value == 1
-
-
-async def test_removed_file_is_written_again(path: Path) -> None:
-    async with running(path) as core:
-        core.call("setParam", "/x", "/before", 1)
-        await until(lambda: saved(core))
-        for entry in list(path.parent.iterdir()):
-            entry.unlink()
-        core.call("setParam", "/x", "/after", 2)
-        await until(lambda: saved(core))
-    async with running(path) as core:
-        assert [core.call("getParam", "/x", key).value for key in ("/before", "/after")] == [1, 2]
 
 
 async def test_a_node_that_answers_with_an_error_keeps_what_it_had(path: Path) -> None:
@@ -348,38 +308,6 @@ async def test_new_registration_wins_over_the_stored_one(path: Path, monkeypatch
             await until(lambda: not late)
             assert core.state().nodes == {"/talker": new.uri}
             assert core.state().publishers == {"/b": {"/talker": new.uri}}
-
-
-async def test_churn_is_gathered_and_a_large_state_is_written_more_rarely(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async with running(path) as core:
-        assert core.stored is not None
-        await until(lambda: saved(core))
-        put, writes = core.stored._put, []
-
-        def slow(stored: StoredState) -> None:
-            writes.append(stored)
-            put(stored)
-            core.stored._took = 0.1  # type: ignore[union-attr] # it was set up above
-
-        monkeypatch.setattr(core.stored, "_put", slow)
-        rests: list[float] = []
-        over = asyncio.Event()
-
-        async def rest(seconds: float) -> None:
-            rests.append(seconds)
-            await over.wait()
-
-        monkeypatch.setattr(core.stored, "_rest", rest)
-        for number in range(100):
-            core.call("registerPublisher", "/node", f"/t{number}", STRING, "http://127.0.0.1:1/")
-        over.set()
-        await until(lambda: saved(core))
-        assert len(writes) <= 2
-        core.call("setParam", "/x", "/a", 1)
-        await until(lambda: saved(core) and len(rests) >= 2)
-        assert rests[-2:] == [CORE_STATE_GATHER, 0.1 * CORE_STATE_SHARE]
 
 
 @pytest.mark.parametrize("why", ["large", "full", "read-only"])
@@ -462,26 +390,18 @@ def nested(depth: int) -> dict[str, Any]:
 @pytest.mark.parametrize(
     "data",
     [
-        b"SQLite format 3\0" * 100,
-        b"",
-        state_of(params={"a": "b" * 20_000})[:-1],
-        state_of(format="rmpa core 1"),
-        msgspec.msgpack.encode({"nodes": {}}),
-        state_of(nodes={"/talker": {"api": "rosrpc://h:1"}}),
+        b"SQLite format 3\0" * 100, b"", state_of(params={"a": "b" * 20_000})[:-1], state_of(format="rmpa core 1"),
+        msgspec.msgpack.encode({"nodes": {}}), state_of(nodes={"/talker": {"api": "rosrpc://h:1"}}),
         state_of(nodes={"talker": {"api": "http://h:1"}}),
         state_of(nodes={"/t": {"api": "http://h:1", "entries": [["publisher", "t", "*"]]}}),
         state_of(nodes={"/t": {"api": "http://h:1", "entries": [["publisher", "/t", "a\0b"]]}}),
-        state_of(params={"a": 1 << 40}),
-        state_of(params={"a": None}),
-        state_of(params={"a": "\x1b"}),
-        state_of(params={"a": {1: 2}}),
-        state_of(params={"a": msgspec.msgpack.Ext(5, b"")}),
+        state_of(params={"a": 1 << 40}), state_of(params={"a": None}), state_of(params={"a": "\x1b"}),
+        state_of(params={"a": {1: 2}}), state_of(params={"a": msgspec.msgpack.Ext(5, b"")}),
         state_of(params=nested(limits.CORE_STATE_DEPTH_MAX)),
-        state_of(params={"a": lists(limits.CORE_STATE_DEPTH_MAX)}),
-        b"\x91" * 100_000,
+        state_of(params={"a": lists(limits.CORE_STATE_DEPTH_MAX)}), b"\x91" * 100_000,
     ],
     ids=lambda data: f"{data[:30]!r}"[:40],
-)
+)  # fmt: skip
 def test_what_no_core_has_written_is_refused(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"\S"):
         parse(data)

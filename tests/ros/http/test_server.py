@@ -11,7 +11,7 @@ import pytest
 
 from rmpa.core.errors import StartError
 from rmpa.ros import limits
-from rmpa.ros.http.rpc import XMLRPC_SLICE, call
+from rmpa.ros.http.rpc import call
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.wire.http import HTTP_HEADERS_MAX
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, parse_response, serialize_call, serialize_response
@@ -300,36 +300,6 @@ async def test_calls_in_one_go_are_answered_in_turn_with_those_of_others(server:
             assert parse_response((await greedy.response())[1])
 
 
-async def test_large_calls_and_answers_take_many_turns_of_the_loop(server: XmlRpcServer) -> None:
-    value: XmlRpcValue = [{"gains": [1.5] * 20, "name": "x"}] * 1000
-    loop = asyncio.get_running_loop()
-    turns = 0
-
-    def turn() -> None:
-        nonlocal turns
-        turns += 1
-        going = loop.call_soon(turn)
-        if asking.done():
-            going.cancel()
-
-    asking = asyncio.ensure_future(call(f"http://127.0.0.1:{server.port}/", "echo", value))
-    turn()
-    assert await asking == [1, "127.0.0.1", [value]]
-    size = len(serialize_call("echo", [value]))
-    assert turns > 1.2 * size / XMLRPC_SLICE
-
-
-async def test_caller_may_disconnect_while_its_large_call_is_read(server: XmlRpcServer) -> None:
-    async with client(server) as c:
-        c.writer.write(post(serialize_call("echo", ["x" * (16 * limits.HTTP_BODY_INLINE)])))
-        await c.writer.drain()
-        while not any(connection._task for connection in server._connections):
-            await asyncio.sleep(0)
-    while len(server._connections):
-        await asyncio.sleep(0.01)
-    assert await call(f"http://127.0.0.1:{server.port}/", "echo", 1) == [1, "127.0.0.1", [1]]
-
-
 @pytest.mark.parametrize("start", [b"", b"POST / HT", post(CALL)[:-1]])
 async def test_unfinished_requests_time_out(
     server: XmlRpcServer, monkeypatch: pytest.MonkeyPatch, start: bytes
@@ -395,14 +365,6 @@ async def test_port_in_use_has_a_remedy(echo: Echo) -> None:
             await XmlRpcServer(echo, port=port).start()
     with pytest.raises(StartError, match="does not have that address"):
         await XmlRpcServer(echo, host="192.0.2.1").start()
-
-
-async def test_a_connection_that_shall_end_with_its_answer_does(server: XmlRpcServer) -> None:
-    async with client(server) as c:
-        c.writer.write(post(serialize_call("echo", []), b"Connection: close"))
-        answer = await c.ended()
-        assert b"Connection: close\r\n" in answer
-        assert answer.endswith(serialize_response([1, "127.0.0.1", []]))
 
 
 async def test_a_client_that_half_closes_behind_a_plain_request_is_answered(server: XmlRpcServer, echo: Echo) -> None:

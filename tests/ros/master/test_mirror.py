@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.mirror import Call, Mirror, Survey, lookup_calls, read_lookups, read_survey, survey_calls
-from rmpa.ros.master.parameters import GraphChange, RegistrationKind
+from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 OURS: Final = "http://127.0.0.1:1/"
@@ -79,54 +79,6 @@ class Pair:
 @pytest.fixture
 def pair() -> Pair:
     return Pair()
-
-
-def test_registrations_of_others_come_with_types_and_uris(pair: Pair) -> None:
-    pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
-    pair.theirs("registerSubscriber", "/s", "/t", "*", MOVED)
-    pair.theirs("registerService", "/p", "/srv", "rosrpc://h:9", THEIRS)
-    assert pair.look() == []
-    assert GraphChange(RegistrationKind.PUBLISHER, True, "/t", "/p", THEIRS, STRING) in pair.graph.take()[1]
-    state = pair.graph.state()
-    assert state == pair.master.registrations.state()
-    assert state.services == {"/srv": {"/p": "rosrpc://h:9"}}
-    assert pair.graph.at(RegistrationKind.PUBLISHER, "/t") == {"/p": THEIRS}
-    assert pair.graph.types()["/t"] == STRING
-    pair.look()
-    assert pair.graph.state() is state, "nothing is new"
-    assert pair.changes() == set()
-
-
-def test_a_node_that_restarts_between_two_looks_went_and_came(pair: Pair) -> None:
-    pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
-    pair.theirs("registerService", "/p", "/srv", "rosrpc://h:9", THEIRS)
-    pair.look()
-    pair.changes()
-    pair.theirs("registerPublisher", "/p", "/t", STRING, MOVED)
-    pair.theirs("registerService", "/p", "/srv", "rosrpc://h:10", MOVED)
-    pair.look()
-    assert pair.changes() == {(sign, name, "/p") for sign in "+-" for name in ("/t", "/srv")}
-    assert pair.graph.state() == pair.master.registrations.state()
-
-
-def test_later_type_is_a_change_but_publishers_keep_theirs(pair: Pair) -> None:
-    pair.theirs("registerSubscriber", "/s", "/t", "*", MOVED)
-    pair.look()
-    pair.theirs("registerSubscriber", "/s2", "/t", STRING, MOVED)
-    pair.look()
-    assert pair.graph.types()["/t"] == STRING
-    pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
-    pair.look()
-    pair.graph.take()[1]
-    pair.theirs("registerPublisher", "/other", "/t", "std_msgs/Int8", THEIRS)
-    pair.look()
-    changes = pair.graph.take()[1]
-    assert [(change.node, change.type) for change in changes] == [("/other", "std_msgs/Int8")]
-    assert [pair.graph.type_of("/t", node) for node in ("/p", "/other", "")] == [
-        STRING,
-        "std_msgs/Int8",
-        "std_msgs/Int8",
-    ]
 
 
 def test_other_type_of_a_topic_is_a_change(pair: Pair) -> None:
@@ -206,23 +158,6 @@ def test_nodes_of_a_former_master_stay_until_they_die_or_return(pair: Pair) -> N
     pair.look()
     assert pair.graph.at(RegistrationKind.PUBLISHER, "/t") == {}
     assert pair.graph.state().nodes == {"/returns": "http://127.0.0.1:4/"}
-
-
-def test_dead_node_is_ignored_until_it_moves_or_revives(pair: Pair) -> None:
-    pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
-    pair.look()
-    pair.changes()
-    pair.mirror.mark_dead("/p", THEIRS)
-    pair.look()
-    assert pair.changes() == {("-", "/t", "/p")}
-    del pair.mirror.dead["/p"]
-    pair.look()
-    assert pair.graph.at(RegistrationKind.PUBLISHER, "/t") == {"/p": THEIRS}
-    pair.mirror.mark_dead("/p", THEIRS)
-    pair.theirs("registerPublisher", "/p", "/t", STRING, MOVED)
-    pair.look()
-    assert pair.graph.at(RegistrationKind.PUBLISHER, "/t") == {"/p": MOVED}
-    assert not pair.mirror.dead
 
 
 def test_local_provider_replaces_our_service_for_good(pair: Pair) -> None:
@@ -327,7 +262,5 @@ def test_whatever_happened_the_next_look_shows_what_the_master_has(steps: list[t
     assert pair.look() == []
     mirror, master = pair.graph.state(), pair.master.registrations.state()
     assert (mirror.publishers, mirror.subscribers, mirror.nodes) == (
-        master.publishers,
-        master.subscribers,
-        master.nodes,
-    )
+        master.publishers, master.subscribers, master.nodes,
+    )  # fmt: skip

@@ -9,9 +9,8 @@ from rmpa.core import limits as core_limits
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.subscription import InProcessConnection
 from rmpa.ros.wire.tcpros import LENGTH, Header, TopicDescription
-from tests.ros.node.peers import LATCHED, STRING
+from tests.ros.node.peers import STRING
 
-OTHER = TopicDescription("std_msgs/Int8", "27ffa0c9c4b8fb8492252bcad9e5c57b", "int8 data\n")
 LARGE = core_limits.CUT_THROUGH_BYTES * 3
 
 
@@ -105,49 +104,6 @@ async def test_it_gets_each_message_in_order_and_counts_as_a_subscriber() -> Non
     assert len(bed.got) == 102
 
 
-async def test_it_waits_until_the_type_is_known() -> None:
-    bed = Bed(None)
-    await bed.connect()
-    assert bed.demand == [True]
-    assert bed.headers == []
-    bed.publication.publish_framed(framed("early"))
-    bed.publication.describe(STRING)
-    assert bed.connection.connected
-    bed.publication.publish_framed(framed("late"))
-    assert bed.got == [framed("late")]
-
-
-async def test_a_message_in_parts_is_whole_for_those_that_take_no_parts() -> None:
-    bed = Bed()
-    await bed.connect()
-    for text in ("first", "second"):
-        whole = framed(text, LARGE)
-        bed.publication.begin(len(whole))
-        for start in range(0, len(whole), 1000):
-            bed.publication.extend(memoryview(whole)[start : start + 1000])
-        bed.publication.publish_framed(framed("small"))
-    assert bed.got == [framed("first", LARGE), framed("small"), framed("second", LARGE), framed("small")]
-    assert bed.connection.messages == 4
-
-
-async def test_parts_are_passed_on_while_they_come() -> None:
-    bed = Bed(parts=True)
-    assert bed.parts is not None
-    await bed.connect()
-    whole = framed("image", LARGE)
-    bed.publication.begin(len(whole))
-    bed.publication.extend(whole[:1000])
-    assert bytes(bed.parts.now) == whole[:1000]
-    bed.publication.extend(whole[1000:])
-    assert bed.got == [whole]
-    bed.publication.publish_framed(whole)
-    small = framed("small")
-    bed.publication.begin(len(small))
-    bed.publication.extend(small)
-    assert bed.got == [whole, whole, small]
-    assert bed.parts.sizes == [len(whole), len(whole)]
-
-
 async def test_what_may_be_sent_on_is_not_overwritten_by_the_next_message() -> None:
     bed = Bed(parts=True)
     views: list[memoryview] = []
@@ -173,60 +129,6 @@ async def test_an_aborted_message_does_not_end_the_connection() -> None:
         bed.publication.publish_framed(framed("next"))
         assert bed.got == [framed("next")]
         assert bed.parts is None or bed.parts.aborted == 1
-
-
-async def test_it_connects_again_once_the_publication_is_back() -> None:
-    bed = Bed()
-    await bed.connect()
-    bed.publication.withdraw()
-    bed.there = None
-    bed.got.clear()
-    async with asyncio.timeout(20):
-        while not bed.lost:
-            await asyncio.sleep(0)
-        assert bed.connection.fields == {}
-        bed.publish(STRING)
-        while not bed.connection.connected:
-            await asyncio.sleep(0.001)
-    bed.publication.publish_framed(framed("again"))
-    assert bed.got == [framed("again")]
-
-
-async def test_another_definition_is_told_by_another_header() -> None:
-    bed = Bed()
-    await bed.connect()
-    assert bed.publication.describe(OTHER) == 1
-    async with asyncio.timeout(20):
-        while len(bed.headers) < 2:
-            await asyncio.sleep(0.001)
-    assert bed.headers[1]["type"] == "std_msgs/Int8"
-    assert bed.lost
-
-
-async def test_nothing_is_called_after_close() -> None:
-    bed = Bed(None)
-    await bed.connect()
-    bed.connection.close()
-    assert bed.demand == [True, False]
-    bed.publication.describe(LATCHED)
-    bed.publication.publish_framed(framed("late"))
-    bed.publication.withdraw()
-    await asyncio.sleep(0)
-    assert (bed.headers, bed.got, bed.lost, bed.refused) == ([], [], [], [])
-
-
-async def test_a_subscriber_may_close_while_it_gets_a_message() -> None:
-    bed = Bed()
-    closing: InProcessConnection = InProcessConnection(
-        "/chatter", "http://127.0.0.1:1/", "/a", find=bed.found, on_message=lambda _: closing.close()
-    )
-    closing.start()
-    await bed.connect()
-    assert bed.publication.subscribers == 2
-    bed.publication.publish_framed(framed("one"))
-    assert bed.publication.listeners == ("/rmpa",)
-    bed.publication.publish_framed(framed("two"))
-    assert bed.got == [framed("one"), framed("two")]
 
 
 async def test_a_wrong_topic_is_refused_once() -> None:

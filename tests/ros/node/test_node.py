@@ -9,7 +9,6 @@ import pytest
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
-from rmpa.ros.http.rpc import call
 from rmpa.ros.node.endpoints import NODE_UNREGISTER_AT_ONCE
 from rmpa.ros.node.node import Node, Received
 from rmpa.ros.types.definitions import DefinitionError
@@ -257,38 +256,6 @@ async def test_nodes_survive_a_restarted_master(core: RosCore) -> None:
         await again.close()
 
 
-async def test_a_node_that_registers_before_it_notices_the_restart_loses_nothing(core: RosCore) -> None:
-    """The master knows the node then, and not what it registered before."""
-    async with node(core, "talker") as talker:
-        await talker.advertise("/before", "std_msgs/String")
-        await talker.follow_param("/gain")
-        port = core.port
-        await core.close()
-        again = RosCore("127.0.0.1", port)
-        again._api._pid += 1  # a process of its own
-        await again.start()
-        await talker.advertise("/after", "std_msgs/String")
-        await until(lambda: {"/before", "/after"} <= again.state().publishers.keys())
-        await talker.close()
-        await again.close()
-
-
-async def test_a_refusal_of_a_restarted_master_is_told_and_the_rest_registered(
-    core: RosCore, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    async with node(core, "talker") as talker:
-        first, second = [await talker.advertise(topic, "std_msgs/String") for topic in ("/first", "/second")]
-
-        async def refuse(*, again: bool = False) -> None:
-            raise PeerRefused("the ROS master", "no more")
-
-        monkeypatch.setattr(first, "register", refuse)
-        for one in (first, second):
-            core.call("unregisterPublisher", "/talker", one.topic, talker.uri)
-        await until(lambda: "/second" in core.state().publishers)
-    assert "/talker: /first: the ROS master refused: no more [core-refuses]" in caplog.text
-
-
 async def test_the_master_ends_a_node_whose_name_is_taken(core: RosCore) -> None:
     reasons: list[str] = []
     async with node(core, "twin", on_shutdown=reasons.append) as first:
@@ -380,55 +347,12 @@ async def test_what_is_registered_while_its_call_ends_is_not_left_at_the_master(
             await closing
 
 
-async def test_a_close_that_is_cancelled_goes_on(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
-    async with node(core, "n") as one:
-        publisher = await one.advertise("/t", "std_msgs/String")
-        call_master, begun, go_on = one.call_master, asyncio.Event(), asyncio.Event()
-
-        async def slow(method: str, *params: Any) -> Any:
-            begun.set()
-            await go_on.wait()
-            return await call_master(method, *params)
-
-        monkeypatch.setattr(one, "call_master", slow)
-        closing = asyncio.create_task(publisher.close())
-        await begun.wait()
-        closing.cancel()
-        await asyncio.wait([closing])
-        go_on.set()
-        await until(lambda: "/t" not in core.state().publishers)
-        await until(lambda: one.slave.publication("/t") is None)
-
-
 @pytest.mark.parametrize("bound", [0, -1])
 async def test_a_queue_has_room_for_a_message(core: RosCore, bound: int) -> None:
     async with node(core, "n") as one:
         for make in (one.advertise, one.subscribe):
             with pytest.raises(ValueError, match=f"queue_messages is at least 1, not {bound}"):
                 await make("/t", "std_msgs/String", queue_messages=bound)
-
-
-async def test_an_ending_node_unregisters_side_by_side(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One behind the other they had one second together, and a slow master kept some."""
-    one = node(core, "n")
-    async with one:
-        for number in range(6):
-            await one.advertise(f"/out{number}", "std_msgs/String")
-            await one.subscribe(f"/in{number}", "std_msgs/String")
-        await one.follow_param("/key")
-        call_master, together = one.call_master, asyncio.Barrier(13)
-
-        async def meeting(method: str, *params: Any) -> Any:
-            await together.wait()  # no call goes on before all have begun
-            if params[0] == "/out0":
-                raise PeerRefused("the master", "one that is refused")
-            return await call_master(method, *params)
-
-        monkeypatch.setattr(one, "call_master", meeting)
-    assert core.state().publishers == {"/out0": {"/n": one.uri}} | {
-        topic: who for topic, who in core.state().publishers.items() if "/n" not in who
-    }
-    assert not any("/n" in who for who in core.state().subscribers.values())
 
 
 async def test_a_master_that_hangs_does_not_keep_a_node_from_its_end(
@@ -450,19 +374,6 @@ async def test_a_master_that_hangs_does_not_keep_a_node_from_its_end(
             await one.close()
     assert len(begun) == NODE_UNREGISTER_AT_ONCE
     assert one.stopped.is_set()
-
-
-async def test_names_are_remapped_and_loopback_is_used_for_a_local_master(core: RosCore) -> None:
-    environment = RosEnvironment.read({"ROS_NAMESPACE": "robot"}, ["out:=there", "__name:=bob"], ["192.0.2.1"])
-    async with Node("n", master_uri=core.uri, environment=environment) as one:
-        await one.advertise("out", "std_msgs/String")
-        assert core.state().publishers["/robot/there"] == {"/robot/bob": one.uri}
-        assert one.uri.startswith("http://127.0.0.1:")
-        assert await call(one.uri, "getPublications", "/x") == [
-            1,
-            "publications",
-            [["/robot/there", "std_msgs/String"]],
-        ]
 
 
 async def test_a_service_is_served_and_called(core: RosCore) -> None:

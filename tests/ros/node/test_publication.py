@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import socket
 import struct
@@ -109,27 +108,10 @@ async def test_a_held_subscriber_that_does_not_fit_is_refused_and_reported(held:
     assert held.said == ["first", f"refused /wrong: {error}"]
 
 
-async def test_a_held_subscriber_that_has_just_left_costs_no_other_the_topic(held: Owner) -> None:
-    gone, stays = await held.subscriber(callerid="/gone", tcp_nodelay="1"), await held.subscriber()
-    stream = held.publication._connections[0]
-    gone.close()
-    while not stream.closed:  # at once, before the publication is told of the end
-        await asyncio.sleep(0)
-    held.publication.describe(STRING)
-    assert (await stays.header())["type"] == "std_msgs/String"
-
-
 async def test_demand_ends_when_all_held_subscribers_are_refused(held: Owner) -> None:
     await held.subscriber(md5sum="0" * 32)
     held.publication.describe(STRING)
     assert [text.split()[0] for text in held.said] == ["first", "refused", "last"]
-
-
-async def test_a_mismatch_is_no_demand(known: Owner) -> None:
-    link = await RawSubscriber.connect(known.server.address, md5sum="0" * 32)
-    assert "error" in await link.header()
-    assert [text.split()[0] for text in known.said] == ["refused"]
-    link.close()
 
 
 @pytest.mark.trap(10)
@@ -143,15 +125,6 @@ async def test_latched_message_is_first_on_each_connection(latched: Owner) -> No
     assert (await late.header())["latching"] == "1"
     assert [await early.message() for _ in range(3)] == [b"old", b"kept", b"new"]
     assert [await late.message() for _ in range(2)] == [b"kept", b"new"]
-
-
-async def test_the_latched_message_can_be_forgotten(latched: Owner) -> None:
-    latched.publication.publish_framed(frame_message(b"old"))
-    latched.publication.forget_latched()
-    link = await latched.subscriber()
-    await link.header()
-    latched.publication.publish_framed(frame_message(b"new"))
-    assert await link.message() == b"new"
 
 
 async def test_another_definition_disconnects_subscribers(latched: Owner) -> None:
@@ -254,17 +227,6 @@ async def test_withdrawal_closes_all_connections_silently(known: Owner) -> None:
     assert known.said == ["first"]
 
 
-async def test_what_was_published_can_be_waited_for(known: Owner) -> None:
-    link = await known.subscriber(buffer=4096)
-    for _ in range(20):
-        known.publication.publish_framed(frame_message(bytes(100_000)))
-    await link.header()
-    reading = [len(await link.message()) for _ in range(20)]
-    await known.publication.drained()
-    assert reading == [100_000] * 20
-    assert limits.SUBSCRIBER_QUEUE_MESSAGES > 20
-
-
 @pytest.mark.trap(18)
 async def test_a_machine_that_was_switched_off_is_noticed_by_the_kernel(known: Owner) -> None:
     await known.subscriber()
@@ -276,7 +238,7 @@ async def test_a_machine_that_was_switched_off_is_noticed_by_the_kernel(known: O
         (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 10),
         (socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 9),
     ):
-        assert inbound._socket.getsockopt(level, option) == value
+        assert inbound._socket.getsockopt(level, option) == value  # fmt: skip
 
 
 # --- messages in parts ------------------------------------------------------------------------------------------
@@ -295,36 +257,6 @@ def extend(publication: Publication, *parts: bytes) -> None:
         buffer = bytearray(part)
         publication.extend(memoryview(buffer))
         buffer[:] = bytes(len(buffer))  # the stream's buffer is used again
-
-
-async def test_parts_go_on_as_they_come_and_make_the_message(known: Owner) -> None:
-    link = await known.subscriber()
-    await link.header()
-    known.publication.publish_framed(frame_message(b"before"))
-    begin(known.publication)
-    extend(known.publication, PARTS[0])
-    assert await link.message() == b"before"
-    while len(link.data) < 4 + len(PARTS[0]):
-        await link._more()
-    assert known.publication.messages == 1
-    extend(known.publication, *PARTS[1:])
-    known.publication.publish_framed(frame_message(b"after"))
-    assert await link.message() == WHOLE
-    assert await link.message() == b"after"
-    assert known.publication.messages == 3
-    assert known.publication.bytes == 4 + len(WHOLE) + 2 * 4 + 11
-
-
-async def test_messages_without_subscribers_are_counted(known: Owner) -> None:
-    begin(known.publication)
-    extend(known.publication, *PARTS)
-    assert (known.publication.messages, known.publication.bytes) == (1, 4 + len(WHOLE))
-    link = await known.subscriber()
-    begin(known.publication)
-    link.close()
-    await until(lambda: known.publication.subscribers == 0)
-    extend(known.publication, *PARTS)
-    assert (known.publication.messages, known.publication.bytes) == (2, 2 * (4 + len(WHOLE)))
 
 
 async def test_a_slow_subscriber_among_fast_ones_gets_whole_messages_or_none(make: Callable[..., Owner]) -> None:
@@ -347,18 +279,6 @@ async def test_a_slow_subscriber_among_fast_ones_gets_whole_messages_or_none(mak
     assert got == [message for message in sent if message in got], "in order, none torn, none twice"
     # The one that was on its way when the rest came may be one of the two that the queue holds.
     assert got[-1] == sent[-1]
-
-
-async def test_who_comes_in_the_middle_begins_with_the_next_one(known: Owner) -> None:
-    early = await known.subscriber(callerid="/early")
-    begin(known.publication)
-    extend(known.publication, *PARTS[:5])
-    late = await known.subscriber(callerid="/late")
-    extend(known.publication, *PARTS[5:])
-    known.publication.publish_framed(frame_message(b"next"))
-    for link, messages in ((early, [WHOLE, b"next"]), (late, [b"next"])):
-        await link.header()
-        assert [await link.message() for _ in messages] == messages
 
 
 @pytest.mark.trap(10)
@@ -417,16 +337,6 @@ async def test_abort_of_the_last_subscriber_ends_the_demand(known: Owner) -> Non
     assert await again.message() == b"next"
 
 
-async def test_what_was_aborted_is_not_latched(latched: Owner) -> None:
-    latched.publication.publish_framed(frame_message(b"old"))
-    begin(latched.publication)
-    extend(latched.publication, *PARTS[:9])
-    assert latched.publication.abort() == 0
-    link = await latched.subscriber()
-    await link.header()
-    assert await link.message() == b"old"
-
-
 async def test_subscriber_leaving_midway_disturbs_no_other(known: Owner) -> None:
     leaves, stays = await known.subscriber(callerid="/leaves"), await known.subscriber(callerid="/stays")
     begin(known.publication)
@@ -436,22 +346,6 @@ async def test_subscriber_leaving_midway_disturbs_no_other(known: Owner) -> None
     extend(known.publication, *PARTS[2:])
     await stays.header()
     assert await stays.message() == WHOLE
-
-
-async def test_new_subscriber_gets_latched_depth_in_order(latched: Owner) -> None:
-    latched.publication.publish_framed(frame_message(b"0"))
-    latched.publication.keep(3)
-    for n in range(1, 3):
-        latched.publication.publish_framed(frame_message(b"%d" % n))
-    begin(latched.publication)
-    extend(latched.publication, *PARTS)
-    kept = list(latched.publication.latched)
-    assert kept == [frame_message(b"1"), frame_message(b"2"), frame_message(WHOLE)]
-    link = await latched.subscriber()
-    await link.header()
-    assert [await link.message() for _ in range(3)] == [b"1", b"2", WHOLE]
-    latched.publication.keep(1)
-    assert list(latched.publication.latched) == kept[-1:]
 
 
 def test_no_contract_keeps_more_than_the_limit() -> None:
@@ -475,19 +369,6 @@ async def test_contract_depth_bounds_each_subscribers_queue(make: Callable[..., 
     assert all(link.dropped > 50 and link.outbox.waiting_entries <= 4 for link in links)
     owner.publication.bound(10**6)
     assert owner.publication._queue_messages == limits.SUBSCRIBER_QUEUE_MESSAGES
-
-
-async def test_a_held_subscriber_counts_as_connected_while_others_are_served(
-    held: Owner, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    [await held.subscriber(callerid=name) for name in ("/one", "/two")]
-    assert held.publication.callers == {"/one", "/two"}
-    seen: list[frozenset[str]] = []
-    monkeypatch.setattr(held, "listeners_changed", lambda: seen.append(held.publication.callers))
-    held.publication.describe(STRING)
-    assert set(seen) == {frozenset({"/one", "/two"})}, "not one of them seems to have left meanwhile"
-    assert held.publication.listeners == ("/one", "/two")
-    assert held.said == ["first"]
 
 
 @pytest.mark.trap(42)

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from rmpa.core.errors import LocalProtocolError, PeerRefused, UnreachableError
+from rmpa.core.errors import LocalProtocolError, UnreachableError
 from rmpa.ros.node import service_client as module
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed, probe
 from rmpa.ros.wire.tcpros import ServiceDescription, encode_header, error_header, server_header
@@ -93,45 +93,6 @@ async def test_one_call_at_a_time(server: Server) -> None:
     connection.close()
 
 
-async def test_a_server_that_dies_in_the_middle_of_a_call(server: Server) -> None:
-    connection, link = await server.serve()
-    answer = asyncio.create_task(connection.call(b"1"))
-    assert await link.message() == b"1"
-    await link.send(b"\x01\x03\x00")
-    link.close()
-    with pytest.raises(
-        ServiceFailed, match=r"service \[/add\]: its server died.* in the middle of the call"
-    ) as error:
-        await answer
-    assert error.value.sent
-    assert connection.closed
-
-
-async def test_server_that_closed_before_the_call_is_distinguished(server: Server) -> None:
-    told: list[bool] = []
-    connection, link = await server.serve()
-    connection._on_closed = lambda: told.append(True)
-    link.close()
-    with pytest.raises(ServiceFailed, match="has closed the connection") as error:  # before the loop has looked
-        await connection.call(b"1")
-    assert not error.value.sent
-    connection, link = await server.serve()
-    connection._on_closed = lambda: told.append(True)
-    link.close()
-    await until(lambda: told)
-    assert connection.closed
-    with pytest.raises(ServiceFailed) as error:
-        await connection.call(b"1")
-    assert not error.value.sent
-
-
-async def test_a_late_answer_closes_the_connection(server: Server) -> None:
-    connection, _link = await server.serve()
-    with pytest.raises(ServiceFailed, match=r"no answer within 0\.02 s"):
-        await connection.call(b"1", 0.02)
-    assert connection.closed
-
-
 async def test_who_does_not_wait_for_the_answer_closes_the_connection(server: Server) -> None:
     connection, link = await server.serve()
     answer = asyncio.create_task(connection.call(b"1"))
@@ -163,19 +124,6 @@ async def test_unrequested_bytes_break_the_protocol(server: Server) -> None:
     connection, link = await server.serve()
     await link.send(b"\x01\x00\x00\x00\x00")
     await until(lambda: connection.closed)
-
-
-async def test_refusals(server: Server) -> None:
-    with pytest.raises(PeerRefused, match="service /add: its server refused: no such service"):
-        await server.serve({"error": "no such service"})
-    with pytest.raises(PeerRefused, match="'md5sum' is missing"):
-        await server.serve({"callerid": "/server"})
-    opening = asyncio.create_task(ServiceConnection.open(server.uri, "/add", "/c", md5sum="0" * 32))
-    link = await server.accept()
-    await link.header()
-    await link.send(encode_header(server_header("/server", ADD)))
-    with pytest.raises(PeerRefused, match=f"the server of /add has md5sum .{MD5}., not"):
-        await opening
 
 
 async def test_nobody_there(server: Server) -> None:
@@ -210,14 +158,12 @@ NO_NODE = "the program that listens there is no ROS node"
         (refusal(OF_ROSCPP), "/talker", UNEXPECTED + OF_ROSCPP),
         (refusal(OF_ROSCPP), "", UNEXPECTED + OF_ROSCPP),
         (
-            refusal(OF_ROSPY.format("/talker2")),
-            "/talker",
-            UNEXPECTED + OF_ROSPY.format("/talker2"),
+            refusal(OF_ROSPY.format("/talker2")), "/talker", UNEXPECTED + OF_ROSPY.format("/talker2"),
         ),
         (b"HTTP/1.1 400 Bad Request\r\n\r\n", "/talker", NO_NODE),
         (b"\x05\0\0\0\x01\0\0\0x", "/talker", NO_NODE),
     ],
-)
+)  # fmt: skip
 async def test_a_probe_says_what_answers(server: Server, answer: bytes, node: str, says: str) -> None:
     assert await server.asked(answer, node=node) == says
     assert await server.links[0].ended(), "the probe leaves nothing behind, and sends nothing more"

@@ -127,32 +127,6 @@ async def test_a_persistent_connection_goes_on(node: SlaveNode, word: str) -> No
         assert await client.reply() == FORTY_TWO
 
 
-async def test_byte_by_byte_and_all_in_one_segment(node: SlaveNode) -> None:
-    serve(node, add)
-    client = await RawClient.call(node, persistent="1")
-    for byte in TWO:
-        await client.send(bytes([byte]))
-        await asyncio.sleep(0)
-    await client.header()
-    assert await client.reply() == FORTY_TWO
-    await client.send(TWO * 3)  # no client of ROS does so: each is answered, in order
-    assert [await client.reply() for _ in range(3)] == [FORTY_TWO] * 3
-    hasty = await RawClient.early(node)
-    await hasty.header()
-    assert await hasty.reply() == FORTY_TWO
-
-
-async def test_a_request_that_came_before_the_description_waits_for_it(node: SlaveNode) -> None:
-    serve(node, add, later := Later(), description=None)
-    clients = [await RawClient.early(node) for _ in range(3)]
-    await until(lambda: later.asked)
-    later.known.set_result(ADD)
-    for client in clients:
-        assert (await client.header())["type"] == ADD.type
-        assert await client.reply() == FORTY_TWO
-    assert later.asked == 1
-
-
 @pytest.mark.trap(23)
 async def test_callers_behind_probes_that_have_just_left_are_answered(
     node: SlaveNode, caplog: pytest.LogCaptureFixture
@@ -246,14 +220,6 @@ async def test_an_unknown_service_is_a_clear_error(node: SlaveNode) -> None:
         await connect(node, service="/none")
 
 
-async def test_the_servers_own_error_text_comes_through(node: SlaveNode) -> None:
-    endpoint = serve(node, lambda call: call.reply(False, b"division by zero"))
-    connection = await connect(node)
-    assert await connection.call(b"") == (False, b"division by zero")
-    assert await connection.call(b"") == (False, b"division by zero")  # an error ends the call, not the connection
-    assert (endpoint.calls, endpoint.failed) == (2, 2)
-
-
 async def test_a_server_that_raises_is_an_error_to_the_client(
     node: SlaveNode, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -267,18 +233,6 @@ async def test_a_server_that_raises_is_an_error_to_the_client(
     ok, text = await connection.call(b"")
     assert (ok, text) == (False, b"service [/add]: [/server] failed at this call; its log says why")
     assert "ZeroDivisionError" in caplog.text
-
-
-async def test_many_connections_are_served_at_once(node: SlaveNode) -> None:
-    calls: list[ServiceCall] = []
-    serve(node, calls.append)
-    connections = [await connect(node, f"/c{i}") for i in range(50)]
-    answers = [asyncio.create_task(c.call(struct.pack("<q", i))) for i, c in enumerate(connections)]
-    await until(lambda: len(calls) == 50)
-    for call in reversed(calls):
-        call.reply(True, call.request + call.caller_id.encode())
-    for i, answer in enumerate(answers):
-        assert await answer == (True, struct.pack("<q", i) + f"/c{i}".encode())
 
 
 async def test_the_deadline_answers_for_a_silent_server(node: SlaveNode) -> None:
@@ -315,17 +269,6 @@ async def test_a_client_that_leaves_in_the_middle_of_a_call_ends_it(node: SlaveN
         client.close()
         await cancelled.wait()
     assert len(endpoint._clients) == 0
-
-
-@pytest.mark.parametrize("size", [0, 65_536, 65_537, 300_000, 5_000_000])
-async def test_bodies_of_every_size_come_back(node: SlaveNode, size: int) -> None:
-    serve(node, echo)
-    connection = await connect(node)
-    body = bytes(range(251)) * (size // 251 + 1)
-    for end in (size, size // 2):
-        ok, answer = await connection.call(body[:end], DEADLINE)
-        assert ok
-        assert answer == body[:end]
 
 
 async def test_oversized_request_is_refused_and_connection_goes_on(
@@ -395,26 +338,6 @@ async def test_a_client_that_does_not_read_is_served_no_further(node: SlaveNode)
     assert calls < 100  # what the kernel's buffers took, some megabytes
     client.close()
     await until(lambda: not len(endpoint._clients))
-
-
-async def test_withdrawn_service_answers_waiting_clients(node: SlaveNode) -> None:
-    calls: list[ServiceCall] = []
-    serve(node, calls.append)
-    waiting = await RawClient.call(node, persistent="1")
-    idle = await RawClient.call(node, persistent="1")
-    await waiting.header()
-    await idle.header()
-    await waiting.send(TWO)
-    await until(lambda: calls)
-    gone: list[bool] = []
-    calls[0].on_gone = lambda: gone.append(True)
-    node.remove_service("/add", "peer base is gone")
-    assert await waiting.reply() == (0, b"peer base is gone")
-    assert await waiting.ended()
-    assert await idle.ended()
-    assert gone == [True]
-    with pytest.raises(PeerRefused, match="does not offer the service"):
-        await connect(node)
 
 
 async def test_a_node_that_ends_answers_what_is_under_way() -> None:

@@ -16,7 +16,7 @@ from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.wire.slave_api import METHODS, BusConnection
 from rmpa.ros.wire.tcpros import TopicDescription
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue
-from tests.ros.node.peers import STRING, RawSubscriber
+from tests.ros.node.peers import STRING
 from tests.waiting import until
 
 
@@ -26,26 +26,6 @@ async def node() -> AsyncIterator[SlaveNode]:
     await made.start()
     yield made
     await made.close()
-
-
-async def test_the_uri_bears_the_advertised_host() -> None:
-    node = SlaveNode("/p", "127.0.0.1", "", advertised_host="robot.local")
-    await node.start()
-    node.add_publication(Publication("/t", "/p", STRING))
-    assert node.uri.startswith("http://robot.local:")
-    assert node.uri.endswith("/")
-    assert node.address_of("/t") == ("robot.local", node._tcpros.address[1])
-    await node.close()
-
-
-async def test_a_removed_topic_is_closed_and_unknown(node: SlaveNode) -> None:
-    node.add_publication(Publication("/t", "/p", STRING))
-    link = await RawSubscriber.connect(node._tcpros.address)
-    await link.header()
-    node.remove_publication("/t")
-    node.remove_publication("/t")
-    assert await link.ended()
-    assert (await call_api(node.uri, "requestTopic", "/s", "/t", [["TCPROS"]])).code == -1
 
 
 async def test_a_port_in_use_is_a_clear_error_and_leaves_nothing_open(node: SlaveNode) -> None:
@@ -89,27 +69,6 @@ async def test_the_answer_to_request_topic_may_take_its_time(node: SlaveNode, ot
     # Topics that it does not have are not asked about.
     assert (await call_api(node.uri, "requestTopic", "/viewer", "/none", [["TCPROS"]])).code != 1
     assert asked == ["/plain", "/viewer", "/plain"]
-
-
-async def test_a_caller_that_leaves_while_it_waits_ends_the_wait(node: SlaveNode) -> None:
-    ended = asyncio.Event()
-    begun = asyncio.Event()
-
-    async def decide() -> RosReply | None:
-        begun.set()
-        try:
-            await asyncio.Event().wait()
-        finally:
-            ended.set()
-        return None
-
-    node.add_publication(Publication("/t", "/p", STRING, events=Asked(lambda _: decide())))
-    waiting = asyncio.create_task(call_api(node.uri, "requestTopic", "/s", "/t", [["TCPROS"]]))
-    async with asyncio.timeout(20.0):
-        await begun.wait()
-        waiting.cancel()
-        await node.close()
-        await ended.wait()
 
 
 class Node(SlaveNode):
@@ -182,24 +141,12 @@ def test_answers(api_node: Node, method: str, params: list[XmlRpcValue], reply: 
     assert tuple(api_node.ask(method, *params)) == reply
 
 
-def test_without_a_master_its_uri_is_a_failure() -> None:
-    assert Node("").ask("getMasterUri", "/c") == [0, "master URI not set", ""]
-
-
 @pytest.mark.trap(29)
 def test_bus_info_is_in_rospys_form(api_node: Node) -> None:
     assert api_node.ask("getBusInfo", "/c")[2] == [
         [1, "/listener", "o", "TCPROS", "/t", True, "port 1"],
         [2, "/echo", "o", "TCPROS", "/t", False, "port 2"],
         [3, "http://10.0.0.1:1/", "i", "TCPROS", "/in", True, "port 3"],
-    ]
-
-
-def test_bus_stats_fit_into_31_bits(api_node: Node) -> None:
-    assert api_node.ask("getBusStats", "/c")[2] == [
-        [["/t", 2147483647, [[1, 2147483647, 7, True], [2, 10, 0, False]]], ["/quiet", 0, []]],
-        [["/in", [[3, 20, 5, -1, True]]]],
-        [],
     ]
 
 

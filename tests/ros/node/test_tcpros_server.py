@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import errno
 import logging
 import socket
 import struct
@@ -75,13 +74,10 @@ async def test_what_is_refused(served: Served, fields: dict[str, str], error: st
 @pytest.mark.parametrize(
     "data",
     [
-        b"GET / HTTP/1.1\r\n\r\n",
-        struct.pack("<II", 4, 0),
-        struct.pack("<II", 9, 5) + b"topic",
-        struct.pack("<II", 12, 900) + b"topic=/t",
-        b"\xff" * 64,
+        b"GET / HTTP/1.1\r\n\r\n", struct.pack("<II", 4, 0), struct.pack("<II", 9, 5) + b"topic",
+        struct.pack("<II", 12, 900) + b"topic=/t", b"\xff" * 64,
     ],
-)
+)  # fmt: skip
 async def test_malformed_headers_are_counted_and_closed(
     served: Served, data: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -234,24 +230,6 @@ async def request_topic(uri: str) -> XmlRpcValue:
     return [reply.code, reply.value]
 
 
-async def test_each_of_many_nodes_is_reached_at_its_own_address(listener: SharedListener) -> None:
-    before = listening()
-    nodes = [await node(listener, f"/n{number}") for number in range(100)]
-    assert listening() == before
-    assert len(listener._nodes) == len({one.uri for one in nodes}) == 100
-    for one in nodes:
-        address = one.address_of("/t")
-        assert address is not None
-        assert one.uri == f"http://{address[0]}:{listener.ports[0]}/"
-        assert one.service_uri == f"rosrpc://{address[0]}:{listener.ports[1]}"
-        assert (await call_api(one.uri, "getName", "/s")).value == one.name
-        assert await request_topic(one.uri) == [1, ["TCPROS", *address]]
-        assert await connect(address) == one.name
-    for one in nodes:
-        await one.close()
-    assert len(listener._nodes) == 0
-
-
 async def test_the_address_of_a_closed_node_is_refused_and_not_given_again(listener: SharedListener) -> None:
     counters = listener._counters
     first = await node(listener, "/n")
@@ -273,43 +251,9 @@ async def test_the_address_of_a_closed_node_is_refused_and_not_given_again(liste
     assert (await call_api(second.uri, "getName", "/s")).value == "/n"
 
 
-async def test_open_connections_end_with_their_node_and_no_other(listener: SharedListener) -> None:
-    one, other = await node(listener, "/one"), await node(listener, "/other")
-    links = []
-    for made in (one, other):
-        address = made.address_of("/t")
-        assert address is not None
-        links.append(await RawSubscriber.connect(address))
-        await links[-1].header()
-    await one.close()
-    assert await links[0].ended()
-    other._publications["/t"].publish_framed(b"\x02\0\0\0hi")
-    assert await links[1].message() == b"hi"
-
-
 async def test_other_addresses_of_this_machine_are_no_nodes(listener: SharedListener) -> None:
     await node(listener, "/n")
     assert await request_topic(f"http://127.0.0.1:{listener.ports[0]}/") == [-1, 0]
-
-
-async def test_a_call_under_way_when_its_node_closes_is_not_left_open(listener: SharedListener) -> None:
-    made = await node(listener, "/n")
-    link = await RawSubscriber.dial((made.uri.split("/")[2].split(":")[0], listener.ports[0]))
-    await until(lambda: made._http._arriving or made._http._connections)
-    await made.close()
-    assert await link.ended()
-
-
-async def test_missing_right_to_bind_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Forbidden(socket.socket):
-        def setsockopt(self, level: int, option: int, value: int | bytes) -> None:  # type: ignore[override]
-            if option == socket.SO_BINDTODEVICE:
-                raise PermissionError(errno.EPERM, "Operation not permitted")
-            super().setsockopt(level, option, value)
-
-    monkeypatch.setattr(socket, "socket", Forbidden)
-    with pytest.raises(StartError, match="one listening socket for all proxies: Operation not permitted"):
-        await SharedListener(SALT).start()
 
 
 async def test_missing_device_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -332,13 +276,6 @@ async def test_addresses_that_lead_nowhere_are_found_out(monkeypatch: pytest.Mon
 RESERVED = [IPv4Network("127.0.0.0/16"), IPv4Network("127.255.0.0/16")]
 
 
-def test_an_address_follows_from_the_name_and_the_graph() -> None:
-    address = LoopbackAddresses(SALT).take("/rmpa/base/driver", 0.0)
-    assert LoopbackAddresses(SALT).take("/rmpa/base/driver", 7.0) == address
-    assert LoopbackAddresses(SALT).take("/rmpa/base/camera", 0.0) != address
-    assert LoopbackAddresses("http://127.0.0.1:11312/").take("/rmpa/base/driver", 0.0) != address
-
-
 def test_ten_thousand_nodes_have_addresses_of_their_own() -> None:
     addresses = LoopbackAddresses(SALT)
     given_out = {addresses.take(f"/rmpa/base/node_{n}", 0.0) for n in range(10_000)}
@@ -351,16 +288,6 @@ def test_no_address_is_special(name: str) -> None:
     assert address in IPv4Network("127.0.0.0/8")
     assert not any(address in network for network in RESERVED)
     assert address.packed[3] not in {0, 255}
-
-
-def test_a_freed_address_rests_even_for_the_same_node() -> None:
-    addresses = LoopbackAddresses(SALT)
-    first = addresses.take("/n", 0.0)
-    addresses.free(first, 10.0)
-    second = addresses.take("/n", 10.0)
-    assert second != first
-    addresses.free(second, 11.0)
-    assert addresses.take("/n", 10.0 + LOOPBACK_REST) == first
 
 
 def test_freeing_what_is_not_in_use_changes_nothing() -> None:

@@ -31,13 +31,11 @@ SERVICES: Final[dict[str, tuple[str, str, str]]] = {
     "---": ("d41d8cd98f00b204e9800998ecf8427e", "", ""),
     "int64 a\n\n---\n\n# none\n": ("019706110004b728d56d8baaa8e32797", "int64 a\n\n", "\n# none\n\n"),
     "int64 a\n---\nint64 b\n---\nint64 c\n": (
-        "e9a1f77cfc139471e2f84c8720116168",
-        "int64 a\n",
-        "int64 b\nint64 c\n\n",
+        "e9a1f77cfc139471e2f84c8720116168", "int64 a\n", "int64 b\nint64 c\n\n",
     ),
     "int64 a\n": ("019706110004b728d56d8baaa8e32797", "int64 a\n\n", ""),
     "int64 a\n ---\n": ("", "", ""),
-}
+}  # fmt: skip
 
 VALUES_OF: Final = (
     "byte small\nbyte[] many\nbyte[2] two\nchar letter\nint32[0] none\ntime at\ntime[] times\nduration took\n"

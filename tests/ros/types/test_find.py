@@ -107,18 +107,6 @@ def test_what_genpy_made_is_read_and_not_run(tmp_path: Path) -> None:
     assert sums("my_msgs/M", CMAKE_PREFIX_PATH=tmp_path / "install") == kind.md5sum
 
 
-def test_an_action_file_is_enough(tmp_path: Path) -> None:
-    package(tmp_path / "my_msgs", action_Do="float64 metres\n---\nbool done\n---\nPose at\n", msg_Pose="float64 x")
-    environ = {"ROS_PACKAGE_PATH": str(tmp_path)}
-    whole = find_message_type("my_msgs/DoAction", environ=environ)
-    assert [field.name for field in whole.fields] == ["action_goal", "action_result", "action_feedback"]
-    goal = find_message_type("my_msgs/DoActionGoal", environ=environ)
-    assert goal.to_plain(goal.make({"goal": {"metres": 2}}))["goal"] == {"metres": 2.0}
-    assert "at" in find_message_type("my_msgs/DoFeedback", environ=environ).definition
-    with pytest.raises(UnknownTypeError, match="my_msgs/DoMore"):
-        find_message_type("my_msgs/DoMore", environ=environ)
-
-
 def test_services(tmp_path: Path) -> None:
     package(
         tmp_path / "src" / "my_pkg",
@@ -197,14 +185,6 @@ def test_what_is_missing_or_malformed_within_is_named(tmp_path: Path) -> None:
     os.mkfifo(made / "msg" / "F.msg")
     with pytest.raises(UnknownTypeError):
         find_message_type("my_msgs/F", environ=environ)
-
-
-def test_a_type_that_was_made_since_the_last_look_is_found(tmp_path: Path) -> None:
-    environ = {"ROS_PACKAGE_PATH": str(tmp_path)}
-    package(tmp_path / "deep" / "my_msgs", msg_A="int8 a")
-    find_message_type("my_msgs/A", environ=environ)
-    package(tmp_path / "deep" / "new_msgs", msg_B="int8 b")
-    find_message_type("new_msgs/B", environ=environ)
 
 
 def test_types_from_headers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -317,23 +297,6 @@ def names(root: Path) -> dict[str, list[str]]:
     found, whole = packages_below(str(root))
     assert whole
     return {name: [str(folder.relative_to(root)) for folder in found[name]] for name in sorted(found)}
-
-
-def test_packages_in_nested_folders(tmp_path: Path) -> None:
-    package(tmp_path / "a_msgs", msg_A="int8 a")
-    package(tmp_path / "stack" / "deep" / "er" / "b_folder", "b_msgs", srv_B="---")
-    package(tmp_path / "c_msgs", action_C="---\n---")
-    package(tmp_path / "only_code")
-    rosbuild = package(tmp_path / "old_msgs", msg_O="int8 o")
-    (rosbuild / "package.xml").rename(rosbuild / "manifest.xml")
-    (tmp_path / "loose" / "msg").mkdir(parents=True)
-    assert names(tmp_path) == {
-        "a_msgs": ["a_msgs"],
-        "b_msgs": ["stack/deep/er/b_folder"],
-        "c_msgs": ["c_msgs"],
-        "loose": ["loose"],
-        "old_msgs": ["old_msgs"],
-    }
 
 
 def test_what_is_hidden(tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from rmpa.ros.wire.slave_api import (
     BusConnection,
     BusLink,
-    bus_info,
     bus_stats,
     read_bus_info,
     read_bus_stats,
@@ -46,31 +45,9 @@ def test_the_connections_of_each_library_are_read(status: str, way: str, port: i
     assert found == BusLink(1, other, way == "i", "/chatter", True, port, ("127.0.0.1", to))
 
 
-def test_a_node_of_ours_is_read_too() -> None:
-    text = "TCPROS connection on port {} to [10.0.0.2:{}]"
-    value = bus_info(
-        [
-            BusConnection(1, "/s", "o", "/out", True, text.format(1, 2), 70, 7),
-            BusConnection(2, "http://10.0.0.2:3/", "i", "/in", False, text.format(4, 5), 50, 5),
-        ]
-    )
-    links = [
-        BusLink(1, "/s", False, "/out", True, 1, ("10.0.0.2", 2)),
-        BusLink(2, "http://10.0.0.2:3/", True, "/in", False, 4, ("10.0.0.2", 5)),
-    ]
-    assert read_bus_info([1, "bus info", value]) == links
-    assert read_bus_info(value) == links
-
-
 ROW: tuple[XmlRpcValue, ...] = (
-    7,
-    "http://base:4711/",
-    "i",
-    "TCPROS",
-    "/a",
-    True,
-    "TCPROS connection on port 4 to [base:5 on socket 6]",
-)
+    7, "http://base:4711/", "i", "TCPROS", "/a", True, "TCPROS connection on port 4 to [base:5 on socket 6]",
+)  # fmt: skip
 LINK = BusLink(7, "http://base:4711/", True, "/a", True, 4, ("base", 5))
 
 
@@ -88,11 +65,8 @@ def link(**changed: object) -> BusLink:
 @pytest.mark.parametrize(
     ("written", "read"),
     [
-        (row(), [LINK]),
-        ([*row(), "more"], [LINK]),
-        (row(connected=1), [LINK]),
-        (row(connected=0), [link(connected=False)]),
-        (row(connected="yes"), [link(connected=False)]),
+        (row(), [LINK]), ([*row(), "more"], [LINK]), (row(connected=1), [LINK]),
+        (row(connected=0), [link(connected=False)]), (row(connected="yes"), [link(connected=False)]),
         (row()[:5], [link(connected=False, local_port=None, remote=None)]),
         (row()[:6], [link(local_port=None, remote=None)]),
         (row(info="Closed TCPROS connection on port 4 to [base:5]"), [link(connected=False)]),
@@ -101,19 +75,11 @@ def link(**changed: object) -> BusLink:
         (row(info="TCPROS connection on port 4 to [fe80::1:5 on socket 6]"), [link(remote=("fe80::1", 5))]),
         (row(info="TCPROS connection to [base]"), [link(local_port=None, remote=None)]),
         (row(info=5), [link(local_port=None, remote=None)]),
-        (row(transport="UDPROS"), [link(local_port=None, remote=None)]),
-        (row(direction="b"), []),
-        (row(direction=[]), []),
-        (row(number="7"), []),
-        (row(number=True), []),
-        (row(other=None), []),
-        (row(topic=5), []),
-        (row()[:4], []),
-        ([], []),
-        ("TCPROS", []),
-        ({"a": 1}, []),
+        (row(transport="UDPROS"), [link(local_port=None, remote=None)]), (row(direction="b"), []),
+        (row(direction=[]), []), (row(number="7"), []), (row(number=True), []), (row(other=None), []),
+        (row(topic=5), []), (row()[:4], []), ([], []), ("TCPROS", []), ({"a": 1}, []),
     ],
-)
+)  # fmt: skip
 def test_a_connection_is_read_as_far_as_it_can_be(written: XmlRpcValue, read: list[BusLink]) -> None:
     assert read_bus_info([1, "", [written]]) == read
     assert read_bus_info([written]) == read

@@ -12,8 +12,6 @@ from rmpa.ros.wire.http import (
     HttpRequest,
     RequestParser,
     ResponseParser,
-    post_request,
-    response_head,
 )
 
 ROSCPP = b"POST / HTTP/1.1\r\nUser-Agent: XMLRPC++ 0.7\r\nHost: 10.0.0.1:11311\r\nContent-Type: text/xml\r\n"
@@ -47,12 +45,6 @@ def test_http_1_0_closes_whatever_it_asks_for() -> None:
     assert parse(data) == [HttpRequest(memoryview(b"x"), "", True)]
 
 
-def test_several_requests_in_one_piece() -> None:
-    data = ROSPY + b"Content-length: 1\r\n\r\n"
-    requests = [HttpRequest(memoryview(body), "", False) for body in (b"a", b"b")]
-    assert parse(data + b"a" + data + b"b" + data) == requests
-
-
 def test_a_body_in_chunks() -> None:
     data = ROSPY + b"Transfer-Encoding: chunked\r\n\r\n2\r\nab\r\n1\r\nc\r\n0\r\n\r\n"
     assert parse(data) == [HttpRequest(memoryview(b"abc"), "", False)]
@@ -61,8 +53,7 @@ def test_a_body_in_chunks() -> None:
 @pytest.mark.parametrize(
     ("data", "status"),
     [
-        (b"GET / HTTP/1.1\r\nHost: x\r\n\r\n", 405),
-        (b"POST / HTTP/1.1\r\nContent-length: 1\r\n\r\nx", 400),
+        (b"GET / HTTP/1.1\r\nHost: x\r\n\r\n", 405), (b"POST / HTTP/1.1\r\nContent-length: 1\r\n\r\nx", 400),
         (b"POST / HTTP/1.1\r\nHost: x\r\nHost: y\r\nContent-length: 1\r\n\r\nx", 400),
         (b"POST / HTTP/1.1\r\nHost: x\r\nContent-length: 1\r\nContent-length: 1\r\n\r\nx", 400),
         (b"POST / HTTP/1.1\r\nHost: x\r\nContent-length: -1\r\n\r\n", 400),
@@ -72,10 +63,9 @@ def test_a_body_in_chunks() -> None:
         (b"POST / HTTP/1.1\r\nHost: x\r\nContent-length: %d\r\n\r\n" % (limits.HTTP_DISCARDED_MAX + 1), 413),
         (b"POST / HTTP/1.1\r\nHost: x\r\nConnection: upgrade\r\nUpgrade: h2c\r\n\r\n", 400),
         (b"POST / HTTP/1.1\r\nHost : x\r\nContent-length: 1\r\n\r\nx", 400),
-        (b"CONNECT x:80 HTTP/1.1\r\nHost: x\r\n\r\n", 405),
-        (b"\x16\x03\x01\x02\x00\x01\x00", 400),
+        (b"CONNECT x:80 HTTP/1.1\r\nHost: x\r\n\r\n", 405), (b"\x16\x03\x01\x02\x00\x01\x00", 400),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_answered_is_refused(data: bytes, status: int) -> None:
     made = parser()
     *_, refusal = made.feed(data)
@@ -119,14 +109,6 @@ def response(*parts: bytes) -> bytes | None:
         if (body := made.feed(part)) is not None:
             return body
     return None
-
-
-def test_our_responses_and_requests_are_read_by_the_parsers() -> None:
-    for status in (200, 431):
-        assert response(response_head(status, 3, close=True) + b"abc") == b"abc"
-    data = post_request("h", 5, "/a b", b"xyz")
-    assert data.startswith(b"POST /a%20b HTTP/1.1\r\nHost: h:5\r\n")
-    assert parse(data) == [HttpRequest(memoryview(b"xyz"), "", True)]
 
 
 def test_a_status_of_1xx_comes_before_the_response() -> None:

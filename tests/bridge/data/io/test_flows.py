@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import pytest
 from hypothesis import given, settings
@@ -22,9 +23,6 @@ from rmpa.mesh.frames import FrameKind
 from rmpa.ros import limits as ros_limits
 from rmpa.runtime import limits as runtime_limits
 from tests.bridge.io.doubles import Clock, Link, Outlet, add, running
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 BEST = Contract()
 RELIABLE = Contract(reliability=Reliability.RELIABLE)
@@ -169,19 +167,12 @@ def test_messages_in_any_parts_are_delivered_unchanged(run: list[tuple[int, set[
 @pytest.mark.parametrize(
     ("first", "then"),
     [
-        (b"", None),
-        (b"\1\0\0", None),
-        (b"\xff\xff\xff\xff", None),
-        ((ros_limits.MESSAGE_MAX - 3).to_bytes(4, "little"), None),
-        (b"\3\0\0\0abcd", None),
-        (b"\3\0\0\0ab", (2, 0, b"cd")),
-        (b"\3\0\0\0ab", (2, LAST, b"")),
-        (b"\3\0\0\0ab", (2, 0, b"c")),
-        (b"\3\0\0\0ab", (3, LAST, b"c")),
-        (b"\3\0\0\0ab", (4, 0, b"c")),
-        (b"\3\0\0\0ab", (3, LAST | ABORT, b"")),
+        (b"", None), (b"\1\0\0", None), (b"\xff\xff\xff\xff", None),
+        ((ros_limits.MESSAGE_MAX - 3).to_bytes(4, "little"), None), (b"\3\0\0\0abcd", None),
+        (b"\3\0\0\0ab", (2, 0, b"cd")), (b"\3\0\0\0ab", (2, LAST, b"")), (b"\3\0\0\0ab", (2, 0, b"c")),
+        (b"\3\0\0\0ab", (3, LAST, b"c")), (b"\3\0\0\0ab", (4, 0, b"c")), (b"\3\0\0\0ab", (3, LAST | ABORT, b"")),
     ],
-)
+)  # fmt: skip
 @pytest.mark.parametrize("contract", [BEST, RELIABLE], ids=["best_effort", "reliable"])
 def test_parts_that_make_no_message_are_the_peers_error(
     first: bytes, then: tuple[int, int, bytes] | None, contract: Contract
@@ -289,16 +280,6 @@ def test_beyond_its_lifespan_a_message_is_worth_nothing(clock: Clock) -> None:
     assert inlet.flow.watch.counts == {QosEventKind.LIFESPAN_EXPIRED: 4}
 
 
-def test_a_lifespan_counts_whatever_held_the_message_up(clock: Clock) -> None:
-    inlet = Inlet(Contract(lifespan=0.5), error=0.001, first=2)
-    inlet.resumed = -math.inf
-    burst(inlet, clock, [0.9])
-    assert inlet.counts == (0, 0, 0, 1)
-    blind = Inlet(Contract(lifespan=0.5))
-    burst(blind, clock, [60.0])
-    assert blind.got == [b"\2"], "without a clock nothing expires"
-
-
 def test_closed_nothing_happens_any_more(clock: Clock) -> None:
     inlet = Inlet(NEWEST, error=0.001, first=2)
     burst(inlet, clock, [9.0])
@@ -339,19 +320,11 @@ def replayed(kept: list[bytes], sent: list[bytes], contract: Contract = BEST, *,
 @pytest.mark.parametrize(
     ("kept", "sent", "new"),
     [
-        ("", "abc", "abc"),
-        ("a", "a", ""),
-        ("a", "ab", "b"),
-        ("a", "aa", "a"),
-        ("a", "ba", "ba"),
-        ("abc", "abc", ""),
-        ("abc", "bcd", "d"),
-        ("abc", "cde", "de"),
-        ("abc", "def", "def"),
-        ("abc", "dabc", "dabc"),
-        ("aaa", "aaaa", "a"),
+        ("", "abc", "abc"), ("a", "a", ""), ("a", "ab", "b"), ("a", "aa", "a"), ("a", "ba", "ba"),
+        ("abc", "abc", ""), ("abc", "bcd", "d"), ("abc", "cde", "de"), ("abc", "def", "def"),
+        ("abc", "dabc", "dabc"), ("aaa", "aaaa", "a"),
     ],
-)
+)  # fmt: skip
 def test_a_new_route_brings_nothing_again(kept: str, sent: str, new: str, contract: Contract, cut: bool) -> None:
     def messages(letters: str) -> list[bytes]:
         return [letter.encode() * 100 for letter in letters]
@@ -362,36 +335,13 @@ def test_a_new_route_brings_nothing_again(kept: str, sent: str, new: str, contra
 # --- in: reliable ---------------------------------------------------------------------------------------------
 
 
-def test_overflow_is_the_exact_gap_on_a_new_link(clock: Clock) -> None:
-    inlet = Inlet(RELIABLE)
-    assert not inlet.begin(5, 1)
-    inlet.message(1, b"1")
-    inlet.message(2, b"2")
-    inlet.flow.torn()
-    assert inlet.flow.position == (5, 2)
-    acks: list[int] = []
-    inlet.acks = acks
-    assert inlet.begin(5, 1)
-    inlet.message(2, b"2")
-    inlet.message(3, b"3")
-    inlet.parts(9, b"9" * BIG, 50)
-    clock.advance(1.0)
-    assert inlet.got == [b"1", b"2", b"3", b"9" * BIG]
-    assert inlet.counts == (5, 0, 0, 0), "what is repeated on request is not late"
-    assert inlet.flow.watch.counts == {QosEventKind.MESSAGES_LOST: 5}
-    assert acks == [9]
-    assert inlet.flow.position == (5, 9)
-
-
 @pytest.mark.parametrize(
     ("priority", "size", "lane"),
     [
-        (Priority.HIGH, BIG, "express"),
-        (Priority.LOW, 1, "bulk"),
-        (Priority.NORMAL, 1, "express"),
+        (Priority.HIGH, BIG, "express"), (Priority.LOW, 1, "bulk"), (Priority.NORMAL, 1, "express"),
         (Priority.NORMAL, BIG, "bulk"),
     ],
-)
+)  # fmt: skip
 def test_the_lane_as_the_monitor_shows_it(priority: Priority, size: int, lane: str) -> None:
     inlet = Inlet(Contract(priority=priority))
     inlet.parts(1, bytes(size), 4)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING, TypeVar
+from collections.abc import Callable, Iterator
+from typing import TypeVar
 
 import pytest
 from hypothesis import given, settings
@@ -16,9 +17,6 @@ from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, History, Reliability
 from rmpa.mesh import limits as mesh_limits
 from tests.bridge.io.doubles import Clock, Link, add, running
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 SMALL = b"s" * 8
 LARGE = b"L" * (mesh_limits.EXPRESS_MESSAGE_MAX + 1)
@@ -150,14 +148,6 @@ def cut(sent: int, missed: int, after: int, contract: Contract = BEST_EFFORT, *,
 def test_without_a_link_the_depth_bounds_what_waits() -> None:
     assert cut(5, 3, after=2, contract=Contract(depth=2)) == [7, 8, 9]
     assert cut(5, 0, after=2, contract=Contract(depth=1)) == [5, 6]
-
-
-def test_what_was_sent_long_ago_is_not_kept() -> None:
-    sender = RouteSender(Link(), 7, Contract())
-    sender.message(0, b"")
-    sender.message(10**10, b"")
-    sender.suspend()
-    assert sender.following == 2
 
 
 # --- best effort, in parts ------------------------------------------------------------------------------------

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import msgspec
 import pytest
@@ -21,9 +22,6 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.statistics import Counters
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.trust.permissions import Permissions
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 SOURCE = Source("/chatter", "/talker")
 URI = "http://10.0.0.1:1234/"
@@ -174,13 +172,6 @@ def module(monkeypatch: pytest.MonkeyPatch) -> Module:
     return Module(monkeypatch)
 
 
-async def test_a_grant_names_the_service_by_which_the_node_is_probed(module: Module) -> None:
-    module.services["/talker/get_loggers"] = {"/talker": "rosrpc://127.0.0.1:1"}
-    assert await module.open() == {"port": 45225, "probe": "/talker/get_loggers"}
-    module.services["/talker/get_loggers"] = {"/other": "rosrpc://127.0.0.1:1"}
-    assert await module.open() == {"port": 45225, "probe": ""}, "of another node"
-
-
 @pytest.mark.trap(12)
 async def test_a_subscriber_is_granted_the_publishers_port(module: Module) -> None:
     assert await module.open() == {"port": 45225, "probe": ""}
@@ -216,29 +207,6 @@ async def test_only_a_peer_with_a_grant_may_have_a_node_examined(module: Module)
     assert module.suspected == []
     await module.open(broken=True)
     assert (module.suspected, module.forgotten) == (["/talker"], [URI])
-
-
-@pytest.mark.parametrize(
-    ("silent", "crashed", "same", "shared", "ends"),
-    [
-        (True, False, False, False, True),
-        (True, True, False, False, False),
-        (True, False, True, False, False),
-        (False, False, False, False, False),
-        (True, False, False, True, False),
-    ],
-)
-async def test_connections_end_where_a_host_may_have_vanished(
-    module: Module, *, silent: bool, crashed: bool, same: bool, shared: bool, ends: bool
-) -> None:
-    await module.open()
-    module.sessions[1].same_machine = same
-    module.sessions[1].silent = silent
-    if shared:
-        module.sessions[2].address = module.sessions[1].address
-    module.sessions[1].link.crashed = crashed
-    module.sut.link_down(module.sessions[1])
-    assert module.ended == ([(45225, "10.0.0.1")] if ends else [])
 
 
 async def test_the_grants_and_the_remembered_refusals_of_a_peer_are_bounded(
@@ -316,34 +284,6 @@ async def test_a_secured_peer_does_not_learn_of_a_service_that_it_may_not_have(
     assert [(peer, what) for peer, what, _ in module.told] == ([] if secured else [(1, "direct.service_again")])
 
 
-@pytest.mark.parametrize("secured", [True, False])
-async def test_a_peer_tries_again_when_what_it_may_have_is_published(module: Module, *, secured: bool) -> None:
-    offered = dict(module.offered)
-    if secured:
-        module.permit(TrustSettings(direct=True))
-        module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=False)
-        assert (await module.open())["text"] == "/talker has just left"
-    else:
-        module.offered.clear()
-        assert (await module.open())["why"] == Condition.OFFERED
-        module.offered.update(offered)
-    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
-    assert [(peer, what) for peer, what, _ in module.told] == [(1, AGAIN)]
-
-
-async def test_an_interruption_by_a_lost_link_is_told_after_it(module: Module) -> None:
-    await module.open()
-    module.sessions[1].link.crashed = True
-    module.sut.link_down(module.sessions[1])
-    assert module.sut.interruptions.get(("peer1", WANT)) is None, "the nodes go on"
-    module.sessions[1].link.crashed = False
-    module.sut.link_down(module.sessions[1])
-    assert module.sut.interruptions["peer1", WANT][2] is None
-    module.sut.gone(module.sessions[1])
-    await module.open()
-    assert module.sut.interruptions["peer1", WANT][2] is not None
-
-
 async def test_a_subscriber_stands_in_the_graph_as_its_proxy_while_it_is_granted(module: Module) -> None:
     there = ("registerSubscriber", "/rmpa/peer1/viewer", "/chatter", "*", "http://10.0.0.1:99/")
     gone = ("unregisterSubscriber", "/rmpa/peer1/viewer", "/chatter", "http://10.0.0.1:99/")
@@ -356,14 +296,3 @@ async def test_a_subscriber_stands_in_the_graph_as_its_proxy_while_it_is_granted
     assert module.registered == [there, there], "the core has been restarted"
     module.close()
     assert module.registered == [there, there, gone]
-
-
-async def test_one_publisher_of_two_that_goes_leaves_the_subscriber_in_the_graph(module: Module) -> None:
-    module.publishers["/chatter"]["/other"] = URI
-    module.offered[Source("/chatter", "/other")] = module.offered[SOURCE]
-    await module.open()
-    await module.open(node="/other")
-    module.close()
-    assert len(module.registered) == 1
-    module.sut.gone(module.sessions[1])
-    assert [method for method, *_ in module.registered] == ["registerSubscriber", "unregisterSubscriber"]

@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import AsyncIterator, Callable
+from typing import Any, cast
 
-from rmpa.config.rules import GatewaySettings, Ros2Settings
+from rmpa.config.rules import CrossingRule, GatewaySettings, Ros2Settings
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, Ros2Qos, parse_token
 from rmpa.gateway.ros2.graph import gid_of
 from rmpa.gateway.ros2.ros2 import Ros2Neighbour
 from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types
-from rmpa.gateway.zenoh.threads import ZenohQos
+from rmpa.gateway.zenoh.threads import ZenohQos, ZenohSample
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_graph import MemoryGraph, MemoryTopic
 from tests.gateway.memory_zenoh import MemoryQuery, MemoryZenoh, eventually
 from tests.gateway.ros2.type_descriptions import response
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
-    from rmpa.config.rules import CrossingRule
-    from rmpa.gateway.zenoh.threads import ZenohSample
 
 STRING = MessageType("std_msgs/String")
 NO_TYPE = "RIHS01_" + "0" * 64

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import UnreachableError
-from rmpa.gateway.ros2.actions import Ros2Actions
 from rmpa.gateway.ros2.conversion import ActionPair
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, data_key
 from rmpa.gateway.ros2.types import Ros2Types, TypePair
@@ -116,16 +115,6 @@ async def test_an_action_of_a_type_that_ros1_lacks_is_learnt_from_its_server(bed
     assert (got.status.status, got.result.where) == (3, "home")
     await bed.ros2.close()
     await eventually(lambda: not bed.graph.topics)
-
-
-async def test_other_topics_of_such_names_are_left_to_other_parts(bed: Ros2Bed) -> None:
-    part = Ros2Actions(bed.neighbour.context)
-    for name, kind, taken in (
-        ("/door/status", STRING, False),
-        ("/goal", STRING, False),
-        ("/do/goal", ACTION["goal"], True),
-    ):
-        assert part.mesh_source(bed.graph.publisher(name, kind), there=True) is taken
 
 
 class OtherSites:

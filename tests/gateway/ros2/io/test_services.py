@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -14,16 +14,13 @@ from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment
 from rmpa.gateway.ros2.graph import gid_of
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.gateway.rules import SourceKind
+from rmpa.gateway.zenoh.threads import ZenohReply
 from rmpa.ros.types.definitions import known_text
 from rmpa.ros.types.installed import ServiceType
+from tests.gateway.memory_graph import MemoryService
 from tests.gateway.memory_zenoh import MemoryQuery, eventually
 from tests.gateway.ros2.io.ros2_bed import NO_TYPE, Ros2Bed, cdr, ros2_bed
 
-if TYPE_CHECKING:
-    from rmpa.gateway.zenoh.threads import ZenohReply
-    from tests.gateway.memory_graph import MemoryService
-
-SET_BOOL = ServiceType("std_srvs/SetBool")
 ADD = ServiceType("rospy_tutorials/AddTwoInts")
 ADD_2 = "example_interfaces/srv/AddTwoInts"
 
@@ -207,30 +204,6 @@ async def test_a_service_of_a_type_that_ros1_lacks_is_learnt_from_its_node_and_c
     got = GRIP.response.deserialize(await service.serve(asking(GRIP, fingers=fingers)))
     assert (got.ok, got.at.sec, got.at.nanosec) == (True, 7, 2)
     assert len(asked) == 1
-
-
-async def test_a_service_that_differs_from_ros1s_is_called_by_the_fields_that_its_node_describes(
-    bed: Ros2Bed,
-) -> None:
-    theirs, name = Ros2Types("jazzy").variant({}), "std_srvs/srv/SetBool"
-    wider = ServiceType("std_srvs/SetBool", "bool data\nstring why\n---\nbool success\nstring message\n")
-    for part in ("", "_Request", "_Response", "_Event"):
-        theirs.store.fielddefs.pop(name + part, None)
-        theirs.store.types.pop(name + part, None)
-    type_hash = theirs.service_hash(wider)
-    bed.describes("/motor", theirs, name)
-    asked: list[bytes] = []
-
-    def answer(query: MemoryQuery) -> None:
-        asked.append(query.payload)
-        query.answer(cdr(theirs, f"{name}_Response", True, "on"))
-
-    bed.server("/on", name, answer, node="/motor", type_hash=type_hash)
-    service = await shown(bed, "/on")
-    assert (await service.describe()).md5sum == SET_BOOL.md5sum
-    assert SET_BOOL.response.deserialize(await service.serve(asking(SET_BOOL, data=True))).message == "on"
-    request: Any = theirs.store.deserialize_cdr(asked[0], f"{name}_Request")
-    assert (request.data, request.why) == (True, "")
 
 
 async def test_rules_and_use_decide_what_crosses() -> None:

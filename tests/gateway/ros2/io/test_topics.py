@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pytest
 
 from rmpa.config.rules import Crossing, CrossingRule, Ros2Settings
 from rmpa.gateway import limits
@@ -16,9 +17,6 @@ from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_zenoh import eventually
 from tests.gateway.ros2.io.ros2_bed import NO_TYPE, STRING, Ros2Bed, cdr, ros2_bed, string
-
-if TYPE_CHECKING:
-    import pytest
 
 LATCHED = Ros2Qos(durability=Ros2Durability.TRANSIENT_LOCAL, depth=1)
 HEADER = "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id"
@@ -40,10 +38,8 @@ async def test_a_topic_of_a_module_is_a_publisher_of_ros2(bed: Ros2Bed) -> None:
     source = bed.graph.publisher("/chatter", STRING)
     (endpoint,) = bed.own(EntityKind.PUBLISHER)
     assert (endpoint.name, endpoint.type, endpoint.node.name) == (
-        "/chatter",
-        "std_msgs/msg/String",
-        "/rmpa/arm/talker",
-    )
+        "/chatter", "std_msgs/msg/String", "/rmpa/arm/talker",
+    )  # fmt: skip
     assert endpoint.type_hash.startswith("RIHS01_df668c740482bbd48fb39d76a70dfd4b")
     assert any("/NN/%/%rmpa%arm/talker" in key for key in bed.network.token_keys)
     assert bed.graph.send(source, string("nothing crosses")) == 0
@@ -124,7 +120,7 @@ async def test_a_subscription_with_another_hash_or_type_is_told(bed: Ros2Bed) ->
         ("/other", {"type_name": "std_msgs/msg/Int32"}),
         ("/fits", {}),
     ):
-        bed.subscribe("/chatter", node=node, **more)
+        bed.subscribe("/chatter", node=node, **more)  # fmt: skip
     await eventually(lambda: len(bed.problems) == 3)
     for node, text in (("older", "definitions differ"), ("humble", "Humble"), ("other", "std_msgs/msg/Int32")):
         assert text in bed.problems[f"/chatter of /{node}"]
@@ -240,16 +236,6 @@ async def test_a_transient_local_topic_is_latched_here(bed: Ros2Bed) -> None:
     first.on_demand(False)
     first.on_demand(True)
     assert first.messages[1] == b"forgotten", "what is latched may be old by then"
-
-
-async def test_a_transient_local_publisher_that_comes_later_has_its_history_asked(bed: Ros2Bed) -> None:
-    await bed.subscribed(bed.publisher("/map", node="/plain"))
-    late = bed.publisher("/map", node="/late", qos=LATCHED)
-    late.say("kept")
-    topic = await bed.shown("/map", "/late")
-    topic.on_demand(True)
-    await eventually(lambda: topic.messages)
-    assert topic.messages[0] == string("kept")
 
 
 async def test_the_fields_of_a_type_that_only_ros2_has_are_asked_of_its_node(bed: Ros2Bed) -> None:
