@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from rmpa.record.format import CLOCK, ClockRecord, ModuleRecord, RecordedSource, SegmentWriter
+from rmpa.record.format import CLOCK, TIME, ClockRecord, ModuleRecord, RecordedSource, SegmentWriter
 from rmpa.ros.types.messages import MessageType
 
 TEXT = MessageType("std_msgs/String")
@@ -34,13 +34,15 @@ Record = Callable[..., Path]
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Record:
-    """Writes a recording of one module: what was said on each topic, and what it knew of others' clocks."""
+    """Writes a file of one module: what was said on each topic, and what it knew of others' clocks at a time."""
 
     def write(
         module: str,
         said: dict[RecordedSource, Said],
         clocks: dict[str, tuple[float, float | None]] | None = None,
         name: str = "00000001.mcap",
+        at: float = 0.0,
+        epoch: float | None = None,
     ) -> Path:
         folder = tmp_path / module
         folder.mkdir(exist_ok=True)
@@ -48,8 +50,11 @@ def recording(tmp_path: Path) -> Record:
         with path.open("wb") as file:
             writer = SegmentWriter(file, ModuleRecord(name=module))
             if clocks:
-                known = {peer: ClockRecord(START, ahead, error) for peer, (ahead, error) in clocks.items()}
+                when = START + round(at * SECOND)
+                known = {peer: ClockRecord(when, ahead, error) for peer, (ahead, error) in clocks.items()}
                 writer.metadata(CLOCK, {peer: msgspec.json.encode(one).decode() for peer, one in known.items()})
+            if epoch is not None:
+                writer.metadata(TIME, {"boot": "1", "epoch": str(START + round(epoch * SECOND))})
             lines = sorted((at, one, data) for one, each in said.items() for at, data in each)
             for at, one, data in lines:
                 when = START + round(at * SECOND)

@@ -12,11 +12,13 @@ from __future__ import annotations
 import heapq
 import logging
 import struct
+from bisect import bisect_left
 from typing import IO, TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
+from mcap.data_stream import ReadDataStream
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, Footer, Message, Metadata, Schema
+from mcap.records import Channel, Chunk, ChunkIndex, Footer, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
@@ -31,8 +33,11 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 # The topic of events.
 EVENTS: Final = "/rmpa/events"
+# A topic of which each segment repeats the last message of each publisher, whether it latches or not.
+STATIC: Final = "/tf_static"
 MODULE: Final = "rmpa.module"
 CLOCK: Final = "rmpa.clock"
+TIME: Final = "rmpa.time"
 MERGE: Final = "rmpa.merge"
 SUFFIX: Final = ".mcap"
 # The end of the name of a segment that is being written.
@@ -40,6 +45,8 @@ UNFINISHED: Final = ".part"
 _ENCODING, _SCHEMA = "ros1", "ros1msg"
 _TEXT: Final = MessageType("std_msgs/String")
 _LENGTH: Final = struct.Struct("<I")
+# Bytes of opcode and length in front of a record of MCAP.
+_RECORD_HEAD: Final = 9
 
 
 class DamagedError(RmpaError):
@@ -84,6 +91,12 @@ class Recorded(NamedTuple):
     log_time: int
     publish_time: int
     data: bytes
+
+    @property
+    def repeated(self) -> bool:
+        """Whether it is a latched message that a segment has again, for what begins to read there."""
+        source = self.source
+        return self.publish_time != self.log_time and (source.latching or source.topic == STATIC)
 
 
 class ClockRecord(msgspec.Struct, frozen=True):
@@ -226,61 +239,110 @@ class SegmentReader:
         self.path = path
         self.module = ModuleRecord()
         self.clocks: dict[str, ClockRecord] = {}
+        # All that the file says of clocks, by peer; a merged one has many of each.
+        self.readings: list[tuple[str, ClockRecord]] = []
+        self.times: dict[str, str] = {}
         self.merged: dict[str, str] = {}
-        # Whether the end of the file is missing; known after ``messages``.
+        # Whether the end of the file is missing, and chunks that cannot be read; known after ``messages``.
         self.unfinished = False
+        self.damage = 0
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, RecordedSource] = {}
+        self._span = 0, 0
 
-    def head(self) -> tuple[int, set[RecordedSource]]:
-        """The time of the first message, and all sources; by the file's index, where it has one.
+    def head(self) -> tuple[int, int, set[RecordedSource]]:
+        """The times of the first and the last message, and all sources; by the file's index, where it has one.
 
         Raises:
             DamagedError: As for ``messages``.
         """
         try:
             with self.path.open("rb") as file:
-                reader = SeekingReader(file)
-                if (summary := reader.get_summary()) is not None and summary.statistics is not None:
-                    for record in reader.iter_metadata():
-                        self._metadata(record)
-                    self._schemas = dict(summary.schemas)
-                    self._channels = {number: self._source(one) for number, one in summary.channels.items()}
-                    return summary.statistics.message_start_time, set(self._channels.values())
-        except Exception as error:  # noqa: BLE001 - it has no index, as after a crash
-            _log.debug("%s: %s", self.path, error)
-        first, sources = 0, set[RecordedSource]()
+                if self._index(file) is not None:
+                    return *self._span, set(self._channels.values())
+        except OSError as error:
+            raise DamagedError(f"{self.path}: {error.strerror or error}") from None
+        first, last, sources = 0, 0, set[RecordedSource]()
         for message in self.messages():
-            first = first or message.log_time
+            first, last = min(first or message.log_time, message.log_time), max(last, message.log_time)
             sources.add(message.source)
-        return first, sources
+        return first, last, sources
 
-    def messages(self) -> Iterator[Recorded]:
+    def messages(self, since: int = 0) -> Iterator[Recorded]:
         """The messages in order of their log times; metadata is known after the first one.
+
+        Args:
+            since: Messages before may be left out, but for latched ones.
 
         Raises:
             DamagedError: The file cannot be read from its beginning on.
         """
-        chunk: list[Recorded] = []
         try:
             with self.path.open("rb") as file:
-                ended = False
-                try:
-                    for record in StreamReader(file, emit_chunks=True).records:
-                        ended = isinstance(record, Footer)
-                        if isinstance(record, Chunk):
-                            yield from _in_order(chunk)
-                            chunk = [one for part in breakup_chunk(record) if (one := self._take(part)) is not None]
-                        elif (one := self._take(record)) is not None:
-                            chunk.append(one)
-                except OSError:
-                    raise
-                except Exception as error:  # noqa: BLE001 - whatever the libraries make of damaged bytes
-                    if not self._channels and not self.module.name:
-                        raise DamagedError(f"{self.path}: it is no recording: {error}") from None
-                self.unfinished = not ended
+                chunks = self._index(file)
+                yield from self._unindexed(file) if chunks is None else self._indexed(file, chunks, since)
         except OSError as error:
             raise DamagedError(f"{self.path}: {error.strerror or error}") from None
+
+    def _index(self, file: IO[bytes]) -> list[ChunkIndex] | None:
+        """The chunks by the times of their first messages; ``None``: there is no index, as after a crash."""
+        try:
+            reader = SeekingReader(file)
+            summary = reader.get_summary()
+            if summary is None or summary.statistics is None or not summary.chunk_indexes:
+                return None
+            for record in reader.iter_metadata():
+                self._metadata(record)
+            self._schemas = dict(summary.schemas)
+            self._channels = {number: self._source(one) for number, one in summary.channels.items()}
+            self._span = summary.statistics.message_start_time, summary.statistics.message_end_time
+            return sorted(summary.chunk_indexes, key=lambda one: (one.message_start_time, one.chunk_start_offset))
+        except OSError:
+            raise
+        except Exception as error:  # noqa: BLE001 - whatever the library makes of damaged bytes
+            _log.debug("%s: %s", self.path, error)
+            return None
+
+    def _indexed(self, file: IO[bytes], chunks: list[ChunkIndex], since: int) -> Iterator[Recorded]:
+        """By the index: in order also where the clock was set back, and past chunks that are damaged."""
+        latching = {number for number, one in self._channels.items() if one.latching or one.topic == STATIC}
+        waiting: list[Recorded] = []
+        for one in chunks:
+            if one.message_end_time < since and not latching & one.message_index_offsets.keys():
+                continue
+            due = bisect_left(waiting, one.message_start_time, key=_log_time)
+            yield from waiting[:due]
+            del waiting[:due]
+            try:
+                file.seek(one.chunk_start_offset + _RECORD_HEAD)
+                records = breakup_chunk(Chunk.read(ReadDataStream(file)), validate_crc=True)
+            except Exception as error:  # noqa: BLE001 - as above
+                _log.debug("%s: %s", self.path, error)
+                self.damage += 1
+                continue
+            waiting += [message for record in records if (message := self._take(record)) is not None]
+            waiting.sort(key=_log_time)
+        yield from waiting
+
+    def _unindexed(self, file: IO[bytes]) -> Iterator[Recorded]:
+        """From the beginning on, as far as the file goes; in order within each chunk."""
+        ended, chunk = False, list[Recorded]()
+        file.seek(0)
+        try:
+            for record in StreamReader(file, emit_chunks=True).records:
+                ended = isinstance(record, Footer)
+                if isinstance(record, Chunk):
+                    yield from _in_order(chunk)
+                    chunk = [one for part in breakup_chunk(record) if (one := self._take(part)) is not None]
+                elif (one := self._take(record)) is not None:
+                    chunk.append(one)
+        except OSError:
+            raise
+        except Exception as error:
+            if not self._channels and not self.module.name:
+                why = "it is empty" if not file.seek(0, 2) else "it is no recording, or its beginning is damaged"
+                raise DamagedError(f"{self.path}: {why}") from error
+        self.unfinished = not ended
         yield from _in_order(chunk)
 
     def _take(self, record: object) -> Recorded | None:
@@ -307,9 +369,11 @@ class SegmentReader:
             if record.name == MODULE:
                 self.module = msgspec.convert(record.metadata, ModuleRecord)
             elif record.name == CLOCK:
-                self.clocks |= {
-                    peer: msgspec.json.decode(text, type=ClockRecord) for peer, text in record.metadata.items()
-                }
+                known = {p: msgspec.json.decode(text, type=ClockRecord) for p, text in record.metadata.items()}
+                self.clocks |= known
+                self.readings += known.items()
+            elif record.name == TIME:
+                self.times = dict(record.metadata)
             elif record.name == MERGE:
                 self.merged = dict(record.metadata)
         except (msgspec.DecodeError, msgspec.ValidationError):
@@ -325,9 +389,26 @@ def _log_time(message: Recorded) -> int:
     return message.log_time
 
 
-def read_in_order(paths: Iterable[Path]) -> Iterator[Recorded]:
-    """The messages of several files of one module, or of a merged one, in order of their log times."""
-    return heapq.merge(*(SegmentReader(path).messages() for path in paths), key=_log_time)
+def read_in_order(streams: Iterable[tuple[int, Iterator[Recorded]]]) -> Iterator[Recorded]:
+    """The messages of several files in order; a file is opened when its first message is due.
+
+    Args:
+        streams: The time of the first message of each, and its messages in order.
+    """
+    waiting: list[tuple[tuple[int, str, str, str], int, Recorded | None, Iterator[Recorded]]] = [
+        ((begin, "", "", ""), number, None, stream) for number, (begin, stream) in enumerate(streams)
+    ]
+    heapq.heapify(waiting)
+    while waiting:
+        _, number, message, stream = waiting[0]
+        if message is not None:
+            yield message
+        if (message := next(stream, None)) is None:
+            heapq.heappop(waiting)
+        else:
+            source = message.source
+            key = message.log_time, source.module, source.topic, source.node
+            heapq.heapreplace(waiting, (key, number, message, stream))
 
 
 def finish_file(path: Path) -> Path:
