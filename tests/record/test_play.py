@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import RmpaError
-from rmpa.record.format import SegmentReader
+from rmpa.record.merge import Timeline
 from rmpa.record.play import Player, PlayOptions
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.endpoints import Received
@@ -51,7 +51,7 @@ async def played(
         for topic, found in heard.items():
             kind = "rosgraph_msgs/Clock" if topic == "/clock" else "std_msgs/String"
             await ears.subscribe(topic, kind, partial(_hear, found))
-        player = Player(node, lambda: SegmentReader(path).messages(), PlayOptions(**options))
+        player = Player(node, Timeline([path]), PlayOptions(**options))
         async with asyncio.timeout(30):
             await player.run()
             while options.get("wait") and not all(heard.values()):
@@ -119,7 +119,7 @@ async def test_it_pauses_and_goes_step_by_step(core: RosCore, recording: Record)
     heard: list[str] = []
     async with Node("listener", master_uri=core.uri) as ears, Node("player", master_uri=core.uri) as node:
         await ears.subscribe("/scan", "std_msgs/String", lambda received: heard.append(received.message.data))
-        player = Player(node, lambda: SegmentReader(path).messages(), PlayOptions())
+        player = Player(node, Timeline([path]), PlayOptions())
         player.pause()
         task = asyncio.create_task(player.run())
         async with asyncio.timeout(30):
@@ -137,5 +137,5 @@ async def test_a_topic_that_changes_its_type_is_played_as_it_was_first(core: Ros
     other = source("/scan", "/other")._replace(type="std_msgs/Int8", md5sum="27ffa0c9c4b8fb8492252bcad9e5c57b")
     path = recording("run", {SCAN: [(0.0, "a")], other: [(0.1, "b")]})
     player, _ = await played(core, path, [])
-    assert player.left_out == {"/scan": "it changes its type, from std_msgs/String to std_msgs/Int8"}
+    assert player.left_out == {"/scan as std_msgs/Int8": "it is std_msgs/String at first"}
     assert player.count == 1

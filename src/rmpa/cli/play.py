@@ -9,6 +9,7 @@ import signal
 import sys
 import termios
 import tty
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -16,7 +17,7 @@ import click
 
 from rmpa.cli.module import check_record
 from rmpa.cli.options import FiniteRange, Options, argument, flag, graph_verb, json_verb
-from rmpa.cli.output import Table, paint, print_text
+from rmpa.cli.output import Table, paint, printable
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.runtime.tasks import start_task
 
@@ -74,24 +75,31 @@ def play(recording: Path, paused: bool, remap: tuple[str, ...], options: Options
 
 
 async def _play(recording: Path, asked: PlayOptions, options: Options, *, paused: bool) -> int:
-    from rmpa.record.bag import read_any
+    from rmpa.record.merge import Timeline
     from rmpa.record.play import NODE, Player
     from rmpa.ros.node.node import Node
 
+    timeline = Timeline([recording])
+    sys.setswitchinterval(0.0002)  # seconds that a message which is due waits for the thread that reads
     async with Node(NODE, master_uri=options.master().uri) as node:
-        player = Player(node, lambda: read_any(recording), asked)
+        player = Player(node, timeline, asked, lambda text: click.echo(paint(printable(text), "yellow"), err=True))
         if paused:
             player.pause()
         task = start_task(player.run(), "play", raises=(RmpaError,))
         loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, task.cancel)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            loop.add_signal_handler(number, _end, task)
         with _keys(player, task), contextlib.suppress(asyncio.CancelledError):
             await task
-    for topic, why in player.left_out.items():
-        print_text(paint(f"not played: {topic}: {why}", "yellow"))
-    options.show({"messages": player.count, "left_out": player.left_out}, f"{player.count:,} messages played")
-    return 0
+    about = {"messages": player.count, "left_out": player.left_out, "notes": timeline.own_notes}
+    options.show(about, timeline.own_notes, f"{player.count:,} messages played")
+    return int(bool(timeline.damaged))
+
+
+def _end(task: asyncio.Task[None]) -> None:
+    """End the player, once: a second Ctrl-C would end it while it sets /use_sim_time as it was."""
+    if not task.cancelling():
+        task.cancel()
 
 
 @contextlib.contextmanager
@@ -104,7 +112,11 @@ def _keys(player: Player, task: asyncio.Task[None]) -> Iterator[None]:
 
     def pressed() -> None:
         key = os.read(sys.stdin.fileno(), 1)
-        actions: dict[bytes, Callable[[], object]] = {b" ": player.pause, b"s": player.step, b"q": task.cancel}
+        actions: dict[bytes, Callable[[], object]] = {
+            b" ": player.pause,
+            b"s": player.step,
+            b"q": partial(_end, task),
+        }
         if key in actions:
             actions[key]()
 

@@ -69,11 +69,11 @@ class BagReader(SegmentReader):
     Where each caller is one of a module (``/rmpa/MODULE/node``), the bag is one that was written here.
     """
 
-    def head(self) -> tuple[int, int, set[RecordedSource]]:
+    def head(self) -> tuple[int, int, list[RecordedSource]]:
         """As of ``SegmentReader``."""
         with self._open() as bag:
             span = (bag.start_time, bag.end_time) if bag.chunk_infos else (0, 0)
-            return *span, set(_sources(bag.connections).values())
+            return *span, list(_sources(bag.connections).values())
 
     def messages(self, since: int = 0) -> Iterator[Recorded]:
         """As of ``SegmentReader``."""

@@ -250,8 +250,8 @@ class SegmentReader:
         self._channels: dict[int, RecordedSource] = {}
         self._span = 0, 0
 
-    def head(self) -> tuple[int, int, set[RecordedSource]]:
-        """The times of the first and the last message, and all sources; by the file's index, where it has one.
+    def head(self) -> tuple[int, int, list[RecordedSource]]:
+        """The times of the first and the last message, and all sources as they appear; by the index, if there is one.
 
         Raises:
             DamagedError: As for ``messages``.
@@ -259,14 +259,13 @@ class SegmentReader:
         try:
             with self.path.open("rb") as file:
                 if self._index(file) is not None:
-                    return *self._span, set(self._channels.values())
+                    return *self._span, list(self._channels.values())
         except OSError as error:
             raise DamagedError(f"{self.path}: {error.strerror or error}") from None
-        first, last, sources = 0, 0, set[RecordedSource]()
+        first = last = 0
         for message in self.messages():
             first, last = min(first or message.log_time, message.log_time), max(last, message.log_time)
-            sources.add(message.source)
-        return first, last, sources
+        return first, last, list(self._channels.values())
 
     def messages(self, since: int = 0) -> Iterator[Recorded]:
         """The messages in order of their log times; metadata is known after the first one.

@@ -169,7 +169,7 @@ class _Head(NamedTuple):
     first: int
     last: int
     readings: list[tuple[str, ClockRecord]]
-    sources: frozenset[RecordedSource]
+    sources: Iterable[RecordedSource]
     merged: dict[str, str]
     times: tuple[str, int]
 
@@ -188,7 +188,7 @@ def _head(path: Path) -> _Head:
         module = min((source.module for source in sources), default="") or path.parent.absolute().name
     epoch = reader.times.get("epoch", "")
     times = reader.times.get("boot", ""), int(epoch) if epoch.isdecimal() else 0
-    return _Head(path, module, first, last, reader.readings, frozenset(sources), reader.merged, times)
+    return _Head(path, module, first, last, reader.readings, sources, reader.merged, times)
 
 
 class Timeline:
@@ -349,6 +349,15 @@ class Timeline:
             if own == self.reference:
                 yield from ((peer, ClockRecord(*one)) for one in known)
 
+    @property
+    def sources(self) -> list[RecordedSource]:
+        """All that messages may be of; those of a topic in the order in which they appear."""
+        heads = sorted(self._heads, key=lambda head: head.first - self._shift(head, head.first))
+        return list(dict.fromkeys(self._named(head, source) for head in heads for source in head.sources))
+
+    def _named(self, head: _Head, source: RecordedSource) -> RecordedSource:
+        return source if source.module or len(self._clocks) == 1 else source._replace(module=head.module)
+
     def messages(self, since: int = 0) -> Iterator[Recorded]:
         """The messages in order of their times.
 
@@ -367,13 +376,11 @@ class Timeline:
     def _timed(self, head: _Head, since: int, repeats: dict[RecordedSource, tuple[int, bytes]]) -> Iterator[Recorded]:
         """The messages of a file by the reference's clock, with their module; without what a segment repeats."""
         reader, named = _reader(head.path), dict[RecordedSource, RecordedSource]()
-        alone = len(self._clocks) == 1
         for message in reader.messages(since and since + self._shift(head, since) - _SECOND):
             source, log_time, publish_time, data = message
             own = named.get(source)
             if own is None:
-                module = source.module or ("" if alone else head.module)
-                own = named[source] = source._replace(module=module)
+                own = named[source] = self._named(head, source)
             if source.latching or source.topic == STATIC:
                 if message.repeated and repeats.get(own) == (publish_time, data):
                     self.doubles += 1
