@@ -124,7 +124,21 @@ def test_messages_are_in_order_of_their_times(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with path.open("wb") as file:
         writer = SegmentWriter(file, None)
-        for late in (3, 1, 2):
+        for late in (3, 1):
             writer.write(ODOM, START + late * SECOND, START, b"")
+        writer.flush()
+        writer.write(ODOM, START + 2 * SECOND, START, b"")  # the clock was set back
         writer.finish()
     assert [m.log_time - START for m in SegmentReader(path).messages()] == [SECOND, 2 * SECOND, 3 * SECOND]
+
+
+def test_reading_from_a_time_on_gives_what_latched_before(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = SegmentWriter(file, None)
+        for late, one in enumerate((MAP, ODOM, ODOM, ODOM)):
+            writer.write(one, START + late * SECOND, START + late * SECOND, b"")
+            writer.flush()
+        writer.finish()
+    found = [(m.source.topic, m.log_time - START) for m in SegmentReader(path).messages(START + 2 * SECOND)]
+    assert found == [("/map", 0), ("/odom", 2 * SECOND), ("/odom", 3 * SECOND)]

@@ -251,14 +251,17 @@ class Timeline:
         return steps
 
     def _read_clocks(self) -> dict[tuple[str, str], list[_Reading]]:
-        """What each module knew of another one's clock, by the clocks as they were set last."""
+        """What each module knew of another one's clock, by the clocks as they were set last.
+
+        Backwards: the last reading is of a clock as it is; each one before fits best with the one after it.
+        """
         pairs: dict[tuple[str, str], list[_Reading]] = {}
-        for head in self._heads:
-            for peer, one in head.readings:
+        for head in reversed(self._heads):
+            for peer, one in reversed(head.readings):
                 there, own = one.at + round(one.ahead * _SECOND), self._set[head.path]
                 steps = [self._set[h.path] for h in self._heads if h.module == peer and _near(h, there)] or [0]
                 known = pairs.setdefault((head.module, peer), [])
-                last = known[-1].ahead if known else one.ahead
+                last = known[-1].ahead if known else one.ahead + own / _SECOND
                 found = ((one.ahead * _SECOND + own - step) / _SECOND for step in steps)
                 known.append(_Reading(one.at - own, min(found, key=lambda each: abs(each - last)), one.error))
         return pairs

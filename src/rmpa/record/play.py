@@ -152,10 +152,10 @@ class Player:
         if not self._publishers:
             why = "; ".join(f"{topic}: {text}" for topic, text in self.left_out.items())
             raise RmpaError(f"nothing is played: {why or 'the recording has no such topic'}", code="unknown-name")
+        if self._options.clock:
+            await self._set_time(published)
         looking = start_task(self._look(), "look for other publishers") if not self._options.over else None
         try:
-            if self._options.clock:
-                await self._set_time(published)
             await asyncio.sleep(_CONNECT)
             await self._round()
             while self._options.loop:
