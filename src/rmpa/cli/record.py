@@ -182,7 +182,7 @@ def _by_hand(module: Module, options: Options, given: dict[str, Any]) -> int:
 def _write(paths: list[Path], output: Path, reference: str = "") -> MergeResult:
     """Merge recordings into one file, MCAP or bag."""
     from rmpa.record.bag import write_bag
-    from rmpa.record.format import read_in_order
+    from rmpa.record.format import SegmentReader
     from rmpa.record.merge import merge
 
     if output.exists():
@@ -192,7 +192,7 @@ def _write(paths: list[Path], output: Path, reference: str = "") -> MergeResult:
         with whole.open("wb") as file:
             result = merge(paths, file, reference)
         if output.suffix == _BAG:
-            write_bag(read_in_order([whole]), output)
+            write_bag(SegmentReader(whole).messages(), output)
         else:
             whole.replace(output)
     except OSError as error:
@@ -443,7 +443,9 @@ def record_merge(recordings: tuple[Path, ...], output: Path, reference: str, opt
         (name, "the clock" if name == result.reference else f"{1e3 * one.ahead:+.3f} ms", _bound(one.error))
         for name, one in result.offsets.items()
     ]
-    options.show({"file": str(output), **about}, _merged(output, result), Table("MODULE, >AHEAD, >±", rows))
+    options.show(
+        {"file": str(output), **about}, _merged(output, result), Table("MODULE, >AHEAD, >±", rows), result.notes
+    )
     return int(bool(result.damaged))
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING, Final
 
-from rosbags.rosbag1 import Reader, ReaderError, Writer
+from rosbags.rosbag1 import Reader, Writer
 
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import OWN_NODE
-from rmpa.record.format import DamagedError, Recorded, RecordedSource, read_in_order
-from rmpa.record.merge import files_of
+from rmpa.record.format import STATIC, DamagedError, Recorded, RecordedSource, SegmentReader
+from rmpa.record.merge import Timeline
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -62,38 +63,61 @@ def write_bag(messages: Iterable[Recorded], path: Path) -> int:
     return count
 
 
-def read_bag(path: Path) -> Iterator[Recorded]:
-    """The messages of a bag, in order of their times.
+class BagReader(SegmentReader):
+    """Reads one bag, as ``SegmentReader`` does MCAP.
 
-    Raises:
-        DamagedError: It cannot be read.
+    Where each caller is one of a module (``/rmpa/MODULE/node``), the bag is one that was written here.
     """
-    try:
-        with Reader(path) as reader:
-            sources = {
-                one.id: RecordedSource(
-                    one.topic,
-                    one.msgtype.replace("/msg/", "/"),
-                    one.digest,
-                    one.msgdef.data,
-                    one.ext.callerid or "",  # type: ignore[union-attr] # of a bag of ROS 1
-                    bool(one.ext.latching),  # type: ignore[union-attr] # likewise
-                )
-                for one in reader.connections
-            }
-            for connection, at, data in reader.messages():
+
+    def head(self) -> tuple[int, int, list[RecordedSource]]:
+        """As of ``SegmentReader``."""
+        with self._open() as bag:
+            span = (bag.start_time, bag.end_time) if bag.chunk_infos else (0, 0)
+            return *span, list(_sources(bag.connections).values())
+
+    def messages(self, since: int = 0) -> Iterator[Recorded]:
+        """As of ``SegmentReader``."""
+        with self._open() as bag:
+            sources = _sources(bag.connections)
+            latching = [one for one in bag.connections if sources[one.id].latching or one.topic == STATIC]
+            if since and latching:
+                for connection, at, data in bag.messages(latching, stop=since):
+                    yield Recorded(sources[connection.id], at, at, data)
+            for connection, at, data in bag.messages(start=since) if bag.connections else ():
                 yield Recorded(sources[connection.id], at, at, data)
-    except (ReaderError, OSError, ValueError) as error:
-        raise DamagedError(f"{path}: {error}; `rosbag reindex` may mend it") from None
+
+    @contextlib.contextmanager
+    def _open(self) -> Iterator[Reader]:
+        try:
+            with Reader(self.path) as bag:
+                yield bag
+        except GeneratorExit:
+            raise
+        except Exception as error:  # noqa: BLE001 - whatever the library makes of damaged bytes
+            raise DamagedError(f"{self.path}: {error}; `rosbag reindex` may mend it") from None
 
 
-def read_any(path: Path) -> Iterator[Recorded]:
-    """The messages of a recording: a bag, an MCAP file, or a folder of segments; in order of their times.
+def _sources(connections: Iterable[Connection]) -> dict[int, RecordedSource]:
+    callers = {one.id: one.ext.callerid or "" for one in connections}  # type: ignore[union-attr] # of a bag of ROS 1
+    ours = all(name.startswith(f"{OWN_NODE}/") for name in callers.values())
+    found = {}
+    for one in connections:
+        module, _, node = callers[one.id][len(OWN_NODE) + 1 :].partition("/") if ours else ("", "", "")
+        node = f"/{node}" if ours else callers[one.id]
+        latching = bool(one.ext.latching)  # type: ignore[union-attr] # likewise
+        kind = one.msgtype.replace("/msg/", "/")
+        found[one.id] = RecordedSource(one.topic, kind, one.digest, one.msgdef.data, node, latching, module)
+    return found
+
+
+def read_any(path: Path, since: int = 0) -> Iterator[Recorded]:
+    """The messages of a recording, in order of their times: a bag, an MCAP file, or a folder of segments.
+
+    Args:
+        path: The recording.
+        since: Messages before may be left out, but for latched ones.
 
     Raises:
-        DamagedError: It cannot be read.
-        RmpaError: There is none.
+        RmpaError: There is none, or it cannot be read.
     """
-    if path.suffix == BAG:
-        return read_bag(path)
-    return read_in_order(files_of(path))
+    return Timeline([path]).messages(since)
