@@ -200,6 +200,7 @@ async def test_a_dead_node_is_purged_when_suspected(core: RosCore, monkeypatch: 
         assert subscriber.calls == [("publisherUpdate", ["/master", "/t", []])]
         assert core.state().nodes == {"/s": subscriber.uri}
         assert core.counters["node.dead"] == 1
+        assert [node for node, _ in core.liveness.died] == ["/dead"]
 
 
 def lists_of(slave: Slave) -> list[XmlRpcValue]:
