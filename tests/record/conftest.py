@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from rmpa.record.format import CLOCK, TIME, ClockRecord, ModuleRecord, RecordedSource, SegmentWriter
+from rmpa.record.format import CLOCK, TIME, ClockRecord, ModuleRecord, Recorded, RecordedSource, SegmentWriter
+from rmpa.record.merge import Timeline
 from rmpa.ros.types.messages import MessageType
 
 TEXT = MessageType("std_msgs/String")
@@ -40,6 +41,11 @@ class HandClock:
 
     def wall(self) -> int:
         return round(self.seconds * SECOND) + self.epoch
+
+
+def read_any(path: Path) -> Iterator[Recorded]:
+    """The messages of a recording, in order of their times."""
+    return Timeline([path]).messages()
 
 
 Record = Callable[..., Path]

@@ -9,18 +9,19 @@ import pytest
 from rosbags.rosbag1 import Reader
 
 from rmpa.core.errors import RmpaError
-from rmpa.record.bag import read_any, write_bag
+from rmpa.record.bag import write_bag
 from rmpa.record.format import TIME, ModuleRecord, SegmentReader, SegmentWriter
-from rmpa.record.merge import MergeResult, Offset, Timeline, merge
-from tests.record.conftest import SECOND, START, TEXT, Record, source, text
+from rmpa.record.merge import Offset, Timeline
+from tests.record.conftest import SECOND, START, TEXT, Record, read_any, source, text
 
 SCAN, CMD = source("/scan", "/laser"), source("/cmd_vel", "/joy")
 
 
-def merged(tmp_path: Path, *paths: Path, reference: str = "", name: str = "all.mcap") -> tuple[Path, MergeResult]:
-    path = tmp_path / name
+def merged(tmp_path: Path, *paths: Path, reference: str = "", name: str = "all.mcap") -> tuple[Path, Timeline]:
+    path, timeline = tmp_path / name, Timeline(paths, reference)
     with path.open("wb") as file:
-        return path, merge(paths, file, reference)
+        timeline.write(file)
+    return path, timeline
 
 
 def lines(path: Path) -> list[tuple[float, str, str]]:
@@ -221,7 +222,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, recording: Record) 
     bad.write_bytes(b"no recording")
     path, result = merged(tmp_path, arm, bad)
     assert len(lines(path)) == 1
-    assert "bad.mcap" in result.damaged[0]
+    assert "bad.mcap" in "".join(result.damaged.values())
     with pytest.raises(RmpaError, match=r"no recording by the clock of leg; there are arm"):
         merged(tmp_path, arm, reference="leg")
     with pytest.raises(RmpaError, match="nothing can be read"):
@@ -242,11 +243,11 @@ def test_what_is_not_whole_is_said_and_the_rest_is_read(tmp_path: Path) -> None:
     path.write_bytes(data.replace(b"1" * 40, b"1" * 39 + b"7"))
     whole, result = merged(tmp_path, path)
     assert [data[0] for *_, data in lines(whole)] == ["0", "2"]
-    assert "arm.mcap: 1 parts cannot be read" in result.damaged[0]
+    assert "arm.mcap: 1 parts cannot be read" in "".join(result.damaged.values())
     assert "1 parts cannot be read" in " ".join(notes_of(whole))
     short, result = merged(tmp_path, tmp_path / "cut.mcap", name="short.mcap")
     assert [data[0] for *_, data in lines(short)] == ["0", "1"]
-    assert "cut.mcap: its end is missing" in result.damaged[0]
+    assert "cut.mcap: its end is missing" in "".join(result.damaged.values())
 
 
 def test_a_bag_has_the_same_messages(tmp_path: Path, recording: Record) -> None:

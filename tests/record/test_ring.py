@@ -18,12 +18,11 @@ from mcap.reader import make_reader
 from rmpa.bridge.kept import Kept, find_kept, read_kept, remove_kept
 from rmpa.core.errors import RmpaError
 from rmpa.record import limits
-from rmpa.record.bag import read_any
 from rmpa.record.format import EVENTS, SegmentReader, SegmentWriter, read_event
-from rmpa.record.merge import Timeline, merge
+from rmpa.record.merge import Timeline
 from rmpa.record.ring import RingThread
 from rmpa.record.story import tell
-from tests.record.conftest import SECOND, HandClock, source, text
+from tests.record.conftest import SECOND, HandClock, read_any, source, text
 
 ODOM = source("/odom")
 REPOSITORY = Path(__file__).parents[2]
@@ -323,11 +322,11 @@ def test_a_clock_that_is_set_changes_neither_what_is_there_nor_what_is_kept(
     assert (told.end - told.begin) / SECOND == pytest.approx(29.0)
     numbers = [m.data[4:].strip() for m in read_any(tmp_path / "kept/step") if m.source.topic != EVENTS]
     assert numbers == [f"{number}".encode() for number in range(20, 50)], "in the order in which they came"
-    whole = tmp_path / "whole.mcap"
+    whole, result = tmp_path / "whole.mcap", Timeline([tmp_path / "kept/step"])
     with whole.open("wb") as file:
-        result = merge([tmp_path / "kept/step"], file)
+        result.write(file)
     assert f"set 3600.000 s {way} while it recorded" in " ".join(result.notes)
-    assert Timeline([whole]).notes == [*result.notes]
+    assert Timeline([whole]).notes == result.notes
     times = [m.log_time for m in read_any(whole)]
     assert times == sorted(times)
     events = [read_event(m.data) for m in read_any(whole) if m.source.topic == EVENTS]

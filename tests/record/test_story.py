@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from rmpa.record.bag import read_any
 from rmpa.record.format import EVENT_SOURCE, Event, ModuleRecord, RecordedSource, SegmentWriter, event_bytes
 from rmpa.record.story import render, tell
 from rmpa.ros.types.messages import MessageType
-from tests.record.conftest import SECOND, START, Record, source
+from tests.record.conftest import SECOND, START, Record, read_any, source
 
 SCAN = source("/scan", "/laser")
 LOG = MessageType("rosgraph_msgs/Log")
@@ -95,7 +94,7 @@ def test_a_resource_of_each_module_has_its_own_profile(recording: Record) -> Non
 def test_what_was_left_out_is_said(tmp_path: Path) -> None:
     event = Event("left_out", "left out: 7 of /image", facts={"/image": 7})
     story = tell(read_any(written(tmp_path / "a.mcap", (EVENT_SOURCE, 0.0, event_bytes(event)))), "fall")
-    assert story.notes == ("Left out, for the budgets of [record]: 7 messages of /image.",)
+    assert story.notes == ("Left out, for the budgets of [record] or the disk: 7 messages of /image.",)
 
 
 @pytest.mark.parametrize("kind", ["md", "html"])

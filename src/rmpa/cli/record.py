@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
-import msgspec
 
 from rmpa.bridge.kept import recording_id
 from rmpa.bridge.recordings import FilePart, ModuleRecordings
@@ -44,7 +43,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.kept import Kept
     from rmpa.cli.module import Module
     from rmpa.observe.control_client import ControlClient
-    from rmpa.record.merge import MergeResult
+    from rmpa.record.merge import Timeline
 
 _log = logging.getLogger("rmpa.record")
 _SECOND: Final = 1_000_000_000
@@ -173,33 +172,32 @@ def _by_hand(module: Module, options: Options, given: dict[str, Any]) -> int:
             click.echo("", err=True)
         result = _write([Path(parts)], output)
     options.show(
-        {"file": str(output), "messages": result.messages, "topics": counts},
-        f"{output}: {result.messages:,} messages of {len(counts)} topics, {size(output.stat().st_size)}",
+        {"file": str(output), "messages": result.count, "topics": counts},
+        f"{output}: {result.count:,} messages of {len(counts)} topics, {size(output.stat().st_size)}",
     )
-    return 0 if result.messages else 1
+    return 0 if result.count else 1
 
 
-def _write(paths: list[Path], output: Path, reference: str = "") -> MergeResult:
+def _write(paths: list[Path], output: Path, reference: str = "") -> Timeline:
     """Merge recordings into one file, MCAP or bag."""
     from rmpa.record.bag import write_bag
-    from rmpa.record.format import SegmentReader
-    from rmpa.record.merge import merge
+    from rmpa.record.merge import Timeline
 
     if output.exists():
         raise ConfigError("-o", f"{output} exists", "name another file")
-    whole = output.with_name(f".{output.name}.new")
+    timeline, whole = Timeline(paths, reference), output.with_name(f".{output.name}.new")
     try:
-        with whole.open("wb") as file:
-            result = merge(paths, file, reference)
         if output.suffix == _BAG:
-            write_bag(SegmentReader(whole).messages(), output)
+            write_bag(timeline.messages(), output)
         else:
+            with whole.open("wb") as file:
+                timeline.write(file)
             whole.replace(output)
     except OSError as error:
         raise _unwritten(output, error) from None
     finally:
         whole.unlink(missing_ok=True)
-    return result
+    return timeline
 
 
 def _of_the_mesh(options: Options, given: dict[str, Any]) -> int:
@@ -438,14 +436,20 @@ def record_merge(recordings: tuple[Path, ...], output: Path, reference: str, opt
     """
     check_record("rmpa record")
     result = _write(list(recordings), output, reference)
-    about = msgspec.to_builtins({**result._asdict(), "offsets": {k: v._asdict() for k, v in result.offsets.items()}})
+    about = {
+        "file": str(output),
+        "reference": result.reference,
+        "offsets": {name: one._asdict() for name, one in result.offsets.items()},
+        "messages": result.count,
+        "doubles": result.doubles,
+        "damaged": list(result.damaged.values()),
+        "notes": result.notes,
+    }
     rows = [
         (name, "the clock" if name == result.reference else f"{1e3 * one.ahead:+.3f} ms", _bound(one.error))
         for name, one in result.offsets.items()
     ]
-    options.show(
-        {"file": str(output), **about}, _merged(output, result), Table("MODULE, >AHEAD, >±", rows), result.notes
-    )
+    options.show(about, _merged(output, result), Table("MODULE, >AHEAD, >±", rows), result.notes)
     return int(bool(result.damaged))
 
 
@@ -453,10 +457,10 @@ def _bound(error: float | None) -> str:
     return "not known" if error is None else f"{1e3 * error:.3f} ms"
 
 
-def _merged(output: Path, result: MergeResult) -> str:
+def _merged(output: Path, result: Timeline) -> str:
     doubles = f", {result.doubles:,} doubles left out" if result.doubles else ""
-    damaged = "".join(f"; not read: {text}" for text in result.damaged)
-    text = f"{output}: {result.messages:,} messages of {len(result.offsets)} modules{doubles}{damaged}"
+    damaged = "".join(f"; not read: {text}" for text in result.damaged.values())
+    text = f"{output}: {result.count:,} messages of {len(result.offsets)} modules{doubles}{damaged}"
     return "\n".join((text, *result.notes))
 
 

@@ -10,7 +10,6 @@ from rosbags.rosbag1 import Reader, Writer
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import OWN_NODE
 from rmpa.record.format import STATIC, DamagedError, Recorded, RecordedSource, SegmentReader
-from rmpa.record.merge import Timeline
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -19,12 +18,6 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 BAG: Final = ".bag"
-
-
-def _bag_type(name: str) -> str:
-    """The type's name as the library writes it: ``std_msgs/msg/String``."""
-    package, _, kind = name.partition("/")
-    return f"{package}/msg/{kind}"
 
 
 def write_bag(messages: Iterable[Recorded], path: Path) -> int:
@@ -46,20 +39,19 @@ def write_bag(messages: Iterable[Recorded], path: Path) -> int:
     writer = Writer(path)
     with writer:
         connections: dict[RecordedSource, Connection] = {}
-        for source, log_time, _, data in messages:
+        for count, (source, log_time, _, data) in enumerate(messages, 1):  # noqa: B007 - it is the result
             connection = connections.get(source)
             if connection is None:
                 node = f"{OWN_NODE}/{source.module}{source.node}" if source.module else source.node
                 connection = connections[source] = writer.add_connection(
                     source.topic,
-                    _bag_type(source.type),
+                    source.type.replace("/", "/msg/"),  # as the library writes it
                     msgdef=source.definition.encode("utf-8", "replace").decode(),  # the library has text alone
                     md5sum=source.md5sum,
                     callerid=node,
                     latching=int(source.latching),
                 )
             writer.write(connection, log_time, data)
-            count += 1
     return count
 
 
@@ -108,16 +100,3 @@ def _sources(connections: Iterable[Connection]) -> dict[int, RecordedSource]:
         kind = one.msgtype.replace("/msg/", "/")
         found[one.id] = RecordedSource(one.topic, kind, one.digest, one.msgdef.data, node, latching, module)
     return found
-
-
-def read_any(path: Path, since: int = 0) -> Iterator[Recorded]:
-    """The messages of a recording, in order of their times: a bag, an MCAP file, or a folder of segments.
-
-    Args:
-        path: The recording.
-        since: Messages before may be left out, but for latched ones.
-
-    Raises:
-        RmpaError: There is none, or it cannot be read.
-    """
-    return Timeline([path]).messages(since)

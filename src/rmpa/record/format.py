@@ -346,7 +346,7 @@ class SegmentReader:
             for record in StreamReader(file, emit_chunks=True).records:
                 ended = isinstance(record, Footer)
                 if isinstance(record, Chunk):
-                    yield from _in_order(chunk)
+                    yield from sorted(chunk, key=_log_time)
                     chunk = [one for part in breakup_chunk(record) if (one := self._take(part)) is not None]
                 elif (one := self._take(record)) is not None:
                     chunk.append(one)
@@ -357,7 +357,7 @@ class SegmentReader:
                 why = "it is empty" if not file.seek(0, 2) else "it is no recording, or its beginning is damaged"
                 raise DamagedError(f"{self.path}: {why}") from error
         self.unfinished = not ended
-        yield from _in_order(chunk)
+        yield from sorted(chunk, key=_log_time)
 
     def _take(self, record: object) -> Recorded | None:
         if isinstance(record, Message):
@@ -394,11 +394,6 @@ class SegmentReader:
                 self.merged = dict(record.metadata)
         except (msgspec.DecodeError, msgspec.ValidationError, KeyError, ValueError):
             pass  # of another release
-
-
-def _in_order(messages: list[Recorded]) -> list[Recorded]:
-    """Messages of a chunk by their log times; those of one time as they were written."""
-    return sorted(messages, key=_log_time)
 
 
 def _log_time(message: Recorded) -> int:

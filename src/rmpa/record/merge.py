@@ -63,26 +63,6 @@ class Offset(NamedTuple):
     error: float | None
 
 
-class MergeResult(NamedTuple):
-    """What a merge gave.
-
-    Attributes:
-        reference: The module whose clock all times are of.
-        offsets: By module.
-        messages: How many.
-        doubles: Messages that were left out because another module has them from their source.
-        damaged: Files that could not be read, or not whole, each with the reason.
-        notes: What limits it: clocks that are not known or were set, modules that are missing.
-    """
-
-    reference: str
-    offsets: dict[str, Offset]
-    messages: int
-    doubles: int
-    damaged: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-
-
 def files_of(path: Path) -> list[Path]:
     """The segments of a recording: a file, or all in a folder, in order.
 
@@ -95,24 +75,16 @@ def files_of(path: Path) -> list[Path]:
     return found
 
 
-class _Reading(NamedTuple):
-    """What was known of a clock: at a time of it, by so many seconds it was ahead of another one, ± the error."""
-
-    at: int
-    ahead: float
-    error: float | None
-
-
 class _Clock:
     """The clock of one module against that of another one, which has one against the reference itself.
 
     Args:
-        known: What is known of it; empty: nothing.
+        known: What is known of it, at times of it; empty: nothing.
         over: The other one; ``None``: it is the reference.
     """
 
-    def __init__(self, known: Iterable[_Reading], over: _Clock | None = None) -> None:
-        self._known = sorted(known, key=lambda each: each[:2])
+    def __init__(self, known: Iterable[ClockRecord], over: _Clock | None = None) -> None:
+        self._known = sorted(known, key=lambda each: (each.at, each.ahead))
         self._over = over
         self.widened = 0.0
 
@@ -132,7 +104,7 @@ class _Clock:
 
     def shift(self, at: int) -> int:
         """Nanoseconds to take off a time of this clock: between two readings evenly, but where it was set."""
-        if not self._known:
+        if not self._known or self._over is None:
             return 0
         after = bisect_right(self._known, at, key=lambda each: each.at)
         one, other = self._known[max(0, after - 1)], self._known[min(after, len(self._known) - 1)]
@@ -141,10 +113,10 @@ class _Clock:
             part = (at - one.at) / (other.at - one.at)
             ahead += (other.ahead - one.ahead) * (round(part) if _was_set(one, other) else part)
         own = round(ahead * _SECOND)
-        return own + (self._over.shift(at - own) if self._over is not None else 0)
+        return own + self._over.shift(at - own)
 
 
-def _was_set(one: _Reading, other: _Reading) -> bool:
+def _was_set(one: ClockRecord, other: ClockRecord) -> bool:
     errors = (one.error or 0.0) + (other.error or 0.0)
     return abs(other.ahead - one.ahead) > errors + _DRIFT * (other.at - one.at) / _SECOND + 0.01
 
@@ -174,7 +146,7 @@ class _Head(NamedTuple):
 
 
 def _reader(path: Path) -> SegmentReader | BagReader:
-    from rmpa.record.bag import BAG, BagReader  # noqa: PLC0415 - which reads folders by this module
+    from rmpa.record.bag import BAG, BagReader  # noqa: PLC0415 - its library is for bags alone
 
     return BagReader(path) if path.suffix == BAG else SegmentReader(path)
 
@@ -202,7 +174,8 @@ class Timeline:
     def __init__(self, paths: Sequence[Path], reference: str = "") -> None:
         # Files that cannot be read, or not whole, each with the reason; the latter are known after ``messages``.
         self.damaged: dict[Path, str] = {}
-        self.doubles = 0
+        # Messages, and what was left out because another module has it from its source; of the last reading.
+        self.count = self.doubles = 0
         self._heads = self._read_heads({each for path in paths for each in files_of(path)})
         if not self._heads:
             raise RmpaError(f"nothing can be read: {'; '.join(self.damaged.values())}", code="recording-damaged")
@@ -216,9 +189,12 @@ class Timeline:
         self._pairs = self._read_clocks()
         self._clocks = self._chain(modules)
         self._compare()
+        self._spans = {
+            h.path: (h.first - self._shift(h, h.first), h.last - self._shift(h, h.last)) for h in self._heads
+        }
+        self._heads.sort(key=lambda head: self._spans[head.path])
         self._covered = self._cover()
-        times = (head.first - self._shift(head, head.first) for head in self._heads if head.first)
-        self.begin = max(1, min(times, default=1))
+        self.begin = next((max(1, self._spans[head.path][0]) for head in self._heads if head.first), 1)
 
     def _read_heads(self, paths: set[Path]) -> list[_Head]:
         heads: list[_Head] = []
@@ -249,12 +225,12 @@ class Timeline:
             after[head.module, boot] = epoch, taken, head.first
         return steps
 
-    def _read_clocks(self) -> dict[tuple[str, str], list[_Reading]]:
+    def _read_clocks(self) -> dict[tuple[str, str], list[ClockRecord]]:
         """What each module knew of another one's clock, by the clocks as they were set last.
 
         Backwards: the last reading is of a clock as it is; each one before fits best with the one after it.
         """
-        pairs: dict[tuple[str, str], list[_Reading]] = {}
+        pairs: dict[tuple[str, str], list[ClockRecord]] = {}
         for head in reversed(self._heads):
             for peer, one in reversed(head.readings):
                 there, own = one.at + round(one.ahead * _SECOND), self._set[head.path]
@@ -262,18 +238,19 @@ class Timeline:
                 known = pairs.setdefault((head.module, peer), [])
                 last = known[-1].ahead if known else one.ahead + own / _SECOND
                 found = ((one.ahead * _SECOND + own - step) / _SECOND for step in steps)
-                known.append(_Reading(one.at - own, min(found, key=lambda each: abs(each - last)), one.error))
+                known.append(ClockRecord(one.at - own, min(found, key=lambda each: abs(each - last)), one.error))
         return pairs
 
     def _chain(self, modules: list[str]) -> dict[str, _Clock]:
         """Each module's clock against the reference: by what one of both knew of the other, else by a third one."""
-        clocks = {self.reference: _Clock([_Reading(0, 0.0, 0.0)])}
+        clocks = {self.reference: _Clock([ClockRecord(0, 0.0, 0.0)])}
         found = [self.reference]
         for other in found:
             for name in modules:
                 there = self._pairs.get((other, name), ())
-                known = [_Reading(one.at + round(one.ahead * _SECOND), *one[1:]) for one in there]
-                known = known or [one._replace(ahead=-one.ahead) for one in self._pairs.get((name, other), ())]
+                known = [ClockRecord(one.at + round(one.ahead * _SECOND), one.ahead, one.error) for one in there]
+                here = self._pairs.get((name, other), ())
+                known = known or [ClockRecord(one.at, -one.ahead, one.error) for one in here]
                 if known and name not in clocks:
                     clocks[name] = _Clock(known, clocks[other])
                     found.append(name)
@@ -286,10 +263,10 @@ class Timeline:
             if one is None or other is None or not one.known or not other.known:
                 continue
             worst = most = 0.0
-            for at, ahead, error in known:
-                there = at + round(ahead * _SECOND)
-                apart = abs(at - one.shift(at) - there + other.shift(there)) / _SECOND
-                bounds = sum(each or 0.0 for each in (error, one.offset.error, other.offset.error))
+            for each in known:
+                there = each.at + round(each.ahead * _SECOND)
+                apart = abs(each.at - one.shift(each.at) - there + other.shift(there)) / _SECOND
+                bounds = sum(bound or 0.0 for bound in (each.error, one.offset.error, other.offset.error))
                 worst, most = max(worst, apart - bounds), max(most, apart)
             if worst > _ROUNDING:
                 (other if peer != self.reference else one).widened = most
@@ -302,9 +279,8 @@ class Timeline:
         What is left in a merged file was judged by what is in it: its path is with the time.
         """
         covered: dict[tuple[str, str, str], list[tuple[int, int, Path | None]]] = {}
-        for head in sorted(self._heads, key=lambda head: head.first - self._shift(head, head.first)):
-            begin, end = head.first - self._shift(head, head.first), head.last - self._shift(head, head.last)
-            owner = head.path if head.merged else None
+        for head in self._heads:
+            (begin, end), owner = self._spans[head.path], head.path if head.merged else None
             for source in head.sources:
                 spans = covered.setdefault((source.module or head.module, source.node, source.type), [])
                 if spans and spans[-1][2] == owner and begin - spans[-1][1] < _APART:
@@ -318,10 +294,11 @@ class Timeline:
         """The clocks of all modules, by name."""
         found = {name: clock.offset for name, clock in self._clocks.items()}
         for head in self._heads:
-            for name, one in _offsets_in(head).items():
-                by = found[head.module].error
-                error = None if by is None or one.error is None else by + one.error
-                found.setdefault(name, Offset(found[head.module].ahead + one.ahead, error))
+            by = found[head.module]
+            for name in head.merged.keys() - {"reference", _NOTES, _MISSING}:
+                one = msgspec.json.decode(head.merged[name], type=Offset)
+                error = None if by.error is None or one.error is None else by.error + one.error
+                found.setdefault(name, Offset(by.ahead + one.ahead, error))
         return dict(sorted(found.items()))
 
     @property
@@ -353,17 +330,9 @@ class Timeline:
         return [*self._notes, *(f"Not whole: {text}." for text in self.damaged.values())]
 
     @property
-    def readings(self) -> Iterator[tuple[str, ClockRecord]]:
-        """What the reference knew of others' clocks: a later merge needs it."""
-        for (own, peer), known in sorted(self._pairs.items()):
-            if own == self.reference:
-                yield from ((peer, ClockRecord(*one)) for one in known)
-
-    @property
     def sources(self) -> list[RecordedSource]:
         """All that messages may be of; those of a topic in the order in which they appear."""
-        heads = sorted(self._heads, key=lambda head: head.first - self._shift(head, head.first))
-        return list(dict.fromkeys(self._named(head, source) for head in heads for source in head.sources))
+        return list(dict.fromkeys(self._named(head, source) for head in self._heads for source in head.sources))
 
     def _named(self, head: _Head, source: RecordedSource) -> RecordedSource:
         return source if source.module or len(self._clocks) == 1 else source._replace(module=head.module)
@@ -374,10 +343,24 @@ class Timeline:
         Args:
             since: Messages before may be left out, but for latched ones.
         """
-        self.doubles = 0
+        self.count = self.doubles = 0
         repeats: dict[RecordedSource, tuple[int, bytes]] = {}
-        streams = [(h.first - self._shift(h, h.first), self._timed(h, since, repeats)) for h in self._heads]
-        yield from read_in_order(streams)
+        streams = [(self._spans[h.path][0], self._timed(h, since, repeats)) for h in self._heads]
+        for self.count, message in enumerate(read_in_order(streams), 1):
+            yield message
+
+    def write(self, file: IO[bytes]) -> None:
+        """Write it as one recording into a file that is open for writing."""
+        writer = SegmentWriter(file, None)
+        for (own, peer), known in sorted(self._pairs.items()):
+            for one in known if own == self.reference else ():  # a later merge needs it
+                writer.metadata(CLOCK, {peer: msgspec.json.encode(one).decode()})
+        for message in self.messages():
+            writer.write(*message)
+        about: dict[str, object] = {**self.offsets, _NOTES: self.own_notes, _MISSING: self.missing}
+        texts = {name: msgspec.json.encode(one).decode() for name, one in about.items()}
+        writer.metadata(MERGE, {"reference": self.reference, **texts})
+        writer.finish()
 
     def _shift(self, head: _Head, at: int) -> int:
         step = self._set[head.path]
@@ -385,19 +368,19 @@ class Timeline:
 
     def _timed(self, head: _Head, since: int, repeats: dict[RecordedSource, tuple[int, bytes]]) -> Iterator[Recorded]:
         """The messages of a file by the reference's clock, with their module; without what a segment repeats."""
-        reader, named = _reader(head.path), dict[RecordedSource, RecordedSource]()
+        reader, known = _reader(head.path), dict[RecordedSource, tuple[RecordedSource, list[tuple[int, int]]]]()
         for message in reader.messages(since and since + self._shift(head, since) - _SECOND):
             source, log_time, publish_time, data = message
-            own = named.get(source)
-            if own is None:
-                own = named[source] = self._named(head, source)
+            if (about := known.get(source)) is None:
+                about = known[source] = self._named(head, source), self._recorded(source, head.path)
+            own, spans = about
             if source.latching or source.topic == STATIC:
                 if message.repeated and repeats.get(own) == (publish_time, data):
                     self.doubles += 1
                     continue
                 repeats[own] = publish_time, data
             shift = self._shift(head, log_time)
-            if self._is_copy(own, log_time - shift, head.path):
+            if spans and any(begin <= log_time - shift <= end + _LATE for begin, end in spans):
                 self.doubles += 1
                 continue
             yield Recorded(own, max(1, log_time - shift), max(1, publish_time - shift), data)
@@ -405,26 +388,17 @@ class Timeline:
             what = f"{reader.damage} parts cannot be read" if reader.damage else "its end is missing"
             self.damaged[head.path] = f"{head.path}: {what}"
 
-    def _is_copy(self, source: RecordedSource, at: int, path: Path) -> bool:
-        """Whether a proxy (``/rmpa/PEER/node``) said what the recording of its own module has, too."""
+    def _recorded(self, source: RecordedSource, path: Path) -> list[tuple[int, int]]:
+        """When the recording of its own module has, too, what a proxy (``/rmpa/PEER/node``) said."""
         if not source.node.startswith(f"{OWN_NODE}/") or source.topic == EVENTS:
-            return False
+            return []
         peer, _, node = source.node[len(OWN_NODE) + 1 :].partition("/")
         spans = self._covered.get((peer, f"/{node}", source.type), ())
-        return any(begin <= at <= end + _LATE and owner != path for begin, end, owner in spans)
+        return [(begin, end) for begin, end, owner in spans if owner != path]
 
 
 def _near(head: _Head, at: int) -> bool:
     return head.first - _APART <= at <= head.last + _APART
-
-
-def _offsets_in(head: _Head) -> dict[str, Offset]:
-    """What a merge wrote of the clocks of a file."""
-    return {
-        name: msgspec.json.decode(text, type=Offset)
-        for name, text in head.merged.items()
-        if name not in ("reference", _NOTES, _MISSING)
-    }
 
 
 def _list_in(head: _Head, key: str) -> list[str]:
@@ -440,21 +414,3 @@ def _best_known(heads: list[_Head], modules: list[str]) -> str:
         return len((own | others) & set(modules))
 
     return max(modules, key=lambda name: (known(name), [-ord(letter) for letter in name]))
-
-
-def merge(paths: Sequence[Path], file: IO[bytes], reference: str = "") -> MergeResult:
-    """Write one recording of several; arguments and errors as of ``Timeline``, ``file`` is open for writing."""
-    timeline = Timeline(paths, reference)
-    writer = SegmentWriter(file, None)
-    for peer, known in timeline.readings:
-        writer.metadata(CLOCK, {peer: msgspec.json.encode(known).decode()})
-    count = 0
-    for count, message in enumerate(timeline.messages(), 1):  # noqa: B007 - it is the result
-        writer.write(*message)
-    offsets = timeline.offsets
-    about: dict[str, object] = {**offsets, _NOTES: timeline.own_notes, _MISSING: timeline.missing}
-    texts = {name: msgspec.json.encode(one).decode() for name, one in about.items()}
-    writer.metadata(MERGE, {"reference": timeline.reference, **texts})
-    writer.finish()
-    damaged = tuple(timeline.damaged.values())
-    return MergeResult(timeline.reference, offsets, count, timeline.doubles, damaged, tuple(timeline.notes))

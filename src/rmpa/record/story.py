@@ -6,6 +6,7 @@ missing in it. Each line names its evidence.
 
 from __future__ import annotations
 
+import contextlib
 import re
 import time
 from collections import Counter, deque
@@ -41,14 +42,8 @@ _QUIET: Final = (
 )  # fmt: skip
 _WARN, _BAD, _INFO = "warn", "error", "info"
 _LEVELS: Final = {
-    "alarm": _WARN,
-    "peer_lost": _BAD,
-    "node_died": _BAD,
-    "clock_step": _WARN,
-    "node_gone": _WARN,
-    "contract": _WARN,
-    "stop": _BAD,
-    "agent_lost": _BAD,
+    **dict.fromkeys(("alarm", "clock_step", "contract", "node_gone"), _WARN),
+    **dict.fromkeys(("agent_lost", "node_died", "peer_lost", "stop"), _BAD),
 }
 
 
@@ -156,11 +151,12 @@ class _Teller:
             return
         if message.repeated:
             return
-        if source.type == _LOG.name:
-            self._log(message)
-            return
-        if source.type == _TEXT.name and source.topic.endswith("/profile"):
-            self._profile(message)
+        with contextlib.suppress(RmpaError):  # what cannot be read says nothing
+            if source.type == _LOG.name:
+                self._log(message)
+                return
+            if source.type == _TEXT.name and source.topic.endswith("/profile"):
+                self._profile(message)
         steady = self._steady.setdefault((source.module, source.topic, source.node), _Steady(message))
         if steady.last is not message:
             self._gap(steady, message.log_time, "")
@@ -192,10 +188,7 @@ class _Teller:
             self._add(steady.last, _WARN, "gap", text)
 
     def _log(self, message: Recorded) -> None:
-        try:
-            line = _LOG.deserialize(message.data)
-        except RmpaError:
-            return
+        line = _LOG.deserialize(message.data)
         node, text, stamp = str(line.name), str(line.msg), line.header.stamp
         key = node, text, stamp.sec * _SECOND + stamp.nanosec
         if int(line.level) < _ERROR or key in self._logged:  # /rosout_agg has it again
@@ -215,10 +208,7 @@ class _Teller:
         self._floods[node] = begin, count + 1, place
 
     def _profile(self, message: Recorded) -> None:
-        try:
-            profile = str(_TEXT.deserialize(message.data).data)
-        except RmpaError:
-            return
+        profile = str(_TEXT.deserialize(message.data).data)
         key = message.source.module, message.source.topic.removesuffix("/profile")
         before, self._profiles[key] = self._profiles.get(key), profile
         if before is not None and profile != before:
@@ -244,7 +234,7 @@ def tell(messages: Iterable[Recorded], title: str, notes: Iterable[str] = ()) ->
     modules = tuple(sorted(filter(None, teller.modules)))
     if teller.left_out:
         counts = ", ".join(f"{count:,} messages of {topic}" for topic, count in sorted(teller.left_out.items()))
-        notes = [*notes, f"Left out, for the budgets of [record]: {counts}."]
+        notes = [*notes, f"Left out, for the budgets of [record] or the disk: {counts}."]
     return Story(title, teller.begin, teller.end, modules, teller.count, tuple(teller.finish()), tuple(notes))
 
 
