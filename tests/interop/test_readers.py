@@ -18,8 +18,8 @@ import pytest
 from lab.bed.processes import Process
 from lab.bed.ros import PYTHON
 from rmpa.record.bag import write_bag
-from rmpa.record.format import CLOCK, ClockRecord, ModuleRecord, RecordedSource, SegmentWriter, read_in_order
-from rmpa.record.merge import merge
+from rmpa.record.format import CLOCK, ClockRecord, ModuleRecord, RecordedSource, SegmentWriter
+from rmpa.record.merge import Timeline
 from rmpa.ros.types.messages import MessageType
 from tests.interop import npm
 from tests.interop.conftest import ShellFactory
@@ -127,10 +127,11 @@ def merged(sent: list[Sent], tmp_path_factory: pytest.TempPathFactory) -> Path:
                     elif one.source.latching:
                         writer.write(one.source, first + round(half * SECOND), first, one.data)
                 writer.finish()
+    timeline = Timeline([home / "arm", home / "base"], "arm")
     with (home / "all.mcap").open("wb") as file:
-        result = merge([home / "arm", home / "base"], file, "arm")
-    assert (result.messages, result.doubles) == (len(sent), 2)
-    write_bag(read_in_order([home / "all.mcap"]), home / "all.bag")
+        timeline.write(file)
+    assert (timeline.count, timeline.doubles) == (len(sent), 2)
+    write_bag(timeline.messages(), home / "all.bag")
     return home
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from rmpa.record.format import CLOCK, TIME, ClockRecord, ModuleRecord, RecordedSource, SegmentWriter
+from rmpa.record.format import CLOCK, TIME, ClockRecord, ModuleRecord, Recorded, RecordedSource, SegmentWriter
+from rmpa.record.merge import Timeline
 from rmpa.ros.types.messages import MessageType
 
 TEXT = MessageType("std_msgs/String")
@@ -42,14 +43,19 @@ class HandClock:
         return round(self.seconds * SECOND) + self.epoch
 
 
+def read_any(path: Path) -> Iterator[Recorded]:
+    """The messages of a recording, in order of their times."""
+    return Timeline([path]).messages()
+
+
 Record = Callable[..., Path]
 
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Record:
-    """Writes a recording of one module: what was said on each topic, and what it knew of others' clocks.
+    """Writes a file of one module: what was said on each topic, and what it knew of others' clocks at a time.
 
-    ``epoch`` is its wall clock less the monotonic one, seconds.
+    ``epoch`` is its wall clock less the monotonic one, seconds from the start.
     """
 
     def write(
@@ -57,6 +63,7 @@ def recording(tmp_path: Path) -> Record:
         said: dict[RecordedSource, Said],
         clocks: dict[str, tuple[float, float | None]] | None = None,
         name: str = "00000001.mcap",
+        at: float | None = None,
         epoch: float | None = None,
     ) -> Path:
         folder = tmp_path / module
@@ -65,12 +72,12 @@ def recording(tmp_path: Path) -> Record:
         with path.open("wb") as file:
             writer = SegmentWriter(file, ModuleRecord(name=module))
             lines = sorted((at, one, data) for one, each in said.items() for at, data in each)
-            if epoch is not None:
-                writer.metadata(TIME, {"boot": module, "epoch": str(round(epoch * SECOND))})
             if clocks:
-                begin = START + round(lines[0][0] * SECOND) if lines else START
-                known = {peer: ClockRecord(begin, ahead, error) for peer, (ahead, error) in clocks.items()}
+                when = START + round((lines[0][0] if at is None else at) * SECOND)
+                known = {peer: ClockRecord(when, ahead, error) for peer, (ahead, error) in clocks.items()}
                 writer.metadata(CLOCK, {peer: msgspec.json.encode(one).decode() for peer, one in known.items()})
+            if epoch is not None:
+                writer.metadata(TIME, {"boot": "1", "epoch": str(START + round(epoch * SECOND))})
             for at, one, data in lines:
                 when = START + round(at * SECOND)
                 writer.write(one, when, when, text(data))

@@ -75,6 +75,18 @@ def test_what_was_flushed_before_a_crash_at_any_byte_is_read(tmp_path: Path) -> 
         assert not path.exists()
 
 
+def test_a_file_that_is_whole_stays_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap.part"
+    with path.open("wb") as file:
+        writer = SegmentWriter(file, ModuleRecord(name="arm"))
+        writer.attachment("parameters.json", "application/json", b"{}", START)
+        writer.write(ODOM, START, START, text("0"))
+        writer.finish()
+    data = path.read_bytes()
+    assert finish_file(path).read_bytes() == data
+    assert not path.exists()
+
+
 @pytest.mark.parametrize("data", [b"", b"no recording", b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n"])
 def test_what_is_no_recording_is_said(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "a.mcap"
@@ -124,7 +136,21 @@ def test_messages_are_in_order_of_their_times(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with path.open("wb") as file:
         writer = SegmentWriter(file, None)
-        for late in (3, 1, 2):
+        for late in (3, 1):
             writer.write(ODOM, START + late * SECOND, START, b"")
+        writer.flush()
+        writer.write(ODOM, START + 2 * SECOND, START, b"")  # the clock was set back
         writer.finish()
     assert [m.log_time - START for m in SegmentReader(path).messages()] == [SECOND, 2 * SECOND, 3 * SECOND]
+
+
+def test_reading_from_a_time_on_gives_what_latched_before(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = SegmentWriter(file, None)
+        for late, one in enumerate((MAP, ODOM, ODOM, ODOM)):
+            writer.write(one, START + late * SECOND, START + late * SECOND, b"")
+            writer.flush()
+        writer.finish()
+    found = [(m.source.topic, m.log_time - START) for m in SegmentReader(path).messages(START + 2 * SECOND)]
+    assert found == [("/map", 0), ("/odom", 2 * SECOND), ("/odom", 3 * SECOND)]

@@ -13,16 +13,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.reader import make_reader
 
 from rmpa.bridge.kept import Kept, find_kept, read_kept, remove_kept
 from rmpa.core.errors import RmpaError
 from rmpa.record import limits
-from rmpa.record.bag import read_any
 from rmpa.record.format import EVENTS, SegmentReader, SegmentWriter, read_event
-from rmpa.record.merge import merge, notes_of
+from rmpa.record.merge import Timeline
 from rmpa.record.ring import RingThread
 from rmpa.record.story import tell
-from tests.record.conftest import SECOND, HandClock, source, text
+from tests.record.conftest import SECOND, HandClock, read_any, source, text
 
 ODOM = source("/odom")
 REPOSITORY = Path(__file__).parents[2]
@@ -157,9 +157,9 @@ def test_a_run_that_was_killed_is_taken_over(make: Make, tmp_path: Path) -> None
     (folder / "00000006.mcap").unlink()
     (folder / "notes.mcap").unlink()
     assert said(folder) == [1, 2]
-    again = SegmentReader(folder / "00000007.mcap")
-    list(again.messages())
-    assert [one.data for one in again.attachments] == [b"{}"], "what it began with is still there"
+    with (folder / "00000007.mcap").open("rb") as file:
+        began = [one.data for one in make_reader(file).iter_attachments()]
+    assert began == [b"{}"], "what it began with is still there"
     assert not half.exists(), "a recording that was not made to its end takes no room"
 
 
@@ -322,11 +322,11 @@ def test_a_clock_that_is_set_changes_neither_what_is_there_nor_what_is_kept(
     assert (told.end - told.begin) / SECOND == pytest.approx(29.0)
     numbers = [m.data[4:].strip() for m in read_any(tmp_path / "kept/step") if m.source.topic != EVENTS]
     assert numbers == [f"{number}".encode() for number in range(20, 50)], "in the order in which they came"
-    whole = tmp_path / "whole.mcap"
+    whole, result = tmp_path / "whole.mcap", Timeline([tmp_path / "kept/step"])
     with whole.open("wb") as file:
-        result = merge([tmp_path / "kept/step"], file)
-    assert f"set meanwhile ({step:+.3f} s)" in " ".join(result.notes)
-    assert notes_of(whole) == result.notes
+        result.write(file)
+    assert f"set 3600.000 s {way} while it recorded" in " ".join(result.notes)
+    assert Timeline([whole]).notes == result.notes
     times = [m.log_time for m in read_any(whole)]
     assert times == sorted(times)
     events = [read_event(m.data) for m in read_any(whole) if m.source.topic == EVENTS]

@@ -8,15 +8,18 @@ import os
 import signal
 import sys
 import termios
+import time
 import tty
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
+import msgspec
 
 from rmpa.cli.module import check_record
 from rmpa.cli.options import FiniteRange, Options, argument, flag, graph_verb, json_verb
-from rmpa.cli.output import Table, paint, print_text
+from rmpa.cli.output import Table, paint, print_error, printable
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.runtime.tasks import start_task
 
@@ -25,6 +28,7 @@ if TYPE_CHECKING:
 
     from rmpa.record.diff import TopicDifference, TopicRun
     from rmpa.record.play import Player, PlayOptions
+    from rmpa.record.story import Story
 
 _RECORDING: Final = click.Path(exists=True, path_type=Path)
 _COLOURS: Final = {"error": "red", "warn": "yellow", "info": ""}
@@ -45,13 +49,18 @@ _COLOURS: Final = {"error": "red", "warn": "yellow", "info": ""}
     argument("remap", nargs=-1, metavar="[OLD:=NEW]..."),
 )
 def play(recording: Path, paused: bool, remap: tuple[str, ...], options: Options, **given: Any) -> int:
-    """Play a RECORDING into this module's core, from where it crosses the mesh: MCAP, a folder of it, or a bag.
+    """Play a RECORDING at this module, from where it crosses the mesh: MCAP, a folder of it, or a bag.
 
-    Space pauses, s plays one message, q ends. A topic that a node publishes already is left out, so that a node under
-    test stands in for the one that was recorded.
+    Space pauses, s plays one message, q ends. What other modules said is played here, too; for each part at its own
+    module, run it at each with -m. A topic is left out while a node publishes it, also at a peer, so that a node
+    under test stands in for the one that was recorded; of a topic of several nodes, only what that node said, if it
+    is one of them. Exits 1 if the recording is not whole.
 
     ---
     {master}
+
+    --clock sets /use_sim_time at this module, and as it was at the end; other modules follow it as [time] says. A
+    player that was killed leaves it; the next `rmpa play` sets it as it was. A recorded /clock is played as it is.
 
     Examples:
       rmpa play fall.mcap
@@ -74,24 +83,31 @@ def play(recording: Path, paused: bool, remap: tuple[str, ...], options: Options
 
 
 async def _play(recording: Path, asked: PlayOptions, options: Options, *, paused: bool) -> int:
-    from rmpa.record.bag import read_any
+    from rmpa.record.merge import Timeline
     from rmpa.record.play import NODE, Player
     from rmpa.ros.node.node import Node
 
+    timeline = Timeline([recording])
+    sys.setswitchinterval(0.0002)  # seconds that a message which is due waits for the thread that reads
     async with Node(NODE, master_uri=options.master().uri) as node:
-        player = Player(node, lambda: read_any(recording), asked)
+        player = Player(node, timeline, asked, lambda text: click.echo(paint(printable(text), "yellow"), err=True))
         if paused:
             player.pause()
         task = start_task(player.run(), "play", raises=(RmpaError,))
         loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, task.cancel)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            loop.add_signal_handler(number, _end, task)
         with _keys(player, task), contextlib.suppress(asyncio.CancelledError):
             await task
-    for topic, why in player.left_out.items():
-        print_text(paint(f"not played: {topic}: {why}", "yellow"))
-    options.show({"messages": player.count, "left_out": player.left_out}, f"{player.count:,} messages played")
-    return 0
+    about = {"messages": player.count, "left_out": player.left_out, "notes": timeline.own_notes}
+    options.show(about, timeline.own_notes, f"{player.count:,} messages played")
+    return int(bool(timeline.damaged))
+
+
+def _end(task: asyncio.Task[None]) -> None:
+    """End the player, once: a second Ctrl-C would end it while it sets /use_sim_time as it was."""
+    if not task.cancelling():
+        task.cancel()
 
 
 @contextlib.contextmanager
@@ -104,7 +120,11 @@ def _keys(player: Player, task: asyncio.Task[None]) -> Iterator[None]:
 
     def pressed() -> None:
         key = os.read(sys.stdin.fileno(), 1)
-        actions: dict[bytes, Callable[[], object]] = {b" ": player.pause, b"s": player.step, b"q": task.cancel}
+        actions: dict[bytes, Callable[[], object]] = {
+            b" ": player.pause,
+            b"s": player.step,
+            b"q": partial(_end, task),
+        }
         if key in actions:
             actions[key]()
 
@@ -134,7 +154,8 @@ def _keys(player: Player, task: asyncio.Task[None]) -> Iterator[None]:
 def diff(first: Path, second: Path, everything: bool, options: Options) -> int:
     """Compare two recordings, topic by topic: messages, rates, gaps, ages, and the first message that differs.
 
-    Numbers and stamps of headers are not compared. Exits 1 if a topic differs.
+    Numbers and stamps of headers are not compared. AGE is the time from the stamp to the recording: the median, and
+    what 99 % have at most. Exits 1 if a topic differs, 2 if a recording cannot be read, or not whole.
 
     ---
 
@@ -143,33 +164,55 @@ def diff(first: Path, second: Path, everything: bool, options: Options) -> int:
       rmpa diff before.bag after.bag --json | jq '.[] | select(.difference != "")'
     """
     check_record("rmpa diff")
-    from rmpa.record.bag import read_any
     from rmpa.record.diff import compare
+    from rmpa.record.merge import Timeline
 
-    found = compare(read_any(first), read_any(second))
-    shown = [one for one in found if everything or not one.same]
-    rows = [row for one in shown for row in _rows(one)]
-    heads = "TOPIC, >MESSAGES, >RATE, >GAP, >AGE, FIRST DIFFERENCE"
-    options.show(found, Table(heads, rows), f"{len(found)} topics, {sum(not one.same for one in found)} differ")
-    return int(any(not one.same for one in found))
+    try:
+        recordings = Timeline([first]), Timeline([second])
+        found = compare(*recordings)
+    except RmpaError as error:
+        print_error(error, error.code)
+        options.show({"error": str(error), "code": error.code})
+        return 2
+    damaged = [text for one in recordings for text in one.damaged.values()]
+    for text in damaged:
+        click.echo(f"not whole: {printable(text)}", err=True)
+    differ = [one for one in found if one.difference]
+    rows = [row for one in (found if everything else differ) for row in _rows(one)]
+    table = [Table("TOPIC, >MESSAGES, >RATE, >GAP, >AGE, FIRST DIFFERENCE", rows)] if rows else []
+    options.show(found, *table, f"{len(found)} topics, {len(differ)} differ")
+    return 2 if damaged else int(bool(differ))
 
 
 def _rows(one: TopicDifference) -> Iterator[tuple[str, ...]]:
     def cells(run: TopicRun) -> tuple[str, ...]:
-        values = ((run.rate, "{:.2f} Hz", 1.0), (run.gap, "{:.3f} s", 1.0), (run.age, "{:.1f} ms", 1e3))
-        return (f"{run.count:,}", *("-" if value is None else text.format(value * by) for value, text, by in values))
+        age = f"{1e3 * run.age:.1f} / {1e3 * run.age_p99:.1f} ms" if run.age is not None and run.age_p99 else "-"
+        rate, gap = (f"{run.rate:.2f} Hz" if run.rate else "-"), (f"{run.gap:.3f} s" if run.gap is not None else "-")
+        return f"{run.count:,}", rate, gap, age
 
     yield one.topic, *cells(one.first), one.difference or "-"
     yield "", *cells(one.second), ""
 
 
+def _at(_context: click.Context, _parameter: click.Parameter, text: str | None) -> float | time.struct_time | None:
+    """A time of a recording: seconds from its beginning, or a time of the day."""
+    try:
+        return None if text is None else time.strptime(text, "%H:%M:%S") if ":" in text else float(text)
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is neither seconds nor a time of the day: 58, 12:15:58.") from None
+
+
 @json_verb(
     argument("recording", type=_RECORDING),
-    click.option("--at", "around", type=FiniteRange(0), metavar="SECONDS", help="Only the half minute around it."),
+    click.option(
+        "--at", callback=_at, metavar="TIME", help="Only the half minute around it: 58 (s), 12:15:58 (UTC)."
+    ),
     click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FILE", help="Write it: .md or .html."),
 )
-def story(recording: Path, around: float | None, output: Path | None, options: Options) -> int:
+def story(recording: Path, at: float | time.struct_time | None, output: Path | None, options: Options) -> int:
     """Say what happened in a RECORDING: alarms, lost links, missed deadlines, profiles, gaps, errors, in order.
+
+    AFTER is in seconds of the recording, as `--at` and `rmpa play --start` take it.
 
     ---
 
@@ -178,11 +221,14 @@ def story(recording: Path, around: float | None, output: Path | None, options: O
       rmpa story fall.mcap --at 58 -o fall.html
     """
     check_record("rmpa story")
-    from rmpa.record.bag import read_any
-    from rmpa.record.merge import notes_of
+    from rmpa.record.merge import Timeline
     from rmpa.record.story import clock_text, render, tell
 
-    told = tell(read_any(recording), recording.name, notes_of(recording), around)
+    timeline = Timeline([recording])
+    told = tell(timeline.messages(), recording.name)
+    told = msgspec.structs.replace(told, notes=(*timeline.notes, *told.notes))
+    if at is not None:
+        told = told.around(at if isinstance(at, float) else _seconds(told, at))
     if output is not None:
         kind = output.suffix.removeprefix(".")
         if kind not in ("md", "html"):
@@ -190,13 +236,22 @@ def story(recording: Path, around: float | None, output: Path | None, options: O
         output.write_text(render(told, kind), encoding="utf-8")
         options.show(told, f"{output}: {len(told.lines)} lines")
         return 0
-    rows = [(clock_text(line.at), line.module or "-", line.text, line.evidence) for line in told.lines]
-    colours = [_COLOURS[line.level] for line in told.lines]
-    seconds = (told.end - told.begin) / 1e9
+    rows = [(f"{e.after:.2f} s", clock_text(e.at), e.module or "-", e.text, e.evidence) for e in told.lines]
+    modules = ", ".join(told.modules) or "one module"
     options.show(
         told,
-        f"{told.title}: {seconds:.1f} s, {told.messages:,} messages of {', '.join(told.modules) or 'one module'}",
-        *told.notes,
-        Table("TIME (UTC), MODULE, WHAT HAPPENED, SEEN IN", rows, colours) if rows else "nothing went wrong",
+        f"{told.title}: {told.seconds:.1f} s, {told.messages:,} messages of {modules}",
+        told.notes,
+        Table(
+            ">AFTER, TIME (UTC), MODULE, WHAT HAPPENED, SEEN IN", rows, [_COLOURS[line.level] for line in told.lines]
+        )
+        if rows
+        else "nothing went wrong here",
     )
     return 0
+
+
+def _seconds(told: Story, at: time.struct_time) -> float:
+    """Seconds from the beginning to the next time of the day."""
+    begin = told.begin / 1e9
+    return (at.tm_hour * 3600 + at.tm_min * 60 + at.tm_sec - begin) % 86_400

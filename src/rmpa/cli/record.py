@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
-import msgspec
 
 from rmpa.cli.completion import completes, peers, topics
 from rmpa.cli.main import LazyGroup
@@ -200,10 +199,10 @@ def _by_hand(module: Module, options: Options, given: dict[str, Any]) -> int:
         end_line()
         result = join([parts], output)
     options.show(
-        {"file": str(output), "messages": result.messages, "topics": counts},
-        f"{output}: {result.messages:,} messages of {len(counts)} topics, {size(output.stat().st_size)}",
+        {"file": str(output), "messages": result.count, "topics": counts},
+        f"{output}: {result.count:,} messages of {len(counts)} topics, {size(output.stat().st_size)}",
     )
-    return 0 if result.messages else 1
+    return 0 if result.count else 1
 
 
 def names(_ctx: click.Context, _: str) -> Iterator[str]:
@@ -309,7 +308,7 @@ def record_keep(why: str, seconds: float | None, output: Path | None, options: O
             with parts_folder(output) as folder:
                 fetched = fetch(client, name, folder)
                 result = join([folder], output)
-            about |= {"file": str(output), "messages": result.messages}
+            about |= {"file": str(output), "messages": result.count}
             lines = [merged(output, result), *(f"! {one.module}: {one.problem}" for one in fetched if one.problem)]
             answers |= {one.module: one.problem for one in fetched if one.problem}
     options.show(about, name, Table("MODULE, STATE", rows), *lines)
@@ -370,12 +369,20 @@ def record_merge(recordings: tuple[Path, ...], output: Path, reference: str, opt
     """
     check_record("rmpa record")
     result = join(list(recordings), _file(output), reference)
-    about = msgspec.to_builtins({**result._asdict(), "offsets": {k: v._asdict() for k, v in result.offsets.items()}})
+    about = {
+        "file": str(output),
+        "reference": result.reference,
+        "offsets": {name: one._asdict() for name, one in result.offsets.items()},
+        "messages": result.count,
+        "doubles": result.doubles,
+        "damaged": list(result.damaged.values()),
+        "notes": result.notes,
+    }
     rows = [
         (name, "the clock" if name == result.reference else f"{1e3 * one.ahead:+.3f} ms", _bound(one.error))
         for name, one in result.offsets.items()
     ]
-    options.show({"file": str(output), **about}, merged(output, result), Table("MODULE, >AHEAD, >±", rows))
+    options.show(about, merged(output, result), Table("MODULE, >AHEAD, >±", rows))
     return int(bool(result.damaged))
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.kept import Kept
     from rmpa.cli.options import Options
     from rmpa.observe.control_client import ControlClient
-    from rmpa.record.merge import MergeResult
+    from rmpa.record.merge import Timeline
 
 BAG: Final = ".bag"
 MB: Final = 1_000_000
@@ -96,37 +96,34 @@ def parts_folder(output: Path) -> Iterator[Path]:
     shutil.rmtree(folder)
 
 
-def join(paths: list[Path], output: Path, reference: str = "", topics: Sequence[str] = ()) -> MergeResult:
+def join(paths: list[Path], output: Path, reference: str = "", topics: Sequence[str] = ()) -> Timeline:
     """Merge recordings into one file, MCAP or bag; ``topics``: only those, by globs, and events."""
     from rmpa.record.bag import write_bag
-    from rmpa.record.format import read_in_order
-    from rmpa.record.merge import merge
+    from rmpa.record.merge import Timeline
 
     if output.exists():
         raise ConfigError("-o", f"{output} exists", "name another file")
-    whole, bag = (output.with_name(f".{output.name}.{end}") for end in ("new", "bag"))
+    timeline, whole = Timeline(paths, reference, topics), output.with_name(f".{output.name}.new")
     try:
-        with whole.open("wb") as file:
-            result = merge(paths, file, reference, topics)
         if output.suffix == BAG:
-            write_bag(read_in_order([whole]), bag)
-            bag.replace(output)
+            write_bag(timeline.messages(), whole)
         else:
-            whole.replace(output)
+            with whole.open("wb") as file:
+                timeline.write(file)
+        whole.replace(output)
     except OSError as error:
         text = f"{output} cannot be written: {error.strerror}; is the disk full?"
         raise RmpaError(text, code="directory-unusable") from None
     finally:
         whole.unlink(missing_ok=True)
-        bag.unlink(missing_ok=True)
-    return result
+    return timeline
 
 
-def merged(output: Path, result: MergeResult) -> str:
+def merged(output: Path, result: Timeline) -> str:
     """What became of a merge, in a line."""
     doubles = f", {result.doubles:,} doubles left out" if result.doubles else ""
-    damaged = "".join(f"; not read: {text}" for text in result.damaged)
-    text = f"{output}: {result.messages:,} messages of {len(result.offsets)} modules{doubles}{damaged}"
+    damaged = "".join(f"; not read: {text}" for text in result.damaged.values())
+    text = f"{output}: {result.count:,} messages of {len(result.offsets)} modules{doubles}{damaged}"
     return "\n".join((text, *result.notes))
 
 
@@ -320,14 +317,14 @@ def record_mesh(options: Options, output: Path, given: dict[str, Any]) -> int:
         if name:
             click.echo(f"the modules have it as {name}: rmpa record fetch {name}", err=True)
     left = {one: count for one in ends if (count := _grown({one: recorders[one]}, ends, "left_out", given["globs"]))}
-    about = {"file": str(output), "messages": result.messages, "modules": list(result.offsets)}
+    about = {"file": str(output), "messages": result.count, "modules": list(result.offsets)}
     options.show(
         {**about, "problems": problems, "left_out": left},
         merged(output, result),
         *(f"! {module}: {problem}" for module, problem in problems.items()),
         *(f"= {module}: {count:,} messages above its [record] topic_rate or thin" for module, count in left.items()),
     )
-    return int(bool(problems) or not result.messages)
+    return int(bool(problems) or not result.count)
 
 
 def _recorders(

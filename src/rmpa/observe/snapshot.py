@@ -205,6 +205,7 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
         counters: What was refused or dropped, by name: ``beacon.malformed`` …
         notes: What the user should know (a port taken, no multicast), each ready to read.
         unreachable: Nodes of the local graph to which no connection can be made, by name.
+        died: The latest nodes that ended without a word and were dropped, each with the time, Unix seconds.
         trust: The module's membership of a secured mesh; ``None``: trust is off.
         topics_left: Topics that are not in it, as nothing here uses them, if only so many were asked for.
         services_left: Services, likewise.
@@ -221,6 +222,7 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
     counters: dict[str, int] = {}
     notes: tuple[str, ...] = ()
     unreachable: tuple[UnreachableInfo, ...] = ()
+    died: tuple[tuple[str, float], ...] = ()
     trust: TrustStatus | None = None
     topics_left: int = 0
     services_left: int = 0

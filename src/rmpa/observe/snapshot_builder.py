@@ -127,6 +127,7 @@ class SnapshotBuilder:
             counters=dict(sorted(counters.items())),
             notes=(*notes, *self._notes()),
             unreachable=parts.core.unreachable_infos(),
+            died=tuple(parts.core.liveness.died),
             trust=trust,
         )
 

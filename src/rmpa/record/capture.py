@@ -100,16 +100,11 @@ class Capture:
         self._taken: dict[str, _Taken] = {}
         # The last message of each source that latches: repeated in each segment.
         self.latched: dict[RecordedSource, tuple[int, bytes]] = {}
-        # Messages that were left out for the budget of their topics, since this was last taken.
+        # Messages that were left out for the budget of their topics.
         self.left_out: Counter[str] = Counter()
         # Messages and bytes that were taken so far, by topic.
         self.count: Counter[str] = Counter()
         self.bytes: Counter[str] = Counter()
-
-    @property
-    def topics(self) -> Iterable[str]:
-        """The topics that are recorded now."""
-        return self._taken.keys()
 
     def wanted(self, topic: str) -> bool:
         """Whether a topic is to be recorded."""
@@ -181,5 +176,3 @@ class Capture:
             self.bytes[topic] += len(raw)
             if latches and len(raw) <= limits.LATCHED_MAX:
                 self.latched[source] = now, raw
-        else:
-            self.left_out[topic] += 1

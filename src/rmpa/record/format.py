@@ -15,6 +15,7 @@ import heapq
 import logging
 import os
 import struct
+from bisect import bisect_left
 from functools import partial
 from types import SimpleNamespace
 from typing import IO, TYPE_CHECKING, Final, NamedTuple
@@ -22,8 +23,9 @@ from typing import IO, TYPE_CHECKING, Final, NamedTuple
 import mcap.writer
 import msgspec
 import zstandard
+from mcap.data_stream import ReadDataStream
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Chunk, Footer, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Footer, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
@@ -32,26 +34,24 @@ from rmpa.record import limits
 from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
 _log = logging.getLogger(__name__)
 # The topic of events.
 EVENTS: Final = "/rmpa/events"
+# A topic of which each segment repeats the last message of each publisher, whether it latches or not.
+STATIC: Final = "/tf_static"
 MODULE: Final = "rmpa.module"
 CLOCK: Final = "rmpa.clock"
 TIME: Final = "rmpa.time"
 MERGE: Final = "rmpa.merge"
-NOTES: Final = "rmpa.notes"
-# Its messages are repeated in each segment, whether its publishers latch or not.
-STATIC: Final = "/tf_static"
 SUFFIX: Final = ".mcap"
 # The end of the name of a segment that is being written.
 UNFINISHED: Final = ".part"
 _ENCODING, _SCHEMA = "ros1", "ros1msg"
 _TEXT: Final = MessageType("std_msgs/String")
 _LENGTH: Final = struct.Struct("<I")
-_SECOND: Final = 1_000_000_000
 # Above all times of the format.
 _TIMES: Final = 1 << 64
 # Definitions may have comments in any encoding, and their MD5 sums are of their bytes.
@@ -59,6 +59,8 @@ _AS_IT_WAS: Final = "surrogateescape"
 # The library compresses at zstd's level 3 and has no option for it. Of an image with noise in its low bits (922 KB)
 # that takes 6 ms and leaves 49 %; level 1 takes 1 ms and leaves 58 %.
 vars(mcap.writer)["zstandard"] = SimpleNamespace(compress=partial(zstandard.compress, level=1))
+# Bytes of opcode and length in front of a record of MCAP.
+_RECORD_HEAD: Final = 9
 
 
 class DamagedError(RmpaError):
@@ -103,6 +105,12 @@ class Recorded(NamedTuple):
     log_time: int
     publish_time: int
     data: bytes
+
+    @property
+    def repeated(self) -> bool:
+        """Whether it is a latched message that a segment has again, for what begins to read there."""
+        source = self.source
+        return self.publish_time != self.log_time and (source.latching or source.topic == STATIC)
 
 
 class ClockRecord(msgspec.Struct, frozen=True):
@@ -228,9 +236,8 @@ class SegmentWriter:
             text.encode()  # what is no UTF-8 would damage the whole file
         key = source.type, source.md5sum
         if key not in self._schemas:
-            self._schemas[key] = self._writer.register_schema(
-                source.type, _SCHEMA, source.definition.encode("utf-8", _AS_IT_WAS)
-            )
+            definition = source.definition.encode("utf-8", _AS_IT_WAS)
+            self._schemas[key] = self._writer.register_schema(source.type, _SCHEMA, definition)
         about = {"callerid": source.node, "latching": str(int(source.latching)), "md5sum": source.md5sum}
         if source.module:
             about["module"] = source.module
@@ -250,69 +257,114 @@ class SegmentReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.module = ModuleRecord()
-        self.clocks: dict[str, ClockRecord] = {}
-        # The machine's run, and its wall clock less the monotonic one, ns; ``None``: not known.
-        self.epoch: tuple[str, int] | None = None
-        # Of a merged recording: what limits it.
-        self.notes: tuple[str, ...] = ()
+        # What the file says of clocks, by peer; a merged one has many of each.
+        self.readings: list[tuple[str, ClockRecord]] = []
+        # The machine's run, and its wall clock less the monotonic one, ns.
+        self.epoch = "", 0
+        self.merged: dict[str, str] = {}
+        # As they are, in an unfinished file; known after ``messages``.
         self.metadata: list[Metadata] = []
         self.attachments: list[Attachment] = []
-        # Whether the end of the file is missing; known after ``messages``.
+        # Whether the end of the file is missing, and chunks that cannot be read; known after ``messages``.
         self.unfinished = False
+        self.damage = 0
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, RecordedSource] = {}
+        self._span = 0, 0
 
-    def head(self) -> tuple[int, int, set[RecordedSource]]:
-        """The times of the first and the last message, and all sources; by the file's index, where it has one.
+    def head(self) -> tuple[int, int, list[RecordedSource]]:
+        """The times of the first and the last message, and all sources as they appear; by the index, if there is one.
 
         Raises:
             DamagedError: As for ``messages``.
         """
         try:
             with self.path.open("rb") as file:
-                reader = SeekingReader(file)
-                if (summary := reader.get_summary()) is not None and summary.statistics is not None:
-                    for record in reader.iter_metadata():
-                        self._metadata(record)
-                    self._schemas = dict(summary.schemas)
-                    self._channels = {number: self._source(one) for number, one in summary.channels.items()}
-                    told = summary.statistics
-                    return told.message_start_time, told.message_end_time, set(self._channels.values())
-        except Exception as error:  # noqa: BLE001 - it has no index, as after a crash
-            _log.debug("%s: %s", self.path, error)
-        first, last, sources = 0, 0, set[RecordedSource]()
+                if self._index(file) is not None:
+                    return *self._span, list(self._channels.values())
+        except OSError as error:
+            raise DamagedError(f"{self.path}: {error.strerror or error}") from error
+        first = last = 0
         for message in self.messages():
-            first, last = first or message.log_time, message.log_time
-            sources.add(message.source)
-        return first, last, sources
+            first, last = min(first or message.log_time, message.log_time), max(last, message.log_time)
+        return first, last, list(self._channels.values())
 
-    def messages(self) -> Iterator[Recorded]:
+    def messages(self, since: int = 0) -> Iterator[Recorded]:
         """The messages in order of their log times; metadata is known after the first one.
+
+        Args:
+            since: Messages before may be left out, but for latched ones.
 
         Raises:
             DamagedError: The file cannot be read from its beginning on.
         """
-        chunk: list[Recorded] = []
         try:
             with self.path.open("rb") as file:
-                ended = False
-                try:
-                    for record in StreamReader(file, emit_chunks=True).records:
-                        ended = isinstance(record, Footer)
-                        if isinstance(record, Chunk):
-                            yield from _in_order(chunk)
-                            chunk = [one for part in breakup_chunk(record) if (one := self._take(part)) is not None]
-                        elif (one := self._take(record)) is not None:
-                            chunk.append(one)
-                except OSError:
-                    raise
-                except Exception as error:  # noqa: BLE001 - whatever the libraries make of damaged bytes
-                    if not self._channels and not self.module.name:
-                        raise DamagedError(f"{self.path}: it is no recording: {error}") from None
-                self.unfinished = not ended
+                chunks = self._index(file)
+                yield from self._unindexed(file) if chunks is None else self._indexed(file, chunks, since)
         except OSError as error:
             raise DamagedError(f"{self.path}: {error.strerror or error}") from error
-        yield from _in_order(chunk)
+
+    def _index(self, file: IO[bytes]) -> list[ChunkIndex] | None:
+        """The chunks by the times of their first messages; ``None``: there is no index, as after a crash."""
+        try:
+            reader = SeekingReader(file)
+            summary = reader.get_summary()
+            if summary is None or summary.statistics is None or not summary.chunk_indexes:
+                return None
+            for record in reader.iter_metadata():
+                self._metadata(record)
+            self._schemas = dict(summary.schemas)
+            self._channels = {number: self._source(one) for number, one in summary.channels.items()}
+            self._span = summary.statistics.message_start_time, summary.statistics.message_end_time
+            return sorted(summary.chunk_indexes, key=lambda one: (one.message_start_time, one.chunk_start_offset))
+        except OSError:
+            raise
+        except Exception as error:  # noqa: BLE001 - whatever the library makes of damaged bytes
+            _log.debug("%s: %s", self.path, error)
+            return None
+
+    def _indexed(self, file: IO[bytes], chunks: list[ChunkIndex], since: int) -> Iterator[Recorded]:
+        """By the index: in order also where the clock was set back, and past chunks that are damaged."""
+        latching = {number for number, one in self._channels.items() if one.latching or one.topic == STATIC}
+        waiting: list[Recorded] = []
+        for one in chunks:
+            if one.message_end_time < since and not latching & one.message_index_offsets.keys():
+                continue
+            due = bisect_left(waiting, one.message_start_time, key=_log_time)
+            yield from waiting[:due]
+            del waiting[:due]
+            try:
+                file.seek(one.chunk_start_offset + _RECORD_HEAD)
+                records = breakup_chunk(Chunk.read(ReadDataStream(file)), validate_crc=True)
+            except Exception as error:  # noqa: BLE001 - as above
+                _log.debug("%s: %s", self.path, error)
+                self.damage += 1
+                continue
+            waiting += [message for record in records if (message := self._take(record)) is not None]
+            waiting.sort(key=_log_time)
+        yield from waiting
+
+    def _unindexed(self, file: IO[bytes]) -> Iterator[Recorded]:
+        """From the beginning on, as far as the file goes; in order within each chunk."""
+        ended, chunk = False, list[Recorded]()
+        file.seek(0)
+        try:
+            for record in StreamReader(file, emit_chunks=True).records:
+                ended = isinstance(record, Footer)
+                if isinstance(record, Chunk):
+                    yield from sorted(chunk, key=_log_time)
+                    chunk = [one for part in breakup_chunk(record) if (one := self._take(part)) is not None]
+                elif (one := self._take(record)) is not None:
+                    chunk.append(one)
+        except OSError:
+            raise
+        except Exception as error:
+            if not self._channels and not self.module.name:
+                why = "it is empty" if not file.seek(0, 2) else "it is no recording, or its beginning is damaged"
+                raise DamagedError(f"{self.path}: {why}") from error
+        self.unfinished = not ended
+        yield from sorted(chunk, key=_log_time)
 
     def _take(self, record: object) -> Recorded | None:
         if isinstance(record, Message):
@@ -341,66 +393,40 @@ class SegmentReader:
             if record.name == MODULE:
                 self.module = msgspec.convert(record.metadata, ModuleRecord)
             elif record.name == CLOCK:
-                self.clocks |= {
-                    peer: msgspec.json.decode(text, type=ClockRecord) for peer, text in record.metadata.items()
-                }
+                known = {p: msgspec.json.decode(text, type=ClockRecord) for p, text in record.metadata.items()}
+                self.readings += known.items()
             elif record.name == TIME:
                 self.epoch = record.metadata["boot"], int(record.metadata["epoch"])
-            elif record.name == NOTES:
-                self.notes = tuple(record.metadata["text"].splitlines())
+            elif record.name == MERGE:
+                self.merged = dict(record.metadata)
         except (msgspec.DecodeError, msgspec.ValidationError, KeyError, ValueError):
             pass  # of another release
-
-
-def _in_order(messages: list[Recorded]) -> list[Recorded]:
-    """Messages of a chunk by their log times; those of one time as they were written."""
-    return sorted(messages, key=_log_time)
 
 
 def _log_time(message: Recorded) -> int:
     return message.log_time
 
 
-# A segment's module, and its ``SegmentReader.epoch``.
-Epoch = tuple[str, tuple[str, int] | None]
+def read_in_order(streams: Iterable[tuple[int, Iterator[Recorded]]]) -> Iterator[Recorded]:
+    """The messages of several files in order; a file is opened when its first message is due.
 
-
-def clock_shifts(segments: Sequence[Epoch]) -> list[int]:
-    """What puts the times of segments, in order, on the clocks of their modules as they were set at last, ns."""
-    shifts, later = list[int](), dict[str, tuple[tuple[str, int] | None, int]]()
-    for module, epoch in reversed(segments):
-        after, shift = later.get(module, (None, 0))
-        if epoch is not None and after is not None:
-            step = after[1] - epoch[1]
-            if epoch[0] != after[0]:
-                shift = 0  # of another boot: what its monotonic clock says is not known
-            elif abs(step) >= limits.CLOCK_STEP * _SECOND:
-                shift += step
-        later[module] = epoch or after, shift
-        shifts.append(shift)
-    return shifts[::-1]
-
-
-def moved(message: Recorded, by: int) -> Recorded:
-    """A message with other times, by so many nanoseconds later."""
-    return message._replace(log_time=max(1, message.log_time + by), publish_time=max(1, message.publish_time + by))
-
-
-def read_in_order(paths: Sequence[Path]) -> Iterator[Recorded]:
-    """The messages of several files of one module, or of a merged one, in order of their log times.
-
-    Where the module's clock was set meanwhile, all times are by the clock as it was set at last.
+    Args:
+        streams: The time of the first message of each, and its messages in order.
     """
-    readers = [SegmentReader(path) for path in paths]
-    for reader in readers if len(readers) > 1 else ():
-        with contextlib.suppress(DamagedError):
-            reader.head()
-    shifts = clock_shifts([(one.module.name, one.epoch) for one in readers])
-    streams = (
-        map(partial(moved, by=by), one.messages()) if by else one.messages()
-        for one, by in zip(readers, shifts, strict=True)
-    )
-    return heapq.merge(*streams, key=_log_time)
+    waiting: list[tuple[tuple[int, str, str, str], int, Recorded | None, Iterator[Recorded]]] = [
+        ((begin, "", "", ""), number, None, stream) for number, (begin, stream) in enumerate(streams)
+    ]
+    heapq.heapify(waiting)
+    while waiting:
+        _, number, message, stream = waiting[0]
+        if message is not None:
+            yield message
+        if (message := next(stream, None)) is None:
+            heapq.heappop(waiting)
+        else:
+            source = message.source
+            key = message.log_time, source.module, source.topic, source.node
+            heapq.heapreplace(waiting, (key, number, message, stream))
 
 
 def finish_file(path: Path) -> Path:
@@ -417,9 +443,10 @@ def finish_file(path: Path) -> Path:
         OSError: It cannot be written.
     """
     reader, done = SegmentReader(path), path.with_name(path.name.removesuffix(UNFINISHED))
-    whole = done.with_name(f"{done.name}.new")
-    found: list[Recorded] = list(reader.messages())
-    about = path.stat()
+    found = list(reader.messages())
+    if not reader.unfinished:
+        return path.replace(done)
+    whole, about = done.with_name(f"{done.name}.new"), path.stat()
     try:
         with whole.open("wb") as file:
             writer = SegmentWriter(file, None)

@@ -9,6 +9,7 @@ import logging
 import os
 import signal
 import time
+from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -140,7 +141,7 @@ class Recorder:
         self._parameters = b""
         self._last: Snapshot | None = None
         self._kept_at: dict[str, float] = {}
-        self._left_out: dict[str, int] = {}
+        self._left_out: Counter[str] = Counter()
         self._since = time.time()
         self._work = OwnedTasks()
         listeners = {ARRAY_TYPE: self._alarms, _BOOL: self._stops}
@@ -192,17 +193,15 @@ class Recorder:
         for source, (first, raw) in list(self.capture.latched.items()):
             with contextlib.suppress(ValueError):  # it was counted as lost
                 writer.write(source, now, first, raw)
-        if counts := {topic: n for topic, n in self._left_out_since().items() if n}:
+        before, self._left_out = self._left_out, self._all_left_out()
+        if counts := self._left_out - before:
             text = f"left out: {', '.join(f'{n} of {topic}' for topic, n in counts.items())}"
             event = Event("left_out", text, module=self._module.name, facts=dict(counts))
             writer.write(EVENT_SOURCE, now, now, event_bytes(event))
 
-    def _left_out_since(self) -> dict[str, int]:
-        before, self._left_out = self._left_out, self._all_left_out()
-        return {topic: count - before.get(topic, 0) for topic, count in self._left_out.items()}
-
-    def _all_left_out(self) -> dict[str, int]:
-        return dict(self.capture.left_out)
+    def _all_left_out(self) -> Counter[str]:
+        """Messages above the budgets, or that the disk did not take, by topic; called in any thread."""
+        return Counter(self.capture.left_out) + Counter(self.ring.lost)
 
     async def _follow(self) -> None:
         """Follow the agent: what there is to record, and what happens."""
@@ -327,14 +326,13 @@ class Recorder:
     def _write_status(self) -> None:
         segments = list(self.ring.segments)
         back = time.monotonic() - segments[0].began if segments else 0.0
-        lost = dict(self.ring.lost)
         status = RecorderStatus(
             pid=os.getpid(),
             since=self._since,
             at=time.time(),
             messages=dict(self.capture.count),
             size=dict(self.capture.bytes),
-            left_out={t: n + lost.get(t, 0) for t, n in {**lost, **self._all_left_out()}.items()},
+            left_out=dict(self._all_left_out()),
             written=self.ring.written,
             ring=(sum(one.size for one in segments), back),
             bounds=(self._settings.megabytes * _MB, self._settings.seconds),
@@ -355,17 +353,17 @@ def _epoch() -> int:
 
 def _events(before: Snapshot | None, after: Snapshot) -> Iterator[Event]:
     """What happened between two snapshots."""
-    for change in changes(before, after) if before is not None else ():
+    if before is None:
+        return
+    for change in changes(before, after):
         if (event := _event(change)) is not None:
             yield event
-    nodes, known = _nodes(after), _nodes(before) if before is not None else None
-    if known is None:
-        return
-    dead = {one.node: one for one in after.unreachable}
-    told = {one.node for one in before.unreachable} if before is not None else set()
-    for node in sorted(dead.keys() - told):
-        yield Event(NODE_DIED, f"{node} does not answer: {dead[node].problem}", node)
-    yield from (Event("node_gone", f"{node} is gone", node) for node in sorted(known - nodes))
+    nodes, known, told = _nodes(after), _nodes(before), {one.node for one in before.unreachable}
+    died = {node for node, _ in set(after.died).difference(before.died)}
+    dead = {node: f"{node} died: no process listens where it did" for node in died & known}
+    dead |= {one.node: f"{one.node} does not answer: {one.problem}" for one in after.unreachable}
+    yield from (Event(NODE_DIED, dead[node], node) for node in sorted(dead.keys() - told))
+    yield from (Event("node_gone", f"{node} is gone", node) for node in sorted(known - nodes - dead.keys()))
     yield from (Event("node_came", f"{node} is there", node) for node in sorted(nodes - known))
 
 

@@ -144,10 +144,8 @@ class RingThread(threading.Thread):
                 return False
             self._waiting.append((source, log_time, publish_time, data))
             self._waiting_bytes += len(data)
-            if (
-                self._waiting_bytes > limits.CHUNK
-            ):  # else the thread looks by itself: waking it costs more than writing
-                self._lock.notify()
+            if self._waiting_bytes > limits.CHUNK:
+                self._lock.notify()  # before, the thread looks by itself: waking it costs more than writing
             return True
 
     def call(self, function: Callable[..., Any], *args: Any) -> Future[Any]:

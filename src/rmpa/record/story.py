@@ -6,7 +6,8 @@ missing in it. Each line names its evidence.
 
 from __future__ import annotations
 
-import statistics
+import contextlib
+import re
 import time
 from collections import Counter, deque
 from pathlib import Path
@@ -26,25 +27,23 @@ _LOG: Final = MessageType("rosgraph_msgs/Log")
 _TEXT: Final = MessageType("std_msgs/String")
 # Level of an error on /rosout (rosgraph_msgs/Log).
 _ERROR: Final = 8
-# A topic has a gap where a message comes so many usual periods late, and so many seconds.
+# A topic has a gap where a message comes after so many of the longer of its periods, and so many seconds.
 _PERIODS: Final = 5
 _LEAST: Final = 0.5
-# The periods of which the usual one is the median.
-_USUAL: Final = 64
+# The last periods, of which the usual one is the median and a longer one the ninth decile; the least number of them.
+_USUAL, _KNOWN = 64, 8
+# Of the errors that a node logs in so many seconds so many are told, the others counted.
+_FLOOD, _FLOOD_LINES = 10, 4
+# Seconds before and after a time that belong to it.
+_AROUND: Final = 15
 # Events that are no line of a story: what comes and goes in order.
 _QUIET: Final = (
     "topic_came", "topic_gone", "service_came", "service_gone", "note_over", "alarm_over", "peer_linked", "kept",
 )  # fmt: skip
 _WARN, _BAD, _INFO = "warn", "error", "info"
 _LEVELS: Final = {
-    "alarm": _WARN,
-    "peer_lost": _BAD,
-    "node_died": _BAD,
-    "clock_step": _WARN,
-    "node_gone": _WARN,
-    "contract": _WARN,
-    "stop": _BAD,
-    "agent_lost": _BAD,
+    **dict.fromkeys(("alarm", "clock_step", "contract", "node_gone"), _WARN),
+    **dict.fromkeys(("agent_lost", "node_died", "peer_lost", "stop"), _BAD),
 }
 
 
@@ -53,14 +52,16 @@ class StoryLine(msgspec.Struct, frozen=True):
 
     Attributes:
         at: When, Unix nanoseconds.
+        after: The same in seconds from the beginning of the recording.
         module: Where; empty: not known.
         level: ``info``, ``warn`` or ``error``.
         kind: ``alarm``, ``gap``, ``log`` …
         text: A sentence.
-        evidence: The topic that it was read from.
+        evidence: Where it was read: a topic, with the file and line of a log.
     """
 
     at: int
+    after: float
     module: str
     level: str
     kind: str
@@ -89,20 +90,54 @@ class Story(msgspec.Struct, frozen=True):
     lines: tuple[StoryLine, ...]
     notes: tuple[str, ...] = ()
 
+    @property
+    def seconds(self) -> float:
+        """Its length."""
+        return (self.end - self.begin) / _SECOND
+
+    def around(self, after: float) -> Story:
+        """What happened in the half minute around a time, in seconds from the beginning."""
+        lines = tuple(line for line in self.lines if abs(line.after - after) <= _AROUND)
+        text = f"Only what happened within {_AROUND} s of {after:.1f} s: {len(lines)} of {len(self.lines)} lines."
+        return msgspec.structs.replace(self, lines=lines, notes=(*self.notes, text))
+
+
+class _Steady:
+    """The times of one publisher of a topic."""
+
+    def __init__(self, message: Recorded) -> None:
+        self.last = message
+        self._periods: deque[float] = deque(maxlen=_USUAL)
+
+    def gap(self, until: int) -> tuple[float, float] | None:
+        """The seconds to a time if it was silent, and what is usual; ``None``: it was not, as far as it is known."""
+        period = (until - self.last.log_time) / _SECOND
+        if period <= _LEAST or len(self._periods) < _KNOWN:
+            return None
+        periods = sorted(self._periods)
+        late = periods[len(periods) * 9 // 10]
+        return (period, periods[len(periods) // 2]) if period > _PERIODS * late else None
+
+    def take(self, message: Recorded) -> None:
+        self._periods.append((message.log_time - self.last.log_time) / _SECOND)
+        self.last = message
+
 
 class _Teller:
     """Reads a recording once."""
 
     def __init__(self) -> None:
-        self.lines: list[StoryLine] = []
+        self._lines: list[StoryLine] = []
         self.begin = self.end = self.count = 0
-        self.modules: dict[str, None] = {}
+        # When each module said something last.
+        self.modules: dict[str, int] = {}
         # Messages that the recorders have left out, by topic.
         self.left_out: Counter[str] = Counter()
-        self._last: dict[tuple[str, str, str], int] = {}
-        self._periods: dict[tuple[str, str, str], deque[float]] = {}
-        self._profiles: dict[str, str] = {}
-        self._logged: dict[tuple[str, str], int] = {}
+        self._steady: dict[tuple[str, str, str], _Steady] = {}
+        self._profiles: dict[tuple[str, str], str] = {}
+        self._logged: set[tuple[str, str, int]] = set()
+        # By node since when its errors are counted, how many, and the place of the last line of it.
+        self._floods: dict[str, tuple[int, int, int]] = {}
 
     def take(self, message: Recorded) -> None:
         """Take a message."""
@@ -110,20 +145,34 @@ class _Teller:
         self.begin = self.begin or message.log_time
         self.end = max(self.end, message.log_time)
         self.count += 1
-        self.modules[source.module] = None
+        self.modules[source.module] = message.log_time
         if source.topic == EVENTS:
             self._event(message)
             return
-        if message.publish_time != message.log_time:
-            return  # repeated
-        self._gap(message)
-        if source.type == _LOG.name:
-            self._log(message)
-        elif source.type == _TEXT.name and source.topic.endswith("/profile"):
-            self._profile(message)
+        if message.repeated:
+            return
+        with contextlib.suppress(RmpaError):  # what cannot be read says nothing
+            if source.type == _LOG.name:
+                self._log(message)
+                return
+            if source.type == _TEXT.name and source.topic.endswith("/profile"):
+                self._profile(message)
+        steady = self._steady.setdefault((source.module, source.topic, source.node), _Steady(message))
+        if steady.last is not message:
+            self._gap(steady, message.log_time, "")
+            steady.take(message)
 
-    def _add(self, message: Recorded, level: str, kind: str, text: str) -> None:
-        self.lines.append(StoryLine(message.log_time, message.source.module, level, kind, text, message.source.topic))
+    def finish(self) -> list[StoryLine]:
+        """The lines in order."""
+        for steady in self._steady.values():
+            self._gap(steady, self.modules[steady.last.source.module], ", to the end")
+        return sorted(self._lines, key=lambda line: (line.at, line.module, line.text))
+
+    def _add(self, message: Recorded, level: str, kind: str, text: str, place: str = "") -> None:
+        at, source = message.log_time, message.source
+        text = "".join(letter if letter.isprintable() else " " for letter in text)
+        after = round((at - self.begin) / _SECOND, 3)
+        self._lines.append(StoryLine(at, after, source.module, level, kind, text, source.topic + place))
 
     def _event(self, message: Recorded) -> None:
         event = read_event(message.data)
@@ -132,62 +181,61 @@ class _Teller:
         elif event is not None and event.kind not in _QUIET:
             self._add(message, _LEVELS.get(event.kind, _INFO), event.kind, event.text)
 
-    def _gap(self, message: Recorded) -> None:
-        source = message.source
-        key = source.module, source.topic, source.node
-        before, self._last[key] = self._last.get(key), message.log_time
-        if before is None:
-            return
-        period = (message.log_time - before) / _SECOND
-        periods = self._periods.setdefault(key, deque(maxlen=_USUAL))
-        usual = statistics.median(periods) if len(periods) >= 8 else None
-        if usual is not None and period > max(_PERIODS * usual, _LEAST):
-            text = f"{source.topic} of {source.node} was silent for {period:.2f} s; usual are {usual:.3g} s"
-            self.lines.append(StoryLine(before, source.module, _WARN, "gap", text, source.topic))
-        periods.append(period)
+    def _gap(self, steady: _Steady, until: int, end: str) -> None:
+        if (found := steady.gap(until)) is not None:
+            source, (period, usual) = steady.last.source, found
+            text = f"{source.topic} of {source.node} was silent for {period:.2f} s{end}; usual are {usual:.3g} s"
+            self._add(steady.last, _WARN, "gap", text)
 
     def _log(self, message: Recorded) -> None:
-        try:
-            line = _LOG.deserialize(message.data)
-        except RmpaError:
+        line = _LOG.deserialize(message.data)
+        node, text, stamp = str(line.name), str(line.msg), line.header.stamp
+        key = node, text, stamp.sec * _SECOND + stamp.nanosec
+        if int(line.level) < _ERROR or key in self._logged:  # /rosout_agg has it again
             return
-        key = str(line.name), str(line.msg)
-        if int(line.level) >= _ERROR and message.log_time - self._logged.get(key, 0) > 10 * _SECOND:
-            self._logged[key] = message.log_time
-            self._add(message, _BAD, "log", f"{line.name} says: {line.msg}")
+        self._logged.add(key)
+        begin, count, place = self._floods.get(node, (0, 0, 0))
+        if message.log_time - begin > _FLOOD * _SECOND:
+            begin, count = message.log_time, 0
+        if count < _FLOOD_LINES:
+            level = "fatal" if int(line.level) > _ERROR else "error"
+            place, where = len(self._lines), f" {line.file}:{line.line}" if line.file else ""
+            self._add(message, _BAD, "log", f"{node} logs {level}: {text}", where)
+        else:
+            last, more = self._lines[place], count - _FLOOD_LINES + 1
+            text = f"{last.text.removesuffix(_more(more - 1))}{_more(more)}"
+            self._lines[place] = msgspec.structs.replace(last, text=text)
+        self._floods[node] = begin, count + 1, place
 
     def _profile(self, message: Recorded) -> None:
-        try:
-            profile = str(_TEXT.deserialize(message.data).data)
-        except RmpaError:
-            return
-        resource = message.source.topic.removesuffix("/profile")
-        before, self._profiles[resource] = self._profiles.get(resource), profile
+        profile = str(_TEXT.deserialize(message.data).data)
+        key = message.source.module, message.source.topic.removesuffix("/profile")
+        before, self._profiles[key] = self._profiles.get(key), profile
         if before is not None and profile != before:
-            self._add(message, _INFO, "profile", f"{resource} runs {profile or 'no profile'} in place of {before}")
+            text = f"{key[1]} runs {profile or 'no profile'} in place of {before or 'none'}"
+            self._add(message, _INFO, "profile", text)
 
 
-def tell(messages: Iterable[Recorded], title: str, notes: Iterable[str] = (), around: float | None = None) -> Story:
+def _more(count: int) -> str:
+    return f" (and {count} more within {_FLOOD} s)" if count else ""
+
+
+def tell(messages: Iterable[Recorded], title: str, notes: Iterable[str] = ()) -> Story:
     """Make the story of a recording.
 
     Args:
         messages: In order of their log times.
         title: What it is called.
         notes: What limits it, from its merge.
-        around: Seconds of the recording, from its beginning; then what happened in the half minute around it alone.
     """
     teller = _Teller()
     for message in messages:
         teller.take(message)
-    lines = sorted(teller.lines, key=lambda line: (line.at, line.module, line.text))
-    if around is not None:
-        at = teller.begin + round(around * _SECOND)
-        lines = [line for line in lines if abs(line.at - at) <= 15 * _SECOND]
     modules = tuple(sorted(filter(None, teller.modules)))
     if teller.left_out:
         counts = ", ".join(f"{count:,} messages of {topic}" for topic, count in sorted(teller.left_out.items()))
-        notes = [*notes, f"Left out, for the budgets of [record]: {counts}."]
-    return Story(title, teller.begin, teller.end, modules, teller.count, tuple(lines), tuple(notes))
+        notes = [*notes, f"Left out, for the budgets of [record] or the disk: {counts}."]
+    return Story(title, teller.begin, teller.end, modules, teller.count, tuple(teller.finish()), tuple(notes))
 
 
 def clock_text(at: int) -> str:
@@ -203,11 +251,14 @@ def render(story: Story, kind: str) -> str:
     escape = select_autoescape(enabled_extensions=("html.j2",))
     loader = FileSystemLoader(Path(__file__).parent)
     environment = Environment(loader=loader, autoescape=escape, trim_blocks=True, lstrip_blocks=True)  # noqa: S701 - by the extension
-    span = max(story.end - story.begin, 1)
-    rows = {module: index for index, module in enumerate(story.modules or ("",))}
-    marks = [(100 * (line.at - story.begin) / span, rows.get(line.module, 0), line) for line in story.lines]
+    environment.filters["cell"] = _cell
     template = environment.get_template(f"story.{kind}.j2")
     return template.render(
-        story=story, rows=rows, marks=marks, seconds=span / _SECOND, clock=clock_text,
+        story=story, clock=clock_text, seconds=max(story.seconds, 1e-9),
         day=time.strftime("%Y-%m-%d", time.gmtime(story.begin / _SECOND)),
     )  # fmt: skip
+
+
+def _cell(text: str) -> str:
+    """Text in Markdown: one line, in which nothing is markup."""
+    return re.sub(r"([\\`*_\[\]<>|#~])", r"\\\1", text).replace("\\<", "&lt;")

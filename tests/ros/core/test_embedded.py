@@ -144,6 +144,22 @@ async def test_node_without_get_name_is_identified_by_its_header(monkeypatch: py
     await node.close()
 
 
+async def test_a_dead_node_is_purged_when_suspected(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rmpa.ros.core.liveness.NODE_RECHECK_DELAY", 0.01)
+    async with Slave() as subscriber:
+        async with Slave() as dead:
+            core.call("registerPublisher", "/dead", "/t", STRING, dead.uri)
+        core.call("registerSubscriber", "/s", "/t", STRING, subscriber.uri)
+        core.suspect("/dead")
+        core.suspect("/dead")
+        core.suspect("/nobody")
+        await until(lambda: bool(subscriber.calls))
+        assert subscriber.calls == [("publisherUpdate", ["/master", "/t", []])]
+        assert core.state().nodes == {"/s": subscriber.uri}
+        assert core.counters["node.dead"] == 1
+        assert [node for node, _ in core.liveness.died] == ["/dead"]
+
+
 def lists_of(slave: Slave) -> list[XmlRpcValue]:
     """The lists of publishers that a slave was told."""
     return [publishers for _, publishers in slave.updates]

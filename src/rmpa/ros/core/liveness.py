@@ -7,7 +7,8 @@ import contextlib
 import logging
 import os
 import random
-from collections import OrderedDict
+import time
+from collections import OrderedDict, deque
 from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Final, TypeAlias, cast
@@ -47,6 +48,8 @@ NODE_RECHECK_DELAY: Final = 0.2
 
 # Time for a connection that only shows that a node is there.
 _CONNECT_TIMEOUT: Final = 3.0
+# Nodes that died and are remembered: those who look once in some seconds learn of each.
+_DIED: Final = 64
 # Concurrent attempts to reach unreachable nodes: each may hold a thread of the resolver for seconds.
 _NODE_UNREACHABLE_CHECKS: Final = 4
 # With this many updates queued for a node, only the latest of each parameter is kept; with fewer all of them.
@@ -137,6 +140,7 @@ class Liveness:
     Attributes:
         unreachable: The nodes to which connecting failed when it was last tried, by name; not to be changed by
             others.
+        died: The latest nodes that were dead, each with the time in seconds since the epoch.
     """
 
     def __init__(self, *, nodes: Callable[[], dict[str, str]], on_dead: Callable[[str, str], None]) -> None:
@@ -150,6 +154,7 @@ class Liveness:
         # The port of each slave API on this machine; ``None`` of the others.
         self._local_ports: dict[str, int | None] = {}
         self.unreachable: dict[str, Unreachable] = {}
+        self.died: deque[tuple[str, float]] = deque(maxlen=_DIED)
         self._slow = asyncio.Semaphore(_NODE_UNREACHABLE_CHECKS)
 
     def start(self) -> None:
@@ -208,6 +213,7 @@ class Liveness:
             await asyncio.sleep(NODE_RECHECK_DELAY)
             if await refuses(api) and self._nodes().get(node) == api:
                 _log.warning("= node %s at %s is dead: no process listens there [node-gone]", node, api)
+                self.died.append((node, time.time()))
                 self._on_dead(node, api)
             return
         except OutOfDescriptors:
