@@ -30,6 +30,11 @@ ROOMS: Final = {
         *("cli/topic.py", "cli/trust.py", "cli/trust_join.py"),
     ),
 }
+ALL: Final = [*itertools.chain(*ROOMS.values())]
+EACH: Final = [
+    pytest.param(ALL, id="all"),
+    *(pytest.param(gone, id=room, marks=pytest.mark.long) for room, gone in ROOMS.items()),
+]
 # Tests that compare the whole tree with its pages and lists; and this one.
 OF_THE_WHOLE: Final = (
     *("api/test_names.py", "cli/test_one_name.py", "cli/test_pictures.py"),
@@ -136,11 +141,9 @@ def checked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-@pytest.mark.parametrize(
-    "gone",
-    [pytest.param(gone, id=room, marks=pytest.mark.long if room == "record" else ()) for room, gone in ROOMS.items()],
-)
-def test_what_remains_imports_and_type_checks(gone: tuple[str, ...], checked: Path, tmp_path: Path) -> None:
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("gone", EACH)
+def test_what_remains_imports_and_type_checks(gone: Sequence[str], checked: Path, tmp_path: Path) -> None:
     tree = Tree(tmp_path, gone)
     tree.run("-c", IMPORT_ALL, str(tmp_path))
     shutil.copytree(checked, tmp_path / ".mypy_cache")
@@ -148,16 +151,10 @@ def test_what_remains_imports_and_type_checks(gone: tuple[str, ...], checked: Pa
 
 
 @pytest.mark.timeout(1800)
-@pytest.mark.parametrize(
-    ("gone", "tests"),
-    [
-        pytest.param([*itertools.chain(*ROOMS.values())], QUICK, id="all"),
-        *(pytest.param(gone, FAST, id=room, marks=pytest.mark.long) for room, gone in ROOMS.items()),
-    ],
-)
-def test_what_remains_passes_its_tests(gone: Sequence[str], tests: Sequence[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize("gone", EACH)
+def test_what_remains_passes_its_tests(gone: Sequence[str], tmp_path: Path) -> None:
     tree = Tree(tmp_path, gone)
     tree.add_tests()
-    there = [each for each in tests if (tmp_path / each).exists()]
+    there = [each for each in (QUICK if gone == ALL else FAST) if (tmp_path / each).exists()]
     # A command that is gone for good is named by its group, which may be gone.
     tree.run("-m", "pytest", "-q", "--timeout", "600", "-m", NO_SYSTEM, "-k", "not wrong_or_gone", *there)

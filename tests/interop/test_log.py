@@ -114,9 +114,10 @@ def test_rosout_crosses_where_both_modules_say_so_with_its_origin_and_without_an
 
     def crossed() -> bool:
         say(there, "knock")
-        return 'name: "/rmpa/b/there"' in echoes["a"].output
+        say(here, "knock")
+        return 'name: "/rmpa/b/there"' in echoes["a"].output and 'name: "/rmpa/a/here"' in echoes["b"].output
 
-    eventually(crossed, what="the log of b at a")
+    eventually(crossed, what="each log at the other")
     say(there, "once from b")
     say(here, "once from a")
     for module, node, text in ((a, "/rmpa/b/there", "from b"), (b, "/rmpa/a/here", "from a")):

@@ -644,3 +644,12 @@ async def test_the_line_alone_is_shown_where_the_page_may_not_invite(site: Site)
     page = await site.open("", "knock")
     await page.wait_text("run here: rmpa trust invite --module arm")
     assert await page.run("document.querySelectorAll('.outside button').length") == 0
+
+
+async def test_a_page_whose_scripts_did_not_all_come_is_loaded_again(site: Site) -> None:
+    await site.page.send("Network.enable")
+    await site.page.send("Network.setBlockedURLs", urls=["*/parts.js"])
+    await site.page.goto(f"http://127.0.0.1:{site.port}/")
+    await site.page.wait("performance.getEntriesByName(new URL('static/again.js', location.href)).length")
+    await site.page.send("Network.setBlockedURLs", urls=[])
+    await site.page.wait("performance.getEntriesByType('navigation')[0].type === 'reload' && window.rmpa?.state")
