@@ -23,7 +23,7 @@ from rmpa.config import limits as config_limits
 from rmpa.config.rules import CLOCK
 from rmpa.config.settings import Settings
 from rmpa.config.values import PEER
-from rmpa.core.identity import ROSOUT, is_own, matches
+from rmpa.core.identity import ROSOUT, is_own, matches, matches_any
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -147,7 +147,7 @@ class ServiceRules:
             return PolicyDecision(False, f"{node} stands for a node of another module, or is the agent itself")
         if matches(OWN_SERVICES, service):
             return PolicyDecision(False, "built in: the agent's own services do not cross")
-        if not settings.loggers and any(matches(pattern, service) for pattern in LOGGERS):
+        if not settings.loggers and matches_any(LOGGERS, service):
             return PolicyDecision(
                 False, "built in: a node's log is set at home; services.loggers = true lets it cross"
             )
@@ -180,7 +180,7 @@ class ServiceRules:
 
     def _fitting(self, service: str) -> Iterator[ServiceRule]:
         """The rules ``[[service]]`` that fit a service, in order."""
-        return (rule for rule in self._settings.rules if any(matches(pattern, service) for pattern in rule.names))
+        return (rule for rule in self._settings.rules if matches_any(rule.names, service))
 
 
 @dataclass(frozen=True, slots=True)

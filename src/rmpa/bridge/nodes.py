@@ -18,7 +18,7 @@ from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RemoteProtocolError, RmpaError
-from rmpa.core.identity import OWN_NODE, is_global_name, is_own, matches, proxied_node
+from rmpa.core.identity import OWN_NODE, is_global_name, is_own, matches_any, proxied_node
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.core.liveness import MASTER_ID, end_node, node_connections, ping_node
 from rmpa.ros.environment import (
@@ -322,7 +322,7 @@ class Nodes(Part):
         peer = asker.link.name
         node, uri = own_node(self._bridge, args, permitted_nodes(self._bridge, Access.KILL, peer, args))
         who = f"{peer}'s {str(args.get('by', ''))[: limits.ASK_NAME_MAX]}"
-        if not any(matches(glob, node) for glob in self._bridge.context.settings.nodes.kill):
+        if not matches_any(self._bridge.context.settings.nodes.kill, node):
             _log.warning("! %s may not end %s: no glob of nodes.kill fits [not-permitted]", who, node)
             here = self._bridge.context.settings.name
             raise RmpaError(

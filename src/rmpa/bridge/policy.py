@@ -17,7 +17,7 @@ from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.rules import CLOCK
 from rmpa.config.settings import TimeSettings
 from rmpa.config.values import PEER
-from rmpa.core.identity import NEVER_CROSSING, OUTSIDE_GUID, ROSOUT, is_own, matches
+from rmpa.core.identity import NEVER_CROSSING, OUTSIDE_GUID, ROSOUT, is_own, matches, matches_any
 from rmpa.core.statistics import Counters
 from rmpa.mesh import limits as mesh_limits
 from rmpa.trust.permissions import PermissionDecision, prohibition, refusal
@@ -143,7 +143,7 @@ def judge_globs(
         for pattern in settings.deny_types:
             if matches(pattern, type_name):
                 return PolicyDecision(False, f"{where}.deny_types has {pattern!r}")
-        if not any(matches(pattern, type_name) for pattern in settings.allow_types):
+        if not matches_any(settings.allow_types, type_name):
             return PolicyDecision(False, f"no glob of {where}.allow_types fits {type_name}")
     for pattern in settings.allow:
         if matches(pattern, name):

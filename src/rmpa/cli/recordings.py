@@ -18,7 +18,7 @@ from rmpa.bridge.limits import RECORDING_PART
 from rmpa.bridge.recordings import FilePart, ModuleRecordings
 from rmpa.cli.output import printable, size
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
-from rmpa.core.identity import matches
+from rmpa.core.identity import matches_any
 from rmpa.core.limits import KIB
 
 if TYPE_CHECKING:
@@ -396,7 +396,7 @@ def _grown(
     for name, each in before.items():
         then = each.status.get(what, {})
         for topic, count in (now[name].status.get(what, {}) if name in now else {}).items():
-            if not globs or any(matches(glob, topic) for glob in globs):
+            if not globs or matches_any(globs, topic):
                 total += max(0, count - then.get(topic, 0))
     return total
 

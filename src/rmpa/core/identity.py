@@ -15,7 +15,7 @@ from rmpa.core import limits
 from rmpa.core.limits import UINT32_MAX
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterable
 
 
 # The GUID of what a gateway reaches outside the mesh: it is well-formed, but no module can have this address.
@@ -208,6 +208,11 @@ def matches(pattern: str, name: str) -> bool:
     ``/cmd_vel``, and ``/a/**/b`` fits ``/a/b``.
     """
     return _compile_glob(pattern).fullmatch(name) is not None
+
+
+def matches_any(patterns: Iterable[str], name: str) -> bool:
+    """Whether a name fits one of several globs."""
+    return any(matches(pattern, name) for pattern in patterns)
 
 
 # Serial numbers of 32 bits, which wrap around and are compared as in RFC 1982. Of two numbers the later one is less

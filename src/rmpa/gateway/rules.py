@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 from rmpa.bridge.policy import OPEN_GATE
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import ROS2, Crossing
-from rmpa.core.identity import is_global_name, matches
+from rmpa.core.identity import is_global_name, matches_any
 from rmpa.trust.permissions import asker_name, refusal
 
 if TYPE_CHECKING:
@@ -264,9 +264,9 @@ class CrossingRules:
     def _fitting(self, module: str, name: str, site: str | None = None) -> Iterator[tuple[int, CrossingRule]]:
         for number, rule in self._rules:
             if (
-                any(matches(glob, name) for glob in rule.names)
-                and any(matches(glob, module) for glob in rule.modules)
-                and (site is None or any(matches(glob, site) for glob in rule.sites))
+                matches_any(rule.names, name)
+                and matches_any(rule.modules, module)
+                and (site is None or matches_any(rule.sites, site))
             ):
                 yield number, rule
 

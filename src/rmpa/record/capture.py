@@ -11,7 +11,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RmpaError
-from rmpa.core.identity import is_own, matches
+from rmpa.core.identity import is_own, matches_any
 from rmpa.core.timers import TokenBucket
 from rmpa.record import limits
 from rmpa.record.format import STATIC, RecordedSource
@@ -47,18 +47,10 @@ class _Taken:
         known = self._known.get(id(header))
         if known is not None and known[0] is header:
             return known[1:]
-        kind = header.get("type", "")
-        source = RecordedSource(
-            topic,
-            kind,
-            header.get("md5sum", ""),
-            header.get("message_definition", ""),
-            header.get("callerid", ""),
-            header.get("latching") == "1",
-        )
-        thin = self._settings.thin
-        bucket = None
-        if thin is not None and any(matches(glob, kind) for glob in self._settings.thin_types):
+        kind, md5, text, node = (header.get(key, "") for key in ("type", "md5sum", "message_definition", "callerid"))
+        source = RecordedSource(topic, kind, md5, text, node, header.get("latching") == "1")
+        thin, bucket = self._settings.thin, None
+        if thin is not None and matches_any(self._settings.thin_types, kind):
             bucket = TokenBucket(thin, max(1.0, thin / 2))
         self._known[id(header)] = header, source, bucket
         return source, bucket
@@ -108,10 +100,7 @@ class Capture:
 
     def wanted(self, topic: str) -> bool:
         """Whether a topic is to be recorded."""
-        settings = self._settings
-        return any(matches(glob, topic) for glob in settings.topics) and not any(
-            matches(glob, topic) for glob in settings.deny
-        )
+        return matches_any(self._settings.topics, topic) and not matches_any(self._settings.deny, topic)
 
     async def update(self, topics: Iterable[TopicInfo]) -> None:
         """Subscribe to what is there now, and end what is gone."""

@@ -15,7 +15,7 @@ from typing import IO, TYPE_CHECKING, Final, NamedTuple
 import msgspec
 
 from rmpa.core.errors import RmpaError
-from rmpa.core.identity import OWN_NODE, matches
+from rmpa.core.identity import OWN_NODE, matches_any
 from rmpa.record import limits
 from rmpa.record.format import (
     CLOCK,
@@ -398,7 +398,7 @@ class Timeline:
 
     def _wants(self, source: RecordedSource) -> bool:
         wanted = not self._topics or source.topic == EVENTS
-        return wanted or any(matches(glob, source.topic) for glob in self._topics)
+        return wanted or matches_any(self._topics, source.topic)
 
     def _recorded(self, source: RecordedSource, path: Path) -> list[tuple[int, int]]:
         """When the recording of its own module has, too, what a proxy (``/rmpa/PEER/node``) said."""

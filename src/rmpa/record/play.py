@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RmpaError
-from rmpa.core.identity import OWN_NODE, matches
+from rmpa.core.identity import OWN_NODE, matches_any
 from rmpa.record.format import EVENTS, STATIC, Recorded
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.types.messages import MessageType
@@ -181,8 +181,8 @@ class Player:
             if (
                 topic == EVENTS
                 or (options.modules and source.module not in options.modules)
-                or not any(matches(glob, topic) for glob in options.topics)
-                or any(matches(glob, topic) for glob in options.deny)
+                or not matches_any(options.topics, topic)
+                or matches_any(options.deny, topic)
             ):
                 continue
             chosen = self._topics.setdefault(topic, [])

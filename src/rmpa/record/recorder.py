@@ -31,7 +31,7 @@ from rmpa.client import (
 )
 from rmpa.config.recording import ALARM, CONTRACT, NODE_DIED, PEER_LOST
 from rmpa.core.errors import RmpaError
-from rmpa.core.identity import is_own, matches
+from rmpa.core.identity import is_own, matches_any
 from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.record import limits
 from rmpa.record.capture import Capture
@@ -257,7 +257,7 @@ class Recorder:
 
     def _stops(self, source: RecordedSource, raw: bytes) -> None:
         """Look for an emergency stop."""
-        if raw[:1] != b"\0" and any(matches(glob, source.topic) for glob in self._settings.stop_topics):
+        if raw[:1] != b"\0" and matches_any(self._settings.stop_topics, source.topic):
             self.happened(Event("stop", f"emergency stop on {source.topic}", source.topic, trigger=True))
 
     async def _keep(self, event: Event, now: int) -> None:

@@ -21,7 +21,7 @@ from rmpa.bridge import limits
 from rmpa.config import limits as config_limits
 from rmpa.config.rules import SIM_TIME, FollowRule, overlap, untouchable
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.identity import matches
+from rmpa.core.identity import matches_any
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.master.parameters import leaves
 
@@ -69,7 +69,7 @@ def key_problem(key: object) -> str:
 
 def why_not_get(settings: Settings, key: str) -> str:
     """Why peers may not read a parameter; empty if they may."""
-    if any(matches(glob, key) for glob in settings.params.remote_get):
+    if matches_any(settings.params.remote_get, key):
         return ""
     return f"{key} may not be read by peers: no glob of params.remote_get fits"
 
@@ -84,7 +84,7 @@ def why_not_set(settings: Settings, key: str) -> str:
         if overlap(rule.to, key):
             owner = f"{rule.owner}:{rule.key}"
             return f"{key} cannot be set here: it is followed from {owner} ([[param]]); ask or set it there"
-    if any(matches(glob, key) for glob in settings.params.remote_set):
+    if matches_any(settings.params.remote_set, key):
         return ""
     return f"{key} may not be set by peers: no glob of params.remote_set fits"
 
