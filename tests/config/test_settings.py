@@ -137,6 +137,7 @@ SOURCES: tuple[tuple[Any, ...], ...] = (
     ("record.megabytes", "record.megabytes", "RMPA_RECORD_MEGABYTES", "", 64),
     ("record.kept_megabytes", "record.kept_megabytes", "RMPA_RECORD_KEPT_MEGABYTES", "", 64),
     ("record.topic_rate", "record.topic_rate", "RMPA_RECORD_TOPIC_RATE", "", 1000, "1 kB/s"),
+    ("record.total_rate", "record.total_rate", "RMPA_RECORD_TOTAL_RATE", "", 1000, "1 kB/s"),
     ("record.thin", "record.thin", "RMPA_RECORD_THIN", "", 2.0, "2 Hz"),
     ("record.thin_types", "record.thin_types", "RMPA_RECORD_THIN_TYPES", "", ("a/*", "b/*")),
     ("record.keep_on", "record.keep_on", "RMPA_RECORD_KEEP_ON", "", ("alarm", "contract")),

@@ -21,7 +21,7 @@ ROOT: Final = Path(__file__).parents[2]
 ROOMS: Final = {
     "gateway": ("gateway", "cli/gateway.py"),
     "web": ("web", "cli/web.py"),
-    "record": ("record", "cli/record.py", "cli/play.py"),
+    "record": ("record", "cli/record.py", "cli/recordings.py", "cli/play.py"),
     "resource": ("resource", "cli/describe.py", "cli/profile.py", "cli/resource.py", "cli/run.py"),
     "doctor": ("observe/doctor", "cli/doctor.py"),
     "verbs": (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from pathlib import Path
 
 import msgspec
@@ -10,6 +10,7 @@ import pytest
 
 from rmpa.record.format import CLOCK, TIME, ClockRecord, ModuleRecord, Recorded, RecordedSource, SegmentWriter
 from rmpa.record.merge import Timeline
+from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.types.messages import MessageType
 
 TEXT = MessageType("std_msgs/String")
@@ -46,6 +47,15 @@ class HandClock:
 def read_any(path: Path) -> Iterator[Recorded]:
     """The messages of a recording, in order of their times."""
     return Timeline([path]).messages()
+
+
+@pytest.fixture
+async def core() -> AsyncIterator[RosCore]:
+    """A module's core."""
+    one = RosCore(port=0)
+    await one.start()
+    yield one
+    await one.close()
 
 
 Record = Callable[..., Path]

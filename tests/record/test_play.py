@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,14 +28,6 @@ def _warm() -> None:
     for name in ("std_msgs/String", "rosgraph_msgs/Clock"):
         kind = MessageType(name)
         kind.deserialize(kind.serialize(kind.make()))
-
-
-@pytest.fixture
-async def core() -> AsyncIterator[RosCore]:
-    one = RosCore(port=0)
-    await one.start()
-    yield one
-    await one.close()
 
 
 def _hear(found: list[Any], received: Received) -> None:

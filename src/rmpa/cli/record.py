@@ -173,7 +173,9 @@ def _by_hand(module: Module, options: Options, given: dict[str, Any]) -> int:
     from rmpa.record.recorder import record_file
 
     settings = module.loaded.settings
-    wanted = replace(settings.record, topics=given["globs"] or ("/**",), topic_rate=None, thin=None, deny=())
+    wanted = replace(
+        settings.record, topics=given["globs"] or ("/**",), topic_rate=None, total_rate=None, thin=None, deny=()
+    )
     shown = 0.0
 
     def progress(seconds: float, messages: int, total: int) -> bool:
@@ -236,18 +238,20 @@ def record_list(options: Options) -> int:
     ]
     options.show(
         found,
-        Table("MODULE, RECORDER, >BACK, >RING, PROBLEM", recorders),
+        Table("MODULE, RECORDER, >BACK, >RING, >WRITTEN, PROBLEM", recorders),
         "",
         Table("RECORDING, MODULES, >SIZE, WHY", rows),
     )
     return int(any(each.problem for each in found))
 
 
-def _state(each: ModuleRecordings) -> tuple[str, str, str]:
-    if not each.status:
-        return "-", "-", "-"
-    total, back = each.status.get("ring", (0, 0.0))
-    return "runs", f"{back:.0f} s", size(total)
+def _state(each: ModuleRecordings) -> tuple[str, str, str, str]:
+    status = each.status
+    if not status:
+        return "-", "-", "-", "-"
+    total, back = status.get("ring", (0, 0.0))
+    hours = max(status["at"] - status["since"], 1.0) / 3600
+    return "runs", f"{back:.0f} s", size(total), f"{size(status.get('written', 0) / hours)}/h"
 
 
 @agent_verb(argument("recording", names))

@@ -322,7 +322,10 @@ def record_mesh(options: Options, output: Path, given: dict[str, Any]) -> int:
         {**about, "problems": problems, "left_out": left},
         merged(output, result),
         *(f"! {module}: {problem}" for module, problem in problems.items()),
-        *(f"= {module}: {count:,} messages above its [record] topic_rate or thin" for module, count in left.items()),
+        *(
+            f"= {module}: {count:,} messages above its [record] topic_rate, total_rate or thin"
+            for module, count in left.items()
+        ),
     )
     return int(bool(problems) or not result.count)
 

@@ -47,6 +47,9 @@ class RecordSettings:
     topic_rate: int | None = setting(
         4_000_000, _BYTES_A_SECOND, "The most that one topic may write; what is above it is left out, and counted."
     )
+    total_rate: int | None = setting(
+        None, _BYTES_A_SECOND, "The most that all topics together may write; likewise.", shown_default="unlimited"
+    )
     thin: float | None = setting(5.0, RATE, "Messages a second of thin_types.")
     thin_types: tuple[str, ...] = setting(
         ("sensor_msgs/*Image", "sensor_msgs/PointCloud*"), list_of(TYPE_GLOB), "Types that are thinned."

@@ -37,8 +37,7 @@ class _Taken:
         self._settings = settings
         self.uris: set[str] = set()
         self.subscriber: Subscriber | None = None
-        rate = settings.topic_rate
-        self._bytes = TokenBucket(rate, _BURST * rate) if rate else None
+        self._bytes = _bucket(settings.topic_rate)
         # By the publisher's header: its source, and the bucket of its type's messages.
         self._known: dict[int, tuple[Mapping[str, str], RecordedSource, TokenBucket | None]] = {}
 
@@ -55,13 +54,18 @@ class _Taken:
         self._known[id(header)] = header, source, bucket
         return source, bucket
 
-    def room(self, size: int, thin: TokenBucket | None, now: float) -> bool:
-        """Whether a message is within the topic's budget; if so, it is taken off."""
-        if (self._bytes is not None and not self._bytes.has(now, size)) or (thin is not None and not thin.take(now)):
+    def room(self, size: int, thin: TokenBucket | None, total: TokenBucket | None, now: float) -> bool:
+        """Whether a message is within the topic's budget and that of all; if so, it is taken off."""
+        budgets = [one for one in (self._bytes, total) if one is not None]
+        if not all(one.has(now, size) for one in budgets) or (thin is not None and not thin.take(now)):
             return False
-        if self._bytes is not None:
-            self._bytes.spend(size)
+        for one in budgets:
+            one.spend(size)
         return True
+
+
+def _bucket(rate: int | None) -> TokenBucket | None:
+    return TokenBucket(rate, _BURST * rate) if rate else None
 
 
 class Capture:
@@ -89,6 +93,7 @@ class Capture:
         self._put = put
         self._listeners = listeners
         self._everything = everything
+        self._total = _bucket(settings.total_rate)
         self._taken: dict[str, _Taken] = {}
         # The last message of each source that latches: repeated in each segment.
         self.latched: dict[RecordedSource, tuple[int, bytes]] = {}
@@ -156,7 +161,7 @@ class Capture:
         if (listener := self._listeners.get(source.type)) is not None:
             listener(source, raw)
         latches = source.latching or topic == STATIC
-        if not taken.room(len(raw), None if latches else thin, time.monotonic()):
+        if not taken.room(len(raw), None if latches else thin, self._total, time.monotonic()):
             self.left_out[topic] += 1
             return
         now = time.time_ns()
