@@ -131,7 +131,8 @@ def test_what_all_modules_kept_is_one_file_that_ros_reads(modules: ModuleFactory
     assert (modules_of["/odom"], modules_of["/scan"]) == ("a", "b")
 
     bag = tmp_path / "all.bag"
-    assert a.agent.rmpa("record", "merge", str(path), "-o", str(bag))[0] == 0
+    code, output = a.agent.rmpa("record", "merge", str(path), "-o", str(bag))
+    assert (code, r"\n" in output) == (0, False), output
     info = a.ros.tool("rosbag", "info", str(bag))
     assert "/odom" in info
     assert "/scan" in info

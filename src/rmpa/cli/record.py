@@ -313,7 +313,7 @@ def record_keep(why: str, seconds: float | None, output: Path | None, options: O
                 fetched = fetch(client, name, folder)
                 result = join([folder], output)
             about |= {"file": str(output), "messages": result.count}
-            lines = [merged(output, result), *(f"! {one.module}: {one.problem}" for one in fetched if one.problem)]
+            lines = [*merged(output, result), *(f"! {one.module}: {one.problem}" for one in fetched if one.problem)]
             answers |= {one.module: one.problem for one in fetched if one.problem}
     options.show(about, name, Table("MODULE, STATE", rows), *lines)
     return int(not name or any(answers.values()))
@@ -386,7 +386,7 @@ def record_merge(recordings: tuple[Path, ...], output: Path, reference: str, opt
         (name, "the clock" if name == result.reference else f"{1e3 * one.ahead:+.3f} ms", _bound(one.error))
         for name, one in result.offsets.items()
     ]
-    options.show(about, merged(output, result), Table("MODULE, >AHEAD, >±", rows))
+    options.show(about, *merged(output, result), Table("MODULE, >AHEAD, >±", rows))
     return int(bool(result.damaged))
 
 

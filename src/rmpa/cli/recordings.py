@@ -119,12 +119,12 @@ def join(paths: list[Path], output: Path, reference: str = "", topics: Sequence[
     return timeline
 
 
-def merged(output: Path, result: Timeline) -> str:
-    """What became of a merge, in a line."""
+def merged(output: Path, result: Timeline) -> list[str]:
+    """What became of a merge, in lines."""
     doubles = f", {result.doubles:,} doubles left out" if result.doubles else ""
     damaged = "".join(f"; not read: {text}" for text in result.damaged.values())
     text = f"{output}: {result.count:,} messages of {len(result.offsets)} modules{doubles}{damaged}"
-    return "\n".join((text, *result.notes))
+    return [text, *result.notes]
 
 
 class Fetched(NamedTuple):
@@ -320,7 +320,7 @@ def record_mesh(options: Options, output: Path, given: dict[str, Any]) -> int:
     about = {"file": str(output), "messages": result.count, "modules": list(result.offsets)}
     options.show(
         {**about, "problems": problems, "left_out": left},
-        merged(output, result),
+        *merged(output, result),
         *(f"! {module}: {problem}" for module, problem in problems.items()),
         *(
             f"= {module}: {count:,} messages above its [record] topic_rate, total_rate or thin"
