@@ -12,7 +12,7 @@ import subprocess
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 from lab.bed.http_client import http_client
 from lab.bed.namespaces import MACHINE
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 # The program, or ``None``: then the tests of the pages are skipped.
 BINARY = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+_NO_IPV6: Final = "/proc/sys/net/ipv6/conf/all/disable_ipv6"
 FLAGS = (
     "--headless=new",
     "--disable-gpu",
@@ -57,6 +58,10 @@ def running_browser(host: Host = MACHINE) -> Iterator[Browser]:
         host: Where it runs.
     """
     assert BINARY is not None
+    if host.namespace:
+        # A new interface has its IPv6 address a second later, and what a page loads then is given up: the network is
+        # another one (ERR_NETWORK_CHANGED).
+        subprocess.run(host.command(["sh", "-c", f"echo 1 > {_NO_IPV6}"]), check=False, stderr=subprocess.DEVNULL)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         flags = [*FLAGS, f"--user-data-dir={profile}"]
         if os.geteuid() == 0:

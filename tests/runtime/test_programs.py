@@ -42,6 +42,9 @@ async def test_a_process_is_known_again_and_no_other_is_taken_for_it(tmp_path: P
     about = figures(process.pid)
     assert about is not None
     assert abs(about.since - log.stat().st_mtime) < 60
+    async with asyncio.timeout(30):
+        while not log.read_text():
+            await asyncio.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     await ended(process.pid)
     assert ProgramMark.of(process.pid) is None, "nobody has waited for it, and it does not run"
