@@ -246,7 +246,7 @@ def test_debians_rosbag_plays_it_to_a_node(sent: list[Sent], merged: Path, shell
     topics = list(dict.fromkeys(one.source.topic for one in sent))
     listener = ros.start(PYTHON, "-c", LISTENER, *topics, name="listener")
     listener.wait_event("up")
-    ros.tool("rosbag", "play", "--rate", "5", "--wait-for-subscribers", str(merged / "all.bag"), timeout=RUN)
+    ros.tool("rosbag", "play", "-r", "5", "-d", "2", "--wait-for-subscribers", str(merged / "all.bag"), timeout=RUN)
     wanted = {
         topic: [
             (s.source.type, s.source.md5sum, s.row[3], s.source.latching) for s in sent if s.source.topic == topic
