@@ -33,11 +33,11 @@ _BURST: Final = 2.0
 class _Taken:
     """One topic that is recorded."""
 
-    def __init__(self, settings: RecordSettings) -> None:
+    def __init__(self, settings: RecordSettings, total: TokenBucket | None) -> None:
         self._settings = settings
         self.uris: set[str] = set()
         self.subscriber: Subscriber | None = None
-        self._bytes = _bucket(settings.topic_rate)
+        self._budgets = [one for one in (_bucket(settings.topic_rate), total) if one is not None]
         # By the publisher's header: its source, and the bucket of its type's messages.
         self._known: dict[int, tuple[Mapping[str, str], RecordedSource, TokenBucket | None]] = {}
 
@@ -54,12 +54,11 @@ class _Taken:
         self._known[id(header)] = header, source, bucket
         return source, bucket
 
-    def room(self, size: int, thin: TokenBucket | None, total: TokenBucket | None, now: float) -> bool:
+    def room(self, size: int, thin: TokenBucket | None, now: float) -> bool:
         """Whether a message is within the topic's budget and that of all; if so, it is taken off."""
-        budgets = [one for one in (self._bytes, total) if one is not None]
-        if not all(one.has(now, size) for one in budgets) or (thin is not None and not thin.take(now)):
+        if not all(one.has(now, size) for one in self._budgets) or (thin is not None and not thin.take(now)):
             return False
-        for one in budgets:
+        for one in self._budgets:
             one.spend(size)
         return True
 
@@ -120,7 +119,7 @@ class Capture:
             if gone.subscriber is not None:
                 await gone.subscriber.close()
         for name, publishers in published.items():
-            taken = self._taken.setdefault(name, _Taken(self._settings))
+            taken = self._taken.setdefault(name, _Taken(self._settings, self._total))
             uris = {uri for node in publishers if not is_own(node) and (uri := await self._uri(node))}
             fresh, taken.uris = uris - taken.uris, uris
             if taken.subscriber is None:
@@ -161,7 +160,7 @@ class Capture:
         if (listener := self._listeners.get(source.type)) is not None:
             listener(source, raw)
         latches = source.latching or topic == STATIC
-        if not taken.room(len(raw), None if latches else thin, self._total, time.monotonic()):
+        if not taken.room(len(raw), None if latches else thin, time.monotonic()):
             self.left_out[topic] += 1
             return
         now = time.time_ns()

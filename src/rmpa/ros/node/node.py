@@ -59,7 +59,6 @@ _log = logging.getLogger(__name__)
 
 # Time between a node's checks whether its master knows it: a restarted core has the node back within a second.
 NODE_MASTER_CHECK: Final = 0.5
-
 # Messages queued for an ``async for``; above it the oldest is dropped.
 _RECEIVED_QUEUE: Final = 1000
 
@@ -101,7 +100,7 @@ class Node(MasterClient):
 
     Attributes:
         stopped: Set when the node is closed.
-        master_check: Seconds between two looks at the master; ``None``: ``NODE_MASTER_CHECK``.
+        master_check: Seconds between two looks at the master.
     """
 
     def __init__(
@@ -122,7 +121,7 @@ class Node(MasterClient):
             name = f"{name}_{os.getpid()}_{time.time_ns() // 1_000_000}"
         self.environment = environment
         self.stopped = asyncio.Event()
-        self.master_check: float | None = None
+        self.master_check = NODE_MASTER_CHECK
         self._on_shutdown = on_shutdown
         self._on_param_update = on_param_update
         self._signals = (signal.SIGINT, signal.SIGTERM) if handle_signals else ()
@@ -536,7 +535,7 @@ class Node(MasterClient):
 
     async def _watch_master(self) -> None:
         while True:
-            await asyncio.sleep(self.master_check or NODE_MASTER_CHECK)
+            await asyncio.sleep(self.master_check)
             if not (self._entries or self._followed):
                 continue
             try:
