@@ -86,7 +86,7 @@ class Bridge:
             counters=self.counters,
             on_param_update=self._param_update,
             on_kill=kills.own,
-            taps=lambda: self.topics.outbound.connections,
+            taps=lambda: self.topics.exports.connections,
         )
         self.proxy_nodes = ProxyNodes(core, self.counters)
         self._parts: list[Part] = [self.rpc]

@@ -56,6 +56,7 @@ class GraphPart(Part, ImportEffects):
         imports: The class of ``imports``.
 
     Attributes:
+        bridge: The core, the peers and the rules.
         exports: What is offered.
         imports: What peers offer.
         direct: The direct connections of local nodes to peers' ones, and of peers' nodes to local ones.
@@ -71,7 +72,7 @@ class GraphPart(Part, ImportEffects):
     def __init__(
         self, bridge: Bridge, exports: type[OfferBook[Any, Any, Any, Any]], imports: type[ImportBook[Any, Any, Any]]
     ) -> None:
-        self._bridge = bridge
+        self.bridge = bridge
         self.rng = bridge.rng
         self.refusals = RefusalLog(_log, bridge.counters)
         self.exports = exports(self)
@@ -91,7 +92,7 @@ class GraphPart(Part, ImportEffects):
     @property
     def context(self) -> BridgeContext:
         """The rules that hold now."""
-        return self._bridge.context
+        return self.bridge.context
 
     async def close(self) -> None:
         """Stop all slices and the timer."""
@@ -102,7 +103,7 @@ class GraphPart(Part, ImportEffects):
 
     def send(self, peer: int, message: Message) -> None:
         """As of ``ImportEffects``."""
-        session = self._bridge.sessions.get(peer)
+        session = self.bridge.sessions.get(peer)
         if session is not None and session.linked:
             session.link.send_control(encode(message))
 
@@ -122,9 +123,9 @@ class GraphPart(Part, ImportEffects):
 
     def pass_on(self, entry: Remote[Any]) -> None:
         """Have what a peer offers relayed to others, if this module relays."""
-        if (session := self._bridge.sessions.get(entry.peer)) is not None:
-            source, place = self._relayed(entry, self._bridge.sessions.proxy_name(session, entry.node, entry.origin))
-            self._bridge.relay.pass_on(entry.peer, session.link.identity, source, place, entry.origin)
+        if (session := self.bridge.sessions.get(entry.peer)) is not None:
+            source, place = self._relayed(entry, self.bridge.sessions.proxy_name(session, entry.node, entry.origin))
+            self.bridge.relay.pass_on(entry.peer, session.link.identity, source, place, entry.origin)
 
     @abstractmethod
     def _relayed(self, entry: Remote[Any], proxy: str) -> tuple[Source, Place]:
@@ -142,7 +143,7 @@ class GraphPart(Part, ImportEffects):
 
     def link_up(self, session: PeerSession) -> None:
         """Begin the advertisement to a peer, and wait for the peer's own."""
-        self.imports.ways.instance = self._bridge.relay.instance
+        self.imports.ways.instance = self.bridge.relay.instance
         self.imports.link_up(session)
         self.exports.link_up(session)
         for each in self.direct:
@@ -232,8 +233,8 @@ class GraphPart(Part, ImportEffects):
         time. A core returns the same object until something is registered, so an idle agent compares seldom. Whether
         a node is reachable decides, too.
         """
-        state = self._bridge.core.state()
-        if self._skipped < limits.RECONCILE_SKIPS and state is self._compared and not self._bridge.core.unreachable():
+        state = self.bridge.core.state()
+        if self._skipped < limits.RECONCILE_SKIPS and state is self._compared and not self.bridge.core.unreachable():
             self._skipped += 1
             return False
         self._compared, self._skipped = state, 0
@@ -282,5 +283,5 @@ class GraphPart(Part, ImportEffects):
                 self._settled()
 
     def _is_busy(self, peer: int) -> bool:
-        session = self._bridge.sessions.get(peer)
+        session = self.bridge.sessions.get(peer)
         return session is not None and session.link.busy

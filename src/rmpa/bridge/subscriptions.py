@@ -204,7 +204,7 @@ class Subscriptions(GraphPart):
 
     def flows(self, source: Source, peer: int) -> bool:
         """Whether a topic of a node of this module goes to a peer, by the agents or directly."""
-        topics = self._bridge.topics
+        topics = self.bridge.topics
         granted = (owner for owner, _, _ in topics.direct_exports.of(source.topic, source.node))
         return peer in topics.exports.routes(source) or peer in granted
 
@@ -257,7 +257,7 @@ class Subscriptions(GraphPart):
         """The subscriptions of this module's nodes to a topic, and those that this agent relays, by node."""
         unreachable, found = self.core.unreachable(), {}
         for node in self.core.subscribers(topic):
-            origin = self._bridge.relay.origin((_place(topic), node)) if is_own(node) else None
+            origin = self.bridge.relay.origin((_place(topic), node)) if is_own(node) else None
             gone = node in unreachable and unreachable[node].withdrawn
             if origin is not None or not (is_own(node) or node.startswith(MEASURING) or gone):
                 found[node] = LocalSubscription(self.core.type_of(topic, node), origin)
@@ -268,8 +268,8 @@ class Subscriptions(GraphPart):
 
     def show(self, entry: Remote[Source]) -> None:
         """Register a peer's subscription at the proxy of its node, in a later turn of the loop."""
-        if (session := self._bridge.sessions.get(entry.peer)) is not None:
-            proxies, node = self._bridge.sessions.proxies(session, entry.node, entry.origin)
+        if (session := self.bridge.sessions.get(entry.peer)) is not None:
+            proxies, node = self.bridge.sessions.proxies(session, entry.node, entry.origin)
             self.pass_on(entry)
             shown, key = ShownSubscription(self, entry), _place(entry.wire.topic)
             self._shown[entry] = shown
@@ -278,7 +278,7 @@ class Subscriptions(GraphPart):
 
     def hide(self, entry: Remote[Source]) -> None:
         """Remove a peer's subscription from the local graph, in a later turn of the loop."""
-        self._bridge.relay.gone(entry.peer, Source(_place(entry.name), entry.node))
+        self.bridge.relay.gone(entry.peer, Source(_place(entry.name), entry.node))
         if (shown := self._shown.pop(entry, None)) is not None:
             shown.release()
 

@@ -18,7 +18,7 @@ from rmpa.bridge.messages import is_crossing_name, is_crossing_type
 from rmpa.bridge.policy import is_outside, service_place
 from rmpa.bridge.services.bodies import LocalService, ServicePool
 from rmpa.bridge.sessions import Part
-from rmpa.bridge.topics.local import own_sources, relayed_sources
+from rmpa.bridge.topics.exports import own_sources, relayed_sources
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.core.log import logged_failure
@@ -234,7 +234,7 @@ class AgentGraph(Part):
     def attend(self, source: MeshSource, listener: ForeignSource) -> TopicTap:
         """Listen under the name that a foreign node has here, and drop what comes.
 
-        Publishers of actions accept a server by the name of its connections; see ``bridge.topics.local``.
+        Publishers of actions accept a server by the name of its connections; see ``bridge.topics.reports``.
 
         Args:
             source: The topic.

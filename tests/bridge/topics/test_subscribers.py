@@ -24,13 +24,9 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
 from rmpa.bridge.sessions import PeerSession
-from rmpa.bridge.topics import local as module
+from rmpa.bridge.topics import reports as module
 from rmpa.bridge.topics.exports import LocalSource
-from rmpa.bridge.topics.local import (
-    RemoteSubscribers,
-    audience,
-)
-from rmpa.bridge.topics.reports import Mismatches
+from rmpa.bridge.topics.reports import Mismatches, RemoteSubscribers, audience
 from rmpa.config.peer_rules import PermissionRule, PolicySettings
 from rmpa.config.settings import TrustSettings
 from rmpa.trust.permissions import Permissions
@@ -97,10 +93,11 @@ class World:
         out: Any = SimpleNamespace(
             warn=lambda kind, _who, _text: self.warned.append(kind),
             send=lambda _peer, message: self.sent.append(message),
+            exports=self.exports,
+            imports=self.imports,
+            context=SimpleNamespace(gate=gate),
         )
-        exports, imports = cast("Any", self.exports), cast("Any", self.imports)
-        shared = SimpleNamespace(context=SimpleNamespace(gate=gate))
-        self.presence = RemoteSubscribers(cast("Any", shared), out, exports, imports)
+        self.presence = RemoteSubscribers(out)
         self.exports.link_up(1, "base" if gate.on else "")
         self.imports.link_up(1)
 
@@ -110,7 +107,8 @@ class World:
             before = entry.route.flow if entry.route is not None else None
             flow = before if before is not None and before.route == entry.number else None
             flow = flow or SimpleNamespace(route=entry.number, told=())
-            entry.route = SimpleNamespace(publication=SimpleNamespace(listeners=listeners), flow=flow)
+            publication = SimpleNamespace(listeners=listeners)
+            entry.route = SimpleNamespace(publication=publication, flow=flow, open=lambda _: None)
             self.presence.changed(entry)
 
     async def changed(self, source: Source, *listeners: str) -> list[object]:
@@ -237,8 +235,10 @@ class Reports(Mismatches):
         out = SimpleNamespace(
             send=lambda peer, message: self.done.append(Send(peer, message)),
             warn=lambda *args: self.warnings.append(args[2]),
+            exports=exports,
+            imports=imports,
         )
-        super().__init__(cast("Any", out), cast("Any", exports), cast("Any", imports))
+        super().__init__(cast("Any", out))
 
     def hear(self, text: str, subscriber: str = "/viewer") -> None:
         self.reported(BASE, "base", Mismatch(CMD.topic, CMD.node, subscriber, text))

@@ -29,7 +29,7 @@ from rmpa.bridge.direct.conditions import (
 )
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.topics.local import compares_names
+from rmpa.bridge.topics.reports import compares_names
 from rmpa.config.peer_rules import Access
 from rmpa.core.contract import Contract, Transport, combine
 from rmpa.core.errors import RemoteProtocolError, RmpaError

@@ -24,7 +24,7 @@ from rmpa.bridge.direct.conditions import (
 from rmpa.bridge.direct.grants import end_all
 from rmpa.bridge.direct.paths import AGENTS, LOST, Path, Paths
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.topics.local import compares_names
+from rmpa.bridge.topics.reports import compares_names
 from rmpa.core.contract import Contract, Transport
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import OWN_NODE, is_own

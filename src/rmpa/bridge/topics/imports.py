@@ -38,7 +38,7 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.peer_offers import ImportBook
 from rmpa.bridge.policy import is_outside
-from rmpa.bridge.topics.import_route import RemoteTopic
+from rmpa.bridge.topics.import_route import ImportRoute, RemoteTopic
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
 from rmpa.core.facts import CONFLICT, CROWDED, DENIED
@@ -127,7 +127,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 self._hand_over(entry)
             if entry.number:
                 # A lingering route has no listener, so it is not continued.
-                self._out.detach(entry, keep=keep and entry.wanted, missed=entry.wanted and not keep)
+                self._detach(entry, keep=keep and entry.wanted, missed=entry.wanted and not keep)
             entry.number, entry.open, entry.until, entry.problem = 0, False, None, "its peer is away"
             if not keep:
                 self._outlived(entry)
@@ -157,7 +157,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         known = self._peers[peer]
         self._hand_all_over(peer)
         for entry in known.routes.values():
-            self._out.detach(entry, missed=entry.wanted)
+            self._detach(entry, missed=entry.wanted)
         known.routes = {}
 
     def forget(self, peer: int) -> dict[Source, RemoteTopic]:
@@ -327,7 +327,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 way.wanted = False
         if carrier is None and best is not None:
             self._peers[best.peer].show(best)
-            self._out.publish(best)
+            self._publish(best)
         elif carrier is not None and best is None:
             self._hide(carrier)
         elif carrier is not best and carrier is not None and best is not None:
@@ -345,12 +345,66 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         module, name = best.module[1], self.peer_name(best.peer)
         return f"{module} has a link of its own" if best.origin is None else f"{module} is reached by way of {name}"
 
+    def _publish(self, entry: RemoteTopic) -> None:
+        """Publish a peer's source at its proxy, in a later turn of the loop."""
+        if (session := self._out.bridge.sessions.get(entry.peer)) is not None:
+            self._out.pass_on(entry)
+            entry.route = ImportRoute(self._out, session, entry)
+            self._out.direct_imports.shown(entry)
+
+    def _unpublish(self, entry: RemoteTopic) -> None:
+        """Remove a peer's source from the local graph: its data stops at once, its registration in a later turn."""
+        self._out.bridge.relay.gone(entry.peer, entry.wire)
+        self._out.direct_imports.hidden(entry)
+        route, entry.route = entry.route, None
+        if route is not None:
+            route.end(missed=True)
+            route.release()
+
+    def _carry(self, old: RemoteTopic, new: RemoteTopic) -> None:
+        """Let another way carry a source, whose proxy and subscribers stay."""
+        session, route = self._out.bridge.sessions.get(new.peer), old.route
+        if session is not None and route is not None:
+            route.session, route.entry = session, new
+            old.route, new.route = None, route
+            self._out.pass_on(new)
+            self._out.bridge.relay.gone(old.peer, old.wire)
+            self._out.direct_imports.hidden(old)
+            self._out.direct_imports.shown(new)
+            self._out.look((new.name,))
+
+    def _detach(
+        self, entry: RemoteTopic, *, keep: bool = False, missed: bool = False, last: int | None = None
+    ) -> None:
+        """End a route's data; unless ``keep``, the latched message is forgotten (a new route brings it again).
+
+        Args:
+            entry: The source and its route.
+            keep: The link is gone, and the next one will continue after the last message that came.
+            missed: Local nodes still listen, so they miss what is published before a route is open again.
+            last: If the publisher has gone: the sequence of its last message.
+        """
+        if entry.number and (session := self._out.bridge.sessions.get(entry.peer)) is not None:
+            session.link.routes.pop(entry.number, None)
+        if not keep and entry.route is not None:
+            entry.route.detach(missed=missed, last=last)
+
+    def _position(self, entry: RemoteTopic) -> tuple[int, int] | None:
+        """Epoch and last message of a source, behind which a route goes on, by this way or another; or ``None``."""
+        carrier = self.carrier(entry)
+        route = carrier.route if carrier is not None else None
+        if route is None or route.node is None:
+            return None
+        if route.flow is not None:
+            return route.flow.position
+        return self._out.exports.position(Source(route.topic, route.node.name))  # a relay has what its peer has
+
     def _move(self, old: RemoteTopic, new: RemoteTopic) -> None:
         """Let another way carry a source: the subscribers, the position and what is kept for late ones stay."""
         self._peers[old.peer].hide(old)
         self._peers[new.peer].show(new)
         wanted, old.wanted = old.wanted, False
-        self._out.moved(old, new)
+        self._carry(old, new)
         self._close(old)
         if wanted and not new.open and not new.wanted:
             self._wait(new, -math.inf)
@@ -377,7 +431,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     def _retract(self, entry: RemoteTopic) -> None:
         """Take a source out of the local graph, and show those that could not stand beside it."""
         self._peers[entry.peer].hide(entry)
-        self._out.retract(entry)
+        self._unpublish(entry)
         self._show_behind(entry)
 
     def _show_behind(self, entry: RemoteTopic) -> None:
@@ -408,7 +462,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 entry.number, known.routes[known.last_route] = known.last_route, entry
                 entry.until = None  # the peer answers once its publisher has, and that may take long
                 entry.asked = self._out.context.contracts.of(entry.name, entry.type)
-                epoch, after = self._out.position(entry) or (0, 0)
+                epoch, after = self._position(entry) or (0, 0)
                 asked = OpenRoute(entry.number, entry.wire.topic, entry.node, entry.asked, epoch, after)
                 self._out.send(entry.peer, asked)
             case "open" | "idle":
@@ -442,7 +496,8 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         entry.description, entry.contract = message.description, message.contract
         if (carrier := self.carrier(entry)) is not None and carrier is not entry:
             self._move(carrier, entry)
-        self._out.describe(entry, message)
+        if entry.route is not None:
+            entry.route.open(message)
 
     def closed(self, peer: int, message: RouteClosed, now: float) -> None:
         """Handle a route that the peer has refused or closed; ignored if it was closed here meanwhile."""
@@ -480,9 +535,9 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         if entry.number:
             self._peers[entry.peer].routes.pop(entry.number, None)
             self._out.send(entry.peer, CloseRoute(entry.number))
-            self._out.detach(entry, missed=missed)
+            self._detach(entry, missed=missed)
         elif entry.wanted and entry.until is None:
-            self._out.detach(entry, missed=missed)  # it waited for a new link
+            self._detach(entry, missed=missed)  # it waited for a new link
         entry.number, entry.open, entry.until, entry.backoff = 0, False, None, None
 
     def _fail(self, entry: RemoteTopic, reason: str, now: float, last: int | None = None) -> None:
@@ -492,7 +547,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             self._hand_over(entry)
         # Where its publisher may be there still, the next route goes on behind what has come.
         keep = last is None and entry.wanted and entry.reliable
-        self._out.detach(entry, keep=keep, missed=entry.wanted, last=last)
+        self._detach(entry, keep=keep, missed=entry.wanted, last=last)
         entry.number, entry.open, entry.until, entry.problem = 0, False, None, reason
         self._choose(entry)
         if entry.wanted:

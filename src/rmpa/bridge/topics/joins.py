@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.bridge import limits, messages
 from rmpa.bridge.data.route_sender import RouteSender
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.topics.local import compares_names
+from rmpa.bridge.topics.reports import compares_names
 from rmpa.core.contract import Contract, History
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_later, serial_add
@@ -38,7 +38,6 @@ from rmpa.runtime.tasks import OwnedTasks
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.export import ExportFlow, ExportRoute
     from rmpa.bridge.data.reception import ImportFlow
     from rmpa.bridge.sessions import PeerSession
@@ -337,16 +336,15 @@ class Joins:
     """The joining subscribers, here and at peers.
 
     Args:
-        bridge: The peers.
         topics: Finds and numbers routes, connects to publishers, and names a peer's subscribers.
     """
 
-    def __init__(self, bridge: Bridge, topics: Topics) -> None:
-        self._bridge, self._topics = bridge, topics
+    def __init__(self, topics: Topics) -> None:
+        self._topics = topics
         self._served: dict[tuple[int, int], ServedJoin] = {}
         self._joining: dict[tuple[int, int], JoiningSubscriber] = {}
         self._tasks = OwnedTasks()
-        bridge.rpc.on_request(JOIN, self._asked, Needs((), "a route that the peer has open"))
+        topics.bridge.rpc.on_request(JOIN, self._asked, Needs((), "a route that the peer has open"))
 
     def sender(self, peer: int, number: int) -> RouteSender | None:
         """What sends to a peer's joining subscriber on this route."""
@@ -384,7 +382,7 @@ class Joins:
         if joining.ended:  # with its link: the number is one of another route by now
             return
         try:
-            after = await self._bridge.rpc.request(session, JOIN, args, limits.JOIN_WINDOW)
+            after = await self._topics.bridge.rpc.request(session, JOIN, args, limits.JOIN_WINDOW)
             joining.begin(messages.convert(JOIN, after, messages.Sequence))
         except RmpaError as error:
             _log.debug("= %s: a subscriber joins unseen: %s", session.link.name, error)
@@ -421,7 +419,7 @@ class Joins:
 
     def _connect(self, route: ExportRoute, flow: ExportFlow, join: ServedJoin, caller: str) -> None:
         _log.debug("> %s: %s joins", route.source, caller)
-        join.connection = self._topics.outbound.connection(
+        join.connection = self._topics.exports.connection(
             route.source,
             flow.uri,
             caller,

@@ -18,12 +18,10 @@ from rmpa.bridge.direct.grants import TopicGrants
 from rmpa.bridge.graph_part import GraphPart
 from rmpa.bridge.messages import Audience, CloseRoute, Mismatch, OpenRoute, RouteClosed, RouteOpened, Source
 from rmpa.bridge.topics.direct import TopicPaths
-from rmpa.bridge.topics.exports import Exports
-from rmpa.bridge.topics.import_route import ImportRoute
+from rmpa.bridge.topics.exports import Exports, own_sources, relayed_sources
 from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.joins import Joins
-from rmpa.bridge.topics.local import LocalSubscriptions, RemoteSubscribers, own_sources, relayed_sources
-from rmpa.bridge.topics.reports import LossReports, Mismatches
+from rmpa.bridge.topics.reports import LossReports, Mismatches, RemoteSubscribers
 from rmpa.core.contract import Priority, Reliability
 from rmpa.core.identity import is_own
 from rmpa.mesh import limits as mesh_limits
@@ -56,7 +54,6 @@ class Topics(GraphPart):
         bridge: The core, the peers and the rules.
 
     Attributes:
-        outbound: The subscriptions to local publishers.
         losses: Reports messages that do not reach their listeners.
         mismatches: Reports subscribers whose definition does not fit.
         subscribers: The names of subscribers, where publishers compare them.
@@ -75,11 +72,10 @@ class Topics(GraphPart):
     def __init__(self, bridge: Bridge) -> None:
         super().__init__(bridge, Exports, Imports)
         self._pasts: OrderedDict[str, Pasts] = OrderedDict()
-        self.losses = LossReports(bridge, self)
-        self.outbound = LocalSubscriptions(bridge, self, bridge.proxy_nodes.publication)
-        self.mismatches = Mismatches(self, self.exports, self.imports)
-        self.subscribers = RemoteSubscribers(bridge, self, self.exports, self.imports)
-        self.joins = Joins(bridge, self)
+        self.losses = LossReports(self)
+        self.mismatches = Mismatches(self)
+        self.subscribers = RemoteSubscribers(self)
+        self.joins = Joins(self)
         self.direct_exports = TopicGrants(bridge, self.exports)
         self.direct_imports = TopicPaths(bridge, self.warn, self.imports)
         self.direct = self.direct_imports, self.direct_exports
@@ -106,7 +102,7 @@ class Topics(GraphPart):
         await self.direct_exports.ports.close()
         self.subscribers.close()
         self.joins.close()
-        self.outbound.close()
+        self.exports.close()
 
     def reload(self) -> None:
         """As of ``GraphPart``."""
@@ -118,7 +114,7 @@ class Topics(GraphPart):
         """As of ``GraphPart``; suspended routes may go on."""
         if session.away_since:
             _log.info("= %s is back: reliable topics go on", session.link.name)
-            self.outbound.back(session.peer)
+            self.exports.link_back(session.peer)
         super().link_up(session)
 
     def pasts(self, name: str) -> Pasts:
@@ -136,7 +132,7 @@ class Topics(GraphPart):
             flow.link_down()
         # Those whose further losses cannot be counted.
         if interrupted := sum(flow.contract.reliability is not Reliability.RELIABLE for flow in flows):
-            self._bridge.counters.add("route.interrupted", interrupted)
+            self.bridge.counters.add("route.interrupted", interrupted)
         self.joins.link_down(peer)
         # Without a pause for data: among it could be the peer's new link, which must find all routes suspended.
         deque(self.exports.link_away(peer, briefly=session.silent), 0)
@@ -166,11 +162,10 @@ class Topics(GraphPart):
         """Retract the rest of a peer's sources."""
         peer = session.peer
         super().gone(session)
-        self.outbound.gone(peer)
         entries = self.imports.forget(peer)
         self.mismatches.peer_gone(session.link.name)
         self.run(self.exports.gone(peer))
-        self._bridge.relay.peer_gone(peer)
+        self.bridge.relay.peer_gone(peer)
         for route in [entry.route for entry in entries.values() if entry.route is not None]:
             route.end(missed=True, gone=False)
             route.release()
@@ -220,14 +215,14 @@ class Topics(GraphPart):
             self.look((change.name,))
 
     def _names(self) -> Iterable[str]:
-        return (*self._nodes, *self._bridge.core.state().publishers)
+        return (*self._nodes, *self.bridge.core.state().publishers)
 
     def _look_at(self, name: str) -> None:
-        core, before = self._bridge.core, self._nodes.pop(name, ())
+        core, before = self.bridge.core, self._nodes.pop(name, ())
         local = own_sources(core, name, lambda source: self.exports.description(source) is not None)
-        publishers = local | relayed_sources(core, self._bridge.relay, name)
+        publishers = local | relayed_sources(core, self.bridge.relay, name)
         nodes = dict.fromkeys((*before, *publishers))
-        leaving = [node for node in nodes if node not in publishers and self.outbound.leave(Source(name, node))]
+        leaving = [node for node in nodes if node not in publishers and self.exports.leave(Source(name, node))]
         if publishers or leaving:
             self._nodes[name] = (*publishers, *leaving)
         for node in nodes:
@@ -237,7 +232,7 @@ class Topics(GraphPart):
 
     def reconcile(self) -> None:
         """Register missing publications again; topics without local subscribers miss nothing any more."""
-        state, compared = self._bridge.core.state(), self.look_again()
+        state, compared = self.bridge.core.state(), self.look_again()
         for pasts in self._pasts.values():
             for source, (watch, missed_at) in pasts.items():
                 if all(map(is_own, state.subscribers.get(missed_at, ()))):
@@ -252,82 +247,17 @@ class Topics(GraphPart):
         self.mismatches.forget_gone()
         self.direct_exports.judge_again(refused=False)
 
-    def position(self, entry: RemoteTopic) -> tuple[int, int] | None:
-        """Epoch and last message of a source, behind which a route goes on, by this way or another; or ``None``."""
-        carrier = self.imports.carrier(entry)
-        route = carrier.route if carrier is not None else None
-        if route is None or route.node is None:
-            return None
-        if route.flow is not None:
-            return route.flow.position
-        return self.exports.position(Source(route.topic, route.node.name))  # a relay has what its peer has
-
-    def publish(self, entry: RemoteTopic) -> None:
-        """Publish a peer's source at its proxy, in a later turn of the loop."""
-        if (session := self._bridge.sessions.get(entry.peer)) is not None:
-            proxies, node = self._bridge.sessions.proxies(session, entry.node, entry.origin)
-            self.pass_on(entry)
-            route = entry.route = ImportRoute(self._bridge, self, session, entry)
-            route.release = lambda: proxies.release(node, route.topic)
-            proxies.hold(node, route.topic, route.ready, route.left)
-            self.direct_imports.shown(entry)
-
-    def moved(self, old: RemoteTopic, new: RemoteTopic) -> None:
-        """Let another way carry a source, whose proxy and subscribers stay."""
-        session, route = self._bridge.sessions.get(new.peer), old.route
-        if session is not None and route is not None:
-            route.session, route.entry = session, new
-            old.route, new.route = None, route
-            self.pass_on(new)
-            self._bridge.relay.gone(old.peer, old.wire)
-            self.direct_imports.hidden(old)
-            self.direct_imports.shown(new)
-            self.look((new.name,))
-
     def _relayed(self, entry: Remote[Any], proxy: str) -> tuple[Source, Place]:
         return entry.wire, (entry.name, proxy)
 
-    def retract(self, entry: RemoteTopic) -> None:
-        """Remove a peer's source from the local graph: its data stops at once, its registration in a later turn."""
-        self._bridge.relay.gone(entry.peer, entry.wire)
-        self.direct_imports.hidden(entry)
-        route, entry.route = entry.route, None
-        if route is not None:
-            route.end(missed=True)
-            route.release()
-
-    def describe(self, entry: RemoteTopic, opened: RouteOpened) -> None:
-        """Prepare for data on a newly opened route, and answer the waiting local subscribers with its description."""
-        if entry.route is not None and entry.route.publication is not None:
-            if self._ticker is None:
-                self._tick_later()
-            entry.route.open(opened, entry.route.publication)
-            self.subscribers.changed(entry)
-
-    def detach(
-        self, entry: RemoteTopic, *, keep: bool = False, missed: bool = False, last: int | None = None
-    ) -> None:
-        """End a route's data; unless ``keep``, the latched message is forgotten (a new route brings it again).
-
-        Args:
-            entry: The source and its route.
-            keep: The link is gone, and the next one will continue after the last message that came.
-            missed: Local nodes still listen, so they miss what is published before a route is open again.
-            last: If the publisher has gone: the sequence of its last message.
-        """
-        if entry.number and (session := self._bridge.sessions.get(entry.peer)) is not None:
-            session.link.routes.pop(entry.number, None)
-        if not keep and entry.route is not None:
-            entry.route.detach(missed=missed, last=last)
-
-    def _tick_later(self) -> None:
-        self._ticker = asyncio.get_running_loop().call_later(STALE_TICK, self._tick)
+    def keep_awake(self) -> None:
+        """Wake up regularly while routes are open, to distinguish a silent link from an agent that slept."""
+        if self._ticker is None and not self._closed and self.imports.flowing:
+            self._ticker = asyncio.get_running_loop().call_later(STALE_TICK, self._tick)
 
     def _tick(self) -> None:
-        """Wake up regularly while routes are open, to distinguish a silent link from an agent that slept."""
         self._ticker = None
-        if not self._closed and self.imports.flowing:
-            self._tick_later()
+        self.keep_awake()
 
 
 def _freed(entries: dict[Source, RemoteTopic]) -> Iterator[None]:

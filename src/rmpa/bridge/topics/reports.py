@@ -1,34 +1,46 @@
-"""What peers and users are told of topics: definitions that do not fit, and messages that do not arrive.
+"""What modules tell each other of topics beside their messages.
 
-Reported are reliable messages that were given up, and messages that are too long to cross: in the log, and to the
-agent at the other end.
+Definitions that do not fit, reliable messages that were given up, messages that are too long to cross: in the log,
+and to the agent at the other end. And the names of subscribers.
+
+Topics of actions are those whose publisher checks the names of its listeners, not only whether there are any. An
+actionlib client accepts a server (``wait_for_server``, ``waitForServer``) when the node that publishes the status
+also listens to the client's goals and cancellations. It compares the caller ids of the connections. Over the mesh,
+one connection of the agent stands for all listeners of a module. For these topics, therefore, the listeners' names
+cross, and the publisher's agent opens one more connection for each, under the listener's name in the publisher's
+graph.
 """
 
 from __future__ import annotations
 
 import asyncio
+import logging
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
+from rmpa.bridge.data.export import ExportFlow
 from rmpa.bridge.data.quality import shown_seconds
-from rmpa.bridge.messages import Mismatch, Source
+from rmpa.bridge.messages import Audience, Mismatch, Source, is_crossing_name
 from rmpa.bridge.policy import Needs
+from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.identity import OWN_NODE, proxied_node, proxy_name
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros import limits as ros_limits
+from rmpa.ros.node.subscription import PublisherConnection
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
-    from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.data.export import ExportFlow, ExportRoute
+    from rmpa.bridge.data.export import ExportRoute
     from rmpa.bridge.peer import PeerRun
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.topics.exports import Exports
-    from rmpa.bridge.topics.imports import Imports
+    from rmpa.bridge.topics.import_route import RemoteTopic
     from rmpa.bridge.topics.part import Topics
+
+_log = logging.getLogger(__name__)
 
 # The notification that a publisher sends messages that are too long.
 OVERSIZED: Final = "message.oversized"
@@ -42,13 +54,11 @@ class Mismatches:
     A subscriber is given by its name: ``/viewer`` here, ``base/viewer`` at the peer ``base``.
 
     Args:
-        out: Sends messages and warns.
-        exports: Finds the local source that a peer means.
-        imports: Knows the peers that have a source.
+        out: The part, which knows the sources of both sides.
     """
 
-    def __init__(self, out: Topics, exports: Exports, imports: Imports) -> None:
-        self._out, self._exports, self._imports = out, exports, imports
+    def __init__(self, out: Topics) -> None:
+        self._out = out
         self._texts: dict[Source, dict[str, str]] = {}
 
     def texts(self, source: Source) -> tuple[str, ...]:
@@ -69,7 +79,7 @@ class Mismatches:
 
     def reported(self, peer: int, name: str, message: Mismatch) -> None:
         """A peer reports that a subscriber there does not fit a local source; an empty text: that it fits now."""
-        source = self._exports.local(peer, Source(message.topic, message.node))
+        source = self._out.exports.local(peer, Source(message.topic, message.node))
         if source is None:
             return  # it went meanwhile
         subscriber = f"{name}{message.subscriber}"
@@ -83,7 +93,7 @@ class Mismatches:
 
     def registration_changed(self, topic: str, subscriber: str) -> None:
         """A local subscriber has gone or has registered again: forget its mismatch, here and at the peers."""
-        for entry in self._imports.at(topic) if self._texts else ():
+        for entry in self._out.imports.at(topic) if self._texts else ():
             if self._texts.get(entry.wire, {}).pop(subscriber, None) is not None:
                 self._out.send(entry.peer, Mismatch(entry.wire.topic, entry.node, subscriber, ""))
 
@@ -96,7 +106,7 @@ class Mismatches:
     def forget_gone(self) -> None:
         """Forget the mismatches of sources that are gone."""
         for source in list(self._texts):
-            if source not in self._exports.offered and not self._imports.knows(source):
+            if source not in self._out.exports.offered and not self._out.imports.knows(source):
                 del self._texts[source]
 
 
@@ -104,14 +114,13 @@ class LossReports:
     """The reports of losses, sent and received, for all peers.
 
     Args:
-        bridge: What the parts share.
-        out: Warns of losses, and knows the routes.
+        out: The part, which knows the routes.
     """
 
-    def __init__(self, bridge: Bridge, out: Topics) -> None:
-        self._bridge, self._out = bridge, out
+    def __init__(self, out: Topics) -> None:
+        self._out = out
         needs = Needs((), "the peer's own topics; a text for the log")
-        bridge.rpc.on_notification(OVERSIZED, self._oversized_there, needs)
+        out.bridge.rpc.on_notification(OVERSIZED, self._oversized_there, needs)
 
     def given_up(self, peer: PeerRun, counts: Mapping[Source, int]) -> None:
         """Report that messages are not kept any more for an absent peer.
@@ -129,14 +138,14 @@ class LossReports:
         text = f"{name} has been away for {shown_seconds(seconds)}: {count} messages for it are given up, of {shown} "
         text += "(the contract's outage is for how long they are kept, "
         text += f"at most {mesh_limits.RESUME_BYTES_MAX >> 20} MiB over all)"
-        self._bridge.counters.add("message.given_up", count)
-        self._bridge.counters.add("route.given_up", len(counts) - 1)
+        self._out.bridge.counters.add("message.given_up", count)
+        self._out.bridge.counters.add("route.given_up", len(counts) - 1)
         self._out.warn("route.given_up", name, text)
 
     def missed(self, route: ExportRoute, count: int) -> None:
         """Report how many messages of a reliable source a peer that is back has missed."""
         source, name = route.source, route.session.name
-        self._bridge.counters.add("message.given_up", count)
+        self._out.bridge.counters.add("message.given_up", count)
         text = f"{source}: {name} has missed {count} messages: it was away for longer than they were kept"
         self._out.warn("route.missed", f"{name} {source}", text)
 
@@ -151,10 +160,10 @@ class LossReports:
 
     def tell_oversized(self, route: ExportRoute, flow: ExportFlow) -> None:
         """Report to one peer how many messages of a source were left out until now, if any."""
-        session, offer = self._bridge.sessions.get(route.peer), self._out.exports.offer(route.peer, route.source)
+        session, offer = self._out.bridge.sessions.get(route.peer), self._out.exports.offer(route.peer, route.source)
         if flow.oversized and session is not None and session.linked and offer is not None:
             told = {"topic": offer.topic, "node": offer.node, "count": flow.oversized, "size": flow.oversized_bytes}
-            self._bridge.rpc.notify(session, OVERSIZED, told)
+            self._out.bridge.rpc.notify(session, OVERSIZED, told)
 
     def _oversized_there(self, session: PeerSession, args: dict[str, Any]) -> None:
         """Takes a peer's report of messages that it left out.
@@ -176,3 +185,97 @@ class LossReports:
             who = f"{session.link.name}: {source}"
             text = f"{who}: its messages of {size} bytes are too long to cross and are left out ({count} until now)"
             self._out.warn("message.oversized_there", who, text)
+
+
+def is_watched(type_name: str) -> bool:
+    """Whether publishers of this type check their listeners' names; judged by type, as topics can be remapped."""
+    return type_name.endswith("ActionGoal") or type_name == "actionlib_msgs/GoalID"
+
+
+def compares_names(type_name: str) -> bool:
+    """Whether a topic is of an action, whose client compares the names in the headers of all five topics.
+
+    rospy's client wants one name as listener of goals and cancellations, and as publisher of status, result and
+    feedback; roscpp's leaves the last two out. So all have to come by the agents, which give a remote node one name.
+    """
+    answers = type_name.endswith(("ActionResult", "ActionFeedback"))
+    return is_watched(type_name) or type_name == "actionlib_msgs/GoalStatusArray" or answers
+
+
+def audience(caller_ids: Iterable[str]) -> tuple[str, ...]:
+    """The listeners to name to a publisher: sorted, without the agent itself, at most ``limits.AUDIENCE_MAX``.
+
+    Proxies are included: they listen to proxies only in a relay, and name listeners of the modules beyond it.
+    """
+    names = {name for name in caller_ids if is_crossing_name(name) and name != OWN_NODE}
+    return tuple(sorted(names)[: limits.AUDIENCE_MAX])
+
+
+class RemoteSubscribers:
+    """The names of listeners, sent and received, for all peers.
+
+    Args:
+        out: The part, which knows the routes of peers and the modules behind relays.
+    """
+
+    def __init__(self, out: Topics) -> None:
+        self._out = out
+        self._changed: dict[RemoteTopic, None] = {}
+        self._soon: asyncio.Handle | None = None
+
+    def changed(self, entry: RemoteTopic) -> None:
+        """Send our listeners of a peer's source again soon: they have changed, or its route was opened."""
+        if not is_watched(entry.type):
+            return
+        self._changed[entry] = None
+        if self._soon is None:
+            # In the next turn: several changes become one message, and a listener's header is answered first.
+            self._soon = asyncio.get_running_loop().call_soon(self._tell)
+
+    def _tell(self) -> None:
+        self._soon = None
+        changed, self._changed = self._changed, {}
+        for entry in changed:
+            if (flow := entry.flow) is None or entry.publication is None:
+                continue
+            names = audience(entry.publication.listeners)
+            if names != flow.told and entry.open:
+                flow.told = names
+                self._out.send(entry.peer, Audience(entry.number, names))
+
+    def named(self, session: PeerSession, message: Audience) -> None:
+        """Takes the listeners that a peer names for a route; ignored if the route was closed meanwhile."""
+        exports = self._out.exports
+        route = exports.route(session.peer, message.route)
+        if route is None or (local := exports.offered.get(route.source)) is None or not is_watched(local.type):
+            return
+        if exports.description(route.source) is None:
+            return  # its publisher is not connected
+        topic, shown, most = route.source.topic, route.audience, limits.AUDIENCES_MAX
+        names = {name for node in message.nodes if (name := self.name(session, node, topic))}
+        for name in shown.keys() - names:
+            shown.pop(name).close()
+        for name in sorted(names - shown.keys()):
+            if sum(len(one.audience) for one in exports.of(session.peer)) >= most:
+                text = f"{session.link.name}: more than {most} of its nodes listen to actions here"
+                self._out.warn("audience.too_many", session.link.name, text)
+                break
+            _log.debug("> %s: %s listens", route.source, name)
+            sink = ExportFlow()  # to no peer: the bridge gets the messages by its own connection
+            shown[name] = PublisherConnection(topic, local.uri, name, on_message=sink.message, on_parts=sink)
+            shown[name].start()
+
+    def name(self, session: PeerSession, node: str, topic: str) -> str:
+        """The local name of a peer's listener; empty for a proxy of a module that the peer may not speak for."""
+        whose = proxied_node(node)
+        if whose is None:
+            return proxy_name(session.proxies.prefix, node)
+        relay = session.link.name
+        if not any((o.name, via) == (whose[0], relay) for o, via in self._out.imports.ways):
+            return ""
+        return node if self._out.context.gate.admits(Access.SUBSCRIBE, whose[0], topic, relay=relay) else ""
+
+    def close(self) -> None:
+        """Tell nothing any more."""
+        if self._soon is not None:
+            self._soon.cancel()
