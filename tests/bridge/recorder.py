@@ -12,7 +12,7 @@ from rmpa.bridge.data.export import ExportFlow, ExportRoute
 from rmpa.bridge.data.route import RouteBegin
 from rmpa.bridge.data.route_sender import RouteSender
 from rmpa.bridge.messages import Description, Message, Origin, RouteOpened, Source
-from rmpa.bridge.peer import PeerRun, PeerState
+from rmpa.bridge.offers import PeerRun, PeerState
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
 from rmpa.bridge.services import books
 from rmpa.bridge.services.bodies import LocalService

@@ -14,7 +14,7 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.graph_part import GraphPart
 from rmpa.bridge.messages import Advertise, Source, TopicOffer, decode, encode
-from rmpa.bridge.peer import PeerState
+from rmpa.bridge.offers import PeerState
 from rmpa.bridge.policy import PermissionGate
 from rmpa.bridge.proxies import PeerProxies, ProxyNodes
 from rmpa.bridge.sessions import AWAY_GRACE, Part, PeerSession, PeerSessions

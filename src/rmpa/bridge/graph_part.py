@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Advertise, AdvertiseServices, decode, encode
-from rmpa.bridge.peer_offers import ImportEffects
+from rmpa.bridge.offers import Effects
 from rmpa.bridge.sessions import Part, guarded
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.log import RefusalLog, logged_failure
@@ -42,7 +42,7 @@ def _while(queue: Collection[object]) -> Iterator[None]:
         yield
 
 
-class GraphPart(Part, ImportEffects):
+class GraphPart(Part, Effects):
     """Offers to peers what the local graph has, and shows in it what they offer.
 
     A graph of thousands of names must not delay a message. Names to look at, advertisements to apply and entries to
@@ -102,21 +102,21 @@ class GraphPart(Part, ImportEffects):
             self._scan_handle.cancel()
 
     def send(self, peer: int, message: Message) -> None:
-        """As of ``ImportEffects``."""
+        """As of ``Effects``."""
         session = self.bridge.sessions.get(peer)
         if session is not None and session.linked:
             session.link.send_control(encode(message))
 
     def warn(self, kind: str, who: str, text: str) -> None:
-        """As of ``ImportEffects``."""
+        """As of ``Effects``."""
         self.refusals.refuse(self.now(), kind, who, text)
 
     def arm_timer(self) -> None:
-        """As of ``ImportEffects``."""
+        """As of ``Effects``."""
         self._timer.arm()
 
     def path_changed(self, entry: Remote[Any]) -> None:
-        """As of ``ImportEffects``."""
+        """As of ``Effects``."""
         if entry.shown:
             self.pass_on(entry)
             self.look((entry.name,))

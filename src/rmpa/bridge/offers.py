@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from enum import Enum, auto
 from itertools import islice
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
@@ -23,8 +24,56 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.messages import Message
-    from rmpa.bridge.peer import PeerRun
+    from rmpa.bridge.peer_offers import Remote
     from rmpa.config.peer_rules import Access
+
+
+class PeerState(Enum):
+    """The state of a peer.
+
+    ::
+
+    LINKED ──silence──► SILENT ──SILENT_GRACE► AWAY ──nothing waits any more──► (gone)
+      ▲  ├──closed in order──────────────────►  │
+      ├──┼────────────── a new link ────────────┘   (from SILENT, too)
+
+    Attributes:
+        LINKED: The peer has a link.
+        SILENT: Its link ended by silence; most peers are back within ``mesh.limits.SILENT_GRACE``.
+        AWAY: It has no link, and a part of the bridge keeps something for it.
+    """
+
+    LINKED = auto()
+    SILENT = auto()
+    AWAY = auto()
+
+
+@dataclass(slots=True, eq=False, kw_only=True)
+class PeerRun:
+    """One run of a peer, across its links.
+
+    Args:
+        peer: Its number in this agent; never used again for another run.
+        name: Its name, which selects the rules for it.
+        instance: The run, as 32 hexadecimal digits.
+        rank: The value of its GUID.
+        state: Whether it has a link.
+        silent: Whether its last link ended by silence.
+        away_since: When its last link ended, monotonic seconds; 0 before.
+    """
+
+    peer: int
+    name: str = ""
+    instance: str = ""
+    rank: int = 0
+    state: PeerState = PeerState.LINKED
+    silent: bool = False
+    away_since: float = 0.0
+
+    @property
+    def linked(self) -> bool:
+        """Whether the peer has a link now."""
+        return self.state is PeerState.LINKED
 
 
 def wire_of(offer: Any) -> Any:
@@ -53,6 +102,14 @@ class Effects(ABC):
     @abstractmethod
     def warn(self, kind: str, who: str, text: str) -> None:
         """Log a warning about ``who`` and count it as ``kind``; repeated ones are only counted."""
+
+    @abstractmethod
+    def arm_timer(self) -> None:
+        """Look at ``ImportBook.next_timer`` again."""
+
+    @abstractmethod
+    def path_changed(self, entry: Remote[Any]) -> None:
+        """Offer what is relayed with the path that it has now."""
 
 
 KeyT = TypeVar("KeyT", bound="Hashable")

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.data.reception import LinkTime
-from rmpa.bridge.peer import PeerRun, PeerState
+from rmpa.bridge.offers import PeerRun, PeerState
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.bridge.proxies import PeerProxies, ProxyNamespaces
 from rmpa.core.log import logged_failure

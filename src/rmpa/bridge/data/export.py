@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.data.reception import ImportFlow
     from rmpa.bridge.messages import Description, OpenRoute, Source
-    from rmpa.bridge.peer import PeerRun
+    from rmpa.bridge.offers import PeerRun
     from rmpa.core.outbox import QueuedMessage
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink

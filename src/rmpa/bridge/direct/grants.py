@@ -38,19 +38,18 @@ from rmpa.ros.environment import is_loopback
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.wire.slave_api import TCPROS
-from rmpa.ros.wire.tcpros import ANY, parse_service_uri
+from rmpa.ros.wire.tcpros import parse_service_uri
 from rmpa.ros.wire.xmlrpc import RosFault
 from rmpa.runtime.kernel_tcp import connections, end_connections, listening_addresses
 from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.services.books import ServiceExports
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import Exports
-    from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.runtime.kernel_tcp import TcpSocket
 
 _log = logging.getLogger(__name__)
@@ -356,30 +355,8 @@ class TopicGrants(Grants):
         interrupted(self.interruptions, session.link.name, want, asyncio.get_running_loop().time(), lasts=lasts)
 
     def _changed(self, session: PeerSession, want: Want, *, granted: bool) -> None:
-        """Have the proxy of a peer's subscriber stand in the graph while it has a grant for the topic."""
         if granted:
             self._interrupted(session, want, lasts=False)
-        nodes = sum((peer, one.name, one.user) == (session.peer, want.name, want.user) for peer, one, _ in self)
-        held, topic = f"subscriber of {want.name}", want.name
-        if granted and nodes == 1:
-            session.proxies.hold(
-                want.user, held, lambda proxy: self._register(topic, proxy), lambda proxy: self._leave(topic, proxy)
-            )
-        elif not nodes:
-            session.proxies.release(want.user, held)
-
-    def _register(self, topic: str, proxy: SlaveNode) -> None:
-        self._bridge.core.call("registerSubscriber", proxy.name, topic, ANY, proxy.uri)
-
-    def _leave(self, topic: str, proxy: SlaveNode) -> None:
-        self._bridge.core.call("unregisterSubscriber", proxy.name, topic, proxy.uri)
-
-    def reconcile(self, subscribers: Mapping[str, Mapping[str, str]]) -> None:
-        """Register missing subscribers again: the core has been restarted."""
-        for session, asked, found in self._entries():
-            proxy = session.proxies.get(asked.user) if isinstance(found, Grant) else None
-            if proxy is not None and proxy.name not in subscribers.get(asked.name, {}):
-                self._register(asked.name, proxy)
 
     def _uri(self, want: Want) -> str:
         """The slave API of a publisher now; the exports learn a new one a little later."""

@@ -17,7 +17,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.direct.grants import ServiceGrants
 from rmpa.bridge.graph_part import GraphPart
 from rmpa.bridge.messages import CloseService, OpenService, ServiceClosed, ServiceOpened, Source
-from rmpa.bridge.peer import PeerState
+from rmpa.bridge.offers import PeerState
 from rmpa.bridge.policy import Needs, service_place
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.services.books import ServiceExports, ServiceImports

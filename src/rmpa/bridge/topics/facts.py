@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.export import ExportRoute
     from rmpa.bridge.data.quality import QosWatch, QualitySummary
-    from rmpa.bridge.peer import PeerRun
+    from rmpa.bridge.offers import PeerRun
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
     from rmpa.bridge.topics.import_route import RemoteTopic

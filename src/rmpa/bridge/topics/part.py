@@ -237,7 +237,6 @@ class Topics(GraphPart):
             for source, (watch, missed_at) in pasts.items():
                 if all(map(is_own, state.subscribers.get(missed_at, ()))):
                     pasts[source] = watch, ""
-        self.direct_exports.reconcile(state.subscribers)
         for entry in yielding_to_data(list(self.imports)) if compared else ():
             if (route := entry.route) is not None and route.is_missing(state.publishers):
                 route.register()

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from rmpa.bridge.data.export import ExportRoute
-    from rmpa.bridge.peer import PeerRun
+    from rmpa.bridge.offers import PeerRun
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.import_route import RemoteTopic
     from rmpa.bridge.topics.part import Topics
