@@ -258,6 +258,10 @@ class NotedExports(topic_exports.Exports):
     def _disconnect(self, source: Source, flow: ExportFlow) -> None:
         self._noted.done.append(Disconnect(source))
 
+    def put(self, key: Source, local: LocalSource | None, *, again: bool = False) -> None:
+        """Nothing is on its way of a publisher that has gone."""
+        topic_exports.TopicBook.put(self, key, local, again=again)
+
     def _suspend(self, route: ExportRoute) -> None:
         self._noted.done.append(SuspendRoute(route.source, route.peer, route.outage))
 
@@ -424,16 +428,9 @@ class Exports(Recorded):
         out = Out(context(policy, contracts, names, limit_settings, gate))
         super().__init__(NotedExports(out, last), out)
 
-    @property
-    def topics(self) -> set[str]:
-        """The topics that the graph has."""
-        return {source.topic for source in self.book.seen}
-
     def graph(self, topic: str, publishers: dict[str, LocalSource]) -> list[Any]:
         """Set a topic's publishers, by node."""
-        before = [source.node for source in self.book.seen if source.topic == topic]
-        for node in dict.fromkeys((*before, *publishers)):
-            self.book.put(Source(topic, node), publishers.get(node))
+        self.book.look(topic, publishers)
         return self.out.take()
 
     def link_away(self, peer: int) -> tuple[list[Any], bool]:

@@ -82,8 +82,7 @@ class GraphPart(Part, Effects):
         self._changed: OrderedDict[str, None] = OrderedDict()
         self._advertisements: deque[tuple[PeerSession, bytes | Iterator[tuple[Any, Any]]]] = deque()
         self._unread_bytes = 0
-        self._rejudging: Iterator[None] = iter(())
-        self._freeing: deque[Iterator[None]] = deque()
+        self._slowly: deque[Iterator[None]] = deque()
         self._scan_handle: asyncio.Handle | None = None
         self._compared: GraphState | None = None
         self._skipped = 0
@@ -243,7 +242,11 @@ class GraphPart(Part, Effects):
 
     def reload(self) -> None:
         """Judge by new rules; entries and routes that they do not change go on untouched."""
-        self._rejudging = chain(self.exports.reload(), self.imports.reload(self.now()))
+        self.slowly(chain(self.exports.reload(), self.imports.reload(self.now())))
+
+    def slowly(self, steps: Iterator[None]) -> None:
+        """Queue work of many items, behind what is queued already."""
+        self._slowly.append(steps)
         self.schedule()
 
     def run(self, steps: Iterator[object]) -> None:
@@ -260,7 +263,7 @@ class GraphPart(Part, Effects):
     def _scan(self) -> None:
         """Take one turn of the loop for it; each kind of work gets on by one item at least."""
         self._scan_handle = None
-        end, told, rejudged = turn_end(), False, False
+        end, told, slow = turn_end(), False, bool(self._slowly)
         with logged_failure(_log, "a slice of work failed; the rest goes on"):
             for _ in until(end, _while(self._changed)):
                 self._look_at(self._changed.popitem(last=False)[0])
@@ -268,13 +271,11 @@ class GraphPart(Part, Effects):
                 told = True
             for _ in until(end, _while(self._advertisements)):
                 self._apply_next()
-            for _ in until(end, _while(self._freeing)):
-                if next(self._freeing[0], _END) is _END:
-                    self._freeing.popleft()
-            for _ in until(end, self._rejudging):
-                rejudged = True
+            for _ in until(end, _while(self._slowly)):
+                if next(self._slowly[0], _END) is _END:
+                    self._slowly.popleft()
         pending = self.exports.pending
-        if self._changed or self._advertisements or self._freeing or rejudged or (told and pending):
+        if self._changed or self._advertisements or slow or (told and pending):
             self.schedule()
         elif pending:  # earlier portions are still on their way
             self.schedule(limits.TELL_PAUSE)

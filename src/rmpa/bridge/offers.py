@@ -20,7 +20,7 @@ from rmpa.ros.wire.tcpros import ANY
 from rmpa.trust.permissions import PermissionDecision
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterator
+    from collections.abc import Callable, Hashable, Iterator, Mapping
 
     from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.messages import Message
@@ -396,10 +396,23 @@ class TopicBook(OfferBook[Source, LocalT, OfferT, RouteT]):
 
     Attributes:
         any_type: Whether ``*``, which stands for any type, crosses.
+        topics: The topics of ``seen``, with the nodes of each.
     """
 
     kind = "topics"
     any_type: ClassVar[bool] = False
+
+    def __init__(self, out: Effects) -> None:
+        super().__init__(out)
+        self.topics: dict[str, tuple[str, ...]] = {}
+
+    def look(self, topic: str, local: Mapping[str, LocalT]) -> None:
+        """Take what the nodes of a topic have to do with it now, by node; see ``put``."""
+        sources = [Source(topic, node) for node in dict.fromkeys((*self.topics.pop(topic, ()), *local))]
+        for source in sources:
+            self.put(source, local.get(source.node))
+        if nodes := tuple(source.node for source in sources if source in self.seen):
+            self.topics[topic] = nodes
 
     def judge(self, key: Source, local: LocalT) -> PolicyDecision:
         """Decide whether an entry may cross at all."""

@@ -37,7 +37,7 @@ from rmpa.ros.wire.tcpros import ANY
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.messages import Message, Origin
@@ -198,7 +198,6 @@ class Subscriptions(GraphPart):
         super().__init__(bridge, SubscriptionOffers, SubscriptionImports)
         self.core = bridge.core
         self._shown: dict[Remote[Source], ShownSubscription] = {}
-        self._nodes: dict[str, tuple[str, ...]] = {}
         needs = Needs((Access.SUBSCRIBE,), "the topics: of others the subscription is not shown")
         bridge.rpc.on_notification(SUBSCRIPTIONS, self._told_by_peer, needs)
 
@@ -244,24 +243,17 @@ class Subscriptions(GraphPart):
                 shown.register()
 
     def _names(self) -> Iterable[str]:
-        return (*self._nodes, *self.core.state().subscribers)
+        return (*self.exports.topics, *self.core.state().subscribers)
 
     def _look_at(self, name: str) -> None:
-        before, local = self._nodes.pop(name, ()), self._local(name)
-        if local:
-            self._nodes[name] = tuple(local)
-        for node in dict.fromkeys((*before, *local)):
-            self.exports.put(Source(name, node), local.get(node))
-
-    def _local(self, topic: str) -> Mapping[str, LocalSubscription]:
-        """The subscriptions of this module's nodes to a topic, and those that this agent relays, by node."""
+        """Offer the subscriptions of this module's nodes to a topic, and those that this agent relays."""
         unreachable, found = self.core.unreachable(), {}
-        for node in self.core.subscribers(topic):
-            origin = self.bridge.relay.origin((_place(topic), node)) if is_own(node) else None
+        for node in self.core.subscribers(name):
+            origin = self.bridge.relay.origin((_place(name), node)) if is_own(node) else None
             gone = node in unreachable and unreachable[node].withdrawn
             if origin is not None or not (is_own(node) or node.startswith(MEASURING) or gone):
-                found[node] = LocalSubscription(self.core.type_of(topic, node), origin)
-        return found
+                found[node] = LocalSubscription(self.core.type_of(name, node), origin)
+        self.exports.look(name, found)
 
     def _relayed(self, entry: Remote[Any], proxy: str) -> tuple[Source, Place]:
         return Source(_place(entry.name), entry.node), (_place(entry.name), proxy)

@@ -74,31 +74,24 @@ class LocalSource(Local):
     origin: Origin | None = None
 
 
-def own_sources(core: Core, topic: str, flows: Callable[[Source], bool] = lambda _: False) -> dict[str, LocalSource]:
-    """This module's own publishers of a topic, by node, without those that cannot be reached.
+def local_sources(
+    core: Core, relay: Relay, topic: str, flows: Callable[[Source], bool] = lambda _: False
+) -> dict[str, LocalSource]:
+    """The publishers of a topic, by node: those of this module that can be reached, and the proxies that it relays.
 
     Args:
         core: The local core.
+        relay: Which proxies are relayed.
         topic: The topic.
         flows: Whether the agent is connected to a source; such a source counts as reachable, whatever the core found.
     """
-    unreachable = core.unreachable()
-    return {
-        node: LocalSource(core.type_of(topic, node), uri)
-        for node, uri in core.publishers(topic).items()
-        if not is_own(node)
-        and (node not in unreachable or not unreachable[node].withdrawn or flows(Source(topic, node)))
-    }
-
-
-def relayed_sources(core: Core, relay: Relay, topic: str) -> dict[str, LocalSource]:
-    """The proxies of a topic that this agent relays, by node, with their origin; empty if it is no relay."""
-    publishers: Mapping[str, str] = core.publishers(topic) if relay.enabled else {}
-    return {
-        node: LocalSource(core.type_of(topic, node), uri, origin)
-        for node, uri in publishers.items()
-        if (origin := relay.origin((topic, node))) is not None
-    }
+    unreachable, found = core.unreachable(), {}
+    for node, uri in core.publishers(topic).items():
+        origin = relay.origin((topic, node)) if is_own(node) else None
+        gone = node in unreachable and unreachable[node].withdrawn and not flows(Source(topic, node))
+        if origin is not None or not (is_own(node) or gone):
+            found[node] = LocalSource(core.type_of(topic, node), uri, origin)
+    return found
 
 
 class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
@@ -423,19 +416,14 @@ class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
         if flow is not None and (local is None or flow.uri != local.uri):
             self.lost(key, reason)
 
-    def leave(self, source: Source) -> bool:
-        """Let a publisher that has unregistered end its connection by itself, so that all that it has sent is read.
-
-        Returns:
-            Whether the source is still connected, and sent to a peer; its end is noticed here.
-        """
-        flow = self.flows.get(source)
-        if flow is None or all(route.sender is None for route in flow.routes.values()):
-            return False
-        if flow.leaving is None:
+    def put(self, key: Source, local: LocalSource | None, *, again: bool = False) -> None:
+        """As of ``OfferBook``; what a publisher that has gone has sent is read first, until its connection ends."""
+        flow = self.flows.get(key)
+        if local is not None or flow is None or all(route.sender is None for route in flow.routes.values()):
+            super().put(key, local, again=again)
+        elif flow.leaving is None:
             loop = asyncio.get_running_loop()
-            flow.leaving = loop.call_later(limits.ROUTE_END, self._gone, source, flow, "its publisher has gone")
-        return True
+            flow.leaving = loop.call_later(limits.ROUTE_END, self._gone, key, flow, "its publisher has gone")
 
     def _is_over(self, source: Source, flow: ExportFlow) -> bool:
         return self.flows.get(source) is not flow

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.bridge.data.quality import shown_seconds
 from rmpa.bridge.direct.grants import TopicGrants
 from rmpa.bridge.graph_part import GraphPart
-from rmpa.bridge.messages import Audience, CloseRoute, Mismatch, OpenRoute, RouteClosed, RouteOpened, Source
+from rmpa.bridge.messages import Audience, CloseRoute, Mismatch, OpenRoute, RouteClosed, RouteOpened
 from rmpa.bridge.topics.direct import TopicPaths
-from rmpa.bridge.topics.exports import Exports, own_sources, relayed_sources
+from rmpa.bridge.topics.exports import Exports, local_sources
 from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.joins import Joins
 from rmpa.bridge.topics.reports import LossReports, Mismatches, RemoteSubscribers
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.quality import QosWatch
     from rmpa.bridge.data.route_sender import RouteSender
-    from rmpa.bridge.messages import Message
+    from rmpa.bridge.messages import Message, Source
     from rmpa.bridge.peer_offers import Remote
     from rmpa.bridge.policy import Place
     from rmpa.bridge.sessions import PeerSession
@@ -59,7 +59,6 @@ class Topics(GraphPart):
         subscribers: The names of subscribers, where publishers compare them.
         joins: The joining subscribers.
         _pasts: By the name of a module: what is remembered of its reliable sources.
-        _nodes: By topic: the nodes that publish it, as it was looked at last.
     """
 
     advertisement = "advertise"
@@ -79,7 +78,6 @@ class Topics(GraphPart):
         self.direct_exports = TopicGrants(bridge, self.exports)
         self.direct_imports = TopicPaths(bridge, self.warn, self.imports)
         self.direct = self.direct_imports, self.direct_exports
-        self._nodes: dict[str, tuple[str, ...]] = {}
         self._ticker: asyncio.TimerHandle | None = None
 
     def sender(self, peer: int, number: int) -> RouteSender | None:
@@ -169,8 +167,7 @@ class Topics(GraphPart):
         for route in [entry.route for entry in entries.values() if entry.route is not None]:
             route.end(missed=True, gone=False)
             route.release()
-        self._freeing.append(_freed(entries))
-        self.schedule()
+        self.slowly(_freed(entries))
 
     def depends(self, session: PeerSession) -> bool:
         """As of ``GraphPart``; or whether nodes of this module have direct connections to the peer's."""
@@ -215,20 +212,16 @@ class Topics(GraphPart):
             self.look((change.name,))
 
     def _names(self) -> Iterable[str]:
-        return (*self._nodes, *self.bridge.core.state().publishers)
+        return (*self.exports.topics, *self.bridge.core.state().publishers)
 
     def _look_at(self, name: str) -> None:
-        core, before = self.bridge.core, self._nodes.pop(name, ())
-        local = own_sources(core, name, lambda source: self.exports.description(source) is not None)
-        publishers = local | relayed_sources(core, self.bridge.relay, name)
-        nodes = dict.fromkeys((*before, *publishers))
-        leaving = [node for node in nodes if node not in publishers and self.exports.leave(Source(name, node))]
-        if publishers or leaving:
-            self._nodes[name] = (*publishers, *leaving)
-        for node in nodes:
-            if node not in leaving:
-                self.exports.put(Source(name, node), publishers.get(node))
-        self.imports.local_type(name, next((one.type for one in reversed(local.values())), None))
+        bridge = self.bridge
+        found = local_sources(
+            bridge.core, bridge.relay, name, lambda source: self.exports.description(source) is not None
+        )
+        self.exports.look(name, found)
+        own = (one.type for one in reversed(found.values()) if one.origin is None)
+        self.imports.local_type(name, next(own, None))
 
     def reconcile(self) -> None:
         """Register missing publications again; topics without local subscribers miss nothing any more."""
