@@ -258,9 +258,8 @@ class NotedExports(topic_exports.Exports):
     def _disconnect(self, source: Source, flow: ExportFlow) -> None:
         self._noted.done.append(Disconnect(source))
 
-    def put(self, key: Source, local: LocalSource | None, *, again: bool = False) -> None:
-        """Nothing is on its way of a publisher that has gone."""
-        topic_exports.TopicBook.put(self, key, local, again=again)
+    def _leaves(self, _key: Source) -> bool:
+        return False  # nothing is on its way of a publisher that has gone
 
     def _suspend(self, route: ExportRoute) -> None:
         self._noted.done.append(SuspendRoute(route.source, route.peer, route.outage))

@@ -53,9 +53,8 @@ def test_a_name_is_renamed_once() -> None:
 
 def test_without_rules_for_it_a_peer_is_plain() -> None:
     names = Names((ROBOT, PeerRule("base")))
-    assert names.of("base").plain
-    assert names.of("nobody").plain
-    assert not names.of("robot2").plain
+    here = [names.of(peer).local_name("/a") for peer in ("base", "nobody", "robot2")]
+    assert here == ["/a", "/a", "/robot2/a"]
 
 
 @given(NAMES)

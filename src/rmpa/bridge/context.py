@@ -56,11 +56,6 @@ class PeerNames:
         self._out = [_filled(each, peer) for rule in mine for each in rule.remap_out]
         self.prefix: Final = prefix
 
-    @property
-    def plain(self) -> bool:
-        """Whether no rule renames anything of this peer."""
-        return not (self.prefix or self._in or self._out)
-
     def local_name(self, wire: str) -> str:
         """The local name of a peer's topic or service."""
         if wire in _FIXED:

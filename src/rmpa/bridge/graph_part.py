@@ -10,7 +10,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.messages import Advertise, AdvertiseServices, decode, encode
+from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, decode, encode
 from rmpa.bridge.offers import Effects
 from rmpa.bridge.sessions import Part, guarded
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
@@ -122,9 +122,12 @@ class GraphPart(Part, Effects):
 
     def pass_on(self, entry: Remote[Any]) -> None:
         """Have what a peer offers relayed to others, if this module relays."""
-        if (session := self.bridge.sessions.get(entry.peer)) is not None:
+        relay, session = self.bridge.relay, self.bridge.sessions.get(entry.peer)
+        if relay.enabled and session is not None:
             source, place = self._relayed(entry, self.bridge.sessions.proxy_name(session, entry.node, entry.origin))
-            self.bridge.relay.pass_on(entry.peer, session.link.identity, source, place, entry.origin)
+            whose = session.link.identity
+            own = Origin(whose.name, str(whose.guid), whose.instance.hex(), source.node, ())
+            relay.shown(entry.peer, source, place, entry.origin or own)
 
     @abstractmethod
     def _relayed(self, entry: Remote[Any], proxy: str) -> tuple[Source, Place]:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge.messages import Origin
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.rules import CLOCK
@@ -25,10 +24,9 @@ from rmpa.trust.permissions import PermissionDecision, prohibition, refusal
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from rmpa.bridge.messages import Source
+    from rmpa.bridge.messages import Origin, Source
     from rmpa.config.peer_rules import Access, PeerRule
     from rmpa.config.settings import ServiceSettings, TrustSettings
-    from rmpa.core.identity import Identity
     from rmpa.trust.permissions import Permissions
 
 
@@ -314,20 +312,6 @@ class Relay:
         self.instance = ""
         self._origins: dict[Place, tuple[int, Source, Origin]] = {}
         self._places: dict[tuple[int, Source], Place] = {}
-
-    def pass_on(self, peer: int, relay: Identity, source: Source, place: Place, origin: Origin | None) -> None:
-        """Offer a peer's source to other peers, if this module relays.
-
-        Args:
-            peer: The number of the peer that offers it.
-            relay: The identity of that peer.
-            source: The source, by its wire name.
-            place: Its topic and proxy here.
-            origin: Its module and node; ``None``: the peer's own.
-        """
-        if self.enabled:
-            own = Origin(relay.name, str(relay.guid), relay.instance.hex(), source.node, ())
-            self.shown(peer, source, place, origin or own)
 
     def shown(self, peer: int, source: Source, place: Place, origin: Origin) -> None:
         """Register a peer's source that is about to appear in the local graph.

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from rmpa.bridge.data.reception import ImportFlow
-    from rmpa.bridge.messages import Description, OpenRoute, Source
+    from rmpa.bridge.messages import Description, Source
     from rmpa.bridge.offers import PeerRun
     from rmpa.core.outbox import QueuedMessage
     from rmpa.mesh.io.lane import LaneSender
@@ -91,12 +91,6 @@ class ExportRoute:
     def outage(self) -> float:
         """For how many seconds its messages are kept without a link."""
         return self.contract.resume_window if self.reliable else mesh_limits.SILENT_GRACE
-
-    def open(self, message: OpenRoute, contract: Contract, *, unknown: bool, shared: bool) -> None:
-        """Take what the peer asks for, over its present link."""
-        self.number, self.contract, self.asked = message.route, contract, message.contract
-        self.position = (message.epoch, message.after) if message.epoch else None
-        self.unknown, self.shared = unknown, shared
 
     def dismiss(self) -> None:
         """Close the connections for the peer's listeners."""

@@ -94,6 +94,12 @@ def local_sources(
     return found
 
 
+def _description(fields: Mapping[str, str]) -> Description:
+    about = TopicDescription.from_header(fields)
+    text = about.definition.encode(errors="surrogateescape").decode("latin-1")
+    return Description(about.type, about.md5sum, text, about.latching)
+
+
 class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
     """The outbound half of topics.
 
@@ -194,9 +200,14 @@ class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
             flow = self.flows[source] = self._connect(source, local.uri)
         route = told.routes[number] = flow.routes[peer] = before or ExportRoute(session, source)
         ours = self._out.context.contracts.of(source.topic, local.type)
-        unknown = self._cut.pop((session.name, source), session.instance) != session.instance
-        contract, shared = combine(ours, message.contract, local.type), flow.description is not None
-        route.open(message, contract, unknown=unknown, shared=shared)
+        route.number, route.asked, route.contract = (
+            number,
+            message.contract,
+            combine(ours, message.contract, local.type),
+        )
+        route.position = (message.epoch, message.after) if message.epoch else None
+        route.unknown = self._cut.pop((session.name, source), session.instance) != session.instance
+        route.shared = flow.description is not None
         if flow.description is not None:
             self._begin(route, flow, flow.description)
 
@@ -215,7 +226,7 @@ class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
             OWN_NODE,
             on_message=flow.message,
             on_parts=flow,
-            on_header=lambda fields: self._header(source, flow, fields),
+            on_header=lambda fields: self.described(source, _description(fields)),
             on_refused=lambda text: self._gone(source, flow, f"its publisher refuses: {text}"),
             on_lost=lambda reason: self._gone(source, flow, reason),
             on_oversized=lambda size: self._out.losses.oversized(source, flow, size),
@@ -245,37 +256,33 @@ class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
         self._epoch = self._epoch % UINT32_MAX + 1
         return self._epoch
 
-    def _header(self, source: Source, flow: ExportFlow, fields: Mapping[str, str]) -> None:
-        """Take the header of a publisher."""
-        about = TopicDescription.from_header(fields)
-        text = about.definition.encode(errors="surrogateescape").decode("latin-1")
-        description = Description(about.type, about.md5sum, text, about.latching)
+    def described(self, source: Source, description: Description) -> None:
+        """Begin to send on the routes of a source whose publisher has answered with its header."""
+        if (flow := self.flows.get(source)) is None:
+            return
         if description.problem:
             self._gone(source, flow, description.problem)
-        elif not isinstance(flow, RelayedFlow) or self._follows(flow, source, fields):
-            if description.latching:
-                flow.latch()
-            self.described(source, description)
+            return
+        if isinstance(flow, RelayedFlow) and not self._follows(flow, source, description):
+            return
+        if description.latching:
+            flow.latch()
+        flow.description = description
+        for route in flow.routes.values():
+            if route.sender is None:
+                self._begin(route, flow, description)
 
-    def _follows(self, flow: RelayedFlow, source: Source, fields: Mapping[str, str]) -> bool:
+    def _follows(self, flow: RelayedFlow, source: Source, description: Description) -> bool:
         """Whether the route that a relayed source comes by gives it its numbers; else it does when it is open."""
         publication = self._proxied(source, flow.uri)
         route = publication.events if publication is not None else None
         if publication is None or not isinstance(route, ImportRoute):
             return False
         if route.flow is None:
-            route.on_open = lambda: None if self._is_over(source, flow) else self._header(source, flow, fields)
+            route.on_open = lambda: None if self._is_over(source, flow) else self.described(source, description)
             return False
         flow.follow(route.flow, publication.latched)
         return True
-
-    def described(self, source: Source, description: Description) -> None:
-        """Begin to send on the routes of a source whose publisher has answered with its header."""
-        if (flow := self.flows.get(source)) is not None:
-            flow.description = description
-            for route in flow.routes.values():
-                if route.sender is None:
-                    self._begin(route, flow, description)
 
     def _begin(self, route: ExportRoute, flow: ExportFlow, about: Description) -> None:
         """Tell a peer that its route is open, and send on it; one that was suspended goes on."""
@@ -416,14 +423,15 @@ class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
         if flow is not None and (local is None or flow.uri != local.uri):
             self.lost(key, reason)
 
-    def put(self, key: Source, local: LocalSource | None, *, again: bool = False) -> None:
-        """As of ``OfferBook``; what a publisher that has gone has sent is read first, until its connection ends."""
+    def _leaves(self, key: Source) -> bool:
+        """As of ``TopicBook``: a publisher ends its connection by itself, so that all that it has sent is read."""
         flow = self.flows.get(key)
-        if local is not None or flow is None or all(route.sender is None for route in flow.routes.values()):
-            super().put(key, local, again=again)
-        elif flow.leaving is None:
+        if flow is None or all(route.sender is None for route in flow.routes.values()):
+            return False
+        if flow.leaving is None:
             loop = asyncio.get_running_loop()
             flow.leaving = loop.call_later(limits.ROUTE_END, self._gone, key, flow, "its publisher has gone")
+        return True
 
     def _is_over(self, source: Source, flow: ExportFlow) -> bool:
         return self.flows.get(source) is not flow
