@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections import OrderedDict, defaultdict
+from collections import defaultdict
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
@@ -18,11 +18,10 @@ from rmpa.config.settings import TimeSettings
 from rmpa.config.values import PEER
 from rmpa.core.identity import NEVER_CROSSING, OUTSIDE_GUID, ROSOUT, is_own, matches, matches_any
 from rmpa.core.statistics import Counters
-from rmpa.mesh import limits as mesh_limits
 from rmpa.trust.permissions import PermissionDecision, prohibition, refusal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Iterable
 
     from rmpa.bridge.messages import Origin, Source
     from rmpa.config.peer_rules import Access, PeerRule
@@ -368,131 +367,3 @@ class Local:
 def may_have(instance: str, origin: Origin) -> bool:
     """Whether a relayed source may be offered to the peer of this instance: not to one that it came from."""
     return instance != origin.instance and instance not in origin.path
-
-
-class RelayPaths:
-    """The receiving side: selects the path to each module, its own link first, else the best relay.
-
-    The best relay has the shortest path; among equal ones, the lowest GUID. A peer counts while it has a link and has
-    told all that it offers.
-
-    Args:
-        may_relay: Whether a peer, by its name, may be a relay at all.
-
-    Attributes:
-        instance: Our own, as 32 hexadecimal digits.
-        reached_here: Instances that this module reaches by itself, outside the mesh: a gateway's sites.
-        lost: The relay that brought a module last, by the names of both, of each that no relay brings any more.
-        _linked: By number of a peer with a link of its own: its name, its instance, and its rank among relays.
-        _ready: The peers that have a link and have told all that they offer.
-        _ways: By instance and relay: the origin as the relay offered it last, and the number of its sources there.
-    """
-
-    def __init__(self, may_relay: Callable[[str], bool] = lambda _: True) -> None:
-        self._may_relay = may_relay
-        self.instance = ""
-        self.reached_here: set[str] = set()
-        self.lost: OrderedDict[str, str] = OrderedDict()
-        self._linked: dict[int, tuple[str, str, int]] = {}
-        self._ready: set[int] = set()
-        self._ways: dict[str, dict[int, tuple[Origin, int]]] = {}
-
-    def __iter__(self) -> Iterator[tuple[Origin, str]]:
-        """Each module that is reached by a relay, and that relay's name."""
-        for instance, ways in self._ways.items():
-            best = self._best(instance)
-            if best is not None and not self._direct(ways[best][0]):
-                yield ways[best][0], self._linked[best][0]
-
-    def __contains__(self, instance: str) -> bool:
-        return instance in self._ways
-
-    def linked(self, peer: int, name: str, instance: str, rank: int) -> set[str]:
-        """Register a linked peer; return the instances whose path may have changed.
-
-        Args:
-            peer: The number of its session.
-            name: Its name.
-            instance: Its run, as 32 hexadecimal digits.
-            rank: Its GUID, as a number.
-        """
-        self._linked[peer] = name, instance, rank
-        return {instance}
-
-    def ready(self, peer: int, *, ready: bool) -> set[str]:
-        """Note whether a peer has a link and has told all; return the instances whose path may have changed."""
-        if ready is (peer in self._ready) or peer not in self._linked:
-            return set()
-        (self._ready.add if ready else self._ready.discard)(peer)
-        return {self._linked[peer][1]} | {instance for instance, ways in self._ways.items() if peer in ways}
-
-    def unlinked(self, peer: int) -> set[str]:
-        """Forget a peer and all paths through it; return the instances whose path may have changed."""
-        self._ready.discard(peer)
-        gone = self._linked.pop(peer, None)
-        changed = {gone[1]} if gone is not None else set()
-        for instance, ways in list(self._ways.items()):
-            if (way := ways.pop(peer, None)) is not None:
-                changed.add(instance)
-                if not ways:
-                    self._lose(way[0], gone)
-        return changed
-
-    def _lose(self, origin: Origin, relay: tuple[str, str, int] | None) -> None:
-        """Note that no relay brings a module any more."""
-        del self._ways[origin.instance]
-        self.lost[origin.name] = relay[0] if relay is not None else ""
-        if len(self.lost) > mesh_limits.MODULES_MAX:
-            self.lost.popitem(last=False)
-
-    def count(self, peer: int, origin: Origin, more: int) -> bool:
-        """Count a source of a module that a peer offers (1) or offers no longer (-1).
-
-        Returns:
-            Whether the best relay to the module has changed.
-        """
-        ours = self.instance in (origin.instance, *origin.path)
-        if ours or peer not in self._linked:
-            return False
-        before, ways = self._best(origin.instance), self._ways.setdefault(origin.instance, {})
-        known, count = ways.pop(peer, (origin, 0))
-        if count + more > 0:
-            ways[peer] = origin if more > 0 else known, count + more
-            self.lost.pop(origin.name, None)
-        if not ways:
-            self._lose(origin, self._linked[peer])
-        return self._best(origin.instance) != before
-
-    def objection(self, origin: Origin) -> str:
-        """Why no relay's source of a module is shown, or empty."""
-        if origin.instance == self.instance:
-            return "it is ours, and came back by a relay"
-        if self.instance in origin.path:
-            return "we passed it on ourselves"
-        if origin.instance in self.reached_here:
-            return f"{origin.name} is reached from here"
-        if self._direct(origin):
-            return f"{origin.name} has a link of its own"
-        return ""
-
-    def why_not(self, peer: int, origin: Origin) -> str:
-        """Why a relayed source of a peer is hidden, or empty."""
-        if why := self.objection(origin):
-            return why
-        best = self._best(origin.instance)
-        if best is not None and best != peer:
-            return f"{origin.name} is reached by way of {self._linked[best][0]}"
-        return ""
-
-    def rank(self, peer: int, origin: Origin | None) -> tuple[bool, int, int, int]:
-        """Sorts the ways to a source: those that work, then links, then relays by their paths, then by GUID."""
-        return peer not in self._ready, len(origin.path) if origin is not None else 0, self._linked[peer][2], peer
-
-    def _direct(self, origin: Origin) -> bool:
-        # Every member of a mesh hears the instances of the others, and may claim one; see Identity.is_same_run.
-        return any(self._linked[peer][:2] == (origin.name, origin.instance) for peer in self._ready)
-
-    def _best(self, instance: str) -> int | None:
-        ways = self._ways.get(instance, {})
-        relays = (peer for peer in ways if self._may_relay(self._linked[peer][0]))
-        return min(relays, key=lambda peer: self.rank(peer, ways[peer][0]), default=None)

@@ -168,12 +168,14 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         self._hand_all_over(peer)
         known = self._peers.pop(peer, None)
         self._topics.pop(peer, None)
-        for entry in known.entries.values() if known is not None else ():
+        if known is None:
+            return {}
+        for entry in known.entries.values():
             self._forget_way(entry)
-        self._ways_changed(self.ways.unlinked(peer))
+        self._ways_changed(self.ways.gone(peer, known.session))
         for other in self.at(CLOCK):
             self._judge(other)
-        return known.entries if known is not None else {}
+        return known.entries
 
     def _entry(self, peer: int, offer: TopicOffer) -> RemoteTopic:
         # Many sources share the names of nodes and types, and each is kept once.
