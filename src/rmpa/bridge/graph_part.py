@@ -24,11 +24,12 @@ if TYPE_CHECKING:
     from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.direct.grants import Grants
     from rmpa.bridge.direct.paths import Paths
-    from rmpa.bridge.messages import Message, Source
+    from rmpa.bridge.messages import Message, Source, SubscriptionChanges
     from rmpa.bridge.offers import OfferBook
     from rmpa.bridge.peer_offers import ImportBook, Remote
     from rmpa.bridge.policy import Place
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.master.parameters import GraphState
 
 _log = logging.getLogger(__name__)
@@ -40,6 +41,12 @@ def _while(queue: Collection[object]) -> Iterator[None]:
     """Yield for as long as something is queued."""
     while queue:
         yield
+
+
+def go_on(queue: deque[Any]) -> None:
+    """Do the next item of the work that has waited longest; what has none any more leaves the queue."""
+    if next(queue[0][1], _END) is _END:
+        queue.popleft()
 
 
 class GraphPart(Part, Effects):
@@ -80,9 +87,9 @@ class GraphPart(Part, Effects):
         self._timer = MachineTimer(self.imports.next_timer, self.imports.handle_timer)
         # Ordered: in a plain dict, taking the first item skips over the places of all items taken before.
         self._changed: OrderedDict[str, None] = OrderedDict()
-        self._advertisements: deque[tuple[PeerSession, bytes | Iterator[tuple[Any, Any]]]] = deque()
+        self._advertisements: deque[tuple[PeerSession, Iterator[None]]] = deque()
         self._unread_bytes = 0
-        self._slowly: deque[Iterator[None]] = deque()
+        self._slowly: deque[tuple[None, Iterator[None]]] = deque()
         self._scan_handle: asyncio.Handle | None = None
         self._compared: GraphState | None = None
         self._skipped = 0
@@ -153,11 +160,9 @@ class GraphPart(Part, Effects):
         self.schedule()
 
     def link_down(self, session: PeerSession) -> None:
-        """Drop the peer's advertisements that are not applied yet."""
+        """A link is gone; the peer may come back. What is left of its advertisements is not applied any more."""
         for each in self.direct:
             each.link_down(session)
-        self._advertisements = deque(one for one in self._advertisements if one[0] is not session)
-        self._unread_bytes = sum(len(waiting) for _, waiting in self._advertisements if isinstance(waiting, bytes))
 
     def gone(self, session: PeerSession) -> None:
         """Forget a peer."""
@@ -180,25 +185,17 @@ class GraphPart(Part, Effects):
         """
         if len(payload) > limits.ADVERTISEMENT_MAX:
             raise LimitExceeded("advertisement", len(payload), limits.ADVERTISEMENT_MAX)
-        self._advertisements.append((session, payload))
         self._unread_bytes += len(payload)
+        self._advertisements.append((session, self._read(session, session.link, payload)))
         self.schedule()
         while self._unread_bytes > limits.ADVERTISED_WAITING_BYTES:
-            self._apply_next()
+            go_on(self._advertisements)
 
-    def _apply_next(self) -> None:
-        """Parse the advertisement that has waited longest, or apply the next entry of it if it is parsed."""
-        session, waiting = self._advertisements[0]
-        if not isinstance(waiting, bytes):
-            if (change := next(waiting, None)) is None:
-                self._advertisements.popleft()
-            else:
-                self.imports.take_in(session.peer, *change, self.now())
-            return
-        self._advertisements.popleft()
-        self._unread_bytes -= len(waiting)
+    def _read(self, session: PeerSession, link: PeerLink, payload: bytes) -> Iterator[None]:
+        """Parse an advertisement, and apply it."""
+        self._unread_bytes -= len(payload)
         try:
-            message = decode(waiting)
+            message = decode(payload) if session.link is link and session.linked else None
         except RemoteProtocolError as error:
             self.refuse(session, error)
             return
@@ -206,7 +203,17 @@ class GraphPart(Part, Effects):
             if message.added or message.removed:
                 more, less = len(message.added), len(message.removed)
                 _log.debug("< %s %s %d more %s, %d less", session.link.name, self.verb, more, self.exports.kind, less)
-            self._advertisements.appendleft((session, self.imports.changes(session.peer, message)))
+            yield from self._apply(session, link, message)
+
+    def _apply(
+        self, session: PeerSession, link: PeerLink, message: Advertise | AdvertiseServices | SubscriptionChanges
+    ) -> Iterator[None]:
+        """Apply an advertisement, an entry with each item, while the link stands by which it came."""
+        for change in self.imports.changes(session.peer, message):
+            if session.link is not link or not session.linked:
+                return
+            self.imports.take_in(session.peer, *change, self.now())
+            yield
 
     @abstractmethod
     def _look_at(self, name: str) -> None:
@@ -249,7 +256,7 @@ class GraphPart(Part, Effects):
 
     def slowly(self, steps: Iterator[None]) -> None:
         """Queue work of many items, behind what is queued already."""
-        self._slowly.append(steps)
+        self._slowly.append((None, steps))
         self.schedule()
 
     def run(self, steps: Iterator[object]) -> None:
@@ -273,10 +280,9 @@ class GraphPart(Part, Effects):
             for _ in until(end, self.exports.advertise(self.now(), self._is_busy)):
                 told = True
             for _ in until(end, _while(self._advertisements)):
-                self._apply_next()
+                go_on(self._advertisements)
             for _ in until(end, _while(self._slowly)):
-                if next(self._slowly[0], _END) is _END:
-                    self._slowly.popleft()
+                go_on(self._slowly)
         pending = self.exports.pending
         if self._changed or self._advertisements or slow or (told and pending):
             self.schedule()

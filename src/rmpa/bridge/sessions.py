@@ -8,6 +8,7 @@ import logging
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from rmpa.bridge.data.quality import PeerClockHistory
 from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.offers import PeerRun, PeerState
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
@@ -41,12 +42,14 @@ class PeerSession(PeerRun):
         link: Its link, or the last one while it has none.
         proxies: The nodes that stand for its nodes in the local graph; those of the module, whichever peers bring it.
         time: The time base of its link: the offset between its clock and the local one.
+        clocks: The estimates of that offset over the last minute.
         wait: Seconds from ``away_since`` to ``due``; ``None`` while it has a link.
     """
 
     link: PeerLink
     proxies: PeerProxies
     time: LinkTime = field(default_factory=LinkTime)
+    clocks: PeerClockHistory = field(default_factory=PeerClockHistory)
     wait: float | None = None
 
     def instance_of(self, origin: Origin | None) -> str:

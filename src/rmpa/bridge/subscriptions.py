@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge.graph_part import GraphPart
+from rmpa.bridge.graph_part import GraphPart, go_on
 from rmpa.bridge.messages import (
     Notification,
     Source,
@@ -209,10 +209,10 @@ class Subscriptions(GraphPart):
 
     def _told_by_peer(self, session: PeerSession, args: dict[str, Any]) -> None:
         changes = convert(SUBSCRIPTIONS, args, SubscriptionChanges)
-        self._advertisements.append((session, self.imports.changes(session.peer, changes)))
+        self._advertisements.append((session, self._apply(session, session.link, changes)))
         self.schedule()
         while len(self._advertisements) > limits.SUBSCRIPTIONS_WAITING:
-            self._apply_next()
+            go_on(self._advertisements)
 
     def link_down(self, session: PeerSession) -> None:
         """As of ``GraphPart``."""
