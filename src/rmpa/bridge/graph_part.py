@@ -160,14 +160,22 @@ class GraphPart(Part, Effects):
         self.schedule()
 
     def link_down(self, session: PeerSession) -> None:
-        """A link is gone; the peer may come back. What is left of its advertisements is not applied any more."""
+        """A link is gone; what the peer offers stays in the graph until ``grace_over``."""
         for each in self.direct:
             each.link_down(session)
+        self.exports.link_down(session.peer)
+        self.imports.link_down(session.peer)
+
+    def grace_over(self, session: PeerSession) -> bool:
+        """Remove what the peer offers from the local graph; nothing is kept for it."""
+        self.run(self.imports.gone(session.peer))
+        return False
 
     def gone(self, session: PeerSession) -> None:
         """Forget a peer."""
         for each in self.direct:
             each.gone(session)
+        self.run(self.imports.gone(session.peer))
 
     def depends(self, session: PeerSession) -> bool:
         """Whether an advertisement of a peer is not applied yet."""

@@ -214,22 +214,6 @@ class Subscriptions(GraphPart):
         while len(self._advertisements) > limits.SUBSCRIPTIONS_WAITING:
             go_on(self._advertisements)
 
-    def link_down(self, session: PeerSession) -> None:
-        """As of ``GraphPart``."""
-        super().link_down(session)
-        self.exports.link_down(session.peer)
-        self.imports.link_down(session.peer)
-
-    def grace_over(self, session: PeerSession) -> bool:
-        """Remove the peer's subscriptions from the local graph."""
-        self.run(self.imports.gone(session.peer))
-        return False
-
-    def gone(self, session: PeerSession) -> None:
-        """As of ``GraphPart``."""
-        super().gone(session)
-        self.run(self.imports.gone(session.peer))
-
     def graph_changed(self, change: GraphChange) -> None:
         """Have the topic of a registration looked at."""
         if change.kind is RegistrationKind.SUBSCRIBER:

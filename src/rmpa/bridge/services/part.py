@@ -147,12 +147,6 @@ class Services(GraphPart):
         for shown in [one for one in self if one.remote.peer == session.peer and (one.waiting or one.asking)]:
             self._want(shown)
 
-    def link_down(self, session: PeerSession) -> None:
-        """Fail the calls under way; the peer's services stay in the graph until ``grace_over`` or ``gone``."""
-        super().link_down(session)
-        self.imports.link_down(session.peer)
-        self.exports.link_down(session.peer)
-
     def grace_over(self, session: PeerSession) -> bool:
         """Remove the peer's services; if its agent has crashed, those that are called directly stay for a time."""
         called = self.direct_imports.called(session.peer)
@@ -167,9 +161,8 @@ class Services(GraphPart):
         return None
 
     def gone(self, session: PeerSession) -> None:
-        """Remove the peer's services, and what else is known of the peer."""
+        """As of ``GraphPart``; what its calls hold is free."""
         super().gone(session)
-        self.run(self.imports.gone(session.peer))
         self._budgets.pop(session.peer, None)
 
     def message(self, session: PeerSession, message: Message) -> bool:

@@ -124,7 +124,8 @@ class Topics(GraphPart):
 
     def link_down(self, session: PeerSession) -> None:
         """Suspend the peer's routes; after silence its sources stay in the local graph for ``SILENT_GRACE``."""
-        super().link_down(session)
+        for each in self.direct:
+            each.link_down(session)
         peer, flows = session.peer, self.imports.flows(session.peer)
         for flow in flows:
             flow.link_down()
@@ -159,7 +160,8 @@ class Topics(GraphPart):
     def gone(self, session: PeerSession) -> None:
         """Retract the rest of a peer's sources."""
         peer = session.peer
-        super().gone(session)
+        for each in self.direct:
+            each.gone(session)
         entries = self.imports.forget(peer)
         self.mismatches.peer_gone(session.link.name)
         self.run(self.exports.gone(peer))
