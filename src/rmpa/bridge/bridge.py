@@ -124,7 +124,7 @@ class Bridge:
         self.node.master_uri = self.core.uri  # only now does the embedded core listen
         await self.node.start()
         await self.proxy_nodes.start()
-        self._reconcile_later()
+        self._reconciler = call_at_tick(limits.RECONCILE_INTERVAL, self._reconcile)
         for part in self._parts:
             self.core.on_change(part.graph_changed)
             part.start()
@@ -174,11 +174,8 @@ class Bridge:
     def _param_update(self, key: str, _value: XmlRpcValue) -> bool:
         return sum(part.param_update(key) for part in self._parts) > 0  # a sum, because every part must be called
 
-    def _reconcile_later(self) -> None:
-        self._reconciler = call_at_tick(limits.RECONCILE_INTERVAL, self._reconcile)
-
     def _reconcile(self) -> None:
-        self._reconcile_later()
+        self._reconciler = call_at_tick(limits.RECONCILE_INTERVAL, self._reconcile)
         self.sessions.reconcile()
         for part in self._parts:
             yield_to_data()

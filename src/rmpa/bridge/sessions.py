@@ -390,17 +390,14 @@ class PeerSessions:
         if session is not None:
             session.time.set(link.clock_offset, link.clock_error)
 
-    def _depends(self, session: PeerSession) -> bool:
-        """Whether anything of this module needs to know within a second that a peer is gone."""
-        return any(session.link.routes) or any(part.depends(session) for part in self._parts)
-
     def reconcile(self) -> None:
         """Try failed proxies again, let unused links rest, and forget unused namespaces of relayed modules."""
         now = asyncio.get_running_loop().time()
         for session in self.linked():
             yield_to_data()
             if session.linked and now - session.link.touched_at >= mesh_limits.REST_AFTER:
-                session.link.need(needed=self._depends(session))
+                needed = any(session.link.routes) or any(part.depends(session) for part in self._parts)
+                session.link.need(needed=needed)
         linked = {id(session.proxies) for session in self}
         for module, proxies in list(self._modules.items()):
             yield_to_data()

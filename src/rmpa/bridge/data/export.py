@@ -204,7 +204,8 @@ class ExportFlow:
 
     def add(self, route: ExportRoute, link: PeerLink, begin: RouteBegin | None = None) -> RouteSender:
         """Send on a route, first the kept messages; ``begin`` is what ``begins`` has said."""
-        self.remove(route)
+        if route.sender is not None:
+            self.remove(route)
         begin, contract = begin or self.begins(route), route.contract
         kind = ReliableRouteSender if route.reliable else RouteSender
         sender = kind(link, route.number, contract, begin.epoch, begin.first, large=self.large)

@@ -67,6 +67,7 @@ class Grants(ABC):
 
     Attributes:
         kind: The middle of the names of the messages.
+        interruptions: When peers' subscribers were without a grant because their link was lost.
         _asked: By peer and what it wants: its session, its question, and the answer; ``None`` while that is looked
             for. A peer may ask for thousands, so nothing here passes over those of all peers for one of them.
         _by_node: What ``of`` returns; ``None``: grants have changed since it was made.
@@ -78,6 +79,7 @@ class Grants(ABC):
         self._bridge = bridge
         self._asked: dict[int, dict[Want, _Entry]] = {}
         self._by_node: dict[tuple[str, str], list[tuple[int, str, Grant]]] | None = None
+        self.interruptions: Interruptions = {}
 
     def __iter__(self) -> Iterator[tuple[int, Want, Grant]]:
         """Every grant: peer, what is granted, and where; changes during the iteration are allowed."""
@@ -108,10 +110,7 @@ class Grants(ABC):
     async def _find(self, session: PeerSession, want: Want) -> Grant | Unmet:
         """Where the node listens, if the peer may reach it."""
 
-    def _changed(self, session: PeerSession, want: Want, *, granted: bool) -> None:  # noqa: B027 - of topics alone
-        """A user has got a grant, or has none any more."""
-
-    def _broke(self, want: Want) -> None:  # noqa: B027 - likewise
+    def _broke(self, want: Want) -> None:  # noqa: B027 - of topics alone
         """A peer's user says that its connection ended by itself."""
 
     async def _ask(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
@@ -168,10 +167,14 @@ class Grants(ABC):
             del self._asked[session.peer]
         if isinstance(before, Grant) == isinstance(found, Grant):
             return
-        self._changed(session, want, granted=isinstance(found, Grant))
+        if isinstance(found, Grant):
+            self._interrupted(session, want, lasts=False)
         for peer, entries in list(self._asked.items()) if isinstance(before, Grant) else ():
             if peer != session.peer and want in entries and isinstance(entries[want][2], Unmet):
                 self._tell(entries[want][0], want)  # perhaps it was refused because of the user's name
+
+    def _interrupted(self, session: PeerSession, want: Want, *, lasts: bool) -> None:
+        interrupted(self.interruptions, session.link.name, want, asyncio.get_running_loop().time(), lasts=lasts)
 
     def _again(self, which: Callable[[Want], bool]) -> None:
         """Let peers ask again: something has changed."""
@@ -320,9 +323,6 @@ class TopicGrants(Grants):
     Args:
         bridge: As of ``Grants``.
         exports: Knows what is offered to each peer.
-
-    Attributes:
-        interruptions: When peers' subscribers were without a grant because their link was lost.
     """
 
     kind = "topic"
@@ -334,7 +334,6 @@ class TopicGrants(Grants):
         rpc.on_notification("direct.topic_release", self._released, _RELEASED)
         self._exports = exports
         self.ports = NodePorts()
-        self.interruptions: Interruptions = {}
 
     def graph_changed(self, change: GraphChange) -> None:
         """Have peers ask again for what a registration that came or went touches."""
@@ -350,13 +349,6 @@ class TopicGrants(Grants):
             if peer == session.peer:
                 self._interrupted(session, want, lasts=True)
         super().link_down(session)
-
-    def _interrupted(self, session: PeerSession, want: Want, *, lasts: bool) -> None:
-        interrupted(self.interruptions, session.link.name, want, asyncio.get_running_loop().time(), lasts=lasts)
-
-    def _changed(self, session: PeerSession, want: Want, *, granted: bool) -> None:
-        if granted:
-            self._interrupted(session, want, lasts=False)
 
     def _uri(self, want: Want) -> str:
         """The slave API of a publisher now; the exports learn a new one a little later."""
