@@ -21,7 +21,7 @@ import itertools
 import math
 import sys
 from heapq import heappop, heappush
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from msgspec import UnsetType
 
@@ -51,6 +51,14 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.reception import ImportFlow
     from rmpa.bridge.topics.import_route import StreamKey
     from rmpa.bridge.topics.part import Topics
+
+_Key = TypeVar("_Key", bound="str | StreamKey")
+
+
+def _take_out(groups: dict[_Key, dict[RemoteTopic, None]], key: _Key, entry: RemoteTopic) -> None:
+    del groups[key][entry]
+    if not groups[key]:
+        del groups[key]
 
 
 class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
@@ -171,7 +179,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         if known is None:
             return {}
         for entry in known.entries.values():
-            self._forget_way(entry)
+            _take_out(self._ways, entry.key, entry)
         self._ways_changed(self.ways.gone(peer, known.session))
         for other in self.at(CLOCK):
             self._judge(other)
@@ -204,18 +212,9 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         self._topics.setdefault(entry.peer, {}).setdefault(entry.name, {})[entry] = None
         self._ways.setdefault(entry.key, {})[entry] = None
 
-    def _forget_way(self, entry: RemoteTopic) -> None:
-        ways = self._ways[entry.key]
-        del ways[entry]
-        if not ways:
-            del self._ways[entry.key]
-
     def _unlist(self, entry: RemoteTopic) -> None:
-        self._forget_way(entry)
-        topics = self._topics[entry.peer]
-        del topics[entry.name][entry]
-        if not topics[entry.name]:
-            del topics[entry.name]
+        _take_out(self._ways, entry.key, entry)
+        _take_out(self._topics[entry.peer], entry.name, entry)
 
     def local_type(self, topic: str, type_name: str | None) -> None:
         """Set the type with which local nodes publish a topic; ``None`` if none publishes it.
@@ -273,49 +272,44 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         origin, topic = entry.origin, entry.name
         if origin is not None and (why := self.ways.objection(origin)):
             return why, ""
-        if topic == CLOCK:
-            why, conflict = self._why_no_time(entry)
-        elif why := self._why_left_out(entry):
-            conflict = False
-        else:
-            local = self._local_types.get(topic, entry.type)
-            conflict = local != entry.type
-            why = f"its type is {entry.type}, but a local node publishes {topic} as {local}; "
-            why = why + "rename one of the topics or use one type" if conflict else ""
-        if why and not conflict:
+        why, cause = self._why_no_time(entry) if topic == CLOCK else self._why_left_out(entry)
+        if why and not cause:
             return why, ""
-        problem, cause = self._no_place(entry)
-        return (why, CONFLICT) if conflict and cause != DENIED else (problem, cause)
+        problem, reason = self._no_place(entry)
+        return (why, cause) if cause and reason != DENIED else (problem, reason)
 
-    def _why_left_out(self, entry: RemoteTopic) -> str:
-        """Why rules or another source of its node keep a source out, or empty."""
+    def _why_left_out(self, entry: RemoteTopic) -> tuple[str, str]:
+        """Why rules, another source of its node or a local type keep a source out, and the cause; or empty."""
         topic, decision = entry.name, self._out.context.policy.judge(entry.name, entry.type, entry.past.node)
         if why := self._kept_out(entry, decision, entry.wire.topic):
-            return why
+            return why, ""
         if not is_crossing_name(topic):
-            return f"its name here would be {topic}, which is too long"
+            return f"its name here would be {topic}, which is too long", ""
         for other in self._topics[entry.peer][topic]:
             if other.node == entry.node and other is not entry and other.shown:
-                return f"it would be {topic} here, as {other.wire.topic} of this node is already; rename one"
-        return ""
+                return f"it would be {topic} here, as {other.wire.topic} of this node is already; rename one", ""
+        if (local := self._local_types.get(topic, entry.type)) != entry.type:
+            why = f"its type is {entry.type}, but a local node publishes {topic} as {local}; "
+            return why + "rename one of the topics or use one type", CONFLICT
+        return "", ""
 
-    def _why_no_time(self, entry: RemoteTopic) -> tuple[str, bool]:
-        """Why a peer's ``/clock`` is hidden, or empty, and whether that is a conflict.
+    def _why_no_time(self, entry: RemoteTopic) -> tuple[str, str]:
+        """Why a peer's ``/clock`` is hidden, and the cause; or empty.
 
         Time has one source: one node of the followed peer, or one of this module.
         """
         if entry.origin is not None and not is_outside(entry.origin):  # the gateway itself brings what is outside
-            return "time does not come by a relay", False
+            return "time does not come by a relay", ""
         decision = self._out.context.policy.judge_clock(self.peer_name(entry.peer))
         if not decision.allowed:
-            return decision.rule, False
+            return decision.rule, ""
         if CLOCK in self._local_types:
-            return "a node of this module publishes /clock, and time has one source: end that one", True
+            return "a node of this module publishes /clock, and time has one source: end that one", CONFLICT
         for other in self.at(CLOCK):
             if other.shown and other is not entry:
                 name = self.peer_name(other.peer)
-                return f"time comes from {other.node} of {name} already, and has one source", True
-        return "", False
+                return f"time comes from {other.node} of {name} already, and has one source", CONFLICT
+        return "", ""
 
     def _choose(self, entry: RemoteTopic) -> None:
         """Let the best way carry a source, by the facts of now; call it whenever one has changed."""
