@@ -10,7 +10,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, decode, encode
+from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, SubscriptionChanges, decode, encode
 from rmpa.bridge.offers import Effects
 from rmpa.bridge.sessions import Part, guarded
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.direct.grants import Grants
     from rmpa.bridge.direct.paths import Paths
-    from rmpa.bridge.messages import Message, Source, SubscriptionChanges
+    from rmpa.bridge.messages import Message, Source
     from rmpa.bridge.offers import OfferBook
     from rmpa.bridge.peer_offers import ImportBook, Remote
     from rmpa.bridge.policy import Place
@@ -194,34 +194,33 @@ class GraphPart(Part, Effects):
         if len(payload) > limits.ADVERTISEMENT_MAX:
             raise LimitExceeded("advertisement", len(payload), limits.ADVERTISEMENT_MAX)
         self._unread_bytes += len(payload)
-        self._advertisements.append((session, self._read(session, session.link, payload)))
+        self._advertisements.append((session, self._apply(session, session.link, payload)))
         self.schedule()
         while self._unread_bytes > limits.ADVERTISED_WAITING_BYTES:
             go_on(self._advertisements)
 
-    def _read(self, session: PeerSession, link: PeerLink, payload: bytes) -> Iterator[None]:
-        """Parse an advertisement, and apply it."""
-        self._unread_bytes -= len(payload)
-        try:
-            message = decode(payload) if session.link is link and session.linked else None
-        except RemoteProtocolError as error:
-            self.refuse(session, error)
-            return
-        if isinstance(message, Advertise | AdvertiseServices):
+    def _apply(
+        self, session: PeerSession, link: PeerLink, message: bytes | Message | SubscriptionChanges
+    ) -> Iterator[None]:
+        """Parse an advertisement, and apply it, an entry with each item, while the link stands by which it came."""
+        if isinstance(message, bytes):
+            self._unread_bytes -= len(message)
+            if session.link is not link or not session.linked:
+                return
+            try:
+                message = decode(message)
+            except RemoteProtocolError as error:
+                self.refuse(session, error)
+                return
+        if isinstance(message, Advertise | AdvertiseServices | SubscriptionChanges):
             if message.added or message.removed:
                 more, less = len(message.added), len(message.removed)
                 _log.debug("< %s %s %d more %s, %d less", session.link.name, self.verb, more, self.exports.kind, less)
-            yield from self._apply(session, link, message)
-
-    def _apply(
-        self, session: PeerSession, link: PeerLink, message: Advertise | AdvertiseServices | SubscriptionChanges
-    ) -> Iterator[None]:
-        """Apply an advertisement, an entry with each item, while the link stands by which it came."""
-        for change in self.imports.changes(session.peer, message):
-            if session.link is not link or not session.linked:
-                return
-            self.imports.take_in(session.peer, *change, self.now())
-            yield
+            for change in self.imports.changes(session.peer, message):
+                if session.link is not link or not session.linked:
+                    return
+                self.imports.take_in(session.peer, *change, self.now())
+                yield
 
     @abstractmethod
     def _look_at(self, name: str) -> None:
