@@ -7,13 +7,12 @@ from collections.abc import Callable, Collection, Iterator
 from types import SimpleNamespace
 from typing import Any, Final, NamedTuple, cast
 
-from rmpa.bridge.context import BridgeContext, Names, ServiceRules
 from rmpa.bridge.data.export import ExportFlow, ExportRoute
 from rmpa.bridge.data.route import RouteBegin
 from rmpa.bridge.data.route_sender import RouteSender
 from rmpa.bridge.messages import Description, Message, Origin, RouteOpened, Source
 from rmpa.bridge.offers import PeerRun, PeerState
-from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
+from rmpa.bridge.policy import OPEN_GATE, BridgeContext, Names, PermissionGate, Policy, ServiceRules
 from rmpa.bridge.services import books
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.services.books import RemoteService

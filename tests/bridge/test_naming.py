@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.bridge.context import Names, PeerNames
+from rmpa.bridge.policy import Names, PeerNames
 from rmpa.config.peer_rules import PeerRule
 from rmpa.core.identity import Guid, Identity, proxied_node, proxy_name, proxy_prefix
 

@@ -13,11 +13,10 @@ import msgspec
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.context import Names
 from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, Source, decode, encode
 from rmpa.bridge.offers import PeerRun
 from rmpa.bridge.peer_offers import Heard, RelayPaths
-from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy, Relay
+from rmpa.bridge.policy import OPEN_GATE, Names, PermissionGate, Policy, Relay
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.config.peer_rules import PolicySettings

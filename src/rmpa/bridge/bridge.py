@@ -6,12 +6,11 @@ import logging
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
-from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.launch import Launcher
 from rmpa.bridge.log import ModuleLogs
 from rmpa.bridge.messages import decode, op_of
 from rmpa.bridge.nodes import ProxyKills
-from rmpa.bridge.policy import PermissionGate, Relay
+from rmpa.bridge.policy import BridgeContext, PermissionGate, Relay
 from rmpa.bridge.proxies import ProxyNodes
 from rmpa.bridge.recordings import Recordings
 from rmpa.bridge.rpc import PeerRpc

@@ -21,13 +21,12 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.direct.grants import Grants
     from rmpa.bridge.direct.paths import Paths
     from rmpa.bridge.messages import Message, Source
     from rmpa.bridge.offers import OfferBook
     from rmpa.bridge.peer_offers import ImportBook, Remote
-    from rmpa.bridge.policy import Place
+    from rmpa.bridge.policy import BridgeContext, Place
     from rmpa.bridge.sessions import PeerSession
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.master.parameters import GraphState

@@ -22,9 +22,9 @@ from rmpa.trust.permissions import PermissionDecision
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator, Mapping
 
-    from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.messages import Message
     from rmpa.bridge.peer_offers import Remote
+    from rmpa.bridge.policy import BridgeContext
     from rmpa.config.peer_rules import Access
 
 
