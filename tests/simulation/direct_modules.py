@@ -11,8 +11,8 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from rmpa.bridge.direct import grants
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
 from rmpa.bridge.direct.grants import TopicGrants
+from rmpa.bridge.direct.paths import Condition, Grant, Unmet
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import OPEN_GATE
 from rmpa.bridge.topics import direct as direct_importer

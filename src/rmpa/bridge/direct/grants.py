@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import (
+from rmpa.bridge.direct.paths import (
     Condition,
     DirectAsk,
     Grant,

@@ -12,17 +12,20 @@ from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import (
+from rmpa.bridge.direct.grants import end_all
+from rmpa.bridge.direct.paths import (
+    AGENTS,
+    LOST,
     Condition,
     Grant,
     Interruptions,
+    Path,
+    Paths,
     Unmet,
     Want,
     interrupted,
     unmet_by_rules,
 )
-from rmpa.bridge.direct.grants import end_all
-from rmpa.bridge.direct.paths import AGENTS, LOST, Path, Paths
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.topics.reports import compares_names
 from rmpa.core.contract import Contract, Transport

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from rmpa.bridge.data.quality import QosEventKind, shown_seconds
 from rmpa.bridge.data.route_sender import ReliableRouteSender
-from rmpa.bridge.direct.conditions import Condition, Want, unmet_by_contract
-from rmpa.bridge.direct.paths import AGENTS
+from rmpa.bridge.direct.paths import AGENTS, Condition, Want, unmet_by_contract
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import PolicyDecision
 from rmpa.config.rules import CLOCK

@@ -11,8 +11,8 @@ import pytest
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct import grants
-from rmpa.bridge.direct.conditions import Condition, DirectAsk, Grant, Unmet, Want
 from rmpa.bridge.direct.grants import NodePorts, ServiceGrants, TopicGrants
+from rmpa.bridge.direct.paths import Condition, DirectAsk, Grant, Unmet, Want
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import PermissionGate
 from rmpa.config.settings import TrustSettings
