@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
@@ -33,8 +32,6 @@ if TYPE_CHECKING:
     from rmpa.ros.core.external import Core
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.trust.permissions import Permissions
-
-_log = logging.getLogger(__name__)
 
 
 class Bridge:
