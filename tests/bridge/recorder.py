@@ -284,6 +284,7 @@ class NotedImports(topic_imports.Imports):
     def __init__(self, out: Out, position: Callable[[int, Source], tuple[int, int] | None]) -> None:
         super().__init__(cast("Any", out))
         self._noted, self._had = out, position
+        self._times: dict[RemoteTopic, float] = {}
 
     def _publish(self, entry: RemoteTopic) -> None:
         name = entry.name if entry.name != entry.wire.topic else ""
@@ -305,6 +306,23 @@ class NotedImports(topic_imports.Imports):
 
     def _position(self, entry: RemoteTopic) -> tuple[int, int] | None:
         return self._had(entry.peer, entry.wire)
+
+    def _wait(self, entry: RemoteTopic, until: float) -> None:
+        entry.until = until
+        self._times[entry] = until
+
+    def next_timer(self) -> float | None:
+        """When the first source is to be followed again."""
+        self._times = {entry: until for entry, until in self._times.items() if entry.until == until}
+        return min(self._times.values(), default=None)
+
+    def handle_timer(self, now: float) -> None:
+        """Follow those whose time has come, the first ones first."""
+        self.next_timer()
+        for entry, until in sorted(self._times.items(), key=lambda item: item[1]):
+            if until <= now and entry.until == until and entry.peer in self._peers:
+                del self._times[entry]
+                self.follow(entry, now)
 
 
 class PeerServiceRules(ServiceRules):

@@ -17,10 +17,9 @@ names; all arguments about the local graph use the names there (``bridge.proxies
 
 from __future__ import annotations
 
-import itertools
+import asyncio
 import math
 import sys
-from heapq import heappop, heappush
 from typing import TYPE_CHECKING, TypeVar
 
 from msgspec import UnsetType
@@ -67,7 +66,6 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     Attributes:
         _topics: The sources of each peer by their local topic (dicts, for their order).
         _ways: What the peers offer of each source (dicts, for their order).
-        _timers: A heap; an item that is not its source's time any more is skipped.
     """
 
     kind, access = "topics", Access.PUBLISH
@@ -78,8 +76,6 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         self._topics: dict[int, dict[str, dict[RemoteTopic, None]]] = {}
         self._ways: dict[StreamKey, dict[RemoteTopic, None]] = {}
         self._local_types: dict[str, str] = {}
-        self._timers: list[tuple[float, int, RemoteTopic]] = []
-        self._serials = itertools.count()
 
     def __iter__(self) -> Iterator[RemoteTopic]:
         """Every source as a peer offers it; changes during the iteration may be missed."""
@@ -505,26 +501,14 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         self._peers[peer].last_route += 1
         return self._peers[peer].last_route
 
-    def next_timer(self) -> float | None:
-        """When ``handle_timer`` is due, monotonic seconds; ``None`` if no timer runs."""
-        while self._timers:
-            until, _, entry = self._timers[0]
-            if entry.until == until and entry.peer in self._peers:
-                return until
-            heappop(self._timers)
-        return None
-
-    def handle_timer(self, now: float) -> None:
-        """Handle due timers, at most ``limits.APPLIED_AT_ONCE``; if some remain, ``next_timer`` is in the past."""
-        for _ in range(limits.APPLIED_AT_ONCE):
-            if (due := self.next_timer()) is None or due > now:
-                return
-            self.follow(heappop(self._timers)[2], now)
-
     def _wait(self, entry: RemoteTopic, until: float) -> None:
-        entry.until = until
-        heappush(self._timers, (until, next(self._serials), entry))
-        self._out.arm_timer()
+        """Follow a source again at a time, in a later turn of the loop, unless it waits for another time by then."""
+        entry.until, loop = until, asyncio.get_running_loop()
+        loop.call_at(max(until, loop.time()), self._waited, entry, until)
+
+    def _waited(self, entry: RemoteTopic, until: float) -> None:
+        if entry.until == until and entry.peer in self._peers:
+            self.follow(entry, max(until, self._out.now()))
 
     def _close(self, entry: RemoteTopic, *, missed: bool = False) -> None:
         """End a source's route in any state; ``missed``: local nodes still listen, and miss messages from now on."""
