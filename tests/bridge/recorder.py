@@ -349,7 +349,7 @@ def context(
     return BridgeContext(settings, policy, rules, names, contracts or Contracts(), gate)
 
 
-_STEPS: Final = {"advertise", "link_away", "reload", "gone"}
+_STEPS: Final = {"advertise", "reload", "gone"}
 """Methods whose work is done as their items are taken; in some books they do it at once."""
 
 
@@ -452,7 +452,7 @@ class Exports(Recorded):
     def link_away(self, peer: int) -> tuple[list[Any], bool]:
         """What is done, and whether a route waits."""
         self.gone_away(peer)
-        deque(self.book.link_away(peer), 0)
+        self.book.link_away(peer)
         return self.out.take(), self.book.outage(peer) > 0
 
     def flowing(self, source: Source) -> tuple[int, ...]:
@@ -500,7 +500,7 @@ class Imports(Recorded):
     def link_away(self, peer: int, *, briefly: bool = False) -> tuple[list[Any], bool]:
         """What is done, and whether a source waits."""
         self.gone_away(peer, silent=briefly)
-        deque(self.book.link_away(peer, briefly=briefly), 0)
+        self.book.link_away(peer, briefly=briefly)
         return self.out.take(), bool(self.book._peers[peer].entries)
 
     def demand(self, peer: int, source: Source, now: float, *, wanted: bool) -> list[Any]:

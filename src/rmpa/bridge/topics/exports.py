@@ -311,8 +311,8 @@ class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
         if (route := self.route(peer, message.route)) is not None:
             self._end_route(route)
 
-    def link_away(self, peer: int, *, briefly: bool = False) -> Iterator[None]:
-        """Suspend the reliable routes of a peer that may come back, and end its other routes, one with each item.
+    def link_away(self, peer: int, *, briefly: bool = False) -> None:
+        """Suspend the reliable routes of a peer that may come back, and end its other routes.
 
         With ``briefly`` the link fell silent, and all routes are suspended. A suspended route that the peer has not
         opened again over this link starts its outage anew.
@@ -324,7 +324,6 @@ class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
                 self._suspend(route)
             else:
                 self._end_route(route)
-            yield
 
     def _suspend(self, route: ExportRoute) -> None:
         """Keep the unacknowledged and all further messages of a route for an absent peer, for its outage."""

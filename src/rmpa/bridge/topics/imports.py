@@ -112,8 +112,8 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         """Whether any route is open."""
         return any(entry.open for known in self._peers.values() for entry in known.routes.values())
 
-    def link_away(self, peer: int, *, briefly: bool = False) -> Iterator[None]:
-        """Suspend the routes of a peer that may come back, and drop what does not outlive the link, one by one.
+    def link_away(self, peer: int, *, briefly: bool = False) -> None:
+        """Suspend the routes of a peer that may come back, and drop what does not outlive the link.
 
         Args:
             peer: The peer's number.
@@ -135,7 +135,6 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             entry.number, entry.open, entry.until, entry.problem = 0, False, None, "its peer is away"
             if not keep:
                 self._outlived(entry)
-            yield
 
     def waits_for(self, peer: int) -> bool:
         """Whether a source outlives the peer's link: one with a local listener that is reliable or latched."""

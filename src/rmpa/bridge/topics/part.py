@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.data.quality import shown_seconds
@@ -134,10 +134,10 @@ class Topics(GraphPart):
             self.bridge.counters.add("route.interrupted", interrupted)
         self.joins.link_down(peer)
         # Without a pause for data: among it could be the peer's new link, which must find all routes suspended.
-        deque(self.exports.link_away(peer, briefly=session.silent), 0)
+        self.exports.link_away(peer, briefly=session.silent)
         if session.silent:
             # Most silences end soon with a new link, so nothing leaves the local graph yet.
-            deque(self.imports.link_away(peer, briefly=True), 0)
+            self.imports.link_away(peer, briefly=True)
 
     def grace_over(self, session: PeerSession) -> bool:
         """Drop the peer's sources that do not outlive their link; return whether any route waits for the peer."""
@@ -145,7 +145,7 @@ class Topics(GraphPart):
         if not self.exports.outage(peer) and not self.imports.waits_for(peer):
             self.imports.detached(peer)
             return False
-        deque(self.imports.link_away(peer), 0)  # without a pause, as in ``link_down``
+        self.imports.link_away(peer)  # without a pause, as in ``link_down``
         longest = max(*self.imports.outages(peer), self.exports.outage(peer), 0.0)
         _log.info("= %s is away: its reliable topics wait for %s", session.link.name, shown_seconds(longest))
         return True
