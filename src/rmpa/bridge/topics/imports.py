@@ -141,14 +141,12 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         known = self._peers[peer]
         return any(entry.outlives(silent=known.session.silent) for entry in known.entries.values())
 
-    def outages(self, peer: int) -> set[float]:
-        """The outages, in seconds, of the sources that are kept for a peer."""
-        return {entry.outage for entry in self._peers[peer].entries.values()}
-
-    def outlasted(self, peer: int, seconds: float) -> None:
-        """Drop the sources whose outage is over: their peer has been away for ``seconds``."""
-        for entry in [one for one in self._peers[peer].entries.values() if one.outage <= seconds]:
+    def outlasted(self, peer: int, seconds: float) -> set[float]:
+        """Drop the sources whose outage a peer has been away for; return the outages of the others, in seconds."""
+        entries = self._peers[peer].entries
+        for entry in [one for one in entries.values() if one.outage <= seconds]:
             self._outlived(entry)
+        return {entry.outage for entry in entries.values()}
 
     def _outlived(self, entry: RemoteTopic) -> None:
         self._hand_over(entry)

@@ -146,15 +146,13 @@ class Topics(GraphPart):
             self.imports.detached(peer)
             return False
         self.imports.link_away(peer)  # without a pause, as in ``link_down``
-        longest = max(*self.imports.outages(peer), self.exports.outage(peer), 0.0)
+        longest = max({*self.imports.outlasted(peer, 0.0), self.exports.outage(peer)})
         _log.info("= %s is away: its reliable topics wait for %s", session.link.name, shown_seconds(longest))
         return True
 
     def outlasted(self, session: PeerSession, seconds: float) -> float | None:
         """Drop sources whose contract's ``outage`` is over; return the next outage that is longer, in seconds."""
-        peer = session.peer
-        self.imports.outlasted(peer, seconds)
-        outages = {*self.imports.outages(peer), self.exports.outage(peer)}
+        outages = {*self.imports.outlasted(session.peer, seconds), self.exports.outage(session.peer)}
         return min((outage for outage in outages if outage > seconds), default=None)
 
     def gone(self, session: PeerSession) -> None:
