@@ -159,7 +159,7 @@ class Bridge:
     def mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
         """Pass an acknowledgement, or the answer to a fence, to the route's sender."""
         session = self.sessions.of(link)
-        sender = self.topics.sender(session.peer, route) if session is not None else None
+        sender = self.topics.exports.sender(session.peer, route) if session is not None else None
         if sender is None:
             return
         if kind is FrameKind.ACK:

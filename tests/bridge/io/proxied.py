@@ -17,6 +17,13 @@ from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.publication import Publication
 
 
+class Unjoined(ImportRoute):
+    """A source whose publisher does not see further subscribers."""
+
+    def join(self, _connection: object) -> None:
+        """There is no publisher."""
+
+
 class Proxied:
     """A source of the peer *b*.
 
@@ -41,11 +48,8 @@ class Proxied:
             changed=lambda _entry: None,
             listeners_changed=lambda _peer, _source: None,
             request=lambda *_: None,
-            join=lambda *_: None,
         )
-        part: Any = SimpleNamespace(
-            imports=nothing, subscribers=nothing, direct_imports=nothing, joins=nothing, now=self.loop.time
-        )
+        part: Any = SimpleNamespace(imports=nothing, subscribers=nothing, direct_imports=nothing, now=self.loop.time)
         part.keep_awake = lambda: None
         part.warn = lambda kind, _who, _text: self.occurred.append((self.loop.time(), _kind(kind)))
         pasts: dict[Any, Any] = {}
@@ -58,7 +62,7 @@ class Proxied:
             peer=1, wire=source, name=source.topic, node=source.node, type=type_name, module=("", "b")
         )
         session = PeerSession(peer=1, name="b", link=link, proxies=self.proxies)
-        self.route = self.entry.route = ImportRoute(part, session, self.entry)
+        self.route = self.entry.route = Unjoined(part, session, self.entry)
 
     @property
     def flow(self) -> ImportFlow:

@@ -301,7 +301,6 @@ class World:
             bridge = side.bridge
             assert not bridge.topics.exports.flows
             assert not any(told.routes for told in bridge.topics.exports.peers.values())
-            assert not bridge.topics.joins._served
             assert not bridge.topics.exports._parked
             assert not bridge.topics.imports.flowing
             assert not any(entry.flow for entry in bridge.topics.imports)

@@ -141,10 +141,18 @@ class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
         return [flow.routes[peer] for flow in self.flows.values() if peer in flow.routes]
 
     def senders(self, peer: int) -> list[RouteSender]:
-        """The senders of the routes that a linked peer has open."""
+        """The senders of the routes that a linked peer has open, and of the subscribers that join them."""
         told = self.peers.get(peer)
-        routes = told.routes.values() if told is not None else ()
-        return [route.sender for route in routes if route.sender is not None]
+        routes = [route for route in told.routes.values() if route.sender is not None] if told is not None else []
+        joins = (join.own for route in routes for join in route.joins.values())
+        return [*(route.sender for route in routes if route.sender is not None), *joins]
+
+    def sender(self, peer: int, number: int) -> RouteSender | None:
+        """What sends on a route to a peer, which is a source's or a joining subscriber's."""
+        if (route := self.route(peer, number)) is not None:
+            return route.sender
+        joins = (route.joins.get(number) for route in self.of(peer))
+        return next((join.own for join in joins if join is not None), None)
 
     def description(self, source: Source) -> Description | None:
         """The header of a source's publisher, while the source is connected; else ``None``."""

@@ -13,6 +13,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.data.reception import ImportFlow
 from rmpa.bridge.messages import Source
 from rmpa.bridge.peer_offers import Remote
+from rmpa.bridge.topics.joins import join
 from rmpa.core.contract import Contract, Durability, Reliability
 from rmpa.core.identity import OWN_NODE, serial_add
 from rmpa.mesh import limits as mesh_limits
@@ -216,7 +217,7 @@ class ImportRoute(PublicationEvents):
 
     def join(self, connection: SubscriberConnection) -> Receiver | None:
         """The publisher may have something to say to it alone."""
-        return self._part.joins.join(self, connection)
+        return join(self._part, self, connection)
 
     def request(self, caller: str) -> Awaitable[RosReply | None] | None:
         """A subscriber may get a direct connection."""

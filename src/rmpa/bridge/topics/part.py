@@ -11,29 +11,31 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import OrderedDict
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.data.quality import shown_seconds
 from rmpa.bridge.direct.grants import TopicGrants
 from rmpa.bridge.graph_part import GraphPart
 from rmpa.bridge.messages import Audience, CloseRoute, Mismatch, OpenRoute, RouteClosed, RouteOpened
+from rmpa.bridge.policy import Needs
 from rmpa.bridge.topics.direct import TopicPaths
 from rmpa.bridge.topics.exports import Exports, local_sources
 from rmpa.bridge.topics.imports import Imports
-from rmpa.bridge.topics.joins import Joins
+from rmpa.bridge.topics.joins import JOIN, JoiningSubscriber, serve
 from rmpa.bridge.topics.reports import LossReports, Mismatches, RemoteSubscribers
 from rmpa.core.contract import Priority, Reliability
 from rmpa.core.identity import is_own
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.runtime.loop import yielding_to_data
+from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.quality import QosWatch
-    from rmpa.bridge.data.route_sender import RouteSender
     from rmpa.bridge.messages import Message, Source
     from rmpa.bridge.peer_offers import Remote
     from rmpa.bridge.policy import Place
@@ -57,7 +59,7 @@ class Topics(GraphPart):
         losses: Reports messages that do not reach their listeners.
         mismatches: Reports subscribers whose definition does not fit.
         subscribers: The names of subscribers, where publishers compare them.
-        joins: The joining subscribers.
+        tasks: Ask for joining subscribers.
         _pasts: By the name of a module: what is remembered of its reliable sources.
     """
 
@@ -74,16 +76,12 @@ class Topics(GraphPart):
         self.losses = LossReports(self)
         self.mismatches = Mismatches(self)
         self.subscribers = RemoteSubscribers(self)
-        self.joins = Joins(self)
+        self.tasks = OwnedTasks()
+        bridge.rpc.on_request(JOIN, partial(serve, self), Needs((), "a route that the peer has open"))
         self.direct_exports = TopicGrants(bridge, self.exports)
         self.direct_imports = TopicPaths(bridge, self.warn, self.imports)
         self.direct = self.direct_imports, self.direct_exports
         self._ticker: asyncio.TimerHandle | None = None
-
-    def sender(self, peer: int, number: int) -> RouteSender | None:
-        """What sends on a route to a peer, which is a source's or a joining subscriber's."""
-        route = self.exports.route(peer, number)
-        return route.sender if route is not None else self.joins.sender(peer, number)
 
     def watch(self, entry: RemoteTopic) -> QosWatch | None:
         """The watch of a peer's source, or that of the last flow of a reliable one."""
@@ -99,7 +97,7 @@ class Topics(GraphPart):
         await self.direct_imports.close()
         await self.direct_exports.ports.close()
         self.subscribers.close()
-        self.joins.close()
+        self.tasks.cancel()
         self.exports.close()
 
     def reload(self) -> None:
@@ -132,7 +130,9 @@ class Topics(GraphPart):
         # Those whose further losses cannot be counted.
         if interrupted := sum(flow.contract.reliability is not Reliability.RELIABLE for flow in flows):
             self.bridge.counters.add("route.interrupted", interrupted)
-        self.joins.link_down(peer)
+        for handler in list(session.link.routes.values()):
+            if isinstance(handler, JoiningSubscriber):
+                handler.release()
         # Without a pause for data: among it could be the peer's new link, which must find all routes suspended.
         self.exports.link_away(peer, briefly=session.silent)
         if session.silent:
@@ -178,7 +178,7 @@ class Topics(GraphPart):
         for flow in self.imports.flows(session.peer):
             if flow.contract.priority is not Priority.HIGH:
                 flow.torn()
-        for sender in [*self.exports.senders(session.peer), *self.joins.senders(session.peer)]:
+        for sender in self.exports.senders(session.peer):
             sender.lane_lost()
 
     def message(self, session: PeerSession, message: Message) -> bool:
