@@ -45,11 +45,10 @@ class Proxied:
         self.link = link
         nothing = SimpleNamespace(
             demand=lambda _entry, _now, wanted: self.demands.append(wanted),
-            changed=lambda _entry: None,
             listeners_changed=lambda _peer, _source: None,
             request=lambda *_: None,
         )
-        part: Any = SimpleNamespace(imports=nothing, subscribers=nothing, direct_imports=nothing, now=self.loop.time)
+        part: Any = SimpleNamespace(imports=nothing, direct_imports=nothing, now=self.loop.time)
         part.keep_awake = lambda: None
         part.warn = lambda kind, _who, _text: self.occurred.append((self.loop.time(), _kind(kind)))
         pasts: dict[Any, Any] = {}

@@ -40,9 +40,10 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.offers import TopicBook
 from rmpa.bridge.policy import Local
 from rmpa.bridge.topics.import_route import ImportRoute
+from rmpa.bridge.topics.reports import is_watched
 from rmpa.config.peer_rules import Access
 from rmpa.core.contract import Durability, combine
-from rmpa.core.identity import OWN_NODE, is_own
+from rmpa.core.identity import OWN_NODE, is_own, proxied_node, proxy_name
 from rmpa.core.limits import UINT32_MAX
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ResumeTable
@@ -55,8 +56,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from rmpa.bridge.data.route_sender import RouteSender
-    from rmpa.bridge.messages import Origin
+    from rmpa.bridge.messages import Audience, Origin
     from rmpa.bridge.policy import Relay
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.part import Topics
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.publication import Publication
@@ -318,6 +320,37 @@ class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
         """End a route that a peer closes; one that is not open is ignored, since both ends may close it at once."""
         if (route := self.route(peer, message.route)) is not None:
             self._end_route(route)
+
+    def named(self, session: PeerSession, message: Audience) -> None:
+        """Connect to a publisher for each listener that a peer names; ignored if the route was closed meanwhile."""
+        route = self.route(session.peer, message.route)
+        if route is None or (local := self.offered.get(route.source)) is None or not is_watched(local.type):
+            return
+        if self.description(route.source) is None:
+            return  # its publisher is not connected
+        topic, shown, most = route.source.topic, route.audience, limits.AUDIENCES_MAX
+        names = {name for node in message.nodes if (name := self.listener(session, node, topic))}
+        for name in shown.keys() - names:
+            shown.pop(name).close()
+        for name in sorted(names - shown.keys()):
+            if sum(len(one.audience) for one in self.of(session.peer)) >= most:
+                text = f"{session.link.name}: more than {most} of its nodes listen to actions here"
+                self._out.warn("audience.too_many", session.link.name, text)
+                break
+            _log.debug("> %s: %s listens", route.source, name)
+            sink = ExportFlow()  # to no peer: the bridge gets the messages by its own connection
+            shown[name] = PublisherConnection(topic, local.uri, name, on_message=sink.message, on_parts=sink)
+            shown[name].start()
+
+    def listener(self, session: PeerSession, node: str, topic: str) -> str:
+        """The local name of a peer's listener; empty for a proxy of a module that the peer may not speak for."""
+        whose = proxied_node(node)
+        if whose is None:
+            return proxy_name(session.proxies.prefix, node)
+        relay = session.link.name
+        if not any((o.name, via) == (whose[0], relay) for o, via in self._out.imports.ways):
+            return ""
+        return node if self._out.context.gate.admits(Access.SUBSCRIBE, whose[0], topic, relay=relay) else ""
 
     def link_away(self, peer: int, *, briefly: bool = False) -> None:
         """Suspend the reliable routes of a peer that may come back, and end its other routes.

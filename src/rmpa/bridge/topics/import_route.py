@@ -11,9 +11,10 @@ from msgspec import UnsetType
 
 from rmpa.bridge import limits
 from rmpa.bridge.data.reception import ImportFlow
-from rmpa.bridge.messages import Source
+from rmpa.bridge.messages import Audience, Source
 from rmpa.bridge.peer_offers import Remote
 from rmpa.bridge.topics.joins import join
+from rmpa.bridge.topics.reports import audience, is_watched
 from rmpa.core.contract import Contract, Durability, Reliability
 from rmpa.core.identity import OWN_NODE, serial_add
 from rmpa.mesh import limits as mesh_limits
@@ -147,11 +148,12 @@ class ImportRoute(PublicationEvents):
         flow: The flow of its route: the open one, or the one that outlived its link.
         on_open: Called when its route is open, where this module has to pass it on since before.
         _pasts, _key: Where its events are remembered.
+        _told: The listeners of which the publisher's agent was told on the route that is open.
     """
 
     __slots__ = (
-        "_bridge", "_key", "_owner", "_part", "_pasts", "_proxies", "entry", "flow", "node", "on_open", "publication",
-        "session", "topic",
+        "_bridge", "_key", "_owner", "_part", "_pasts", "_proxies", "_telling", "_told",
+        "entry", "flow", "node", "on_open", "publication", "session", "topic",
     )  # fmt: skip
 
     def __init__(self, part: Topics, session: PeerSession, entry: RemoteTopic) -> None:
@@ -163,6 +165,8 @@ class ImportRoute(PublicationEvents):
         self.publication: Publication | None = None
         self.flow: ImportFlow | None = None
         self.on_open: Callable[[], object] | None = None
+        self._told: tuple[str, ...] = ()
+        self._telling: asyncio.Handle | None = None
         self._proxies, self._owner = part.bridge.sessions.proxies(session, entry.node, entry.origin)
         self._proxies.hold(self._owner, self.topic, self.ready, self.left)
 
@@ -212,7 +216,7 @@ class ImportRoute(PublicationEvents):
 
     def listeners_changed(self) -> None:
         """The peer may have to know their names."""
-        self._part.subscribers.changed(self.entry)
+        self._tell_soon()
         self._part.direct_imports.listeners_changed(self.entry.peer, self.entry.wire)
 
     def join(self, connection: SubscriberConnection) -> Receiver | None:
@@ -252,7 +256,7 @@ class ImportRoute(PublicationEvents):
         """
         if (publication := self.publication) is None:
             return
-        contract, before = opened.contract, self.flow
+        contract, before, self._told = opened.contract, self.flow, ()
         reliable = contract.reliability is Reliability.RELIABLE
         past, missed_at = self._pasts.pop(self._key, (None, ""))
         if before is not None and before.contract.reliability is Reliability.RELIABLE:
@@ -284,7 +288,21 @@ class ImportRoute(PublicationEvents):
         if on_open is not None:
             on_open()
         self._part.keep_awake()
-        self._part.subscribers.changed(self.entry)
+        self._tell_soon()
+
+    def _tell_soon(self) -> None:
+        if self._telling is None and is_watched(self.entry.type):
+            # In the next turn: several changes become one message, and a listener's header is answered first.
+            self._telling = asyncio.get_running_loop().call_soon(self._tell)
+
+    def _tell(self) -> None:
+        """Tell the peer the names of the listeners, where they are others than it was told on this route."""
+        self._telling = None
+        if self.flow is not None and self.publication is not None and self.entry.open:
+            names = audience(self.publication.listeners)
+            if names != self._told:
+                self._told = names
+                self._part.send(self.entry.peer, Audience(self.entry.number, names))
 
     def _flow(self, opened: RouteOpened, publication: Publication, past: QosWatch | None) -> ImportFlow:
         """The flow of a newly opened route: the one that it had, or a new one."""

@@ -399,7 +399,7 @@ def serve(part: Topics, session: PeerSession, args: dict[str, Any]) -> int:
     flow = exports.flows[route.source]
     sender = RouteSender(session.link, own, Contract(history=History.KEEP_ALL), large=flow.large)
     served = route.joins[own] = ServedJoin(flow, route, route.sender, sender, session.link)
-    caller = part.subscribers.name(session, node, route.source.topic) or f"{session.proxies.prefix}/joins"
+    caller = part.exports.listener(session, node, route.source.topic) or f"{session.proxies.prefix}/joins"
     _log.debug("> %s: %s joins", route.source, caller)
     served.connection = exports.connection(
         route.source,

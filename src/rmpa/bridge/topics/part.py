@@ -23,7 +23,7 @@ from rmpa.bridge.topics.direct import TopicPaths
 from rmpa.bridge.topics.exports import Exports, local_sources
 from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.joins import JOIN, JoiningSubscriber, serve
-from rmpa.bridge.topics.reports import LossReports, Mismatches, RemoteSubscribers
+from rmpa.bridge.topics.reports import LossReports, Mismatches
 from rmpa.core.contract import Priority, Reliability
 from rmpa.core.identity import is_own
 from rmpa.mesh import limits as mesh_limits
@@ -58,7 +58,6 @@ class Topics(GraphPart):
     Attributes:
         losses: Reports messages that do not reach their listeners.
         mismatches: Reports subscribers whose definition does not fit.
-        subscribers: The names of subscribers, where publishers compare them.
         tasks: Ask for joining subscribers.
         _pasts: By the name of a module: what is remembered of its reliable sources.
     """
@@ -75,7 +74,6 @@ class Topics(GraphPart):
         self._pasts: OrderedDict[str, Pasts] = OrderedDict()
         self.losses = LossReports(self)
         self.mismatches = Mismatches(self)
-        self.subscribers = RemoteSubscribers(self)
         self.tasks = OwnedTasks()
         bridge.rpc.on_request(JOIN, partial(serve, self), Needs((), "a route that the peer has open"))
         self.direct_exports = TopicGrants(bridge, self.exports)
@@ -96,7 +94,6 @@ class Topics(GraphPart):
             self._ticker.cancel()
         await self.direct_imports.close()
         await self.direct_exports.ports.close()
-        self.subscribers.close()
         self.tasks.cancel()
         self.exports.close()
 
@@ -197,7 +194,7 @@ class Topics(GraphPart):
             case Mismatch():
                 self.mismatches.reported(peer, session.link.name, message)
             case Audience():
-                self.subscribers.named(session, message)
+                self.exports.named(session, message)
             case _:
                 return False
         return True

@@ -1,7 +1,7 @@
 """What modules tell each other of topics beside their messages.
 
 Definitions that do not fit, reliable messages that were given up, messages that are too long to cross: in the log,
-and to the agent at the other end. And the names of subscribers.
+and to the agent at the other end. And which subscribers are told by their names.
 
 Topics of actions are those whose publisher checks the names of its listeners, not only whether there are any. An
 actionlib client accepts a server (``wait_for_server``, ``waitForServer``) when the node that publishes the status
@@ -14,33 +14,26 @@ graph.
 from __future__ import annotations
 
 import asyncio
-import logging
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.data.export import ExportFlow
 from rmpa.bridge.data.quality import shown_seconds
-from rmpa.bridge.messages import Audience, Mismatch, Source, is_crossing_name
+from rmpa.bridge.messages import Mismatch, Source, is_crossing_name
 from rmpa.bridge.policy import Needs
-from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.identity import OWN_NODE, proxied_node, proxy_name
+from rmpa.core.identity import OWN_NODE
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros import limits as ros_limits
-from rmpa.ros.node.subscription import PublisherConnection
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from rmpa.bridge.data.export import ExportRoute
+    from rmpa.bridge.data.export import ExportFlow, ExportRoute
     from rmpa.bridge.offers import PeerRun
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.topics.import_route import RemoteTopic
     from rmpa.bridge.topics.part import Topics
-
-_log = logging.getLogger(__name__)
 
 # The notification that a publisher sends messages that are too long.
 OVERSIZED: Final = "message.oversized"
@@ -209,73 +202,3 @@ def audience(caller_ids: Iterable[str]) -> tuple[str, ...]:
     """
     names = {name for name in caller_ids if is_crossing_name(name) and name != OWN_NODE}
     return tuple(sorted(names)[: limits.AUDIENCE_MAX])
-
-
-class RemoteSubscribers:
-    """The names of listeners, sent and received, for all peers.
-
-    Args:
-        out: The part, which knows the routes of peers and the modules behind relays.
-    """
-
-    def __init__(self, out: Topics) -> None:
-        self._out = out
-        self._changed: dict[RemoteTopic, None] = {}
-        self._soon: asyncio.Handle | None = None
-
-    def changed(self, entry: RemoteTopic) -> None:
-        """Send our listeners of a peer's source again soon: they have changed, or its route was opened."""
-        if not is_watched(entry.type):
-            return
-        self._changed[entry] = None
-        if self._soon is None:
-            # In the next turn: several changes become one message, and a listener's header is answered first.
-            self._soon = asyncio.get_running_loop().call_soon(self._tell)
-
-    def _tell(self) -> None:
-        self._soon = None
-        changed, self._changed = self._changed, {}
-        for entry in changed:
-            if (flow := entry.flow) is None or entry.publication is None:
-                continue
-            names = audience(entry.publication.listeners)
-            if names != flow.told and entry.open:
-                flow.told = names
-                self._out.send(entry.peer, Audience(entry.number, names))
-
-    def named(self, session: PeerSession, message: Audience) -> None:
-        """Takes the listeners that a peer names for a route; ignored if the route was closed meanwhile."""
-        exports = self._out.exports
-        route = exports.route(session.peer, message.route)
-        if route is None or (local := exports.offered.get(route.source)) is None or not is_watched(local.type):
-            return
-        if exports.description(route.source) is None:
-            return  # its publisher is not connected
-        topic, shown, most = route.source.topic, route.audience, limits.AUDIENCES_MAX
-        names = {name for node in message.nodes if (name := self.name(session, node, topic))}
-        for name in shown.keys() - names:
-            shown.pop(name).close()
-        for name in sorted(names - shown.keys()):
-            if sum(len(one.audience) for one in exports.of(session.peer)) >= most:
-                text = f"{session.link.name}: more than {most} of its nodes listen to actions here"
-                self._out.warn("audience.too_many", session.link.name, text)
-                break
-            _log.debug("> %s: %s listens", route.source, name)
-            sink = ExportFlow()  # to no peer: the bridge gets the messages by its own connection
-            shown[name] = PublisherConnection(topic, local.uri, name, on_message=sink.message, on_parts=sink)
-            shown[name].start()
-
-    def name(self, session: PeerSession, node: str, topic: str) -> str:
-        """The local name of a peer's listener; empty for a proxy of a module that the peer may not speak for."""
-        whose = proxied_node(node)
-        if whose is None:
-            return proxy_name(session.proxies.prefix, node)
-        relay = session.link.name
-        if not any((o.name, via) == (whose[0], relay) for o, via in self._out.imports.ways):
-            return ""
-        return node if self._out.context.gate.admits(Access.SUBSCRIBE, whose[0], topic, relay=relay) else ""
-
-    def close(self) -> None:
-        """Tell nothing any more."""
-        if self._soon is not None:
-            self._soon.cancel()
