@@ -200,7 +200,6 @@ class Out:
         self.serving = self
         unlinked = SimpleNamespace(link=None, linked=False)
         self.bridge = SimpleNamespace(sessions=SimpleNamespace(get=lambda _: unlinked))
-        self.losses = SimpleNamespace(tell_oversized=lambda *_: None)
         self.direct_exports = SimpleNamespace(server_gone=lambda _: None)
         self.done: list[Any] = []
 

@@ -40,7 +40,7 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.offers import TopicBook
 from rmpa.bridge.policy import Local
 from rmpa.bridge.topics.import_route import ImportRoute
-from rmpa.bridge.topics.reports import is_watched
+from rmpa.bridge.topics.reports import is_watched, report_given_up, report_missed, report_oversized, tell_oversized
 from rmpa.config.peer_rules import Access
 from rmpa.core.contract import Durability, combine
 from rmpa.core.identity import OWN_NODE, is_own, proxied_node, proxy_name
@@ -239,7 +239,7 @@ class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
             on_header=lambda fields: self.described(source, _description(fields)),
             on_refused=lambda text: self._gone(source, flow, f"its publisher refuses: {text}"),
             on_lost=lambda reason: self._gone(source, flow, reason),
-            on_oversized=lambda size: self._out.losses.oversized(source, flow, size),
+            on_oversized=lambda size: report_oversized(self._out, source, flow, size),
         )
         flow.connection.start()
         return flow
@@ -311,10 +311,10 @@ class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
         if begin.resumed and route.sender is not None and route.position is not None:
             route.sender.resume(session.link, route.number, route.position[1])
             if isinstance(route.sender, ReliableRouteSender) and (missed := route.sender.missed()):
-                self._out.losses.missed(route, missed)
+                report_missed(self._out, route, missed)
         else:
             flow.add(route, session.link, begin)
-        self._out.losses.tell_oversized(route, flow)
+        tell_oversized(self._out, route, flow)
 
     def closed(self, peer: int, message: CloseRoute) -> None:
         """End a route that a peer closes; one that is not open is ignored, since both ends may close it at once."""
@@ -409,7 +409,7 @@ class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
                 and isinstance(route.sender, ReliableRouteSender)
                 and not isinstance(self.flows[route.source], RelayedFlow)
             }
-            self._out.losses.given_up(session, counts)
+            report_given_up(self._out, session, counts)
         for route in routes:
             self.given_up(route)
 

@@ -23,7 +23,7 @@ from rmpa.bridge.topics.direct import TopicPaths
 from rmpa.bridge.topics.exports import Exports, local_sources
 from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.joins import JOIN, JoiningSubscriber, serve
-from rmpa.bridge.topics.reports import LossReports, Mismatches
+from rmpa.bridge.topics.reports import OVERSIZED, Mismatches, oversized_there
 from rmpa.core.contract import Priority, Reliability
 from rmpa.core.identity import is_own
 from rmpa.mesh import limits as mesh_limits
@@ -56,7 +56,6 @@ class Topics(GraphPart):
         bridge: The core, the peers and the rules.
 
     Attributes:
-        losses: Reports messages that do not reach their listeners.
         mismatches: Reports subscribers whose definition does not fit.
         tasks: Ask for joining subscribers.
         _pasts: By the name of a module: what is remembered of its reliable sources.
@@ -72,10 +71,11 @@ class Topics(GraphPart):
     def __init__(self, bridge: Bridge) -> None:
         super().__init__(bridge, Exports, Imports)
         self._pasts: OrderedDict[str, Pasts] = OrderedDict()
-        self.losses = LossReports(self)
         self.mismatches = Mismatches(self)
         self.tasks = OwnedTasks()
         bridge.rpc.on_request(JOIN, partial(serve, self), Needs((), "a route that the peer has open"))
+        told = Needs((), "the peer's own topics; a text for the log")
+        bridge.rpc.on_notification(OVERSIZED, partial(oversized_there, self), told)
         self.direct_exports = TopicGrants(bridge, self.exports)
         self.direct_imports = TopicPaths(bridge, self.warn, self.imports)
         self.direct = self.direct_imports, self.direct_exports

@@ -13,14 +13,12 @@ graph.
 
 from __future__ import annotations
 
-import asyncio
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.data.quality import shown_seconds
 from rmpa.bridge.messages import Mismatch, Source, is_crossing_name
-from rmpa.bridge.policy import Needs
 from rmpa.config.rules import CLOCK
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import OWN_NODE
@@ -103,81 +101,72 @@ class Mismatches:
                 del self._texts[source]
 
 
-class LossReports:
-    """The reports of losses, sent and received, for all peers.
+def report_given_up(part: Topics, peer: PeerRun, counts: Mapping[Source, int]) -> None:
+    """Report that messages are not kept any more for an absent peer.
 
     Args:
-        out: The part, which knows the routes.
+        part: The part, which warns.
+        peer: The peer.
+        counts: By source: how many messages it misses until now.
     """
+    if not (count := sum(counts.values())):
+        return
+    name, seconds = peer.name, part.now() - peer.away_since
+    shown = ", ".join(map(str, islice(counts, _NAMED)))
+    if len(counts) > _NAMED:
+        shown += f" and {len(counts) - _NAMED} others"
+    text = f"{name} has been away for {shown_seconds(seconds)}: {count} messages for it are given up, of {shown} "
+    text += "(the contract's outage is for how long they are kept, "
+    text += f"at most {mesh_limits.RESUME_BYTES_MAX >> 20} MiB over all)"
+    part.bridge.counters.add("message.given_up", count)
+    part.bridge.counters.add("route.given_up", len(counts) - 1)
+    part.warn("route.given_up", name, text)
 
-    def __init__(self, out: Topics) -> None:
-        self._out = out
-        needs = Needs((), "the peer's own topics; a text for the log")
-        out.bridge.rpc.on_notification(OVERSIZED, self._oversized_there, needs)
 
-    def given_up(self, peer: PeerRun, counts: Mapping[Source, int]) -> None:
-        """Report that messages are not kept any more for an absent peer.
+def report_missed(part: Topics, route: ExportRoute, count: int) -> None:
+    """Report how many messages of a reliable source a peer that is back has missed."""
+    source, name = route.source, route.session.name
+    part.bridge.counters.add("message.given_up", count)
+    text = f"{source}: {name} has missed {count} messages: it was away for longer than they were kept"
+    part.warn("route.missed", f"{name} {source}", text)
 
-        Args:
-            peer: The peer.
-            counts: By source: how many messages it misses until now.
-        """
-        if not (count := sum(counts.values())):
-            return
-        name, seconds = peer.name, asyncio.get_running_loop().time() - peer.away_since
-        shown = ", ".join(map(str, islice(counts, _NAMED)))
-        if len(counts) > _NAMED:
-            shown += f" and {len(counts) - _NAMED} others"
-        text = f"{name} has been away for {shown_seconds(seconds)}: {count} messages for it are given up, of {shown} "
-        text += "(the contract's outage is for how long they are kept, "
-        text += f"at most {mesh_limits.RESUME_BYTES_MAX >> 20} MiB over all)"
-        self._out.bridge.counters.add("message.given_up", count)
-        self._out.bridge.counters.add("route.given_up", len(counts) - 1)
-        self._out.warn("route.given_up", name, text)
 
-    def missed(self, route: ExportRoute, count: int) -> None:
-        """Report how many messages of a reliable source a peer that is back has missed."""
-        source, name = route.source, route.session.name
-        self._out.bridge.counters.add("message.given_up", count)
-        text = f"{source}: {name} has missed {count} messages: it was away for longer than they were kept"
-        self._out.warn("route.missed", f"{name} {source}", text)
+def report_oversized(part: Topics, source: Source, flow: ExportFlow, size: int) -> None:
+    """Count a message that is too long, and report it in the log and to the peers to which its source flows."""
+    flow.oversized += 1
+    flow.oversized_bytes = size
+    text = f"{source}: a message of {size} bytes is left out, at most {ros_limits.TCPROS_MESSAGE_MAX} cross"
+    part.warn("message.oversized", str(source), f"{text}; others do: send it in parts, or compressed")
+    for route in flow.flowing:
+        tell_oversized(part, route, flow)
 
-    def oversized(self, source: Source, flow: ExportFlow, size: int) -> None:
-        """Count a message that is too long, and report it in the log and to the peers to which its source flows."""
-        flow.oversized += 1
-        flow.oversized_bytes = size
-        text = f"{source}: a message of {size} bytes is left out, at most {ros_limits.TCPROS_MESSAGE_MAX} cross"
-        self._out.warn("message.oversized", str(source), f"{text}; others do: send it in parts, or compressed")
-        for route in flow.flowing:
-            self.tell_oversized(route, flow)
 
-    def tell_oversized(self, route: ExportRoute, flow: ExportFlow) -> None:
-        """Report to one peer how many messages of a source were left out until now, if any."""
-        session, offer = self._out.bridge.sessions.get(route.peer), self._out.exports.offer(route.peer, route.source)
-        if flow.oversized and session is not None and session.linked and offer is not None:
-            told = {"topic": offer.topic, "node": offer.node, "count": flow.oversized, "size": flow.oversized_bytes}
-            self._out.bridge.rpc.notify(session, OVERSIZED, told)
+def tell_oversized(part: Topics, route: ExportRoute, flow: ExportFlow) -> None:
+    """Report to one peer how many messages of a source were left out until now, if any."""
+    session = part.bridge.sessions.get(route.peer) if flow.oversized else None
+    if session is not None and session.linked and (offer := part.exports.offer(route.peer, route.source)) is not None:
+        told = {"topic": offer.topic, "node": offer.node, "count": flow.oversized, "size": flow.oversized_bytes}
+        part.bridge.rpc.notify(session, OVERSIZED, told)
 
-    def _oversized_there(self, session: PeerSession, args: dict[str, Any]) -> None:
-        """Takes a peer's report of messages that it left out.
 
-        Raises:
-            RemoteProtocolError: The report names no source, or no numbers above 0.
-        """
-        match args:
-            case {"topic": str(topic), "node": str(node), "count": int(count), "size": int(size)} if (
-                min(count, size) > 0
-            ):
-                source = Source(topic, node)
-            case _:
-                raise RemoteProtocolError(f"{OVERSIZED} names no source, or no number of messages")
-        entry = self._out.imports.get(session.peer, source)
-        flow = entry.flow if entry is not None else None
-        if flow is not None and (count, size) != (flow.oversized, flow.oversized_bytes):
-            flow.oversized, flow.oversized_bytes = count, size
-            who = f"{session.link.name}: {source}"
-            text = f"{who}: its messages of {size} bytes are too long to cross and are left out ({count} until now)"
-            self._out.warn("message.oversized_there", who, text)
+def oversized_there(part: Topics, session: PeerSession, args: dict[str, Any]) -> None:
+    """Take a peer's report of messages that it left out.
+
+    Raises:
+        RemoteProtocolError: The report names no source, or no numbers above 0.
+    """
+    match args:
+        case {"topic": str(topic), "node": str(node), "count": int(count), "size": int(size)} if min(count, size) > 0:
+            source = Source(topic, node)
+        case _:
+            raise RemoteProtocolError(f"{OVERSIZED} names no source, or no number of messages")
+    entry = part.imports.get(session.peer, source)
+    flow = entry.flow if entry is not None else None
+    if flow is not None and (count, size) != (flow.oversized, flow.oversized_bytes):
+        flow.oversized, flow.oversized_bytes = count, size
+        who = f"{session.link.name}: {source}"
+        text = f"{who}: its messages of {size} bytes are too long to cross and are left out ({count} until now)"
+        part.warn("message.oversized_there", who, text)
 
 
 def is_watched(type_name: str) -> bool:
