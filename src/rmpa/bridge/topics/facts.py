@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.export import ExportRoute
-    from rmpa.bridge.data.quality import QosWatch, QualitySummary
+    from rmpa.bridge.data.quality import QosWatch
     from rmpa.bridge.offers import PeerRun
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
@@ -168,7 +168,7 @@ class TopicFacts:
                 "late": flow.counts["late"] + flow.counts["stale"],
                 "expired": flow.counts["expired"],
                 "lane": flow.lane,
-                **_quality(flow.quality.summary(session.clocks, now, latching=latched)),
+                **flow.quality.summary(session.clocks, now, latching=latched)._asdict(),
             }
         return RouteInfo(
             peer=session.link.name,
@@ -425,14 +425,6 @@ def _transport_name(*, direct: bool, relayed: bool) -> str:
     if direct:
         return "both" if relayed else "direct"
     return "relay" if relayed else ""
-
-
-def _quality(quality: QualitySummary) -> dict[str, Any]:
-    """The fields of a route that its quality gives; bytes without TCPROS's length fields."""
-    known = quality._asdict() | {"bytes": quality.bytes - LENGTH.size * quality.messages}
-    if quality.bandwidth is not None and quality.rate is not None:
-        known["bandwidth"] = quality.bandwidth - LENGTH.size * quality.rate
-    return known | {"period": quality.period if quality.period.count else None}
 
 
 def _events(watch: QosWatch | None, now: float) -> dict[str, Any]:
