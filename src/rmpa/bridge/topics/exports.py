@@ -145,9 +145,9 @@ class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
     def senders(self, peer: int) -> list[RouteSender]:
         """The senders of the routes that a linked peer has open, and of the subscribers that join them."""
         told = self.peers.get(peer)
-        routes = [route for route in told.routes.values() if route.sender is not None] if told is not None else []
-        joins = (join.own for route in routes for join in route.joins.values())
-        return [*(route.sender for route in routes if route.sender is not None), *joins]
+        routes = told.routes.values() if told is not None else ()
+        own = [route.sender for route in routes if route.sender is not None]
+        return own + [join.own for route in routes for join in route.joins.values()]
 
     def sender(self, peer: int, number: int) -> RouteSender | None:
         """What sends on a route to a peer, which is a source's or a joining subscriber's."""
