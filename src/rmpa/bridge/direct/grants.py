@@ -168,13 +168,10 @@ class Grants(ABC):
         if isinstance(before, Grant) == isinstance(found, Grant):
             return
         if isinstance(found, Grant):
-            self._interrupted(session, want, lasts=False)
+            interrupted(self.interruptions, session, want, lasts=False)
         for peer, entries in list(self._asked.items()) if isinstance(before, Grant) else ():
             if peer != session.peer and want in entries and isinstance(entries[want][2], Unmet):
                 self._tell(entries[want][0], want)  # perhaps it was refused because of the user's name
-
-    def _interrupted(self, session: PeerSession, want: Want, *, lasts: bool) -> None:
-        interrupted(self.interruptions, session.link.name, want, asyncio.get_running_loop().time(), lasts=lasts)
 
     def _again(self, which: Callable[[Want], bool]) -> None:
         """Let peers ask again: something has changed."""
@@ -347,7 +344,7 @@ class TopicGrants(Grants):
         """As of ``Grants``."""
         for peer, want, _ in self if not session.link.crashed else ():
             if peer == session.peer:
-                self._interrupted(session, want, lasts=True)
+                interrupted(self.interruptions, session, want, lasts=True)
         super().link_down(session)
 
     def _uri(self, want: Want) -> str:

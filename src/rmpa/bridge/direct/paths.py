@@ -244,8 +244,9 @@ def reply_of(found: Grant | Unmet) -> dict[str, object]:
 Interruptions = dict[tuple[str, Want], tuple[int, float, float | None]]
 
 
-def interrupted(known: Interruptions, peer: str, want: Want, now: float, *, lasts: bool) -> None:
+def interrupted(known: Interruptions, session: PeerSession, want: Want, *, lasts: bool) -> None:
     """Note that a path is gone (``lasts``), or that a subscriber has one again, direct or relayed."""
+    peer, now = session.link.name, asyncio.get_running_loop().time()
     count, began, ended = known.pop((peer, want), (0, now, now))
     if lasts and ended is not None:
         count, began, ended = count + 1, now, None

@@ -277,12 +277,9 @@ class TopicPaths(Paths["RemoteTopic"]):
     def _put(self, path: TopicPath, place: tuple[str, int], at: float | None = None) -> None:
         """Note where a subscriber is now; one that is lost is interrupted until it is somewhere again."""
         path.place, path.placed_at = place, self._now() if at is None else at
-        self._interrupted(path, lasts=place is LOST)
+        interrupted(self.interruptions, path.session, path.want, lasts=place is LOST)
         self._place(path)
         self._watch()
-
-    def _interrupted(self, path: TopicPath, *, lasts: bool) -> None:
-        interrupted(self.interruptions, path.session.link.name, path.want, self._now(), lasts=lasts)
 
     def listeners_changed(self, peer: int, source: Source) -> None:
         """Note which subscribers have left the proxy of a source, or have come back to it by themselves."""
@@ -307,7 +304,7 @@ class TopicPaths(Paths["RemoteTopic"]):
             if path.endpoint is not None and session.link.crashed:
                 path.entry.direct = True
             elif path.endpoint is not None:
-                self._interrupted(path, lasts=True)
+                interrupted(self.interruptions, session, path.want, lasts=True)
         super().link_down(session)
 
     def gone(self, session: PeerSession) -> None:
@@ -345,7 +342,7 @@ class TopicPaths(Paths["RemoteTopic"]):
 
     def _decided(self, path: TopicPath) -> None:
         if path.endpoint == path.target is not None:
-            self._interrupted(path, lasts=False)
+            interrupted(self.interruptions, path.session, path.want, lasts=False)
         self._place(path)
         self._watch()
 
