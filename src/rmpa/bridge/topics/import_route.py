@@ -227,11 +227,6 @@ class ImportRoute(PublicationEvents):
         """A subscriber may get a direct connection."""
         return self._part.direct_imports.request(self.entry.peer, self.entry.wire, caller)
 
-    @property
-    def watch(self) -> QosWatch | None:
-        """The watch of its flow, or of the last one of a reliable source."""
-        return self.flow.watch if self.flow is not None else self._pasts.get(self._key, (None, ""))[0]
-
     def _occurred(self, event: QosEvent) -> None:
         who, text = (
             f"{self.entry.peer} {self.entry.wire}",

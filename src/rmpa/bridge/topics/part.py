@@ -83,8 +83,8 @@ class Topics(GraphPart):
 
     def watch(self, entry: RemoteTopic) -> QosWatch | None:
         """The watch of a peer's source, or that of the last flow of a reliable one."""
-        if entry.route is not None:
-            return entry.route.watch
+        if entry.flow is not None:
+            return entry.flow.watch
         return self._pasts.get(entry.module[1], {}).get(entry.past, (None, ""))[0]
 
     async def close(self) -> None:
