@@ -97,7 +97,8 @@ class ExportRoute:
 
     def dismiss(self) -> None:
         """Close what stands for single subscribers of the peer."""
-        for one in (*self.audience.values(), *self.joins.values()):
+        standing: list[TopicConnection | ServedJoin] = [*self.audience.values(), *self.joins.values()]
+        for one in standing:
             one.close()
         self.audience.clear()
 
