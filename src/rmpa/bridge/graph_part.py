@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, SubscriptionChanges, decode, encode
-from rmpa.bridge.offers import Effects
+from rmpa.bridge.peer_offers import ImportEffects
 from rmpa.bridge.sessions import Part, guarded
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.log import RefusalLog, logged_failure
@@ -48,7 +48,7 @@ def go_on(queue: deque[Any]) -> None:
         queue.popleft()
 
 
-class GraphPart(Part, Effects):
+class GraphPart(Part, ImportEffects):
     """Offers to peers what the local graph has, and shows in it what they offer.
 
     A graph of thousands of names must not delay a message. Names to look at, advertisements to apply and entries to
@@ -107,21 +107,21 @@ class GraphPart(Part, Effects):
             self._scan_handle.cancel()
 
     def send(self, peer: int, message: Message) -> None:
-        """As of ``Effects``."""
+        """As of ``ImportEffects``."""
         session = self.bridge.sessions.get(peer)
         if session is not None and session.linked:
             session.link.send_control(encode(message))
 
     def warn(self, kind: str, who: str, text: str) -> None:
-        """As of ``Effects``."""
+        """As of ``ImportEffects``."""
         self.refusals.refuse(self.now(), kind, who, text)
 
     def arm_timer(self) -> None:
-        """As of ``Effects``."""
+        """As of ``ImportEffects``."""
         self._timer.arm()
 
     def path_changed(self, entry: Remote[Any]) -> None:
-        """As of ``Effects``."""
+        """As of ``ImportEffects``."""
         if entry.shown:
             self.pass_on(entry)
             self.look((entry.name,))

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator, Mapping
 
     from rmpa.bridge.messages import Message
-    from rmpa.bridge.peer_offers import Remote
     from rmpa.bridge.policy import BridgeContext
     from rmpa.config.peer_rules import Access
 
@@ -102,14 +101,6 @@ class Effects(ABC):
     @abstractmethod
     def warn(self, kind: str, who: str, text: str) -> None:
         """Log a warning about ``who`` and count it as ``kind``; repeated ones are only counted."""
-
-    @abstractmethod
-    def arm_timer(self) -> None:
-        """Look at ``ImportBook.next_timer`` again."""
-
-    @abstractmethod
-    def path_changed(self, entry: Remote[Any]) -> None:
-        """Offer what is relayed with the path that it has now."""
 
 
 KeyT = TypeVar("KeyT", bound="Hashable")

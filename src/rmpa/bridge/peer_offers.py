@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge.offers import KeyT, OfferT, wire_of
+from rmpa.bridge.offers import Effects, KeyT, OfferT, wire_of
 from rmpa.core.facts import CROWDED, DENIED
 from rmpa.mesh import limits as mesh_limits
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
 
     from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, SubscriptionChanges
-    from rmpa.bridge.offers import Effects, PeerRun
+    from rmpa.bridge.offers import PeerRun
     from rmpa.bridge.policy import PolicyDecision
     from rmpa.config.peer_rules import Access
     from rmpa.trust.permissions import PermissionDecision
@@ -131,6 +131,18 @@ def _is_same(entry: Remote[Any], offer: Any) -> bool:
     if one is not None and other is not None:
         one = msgspec.structs.replace(one, guid=other.guid, path=other.path)
     return entry.node == offer.node and one == other and entry.type == getattr(offer, "type", None)
+
+
+class ImportEffects(Effects):
+    """What a part does for what peers offer, likewise."""
+
+    @abstractmethod
+    def arm_timer(self) -> None:
+        """Look at ``ImportBook.next_timer`` again."""
+
+    @abstractmethod
+    def path_changed(self, entry: Remote[Any]) -> None:
+        """Offer what is relayed with the path that it has now."""
 
 
 class RelayPaths:
@@ -259,7 +271,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
     kind: ClassVar[str]
     access: ClassVar[Access]
 
-    def __init__(self, out: Effects) -> None:
+    def __init__(self, out: ImportEffects) -> None:
         self._out = out
         self._peers: dict[int, Heard[KeyT, EntryT, OfferT]] = {}
         self.ways = RelayPaths(self._peers, out.context.gate.may_relay)

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.reception import ImportFlow
     from rmpa.bridge.messages import Description, Source
     from rmpa.bridge.offers import PeerRun
-    from rmpa.bridge.topics.joins import ServedJoin
     from rmpa.core.outbox import QueuedMessage
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
@@ -73,7 +72,7 @@ class ExportRoute:
     shared: bool = False
     sender: RouteSender | None = None
     audience: dict[str, TopicConnection] = field(default_factory=dict)
-    joins: dict[int, ServedJoin] = field(default_factory=dict)
+    joins: dict[int, FlowSender] = field(default_factory=dict)
 
     @property
     def peer(self) -> int:
@@ -97,7 +96,7 @@ class ExportRoute:
 
     def dismiss(self) -> None:
         """Close what stands for single subscribers of the peer."""
-        standing: list[TopicConnection | ServedJoin] = [*self.audience.values(), *self.joins.values()]
+        standing: list[TopicConnection | FlowSender] = [*self.audience.values(), *self.joins.values()]
         for one in standing:
             one.close()
         self.audience.clear()

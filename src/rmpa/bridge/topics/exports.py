@@ -40,6 +40,7 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.offers import TopicBook
 from rmpa.bridge.policy import Local
 from rmpa.bridge.topics.import_route import ImportRoute
+from rmpa.bridge.topics.joins import ServedJoin
 from rmpa.bridge.topics.reports import is_watched, report_given_up, report_missed, report_oversized, tell_oversized
 from rmpa.config.peer_rules import Access
 from rmpa.core.contract import Durability, combine
@@ -147,14 +148,15 @@ class Exports(TopicBook[LocalSource, TopicOffer, ExportRoute]):
         told = self.peers.get(peer)
         routes = told.routes.values() if told is not None else ()
         own = [route.sender for route in routes if route.sender is not None]
-        return own + [join.own for route in routes for join in route.joins.values()]
+        joins = (join for route in routes for join in route.joins.values())
+        return own + [join.own for join in joins if isinstance(join, ServedJoin)]
 
     def sender(self, peer: int, number: int) -> RouteSender | None:
         """What sends on a route to a peer, which is a source's or a joining subscriber's."""
         if (route := self.route(peer, number)) is not None:
             return route.sender
         joins = (route.joins.get(number) for route in self.of(peer))
-        return next((join.own for join in joins if join is not None), None)
+        return next((join.own for join in joins if isinstance(join, ServedJoin)), None)
 
     def description(self, source: Source) -> Description | None:
         """The header of a source's publisher, while the source is connected; else ``None``."""

@@ -14,7 +14,7 @@ from rmpa.bridge.data.reception import ImportFlow
 from rmpa.bridge.messages import Audience, Source
 from rmpa.bridge.peer_offers import Remote
 from rmpa.bridge.topics.joins import join
-from rmpa.bridge.topics.reports import audience, is_watched
+from rmpa.bridge.topics.reports import audience, compares_names, is_watched
 from rmpa.core.contract import Contract, Durability, Reliability
 from rmpa.core.identity import OWN_NODE, serial_add
 from rmpa.mesh import limits as mesh_limits
@@ -221,7 +221,10 @@ class ImportRoute(PublicationEvents):
 
     def join(self, connection: SubscriberConnection) -> Receiver | None:
         """The publisher may have something to say to it alone."""
-        return join(self._part, self, connection)
+        flow, publication = self.flow, self.publication
+        if flow is None or publication is None or compares_names(self.entry.type):
+            return None  # clients of actions are seen by their names
+        return join(self._part, self.session, publication, flow, connection)
 
     def request(self, caller: str) -> Awaitable[RosReply | None] | None:
         """A subscriber may get a direct connection."""

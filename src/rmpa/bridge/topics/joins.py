@@ -25,7 +25,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits, messages
 from rmpa.bridge.data.route_sender import RouteSender
-from rmpa.bridge.topics.reports import compares_names
 from rmpa.core.contract import Contract, History
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_later, serial_add
@@ -39,7 +38,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.export import ExportFlow, ExportRoute
     from rmpa.bridge.data.reception import ImportFlow
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.topics.import_route import ImportRoute
     from rmpa.bridge.topics.part import Topics
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.node.publication import Publication, SubscriberConnection
@@ -352,20 +350,16 @@ class JoiningSubscriber:
             self._publication.joined(self._connection)
 
 
-def join(part: Topics, route: ImportRoute, connection: SubscriberConnection) -> JoiningSubscriber | None:
-    """Let the publisher see a new subscriber of an open route here; ``None`` if that is not possible.
-
-    Clients of actions are seen by their names.
-    """
-    flow, session, publication = route.flow, route.session, route.publication
-    if flow is None or publication is None or not session.linked or compares_names(route.entry.type):
-        return None
-    if flow.contract.max_rate is not None:
+def join(
+    part: Topics, session: PeerSession, publication: Publication, flow: ImportFlow, connection: SubscriberConnection
+) -> JoiningSubscriber | None:
+    """Let the publisher see a new subscriber of an open route here; ``None`` if that is not possible."""
+    if not session.linked or flow.contract.max_rate is not None:
         return None
     own = part.imports.next_route(session.peer)
     joining = JoiningSubscriber(connection, publication, flow, session.link, own)
     args = {"route": flow.route, "own": own, "node": connection.caller_id}
-    part.tasks.start(_ask(part, session, joining, args), f"join {route.topic}")
+    part.tasks.start(_ask(part, session, joining, args), f"join {publication.topic}")
     return joining
 
 
