@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import Condition
+from rmpa.bridge.direct.paths import Condition
 from rmpa.bridge.policy import Needs
 from rmpa.config.settings import ServiceSettings
 from rmpa.core.contract import Transport

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from types import SimpleNamespace
 from typing import Any, Final, NamedTuple, cast
 
-from rmpa.bridge.context import BridgeContext, Names, ServiceRules
 from rmpa.bridge.data.export import ExportFlow, ExportRoute
 from rmpa.bridge.data.route import RouteBegin
+from rmpa.bridge.data.route_sender import RouteSender
 from rmpa.bridge.messages import Description, Message, Origin, RouteOpened, Source
-from rmpa.bridge.peer import PeerRun, PeerState
-from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
+from rmpa.bridge.offers import PeerRun, PeerState
+from rmpa.bridge.policy import OPEN_GATE, BridgeContext, Names, PermissionGate, Policy, ServiceRules
 from rmpa.bridge.services import books
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.services.books import RemoteService
@@ -171,26 +170,10 @@ class ForgetAbout(NamedTuple):
     service: str
 
 
-def _detached(entry: RemoteTopic, **how: Any) -> Detach:
-    return Detach(entry.peer, entry.wire, entry.number, **how)
-
-
-def _described(entry: RemoteTopic, opened: RouteOpened) -> Describe:
-    terms = (opened.contract, opened.epoch, opened.first)
-    return Describe(entry.peer, entry.wire, opened.route, opened.description, *terms)
-
-
 _EFFECTS: Final[dict[str, Callable[..., Any]]] = {
     "send": Send,
     "warn": Warn,
-    "disconnect": lambda source, _flow: Disconnect(source),
-    "suspend": lambda r: SuspendRoute(r.source, r.peer, r.outage),
-    "publish": lambda e: Publish(e.peer, e.wire, e.type, e.name if e.name != e.wire.topic else "", e.origin),
-    "retract": lambda e: Retract(e.peer, e.wire),
-    "moved": lambda old, new: Moved(old.peer, old.wire, new.peer, new.wire, new.origin),
     "path_changed": lambda e: PathChanged(e.peer, e.wire, e.origin),
-    "describe": _described,
-    "detach": _detached,
     "probe": Probe,
     "serve": lambda peer, n, r, server: ServeRoute(peer, n, r.requests, r.service, server, r.timeout),
     "end_route": EndRoute,
@@ -211,31 +194,14 @@ class Out:
         self,
         context: BridgeContext,
         rng: Callable[[], float] = lambda: 1.0,
-        position: Callable[[int, Source], tuple[int, int] | None] = lambda *_: None,
-        last: int | None = None,
     ) -> None:
         self.context = context
         self.rng = rng
-        self.outbound = self.serving = self
+        self.serving = self
+        unlinked = SimpleNamespace(link=None, linked=False)
+        self.bridge = SimpleNamespace(sessions=SimpleNamespace(get=lambda _: unlinked))
         self.direct_exports = SimpleNamespace(server_gone=lambda _: None)
         self.done: list[Any] = []
-        self._epochs = itertools.count(1)
-        self._last = last
-        self._position = position
-
-    def connect(self, source: Source, uri: str) -> ExportFlow:
-        self.done.append(Connect(source, uri))
-        return ExportFlow(uri, lambda: next(self._epochs))
-
-    def begin(self, _flow: ExportFlow, route: ExportRoute, begin: RouteBegin) -> None:
-        after = route.position[1] if route.position is not None and begin.goes_on else None
-        self.done.append(AddRoute(route.source, route.peer, route.number, route.contract, begin.epoch, after))
-        contract, last = route.contract, self._last
-        route.sender = cast("Any", SimpleNamespace(epoch=begin.epoch, contract=contract, following=0, last=last))
-
-    def end(self, _flow: ExportFlow, route: ExportRoute) -> None:
-        self.done.append(RemoveRoute(route.source, route.peer, route.number))
-        route.sender = None
 
     def take(self) -> list[Any]:
         """What was done since the last call."""
@@ -245,12 +211,117 @@ class Out:
     def arm_timer(self) -> None:
         """Tests ask for the time."""
 
-    def position(self, entry: RemoteTopic) -> tuple[int, int] | None:
-        return self._position(entry.peer, entry.wire)
-
     def __getattr__(self, name: str) -> Any:
         effect = _EFFECTS[name]
         return lambda *args, **how: self.done.append(effect(*args, **how))
+
+
+class NotedFlow(ExportFlow):
+    """A connected source: on which routes it is sent is written down."""
+
+    def __init__(self, uri: str, new_epoch: Callable[[], int], out: Out, last: int | None) -> None:
+        super().__init__(uri, new_epoch)
+        self._out, self._last = out, last
+
+    def add(self, route: ExportRoute, _link: object, begin: RouteBegin | None = None) -> RouteSender:
+        assert begin is not None
+
+        def noted(*_: object) -> None:
+            after = route.position[1] if route.position is not None and begin.goes_on else None
+            self._out.done.append(
+                AddRoute(route.source, route.peer, route.number, route.contract, begin.epoch, after)
+            )
+
+        terms = {"epoch": begin.epoch, "contract": route.contract, "following": 0, "last": self._last}
+        sender = route.sender = cast("Any", SimpleNamespace(**terms, resume=noted))
+        noted()
+        return cast("RouteSender", sender)
+
+    def remove(self, route: ExportRoute) -> None:
+        self._out.done.append(RemoveRoute(route.source, route.peer, route.number))
+        route.sender = None
+
+
+class NotedExports(topic_exports.Exports):
+    """Exports whose work at the local graph is written down."""
+
+    def __init__(self, out: Out, last: int | None) -> None:
+        super().__init__(cast("Any", out))
+        self._noted, self._last = out, last
+
+    def _connect(self, source: Source, uri: str) -> ExportFlow:
+        self._noted.done.append(Connect(source, uri))
+        return NotedFlow(uri, self._new_epoch, self._noted, self._last)
+
+    def _disconnect(self, source: Source, flow: ExportFlow) -> None:
+        self._noted.done.append(Disconnect(source))
+
+    def _leaves(self, _key: Source) -> bool:
+        return False  # nothing is on its way of a publisher that has gone
+
+    def _suspend(self, route: ExportRoute) -> None:
+        self._noted.done.append(SuspendRoute(route.source, route.peer, route.outage))
+
+
+class NotedRoute:
+    """A source in the local graph: what opens its route is written down."""
+
+    flow = publication = node = None
+
+    def __init__(self, out: Out, entry: RemoteTopic) -> None:
+        self._out, self.entry = out, entry
+
+    def open(self, opened: RouteOpened) -> None:
+        terms = (opened.contract, opened.epoch, opened.first)
+        entry, about = self.entry, opened.description
+        self._out.done.append(Describe(entry.peer, entry.wire, opened.route, about, *terms))
+
+
+class NotedImports(topic_imports.Imports):
+    """Imports whose work at the local graph is written down."""
+
+    def __init__(self, out: Out, position: Callable[[int, Source], tuple[int, int] | None]) -> None:
+        super().__init__(cast("Any", out))
+        self._noted, self._had = out, position
+        self._times: dict[RemoteTopic, float] = {}
+
+    def _publish(self, entry: RemoteTopic) -> None:
+        name = entry.name if entry.name != entry.wire.topic else ""
+        self._noted.done.append(Publish(entry.peer, entry.wire, entry.type, name, entry.origin))
+        entry.route = cast("Any", NotedRoute(self._noted, entry))
+
+    def _unpublish(self, entry: RemoteTopic) -> None:
+        self._noted.done.append(Retract(entry.peer, entry.wire))
+        entry.route = None
+
+    def _carry(self, old: RemoteTopic, new: RemoteTopic) -> None:
+        self._noted.done.append(Moved(old.peer, old.wire, new.peer, new.wire, new.origin))
+        route = old.route
+        assert route is not None
+        old.route, new.route, route.entry = None, route, new
+
+    def _detach(self, entry: RemoteTopic, **how: Any) -> None:
+        self._noted.done.append(Detach(entry.peer, entry.wire, entry.number, **how))
+
+    def _position(self, entry: RemoteTopic) -> tuple[int, int] | None:
+        return self._had(entry.peer, entry.wire)
+
+    def _wait(self, entry: RemoteTopic, until: float) -> None:
+        entry.until = until
+        self._times[entry] = until
+
+    def next_timer(self) -> float | None:
+        """When the first source is to be followed again."""
+        self._times = {entry: until for entry, until in self._times.items() if entry.until == until}
+        return min(self._times.values(), default=None)
+
+    def handle_timer(self, now: float) -> None:
+        """Follow those whose time has come, the first ones first."""
+        self.next_timer()
+        for entry, until in sorted(self._times.items(), key=lambda item: item[1]):
+            if until <= now and entry.until == until and entry.peer in self._peers:
+                del self._times[entry]
+                self.follow(entry, now)
 
 
 class PeerServiceRules(ServiceRules):
@@ -277,7 +348,7 @@ def context(
     return BridgeContext(settings, policy, rules, names, contracts or Contracts(), gate)
 
 
-_STEPS: Final = {"advertise", "link_away", "reload", "gone"}
+_STEPS: Final = {"advertise", "reload", "gone"}
 """Methods whose work is done as their items are taken; in some books they do it at once."""
 
 
@@ -369,25 +440,18 @@ class Exports(Recorded):
         last: int | None = None,
         gate: PermissionGate = OPEN_GATE,
     ) -> None:
-        out = Out(context(policy, contracts, names, limit_settings, gate), last=last)
-        super().__init__(topic_exports.Exports(cast("Any", out)), out)
-
-    @property
-    def topics(self) -> set[str]:
-        """The topics that the graph has."""
-        return {source.topic for source in self.book.seen}
+        out = Out(context(policy, contracts, names, limit_settings, gate))
+        super().__init__(NotedExports(out, last), out)
 
     def graph(self, topic: str, publishers: dict[str, LocalSource]) -> list[Any]:
         """Set a topic's publishers, by node."""
-        before = [source.node for source in self.book.seen if source.topic == topic]
-        for node in dict.fromkeys((*before, *publishers)):
-            self.book.put(Source(topic, node), publishers.get(node))
+        self.book.look(topic, publishers)
         return self.out.take()
 
     def link_away(self, peer: int) -> tuple[list[Any], bool]:
         """What is done, and whether a route waits."""
         self.gone_away(peer)
-        deque(self.book.link_away(peer), 0)
+        self.book.link_away(peer)
         return self.out.take(), self.book.outage(peer) > 0
 
     def flowing(self, source: Source) -> tuple[int, ...]:
@@ -429,13 +493,13 @@ class Imports(Recorded):
         limit_settings: LimitSettings | None = None,
         gate: PermissionGate = OPEN_GATE,
     ) -> None:
-        out = Out(context(policy, contracts, names, limit_settings, gate), rng, position)
-        super().__init__(topic_imports.Imports(cast("Any", out)), out)
+        out = Out(context(policy, contracts, names, limit_settings, gate), rng)
+        super().__init__(NotedImports(out, position), out)
 
     def link_away(self, peer: int, *, briefly: bool = False) -> tuple[list[Any], bool]:
         """What is done, and whether a source waits."""
         self.gone_away(peer, silent=briefly)
-        deque(self.book.link_away(peer, briefly=briefly), 0)
+        self.book.link_away(peer, briefly=briefly)
         return self.out.take(), bool(self.book._peers[peer].entries)
 
     def demand(self, peer: int, source: Source, now: float, *, wanted: bool) -> list[Any]:

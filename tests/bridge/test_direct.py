@@ -14,7 +14,8 @@ import pytest
 
 import rmpa
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import (
+from rmpa.bridge.direct.grants import NodePorts, ServiceGrants, end_all, grant_at
+from rmpa.bridge.direct.paths import (
     Condition,
     DirectAsk,
     Grant,
@@ -24,7 +25,6 @@ from rmpa.bridge.direct.conditions import (
     read_reply,
     reply_of,
 )
-from rmpa.bridge.direct.grants import NodePorts, ServiceGrants, end_all, grant_at
 from rmpa.bridge.topics.direct import bus_links, end_link, publisher_update, standing
 from rmpa.config import limits as config_limits
 from rmpa.core.contract import Contract, Transport

@@ -15,11 +15,10 @@ from typing import Any
 import pytest
 
 from rmpa.bridge import launched, limits
-from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.launch import LAUNCH, Launcher
 from rmpa.bridge.launch_files import is_name, list_files
 from rmpa.bridge.launched import LaunchedResource, ModuleResources
-from rmpa.bridge.policy import OPEN_GATE, PermissionGate
+from rmpa.bridge.policy import OPEN_GATE, BridgeContext, PermissionGate
 from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.settings import ResourceSettings, Settings, TrustSettings
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError

@@ -12,11 +12,10 @@ import msgspec
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.log import LEVEL, LINES, ModuleLogs
 from rmpa.bridge.log_ring import LogLines, LogQuery, LogRing
-from rmpa.bridge.policy import OPEN_GATE, PermissionGate
+from rmpa.bridge.policy import OPEN_GATE, BridgeContext, PermissionGate
 from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.settings import Settings, TrustSettings
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError

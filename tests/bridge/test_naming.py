@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.bridge.context import Names, PeerNames
+from rmpa.bridge.policy import Names, PeerNames
 from rmpa.config.peer_rules import PeerRule
 from rmpa.core.identity import Guid, Identity, proxied_node, proxy_name, proxy_prefix
 
@@ -53,9 +53,8 @@ def test_a_name_is_renamed_once() -> None:
 
 def test_without_rules_for_it_a_peer_is_plain() -> None:
     names = Names((ROBOT, PeerRule("base")))
-    assert names.of("base").plain
-    assert names.of("nobody").plain
-    assert not names.of("robot2").plain
+    here = [names.of(peer).local_name("/a") for peer in ("base", "nobody", "robot2")]
+    assert here == ["/a", "/a", "/robot2/a"]
 
 
 @given(NAMES)

@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.bridge import limits
-from rmpa.bridge.context import Names
 from rmpa.bridge.messages import Advertise, AdvertiseServices, ServiceOffer, Source, TopicOffer
-from rmpa.bridge.policy import Policy
+from rmpa.bridge.policy import Names, Policy
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.config.peer_rules import PeerRule, PolicySettings

@@ -12,14 +12,13 @@ import pytest
 
 from rmpa.bridge import limits
 from rmpa.bridge.bridge import Bridge
-from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.messages import decode
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.follower import Params
 from rmpa.bridge.params.owner import read_text, write_text
 from rmpa.bridge.params.transfer import follow_rules, key_problem, replaced, why_not_follow, why_not_get, why_not_set
-from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
+from rmpa.bridge.policy import OPEN_GATE, BridgeContext, Needs, PermissionGate
 from rmpa.bridge.rpc import PeerRpc
 from rmpa.bridge.sessions import PeerSession
 from rmpa.config.peer_rules import Effect, PermissionRule

@@ -10,7 +10,6 @@ import pytest
 from click.testing import CliRunner
 
 from rmpa.bridge import limits
-from rmpa.bridge.context import Names
 from rmpa.bridge.messages import (
     Advertise,
     AdvertiseServices,
@@ -22,7 +21,7 @@ from rmpa.bridge.messages import (
     Source,
     TopicOffer,
 )
-from rmpa.bridge.policy import PermissionGate, Policy
+from rmpa.bridge.policy import Names, PermissionGate, Policy
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.cli.trust import trust_check

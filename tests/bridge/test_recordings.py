@@ -14,10 +14,9 @@ from typing import Any
 import msgspec
 import pytest
 
-from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.kept import KEPT, REQUESTS, Kept, end_request, read_requests, write_kept
-from rmpa.bridge.policy import OPEN_GATE, PermissionGate
+from rmpa.bridge.policy import OPEN_GATE, BridgeContext, PermissionGate
 from rmpa.bridge.recordings import KEEP, LIST, READ, REMOVE, Recordings
 from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.settings import Settings, TrustSettings

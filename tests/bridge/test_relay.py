@@ -13,9 +13,10 @@ import msgspec
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.context import Names
 from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, Source, decode, encode
-from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy, Relay, RelayPaths
+from rmpa.bridge.offers import PeerRun
+from rmpa.bridge.peer_offers import Heard, RelayPaths
+from rmpa.bridge.policy import OPEN_GATE, Names, PermissionGate, Policy, Relay
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.config.peer_rules import PolicySettings
@@ -269,11 +270,15 @@ def test_any_map_settles_with_each_source_once_everywhere(seed: int) -> None:
     world.check()
 
 
+def heard(name: str, number: int) -> Heard[Any, Any, Any]:
+    """A peer with a link that has told all."""
+    return Heard(session=PeerRun(peer=number, name=name, instance=instance(number), rank=number), ready=True)
+
+
 def test_the_way_is_told_and_what_came_round_is_not_shown() -> None:
-    ways = RelayPaths()
+    relay = heard("r", 2)
+    ways = RelayPaths({1: relay})
     ways.instance = instance(9)
-    ways.linked(1, "r", instance(2), 2)
-    ways.ready(1, ready=True)
     assert not ways.count(1, origin(9, 2), 1)
     assert ways.why_not(1, origin(9, 2)) == "it is ours, and came back by a relay"
     assert not ways.count(1, origin(1, 9, 2), 1)
@@ -285,34 +290,27 @@ def test_the_way_is_told_and_what_came_round_is_not_shown() -> None:
     assert ways.lost == {"m1": "r"}, "for `rmpa why`, which names the relay"
     assert ways.count(1, origin(1, 2), 1)
     assert ways.lost == {}
-    ways.unlinked(1)
+    assert ways.gone(1, relay.session) == {instance(1), instance(2)}
     assert ways.lost == {"m1": "r"}
 
 
 def test_a_peer_that_claims_the_run_of_a_relayed_module_does_not_hide_it() -> None:
     """Instances are no secret: each member hears them in beacons. In a secured mesh the name alone is proved."""
-    ways = RelayPaths()
+    peers = {1: heard("r", 2)}
+    ways = RelayPaths(peers)
     ways.instance = instance(9)
-    ways.linked(1, "r", instance(2), 2)
-    ways.ready(1, ready=True)
     ways.count(1, origin(1, 2), 1)
-    ways.linked(2, "thief", instance(1), 1)
-    ways.ready(2, ready=True)
+    peers[2] = heard("thief", 1)
     assert not ways.why_not(1, origin(1, 2))
     assert list(ways) == [(origin(1, 2), "r")]
-    ways.linked(3, "m1", instance(1), 1)
-    ways.ready(3, ready=True)
+    peers[3] = heard("m1", 1)
     assert ways.why_not(1, origin(1, 2)) == "m1 has a link of its own"
     assert list(ways) == []
 
 
 def test_a_peer_that_may_not_relay_does_not_rename_a_module() -> None:
-    ways = RelayPaths(lambda name: name == "r")
+    ways = RelayPaths({1: heard("r", 2), 2: heard("liar", 3)}, lambda name: name == "r")
     ways.instance = instance(9)
-    ways.linked(1, "r", instance(2), 2)
-    ways.ready(1, ready=True)
-    ways.linked(2, "liar", instance(3), 3)
-    ways.ready(2, ready=True)
     renamed = msgspec.structs.replace(origin(1, 3), name="other")
     ways.count(2, renamed, 1)
     ways.count(1, origin(1, 2), 1)

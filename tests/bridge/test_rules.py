@@ -8,7 +8,6 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rmpa.bridge.context import Names
 from rmpa.bridge.messages import (
     Advertise,
     CloseRoute,
@@ -21,7 +20,7 @@ from rmpa.bridge.messages import (
     decode,
     encode,
 )
-from rmpa.bridge.policy import Policy
+from rmpa.bridge.policy import Names, Policy
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.config.peer_rules import PeerRule, PolicySettings
 from rmpa.core.contract import ContractRule, Contracts

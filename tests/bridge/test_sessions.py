@@ -14,7 +14,7 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.graph_part import GraphPart
 from rmpa.bridge.messages import Advertise, Source, TopicOffer, decode, encode
-from rmpa.bridge.peer import PeerState
+from rmpa.bridge.offers import PeerState
 from rmpa.bridge.policy import PermissionGate
 from rmpa.bridge.proxies import PeerProxies, ProxyNodes
 from rmpa.bridge.sessions import AWAY_GRACE, Part, PeerSession, PeerSessions
@@ -374,6 +374,16 @@ async def test_where_they_cannot_share_each_listens_by_itself_and_the_log_says_w
 LOCAL = LocalSource("a/B", "http://x:1/")
 
 
+class ShownImports(Imports):
+    """Imports that note what they show."""
+
+    def _publish(self, entry: Any) -> None:
+        cast("Any", self._out).shown.append(entry.name)
+
+    def _unpublish(self, entry: Any) -> None:
+        """Nothing was made."""
+
+
 class OnePart(GraphPart):
     """Topics of one linked peer, without a graph."""
 
@@ -392,7 +402,7 @@ class OnePart(GraphPart):
         link.abort = self.sent.append
         self.session = PeerSession(peer=1, name="far", link=cast("Any", link), proxies=cast("Any", None))
         shared = SimpleNamespace(counters=Counters(), rng=lambda: 0.5, context=context(), sessions={1: self.session})
-        super().__init__(cast("Any", shared), cast("Any", Exports), cast("Any", Imports))
+        super().__init__(cast("Any", shared), cast("Any", Exports), cast("Any", ShownImports))
         self.imports.link_up(self.session)
         self.exports.link_up(self.session)
 
@@ -409,10 +419,6 @@ class OnePart(GraphPart):
 
     def _settled(self) -> None:
         self.settled += 1
-
-    def publish(self, entry: Any) -> None:
-        """Note what is shown."""
-        self.shown.append(entry.name)
 
 
 async def until_settled(part: OnePart) -> None:

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from rmpa.bridge.direct.conditions import DirectAsk, Grant, read_ask, read_reply, reply_of
+from rmpa.bridge.direct.paths import DirectAsk, Grant, read_ask, read_reply, reply_of
 from rmpa.bridge.messages import decode, encode
 from rmpa.core.contract import Contract
 from rmpa.core.errors import RmpaError

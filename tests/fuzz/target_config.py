@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rmpa.bridge.context import PeerNames
 from rmpa.bridge.messages import OpenRoute, decode, encode
+from rmpa.bridge.policy import PeerNames
 from rmpa.config import limits
 from rmpa.config.peer_rules import PEER_RULES, PeerRule
 from rmpa.config.read import parse_config

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from rmpa.bridge.context import BridgeContext
-from rmpa.bridge.policy import PermissionGate
+from rmpa.bridge.policy import BridgeContext, PermissionGate
 from rmpa.config.peer_rules import Access, Effect, PermissionRule, PolicySettings
 from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.config.settings import ServiceSettings, Settings, TrustSettings

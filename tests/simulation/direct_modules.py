@@ -11,8 +11,8 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from rmpa.bridge.direct import grants
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
 from rmpa.bridge.direct.grants import TopicGrants
+from rmpa.bridge.direct.paths import Condition, Grant, Unmet
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import OPEN_GATE
 from rmpa.bridge.topics import direct as direct_importer
@@ -139,15 +139,10 @@ class Listener:
 
 
 class Proxies:
-    """The proxies of a peer's nodes; nothing is registered at them here."""
+    """The proxies of a peer's nodes."""
 
     def get(self, node: str) -> Any:
         return SimpleNamespace(name=node, uri=f"http://proxy{node}/", address_of=lambda _: None)
-
-    def hold(self, *_: object) -> None:
-        """Does nothing."""
-
-    release = hold
 
 
 def session(peer: int, name: str, address: str) -> Any:
@@ -205,7 +200,6 @@ class PublisherModule:
             },
             subscribers=lambda _: dict.fromkeys(self.local, "http://local/"),
             suspect=lambda _: None,
-            call=lambda *_: None,
             state=lambda: SimpleNamespace(services={}),
         )
         exports = SimpleNamespace(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from unittest.mock import patch
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import Condition, Want
+from rmpa.bridge.direct.paths import Condition, Want
 from rmpa.bridge.messages import Source
 from rmpa.ros.master.parameters import RegistrationKind
 from tests.bridge.io.virtual import VirtualLoop, run

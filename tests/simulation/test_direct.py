@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import Want
+from rmpa.bridge.direct.paths import Want
 from rmpa.bridge.messages import Source
 from tests.simulation.direct_modules import SubscriberModule
 from tests.simulation.direct_scenario import DirectScenario

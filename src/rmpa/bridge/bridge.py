@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
-from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.launch import Launcher
 from rmpa.bridge.log import ModuleLogs
 from rmpa.bridge.messages import decode, op_of
 from rmpa.bridge.nodes import ProxyKills
-from rmpa.bridge.policy import PermissionGate, Relay
+from rmpa.bridge.policy import BridgeContext, PermissionGate, Relay
 from rmpa.bridge.proxies import ProxyNodes
 from rmpa.bridge.recordings import Recordings
 from rmpa.bridge.rpc import PeerRpc
@@ -34,8 +32,6 @@ if TYPE_CHECKING:
     from rmpa.ros.core.external import Core
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.trust.permissions import Permissions
-
-_log = logging.getLogger(__name__)
 
 
 class Bridge:
@@ -86,7 +82,7 @@ class Bridge:
             counters=self.counters,
             on_param_update=self._param_update,
             on_kill=kills.own,
-            taps=lambda: self.topics.outbound.connections,
+            taps=lambda: self.topics.exports.connections,
         )
         self.proxy_nodes = ProxyNodes(core, self.counters)
         self._parts: list[Part] = [self.rpc]
@@ -124,7 +120,7 @@ class Bridge:
         self.node.master_uri = self.core.uri  # only now does the embedded core listen
         await self.node.start()
         await self.proxy_nodes.start()
-        self._reconcile_later()
+        self._reconciler = call_at_tick(limits.RECONCILE_INTERVAL, self._reconcile)
         for part in self._parts:
             self.core.on_change(part.graph_changed)
             part.start()
@@ -163,7 +159,7 @@ class Bridge:
     def mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
         """Pass an acknowledgement, or the answer to a fence, to the route's sender."""
         session = self.sessions.of(link)
-        sender = self.topics.sender(session.peer, route) if session is not None else None
+        sender = self.topics.exports.sender(session.peer, route) if session is not None else None
         if sender is None:
             return
         if kind is FrameKind.ACK:
@@ -174,11 +170,8 @@ class Bridge:
     def _param_update(self, key: str, _value: XmlRpcValue) -> bool:
         return sum(part.param_update(key) for part in self._parts) > 0  # a sum, because every part must be called
 
-    def _reconcile_later(self) -> None:
-        self._reconciler = call_at_tick(limits.RECONCILE_INTERVAL, self._reconcile)
-
     def _reconcile(self) -> None:
-        self._reconcile_later()
+        self._reconciler = call_at_tick(limits.RECONCILE_INTERVAL, self._reconcile)
         self.sessions.reconcile()
         for part in self._parts:
             yield_to_data()

@@ -10,7 +10,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.messages import Advertise, AdvertiseServices, decode, encode
+from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, SubscriptionChanges, decode, encode
 from rmpa.bridge.peer_offers import ImportEffects
 from rmpa.bridge.sessions import Part, guarded
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.direct.grants import Grants
     from rmpa.bridge.direct.paths import Paths
     from rmpa.bridge.messages import Message, Source
     from rmpa.bridge.offers import OfferBook
     from rmpa.bridge.peer_offers import ImportBook, Remote
-    from rmpa.bridge.policy import Place
+    from rmpa.bridge.policy import BridgeContext, Place
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.master.parameters import GraphState
 
 _log = logging.getLogger(__name__)
@@ -40,6 +40,12 @@ def _while(queue: Collection[object]) -> Iterator[None]:
     """Yield for as long as something is queued."""
     while queue:
         yield
+
+
+def go_on(queue: deque[Any]) -> None:
+    """Do the next item of the work that has waited longest; what has none any more leaves the queue."""
+    if next(queue[0][1], _END) is _END:
+        queue.popleft()
 
 
 class GraphPart(Part, ImportEffects):
@@ -56,6 +62,7 @@ class GraphPart(Part, ImportEffects):
         imports: The class of ``imports``.
 
     Attributes:
+        bridge: The core, the peers and the rules.
         exports: What is offered.
         imports: What peers offer.
         direct: The direct connections of local nodes to peers' ones, and of peers' nodes to local ones.
@@ -71,7 +78,7 @@ class GraphPart(Part, ImportEffects):
     def __init__(
         self, bridge: Bridge, exports: type[OfferBook[Any, Any, Any, Any]], imports: type[ImportBook[Any, Any, Any]]
     ) -> None:
-        self._bridge = bridge
+        self.bridge = bridge
         self.rng = bridge.rng
         self.refusals = RefusalLog(_log, bridge.counters)
         self.exports = exports(self)
@@ -79,10 +86,9 @@ class GraphPart(Part, ImportEffects):
         self._timer = MachineTimer(self.imports.next_timer, self.imports.handle_timer)
         # Ordered: in a plain dict, taking the first item skips over the places of all items taken before.
         self._changed: OrderedDict[str, None] = OrderedDict()
-        self._advertisements: deque[tuple[PeerSession, bytes | Iterator[tuple[Any, Any]]]] = deque()
+        self._advertisements: deque[tuple[PeerSession, Iterator[None]]] = deque()
         self._unread_bytes = 0
-        self._rejudging: Iterator[None] = iter(())
-        self._freeing: deque[Iterator[None]] = deque()
+        self._slowly: deque[tuple[None, Iterator[None]]] = deque()
         self._scan_handle: asyncio.Handle | None = None
         self._compared: GraphState | None = None
         self._skipped = 0
@@ -91,7 +97,7 @@ class GraphPart(Part, ImportEffects):
     @property
     def context(self) -> BridgeContext:
         """The rules that hold now."""
-        return self._bridge.context
+        return self.bridge.context
 
     async def close(self) -> None:
         """Stop all slices and the timer."""
@@ -102,7 +108,7 @@ class GraphPart(Part, ImportEffects):
 
     def send(self, peer: int, message: Message) -> None:
         """As of ``ImportEffects``."""
-        session = self._bridge.sessions.get(peer)
+        session = self.bridge.sessions.get(peer)
         if session is not None and session.linked:
             session.link.send_control(encode(message))
 
@@ -122,9 +128,12 @@ class GraphPart(Part, ImportEffects):
 
     def pass_on(self, entry: Remote[Any]) -> None:
         """Have what a peer offers relayed to others, if this module relays."""
-        if (session := self._bridge.sessions.get(entry.peer)) is not None:
-            source, place = self._relayed(entry, self._bridge.sessions.proxy_name(session, entry.node, entry.origin))
-            self._bridge.relay.pass_on(entry.peer, session.link.identity, source, place, entry.origin)
+        relay, session = self.bridge.relay, self.bridge.sessions.get(entry.peer)
+        if relay.enabled and session is not None:
+            source, place = self._relayed(entry, self.bridge.sessions.proxy_name(session, entry.node, entry.origin))
+            whose = session.link.identity
+            own = Origin(whose.name, str(whose.guid), whose.instance.hex(), source.node, ())
+            relay.shown(entry.peer, source, place, entry.origin or own)
 
     @abstractmethod
     def _relayed(self, entry: Remote[Any], proxy: str) -> tuple[Source, Place]:
@@ -142,7 +151,7 @@ class GraphPart(Part, ImportEffects):
 
     def link_up(self, session: PeerSession) -> None:
         """Begin the advertisement to a peer, and wait for the peer's own."""
-        self.imports.ways.instance = self._bridge.relay.instance
+        self.imports.ways.instance = self.bridge.relay.instance
         self.imports.link_up(session)
         self.exports.link_up(session)
         for each in self.direct:
@@ -150,16 +159,22 @@ class GraphPart(Part, ImportEffects):
         self.schedule()
 
     def link_down(self, session: PeerSession) -> None:
-        """Drop the peer's advertisements that are not applied yet."""
+        """A link is gone; what the peer offers stays in the graph until ``grace_over``."""
         for each in self.direct:
             each.link_down(session)
-        self._advertisements = deque(one for one in self._advertisements if one[0] is not session)
-        self._unread_bytes = sum(len(waiting) for _, waiting in self._advertisements if isinstance(waiting, bytes))
+        self.exports.link_down(session.peer)
+        self.imports.link_down(session.peer)
+
+    def grace_over(self, session: PeerSession) -> bool:
+        """Remove what the peer offers from the local graph; nothing is kept for it."""
+        self.run(self.imports.gone(session.peer))
+        return False
 
     def gone(self, session: PeerSession) -> None:
         """Forget a peer."""
         for each in self.direct:
             each.gone(session)
+        self.run(self.imports.gone(session.peer))
 
     def depends(self, session: PeerSession) -> bool:
         """Whether an advertisement of a peer is not applied yet."""
@@ -177,33 +192,34 @@ class GraphPart(Part, ImportEffects):
         """
         if len(payload) > limits.ADVERTISEMENT_MAX:
             raise LimitExceeded("advertisement", len(payload), limits.ADVERTISEMENT_MAX)
-        self._advertisements.append((session, payload))
         self._unread_bytes += len(payload)
+        self._advertisements.append((session, self._apply(session, session.link, payload)))
         self.schedule()
         while self._unread_bytes > limits.ADVERTISED_WAITING_BYTES:
-            self._apply_next()
+            go_on(self._advertisements)
 
-    def _apply_next(self) -> None:
-        """Parse the advertisement that has waited longest, or apply the next entry of it if it is parsed."""
-        session, waiting = self._advertisements[0]
-        if not isinstance(waiting, bytes):
-            if (change := next(waiting, None)) is None:
-                self._advertisements.popleft()
-            else:
-                self.imports.take_in(session.peer, *change, self.now())
-            return
-        self._advertisements.popleft()
-        self._unread_bytes -= len(waiting)
-        try:
-            message = decode(waiting)
-        except RemoteProtocolError as error:
-            self.refuse(session, error)
-            return
-        if isinstance(message, Advertise | AdvertiseServices):
+    def _apply(
+        self, session: PeerSession, link: PeerLink, message: bytes | Message | SubscriptionChanges
+    ) -> Iterator[None]:
+        """Parse an advertisement, and apply it, an entry with each item, while the link stands by which it came."""
+        if isinstance(message, bytes):
+            self._unread_bytes -= len(message)
+            if session.link is not link or not session.linked:
+                return
+            try:
+                message = decode(message)
+            except RemoteProtocolError as error:
+                self.refuse(session, error)
+                return
+        if isinstance(message, Advertise | AdvertiseServices | SubscriptionChanges):
             if message.added or message.removed:
                 more, less = len(message.added), len(message.removed)
                 _log.debug("< %s %s %d more %s, %d less", session.link.name, self.verb, more, self.exports.kind, less)
-            self._advertisements.appendleft((session, self.imports.changes(session.peer, message)))
+            for change in self.imports.changes(session.peer, message):
+                if session.link is not link or not session.linked:
+                    return
+                self.imports.take_in(session.peer, *change, self.now())
+                yield
 
     @abstractmethod
     def _look_at(self, name: str) -> None:
@@ -232,8 +248,8 @@ class GraphPart(Part, ImportEffects):
         time. A core returns the same object until something is registered, so an idle agent compares seldom. Whether
         a node is reachable decides, too.
         """
-        state = self._bridge.core.state()
-        if self._skipped < limits.RECONCILE_SKIPS and state is self._compared and not self._bridge.core.unreachable():
+        state = self.bridge.core.state()
+        if self._skipped < limits.RECONCILE_SKIPS and state is self._compared and not self.bridge.core.unreachable():
             self._skipped += 1
             return False
         self._compared, self._skipped = state, 0
@@ -242,7 +258,11 @@ class GraphPart(Part, ImportEffects):
 
     def reload(self) -> None:
         """Judge by new rules; entries and routes that they do not change go on untouched."""
-        self._rejudging = chain(self.exports.reload(), self.imports.reload(self.now()))
+        self.slowly(chain(self.exports.reload(), self.imports.reload(self.now())))
+
+    def slowly(self, steps: Iterator[None]) -> None:
+        """Queue work of many items, behind what is queued already."""
+        self._slowly.append((None, steps))
         self.schedule()
 
     def run(self, steps: Iterator[object]) -> None:
@@ -259,21 +279,18 @@ class GraphPart(Part, ImportEffects):
     def _scan(self) -> None:
         """Take one turn of the loop for it; each kind of work gets on by one item at least."""
         self._scan_handle = None
-        end, told, rejudged = turn_end(), False, False
+        end, told, slow = turn_end(), False, bool(self._slowly)
         with logged_failure(_log, "a slice of work failed; the rest goes on"):
             for _ in until(end, _while(self._changed)):
                 self._look_at(self._changed.popitem(last=False)[0])
             for _ in until(end, self.exports.advertise(self.now(), self._is_busy)):
                 told = True
             for _ in until(end, _while(self._advertisements)):
-                self._apply_next()
-            for _ in until(end, _while(self._freeing)):
-                if next(self._freeing[0], _END) is _END:
-                    self._freeing.popleft()
-            for _ in until(end, self._rejudging):
-                rejudged = True
+                go_on(self._advertisements)
+            for _ in until(end, _while(self._slowly)):
+                go_on(self._slowly)
         pending = self.exports.pending
-        if self._changed or self._advertisements or self._freeing or rejudged or (told and pending):
+        if self._changed or self._advertisements or slow or (told and pending):
             self.schedule()
         elif pending:  # earlier portions are still on their way
             self.schedule(limits.TELL_PAUSE)
@@ -282,5 +299,5 @@ class GraphPart(Part, ImportEffects):
                 self._settled()
 
     def _is_busy(self, peer: int) -> bool:
-        session = self._bridge.sessions.get(peer)
+        session = self.bridge.sessions.get(peer)
         return session is not None and session.link.busy

@@ -93,7 +93,7 @@ JOINS_MAX: Final = 64
 # [Graph] Connections to action servers here for one peer's clients
 # At it: further clients are not seen by the server
 # Told in: log
-# Why: They represent its subscribers (``bridge.topics.local``): enough for 512 action servers of one module.
+# Why: They represent its subscribers (``Exports.named``): enough for 512 action servers of one module.
 AUDIENCES_MAX: Final = 1024
 # Characters in the name of a request between agents.
 ASK_NAME_MAX: Final = 64

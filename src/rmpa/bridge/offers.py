@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from enum import Enum, auto
 from itertools import islice
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
@@ -19,12 +20,59 @@ from rmpa.ros.wire.tcpros import ANY
 from rmpa.trust.permissions import PermissionDecision
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterator
+    from collections.abc import Callable, Hashable, Iterator, Mapping
 
-    from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.messages import Message
-    from rmpa.bridge.peer import PeerRun
+    from rmpa.bridge.policy import BridgeContext
     from rmpa.config.peer_rules import Access
+
+
+class PeerState(Enum):
+    """The state of a peer.
+
+    ::
+
+    LINKED ──silence──► SILENT ──SILENT_GRACE► AWAY ──nothing waits any more──► (gone)
+      ▲  ├──closed in order──────────────────►  │
+      ├──┼────────────── a new link ────────────┘   (from SILENT, too)
+
+    Attributes:
+        LINKED: The peer has a link.
+        SILENT: Its link ended by silence; most peers are back within ``mesh.limits.SILENT_GRACE``.
+        AWAY: It has no link, and a part of the bridge keeps something for it.
+    """
+
+    LINKED = auto()
+    SILENT = auto()
+    AWAY = auto()
+
+
+@dataclass(slots=True, eq=False, kw_only=True)
+class PeerRun:
+    """One run of a peer, across its links.
+
+    Args:
+        peer: Its number in this agent; never used again for another run.
+        name: Its name, which selects the rules for it.
+        instance: The run, as 32 hexadecimal digits.
+        rank: The value of its GUID.
+        state: Whether it has a link.
+        silent: Whether its last link ended by silence.
+        away_since: When its last link ended, monotonic seconds; 0 before.
+    """
+
+    peer: int
+    name: str = ""
+    instance: str = ""
+    rank: int = 0
+    state: PeerState = PeerState.LINKED
+    silent: bool = False
+    away_since: float = 0.0
+
+    @property
+    def linked(self) -> bool:
+        """Whether the peer has a link now."""
+        return self.state is PeerState.LINKED
 
 
 def wire_of(offer: Any) -> Any:
@@ -145,29 +193,23 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
 
     def judge_for(
         self, told: Told[KeyT, LocalT, OfferT, RouteT], key: KeyT, local: LocalT
-    ) -> tuple[PolicyDecision | PermissionDecision, str]:
-        """Decide whether an entry that may cross may cross to one peer, and by which name on the wire."""
+    ) -> tuple[PolicyDecision | PermissionDecision, OfferT | None]:
+        """Decide whether an entry that may cross may cross to one peer, and make its offer if it may.
+
+        Permissions decide only where they refuse it.
+        """
         context, origin = self._out.context, local.origin
         name, peer = self.name_of(key), told.session.name
         if origin is not None and not may_have(told.session.instance, origin):
-            return PolicyDecision(False, f"it comes from {peer}"), ""
+            return PolicyDecision(False, f"it comes from {peer}"), None
         wire = context.names.of(peer).wire_name(name)
         if not is_crossing_name(wire):
-            return PolicyDecision(False, f"its name there would be {wire!r}"), wire
+            return PolicyDecision(False, f"its name there would be {wire!r}"), None
         decision = context.policy.judge_for(peer, name, local.type, wire)
         permission = context.gate.judge(self.access, peer, name)
-        return (decision if permission.allowed or not decision.allowed else permission), wire
-
-    def _offer(self, told: Told[KeyT, LocalT, OfferT, RouteT], key: KeyT) -> OfferT | None:
-        """The offer of an entry for one peer; ``None`` if the peer may not know of it."""
-        if (local := self.offered.get(key)) is None:
-            return None
-        decision, wire = self.judge_for(told, key, local)
-        if decision.allowed:
-            return self.offer_for(key, local, wire)
-        if isinstance(decision, PermissionDecision) and self.reports:
-            self._out.context.gate.refused(self.access, told.session.name, self.name_of(key), decision)
-        return None
+        if not (decision.allowed and permission.allowed):
+            return (permission if decision.allowed else decision), None
+        return decision, self.offer_for(key, local, wire)
 
     @property
     def limit(self) -> int:
@@ -188,33 +230,31 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
             del self.seen[key]
         else:
             self.seen[key] = local
-        before = self.offered.get(key)
+        before, ended = self.offered.get(key), f"{self.owner} has restarted"
         if local is None or not self.judge(key, local).allowed:
             self.beyond.pop(key, None)
-            if before is not None:
-                del self.offered[key]
-                self.note(key)
-                self._ended(key, f"{self.owner} has gone" if local is None else "a rule keeps it home now")
-                if self.beyond and len(self.offered) < self.limit:
-                    first = next(iter(self.beyond))
-                    self.put(first, self.seen[first], again=True)
-        elif local != before:
-            if before is None and len(self.offered) >= self.limit:
-                self.beyond[key] = None
-                text = f"this module has more {self.kind} than limits.{self.kind} = {self.limit}; the rest is "
-                text += "offered to no peer: raise it in rmpa.toml and `rmpa reload`, or deny some"
-                self._out.warn(self.counter, "local", text)
+            if before is None:
                 return
+            del self.offered[key]
+            ended = f"{self.owner} has gone" if local is None else "a rule keeps it home now"
+        elif local == before:
+            return
+        elif before is None and len(self.offered) >= self.limit:
+            self.beyond[key] = None
+            text = f"this module has more {self.kind} than limits.{self.kind} = {self.limit}; the rest is "
+            text += "offered to no peer: raise it in rmpa.toml and `rmpa reload`, or deny some"
+            self._out.warn(self.counter, "local", text)
+            return
+        else:
             self.beyond.pop(key, None)
             self.offered[key] = local
-            self.note(key)
-            if before is not None:
-                self._ended(key, f"{self.owner} has restarted")
-
-    def note(self, key: KeyT) -> None:
-        """Have an entry examined for every peer."""
         for told in self.peers.values():
             told.due[key] = None
+        if before is not None:
+            self._ended(key, ended)
+            if key not in self.offered and self.beyond and len(self.offered) < self.limit:
+                first = next(iter(self.beyond))
+                self.put(first, self.seen[first], again=True)
 
     def reload(self) -> Iterator[None]:
         """Judge by new rules, an entry with each item; then peers are told what has changed for them."""
@@ -249,11 +289,10 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
         if told is None:
             return None
         key = told.by_wire.get(wire, wire)  # one that it has not been told yet may be on its way
-        local = self.offered.get(key)
-        if local is None:
+        if (local := self.offered.get(key)) is None:
             return None
-        decision, name = self.judge_for(told, key, local)  # anew: after new rules the peer is told a little later
-        return key if decision.allowed and wire_of(self.offer_for(key, local, name)) == wire else None
+        _, offer = self.judge_for(told, key, local)  # anew: after new rules the peer is told a little later
+        return key if offer is not None and wire_of(offer) == wire else None
 
     def decision(self, peer: int, key: KeyT) -> PolicyDecision | PermissionDecision | None:
         """Whether an entry may cross to a peer, and the rule that decides; ``None``: the graph has no such entry."""
@@ -300,7 +339,10 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
         removed: list[KeyT] = []
         for key in tuple(islice(told.due, limits.ADVERTISED_AT_ONCE)):
             del told.due[key]
-            offer, before = self._offer(told, key), told.offers.get(key)
+            local, before = self.offered.get(key), told.offers.get(key)
+            decision, offer = self.judge_for(told, key, local) if local is not None else (None, None)
+            if isinstance(decision, PermissionDecision) and self.reports:
+                self._out.context.gate.refused(self.access, told.session.name, self.name_of(key), decision)
             if before is not None and (offer is None or wire_of(offer) != wire_of(before[0])):
                 wire = wire_of(before[0])
                 del told.offers[key], told.by_wire[wire]
@@ -308,9 +350,9 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
                 removed.append(wire)
                 self._ended_for(peer, key)
                 before = None
-            if offer is None:
+            if offer is None or local is None:
                 continue
-            if before is not None and before == (offer, self.offered[key] if self.renews else before[1]):
+            if before is not None and before == (offer, local if self.renews else before[1]):
                 continue
             holder = told.by_wire.setdefault(wire_of(offer), key)
             if holder != key:
@@ -319,7 +361,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT, RouteT]):
                 text = f"{key} would be {name} at {told.session.name}, as {other} is already: rename one"
                 self._out.warn("names.taken", f"{peer} {key}", text)
                 continue
-            told.offers[key] = (offer, self.offered[key])
+            told.offers[key] = (offer, local)
             added.append(offer)
         full, more = not told.begun, not told.whole and bool(told.due)
         if added or removed or full or (not told.whole and not more):
@@ -339,10 +381,28 @@ class TopicBook(OfferBook[Source, LocalT, OfferT, RouteT]):
 
     Attributes:
         any_type: Whether ``*``, which stands for any type, crosses.
+        topics: The topics of ``seen``, with the nodes of each.
     """
 
     kind = "topics"
     any_type: ClassVar[bool] = False
+
+    def __init__(self, out: Effects) -> None:
+        super().__init__(out)
+        self.topics: dict[str, tuple[str, ...]] = {}
+
+    def look(self, topic: str, local: Mapping[str, LocalT]) -> None:
+        """Take what the nodes of a topic have to do with it now, by node; see ``put``."""
+        sources = [Source(topic, node) for node in dict.fromkeys((*self.topics.pop(topic, ()), *local))]
+        for source in sources:
+            if source.node in local or not self._leaves(source):
+                self.put(source, local.get(source.node))
+        if nodes := tuple(source.node for source in sources if source in self.seen):
+            self.topics[topic] = nodes
+
+    def _leaves(self, key: Source) -> bool:  # noqa: ARG002 - for those that override it
+        """Whether something is still to come of what the graph does not have any more: it is looked at again then."""
+        return False
 
     def judge(self, key: Source, local: LocalT) -> PolicyDecision:
         """Decide whether an entry may cross at all."""

@@ -11,14 +11,14 @@ import msgspec
 
 from rmpa.bridge import limits
 from rmpa.bridge.offers import Effects, KeyT, OfferT, wire_of
-from rmpa.bridge.policy import RelayPaths
 from rmpa.core.facts import CROWDED, DENIED
+from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterator, Mapping
 
     from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, SubscriptionChanges
-    from rmpa.bridge.peer import PeerRun
+    from rmpa.bridge.offers import PeerRun
     from rmpa.bridge.policy import PolicyDecision
     from rmpa.config.peer_rules import Access
     from rmpa.trust.permissions import PermissionDecision
@@ -70,6 +70,7 @@ class Heard(Generic[KeyT, EntryT, OfferT]):
         crowded: The nodes without a place, and the entries of each that wait for one (ordered: taking the first item
             of a plain dict passes over all that were taken before it).
         complete: Whether it has told all that it offers.
+        ready: Whether it is a way to other modules: it has a link, and is complete.
         routes: The routes that are asked for or open, by number.
         last_route: The number of the last one.
     """
@@ -81,6 +82,7 @@ class Heard(Generic[KeyT, EntryT, OfferT]):
     shown: Counter[str] = field(default_factory=Counter)
     crowded: OrderedDict[str, dict[EntryT, None]] = field(default_factory=OrderedDict)
     complete: bool = False
+    ready: bool = False
     routes: dict[int, EntryT] = field(default_factory=dict)
     last_route: int = 0
 
@@ -143,6 +145,117 @@ class ImportEffects(Effects):
         """Offer what is relayed with the path that it has now."""
 
 
+class RelayPaths:
+    """Selects the path to each module, its own link first, else the best relay; see ``policy.Relay``.
+
+    The best relay has the shortest path; among equal ones, the lowest GUID. A peer counts while it has a link and has
+    told all that it offers.
+
+    Args:
+        peers: What each peer offers, by its number.
+        may_relay: Whether a peer, by its name, may be a relay at all.
+
+    Attributes:
+        instance: Our own, as 32 hexadecimal digits.
+        reached_here: Instances that this module reaches by itself, outside the mesh: a gateway's sites.
+        lost: The relay that brought a module last, by the names of both, of each that no relay brings any more.
+        _ways: By instance and relay: the origin as the relay offered it last, and the number of its sources there.
+    """
+
+    def __init__(
+        self, peers: Mapping[int, Heard[Any, Any, Any]], may_relay: Callable[[str], bool] = lambda _: True
+    ) -> None:
+        self._peers, self._may_relay = peers, may_relay
+        self.instance = ""
+        self.reached_here: set[str] = set()
+        self.lost: OrderedDict[str, str] = OrderedDict()
+        self._ways: dict[str, dict[int, tuple[Origin, int]]] = {}
+
+    def __iter__(self) -> Iterator[tuple[Origin, str]]:
+        """Each module that is reached by a relay, and that relay's name."""
+        for instance, ways in self._ways.items():
+            best = self._best(instance)
+            if best is not None and not self._direct(ways[best][0]):
+                yield ways[best][0], self._peers[best].session.name
+
+    def __contains__(self, instance: str) -> bool:
+        return instance in self._ways
+
+    def through(self, peer: int) -> set[str]:
+        """The instances whose path may be another one when a peer becomes a way, or is none any more."""
+        return {self._peers[peer].session.instance} | {one for one, ways in self._ways.items() if peer in ways}
+
+    def gone(self, peer: int, relay: PeerRun) -> set[str]:
+        """Forget all paths through a peer that is gone; return the instances whose path may have changed."""
+        changed = {relay.instance}
+        for instance, ways in list(self._ways.items()):
+            if (way := ways.pop(peer, None)) is not None:
+                changed.add(instance)
+                if not ways:
+                    self._lose(way[0], relay.name)
+        return changed
+
+    def _lose(self, origin: Origin, relay: str) -> None:
+        """Note that no relay brings a module any more."""
+        del self._ways[origin.instance]
+        self.lost[origin.name] = relay
+        if len(self.lost) > mesh_limits.MODULES_MAX:
+            self.lost.popitem(last=False)
+
+    def count(self, peer: int, origin: Origin, more: int) -> bool:
+        """Count a source of a module that a peer offers (1) or offers no longer (-1).
+
+        Returns:
+            Whether the best relay to the module has changed.
+        """
+        if self.instance in (origin.instance, *origin.path):
+            return False
+        before, ways = self._best(origin.instance), self._ways.setdefault(origin.instance, {})
+        known, count = ways.pop(peer, (origin, 0))
+        if count + more > 0:
+            ways[peer] = origin if more > 0 else known, count + more
+            self.lost.pop(origin.name, None)
+        if not ways:
+            self._lose(origin, self._peers[peer].session.name)
+        return self._best(origin.instance) != before
+
+    def objection(self, origin: Origin) -> str:
+        """Why no relay's source of a module is shown, or empty."""
+        if origin.instance == self.instance:
+            return "it is ours, and came back by a relay"
+        if self.instance in origin.path:
+            return "we passed it on ourselves"
+        if origin.instance in self.reached_here:
+            return f"{origin.name} is reached from here"
+        if self._direct(origin):
+            return f"{origin.name} has a link of its own"
+        return ""
+
+    def why_not(self, peer: int, origin: Origin) -> str:
+        """Why a relayed source of a peer is hidden, or empty."""
+        if why := self.objection(origin):
+            return why
+        best = self._best(origin.instance)
+        if best is not None and best != peer:
+            return f"{origin.name} is reached by way of {self._peers[best].session.name}"
+        return ""
+
+    def rank(self, peer: int, origin: Origin | None) -> tuple[bool, int, int, int]:
+        """Sorts the ways to a source: those that work, then links, then relays by their paths, then by GUID."""
+        known = self._peers[peer]
+        return not known.ready, len(origin.path) if origin is not None else 0, known.session.rank, peer
+
+    def _direct(self, origin: Origin) -> bool:
+        # Every member of a mesh hears the instances of the others, and may claim one; see Identity.is_same_run.
+        runs = (known.session for known in self._peers.values() if known.ready)
+        return any((run.name, run.instance) == (origin.name, origin.instance) for run in runs)
+
+    def _best(self, instance: str) -> int | None:
+        ways = self._ways.get(instance, {})
+        relays = (peer for peer in ways if self._may_relay(self._peers[peer].session.name))
+        return min(relays, key=lambda peer: self.rank(peer, ways[peer][0]), default=None)
+
+
 class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
     """What peers offer, and what of it is in the local graph.
 
@@ -161,7 +274,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
     def __init__(self, out: ImportEffects) -> None:
         self._out = out
         self._peers: dict[int, Heard[KeyT, EntryT, OfferT]] = {}
-        self.ways = RelayPaths(out.context.gate.may_relay)
+        self.ways = RelayPaths(self._peers, out.context.gate.may_relay)
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, monotonic seconds; ``None`` if no timer runs."""
@@ -221,7 +334,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         peer = session.peer
         known = self._peers.setdefault(peer, Heard(session=session))
         known.routes, known.last_route = {}, 0
-        self._ways_changed(self.ways.linked(peer, session.name, session.instance, session.rank))
+        self._ways_changed((session.instance,))
         self._ready(peer)
 
     def link_down(self, peer: int) -> None:
@@ -246,7 +359,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
                 yield
         if not known.entries:
             del self._peers[peer]
-            self._ways_changed(self.ways.unlinked(peer))
+            self._ways_changed(self.ways.gone(peer, known.session))
 
     def changes(
         self, peer: int, message: Advertise | AdvertiseServices | SubscriptionChanges
@@ -274,7 +387,10 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
     def _ready(self, peer: int) -> None:
         """Judge again what other peers bring, if a peer has become a way or is none any more."""
         known = self._peers[peer]
-        self._ways_changed(self.ways.ready(peer, ready=known.complete and known.session.linked))
+        ready = known.complete and known.session.linked
+        if ready is not known.ready:
+            known.ready = ready
+            self._ways_changed(self.ways.through(peer))
 
     def take_in(self, peer: int, wire: KeyT, offer: OfferT | None, now: float) -> None:
         """Apply one change of an advertisement: an offer, or ``None`` for what is offered no more."""

@@ -1,9 +1,22 @@
-"""Decides what may cross the mesh, by a pure table of rules, and names the rule that decided."""
+"""What the settings say of peers: which topics and services cross, and how they are called at each end. Pure.
+
+What decides is a table of rules, and the rule that decided is named. The context is frozen; when settings are read
+again it is replaced as a whole, and the parts judge again by it.
+
+*Wire* names are those that cross: topics and services as the module has them that publishes or provides them. ::
+
+    their graph   wire            our graph
+    /odom  ─────► /odom  ──in───► /robot1/odom      prefix = "/robot1"
+    /cmd_vel ◄─── /cmd_vel ◄─out─ /robot1/cmd_vel
+
+The first rule that fits renames a name, once; the result is not renamed again. Only a relay offers the proxies of
+other modules, and never to the module that they came from, so no rule can make a message loop.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections import OrderedDict, defaultdict
+from collections import defaultdict
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
@@ -11,24 +24,22 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge.messages import Origin
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.rules import CLOCK
-from rmpa.config.settings import TimeSettings
+from rmpa.config.settings import Settings, TimeSettings
 from rmpa.config.values import PEER
 from rmpa.core.identity import NEVER_CROSSING, OUTSIDE_GUID, ROSOUT, is_own, matches, matches_any
 from rmpa.core.statistics import Counters
-from rmpa.mesh import limits as mesh_limits
 from rmpa.trust.permissions import PermissionDecision, prohibition, refusal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Iterable, Iterator
 
-    from rmpa.bridge.messages import Source
-    from rmpa.config.peer_rules import Access, PeerRule
+    from rmpa.bridge.messages import Origin, Source
+    from rmpa.config.peer_rules import Access, PeerRule, ServiceRule
     from rmpa.config.settings import ServiceSettings, TrustSettings
-    from rmpa.core.identity import Identity
+    from rmpa.core.contract import Contracts, Transport
     from rmpa.trust.permissions import Permissions
 
 
@@ -276,6 +287,183 @@ class PermissionGate:
 OPEN_GATE: Final = PermissionGate()
 
 
+# Topics that have one name in all modules.
+_FIXED: Final = (CLOCK, ROSOUT)
+
+
+class PeerNames:
+    """The names of one peer.
+
+    Args:
+        peer: The peer's name.
+        rules: All ``[[peer]]`` tables, in the order of the file; those for other peers are ignored.
+
+    Attributes:
+        prefix: The prefix of the peer's names in the local graph, such as ``/robot1``, or empty.
+    """
+
+    def __init__(self, peer: str, rules: Iterable[PeerRule] = ()) -> None:
+        mine = [rule for rule in rules if matches(rule.name, peer)]
+        prefix = next((rule.prefix for rule in mine if rule.prefix), "").replace(PEER, peer)
+        self._in = [_filled(each, peer) for rule in mine for each in rule.remap_in]
+        self._out = [_filled(each, peer) for rule in mine for each in rule.remap_out]
+        self.prefix: Final = prefix
+
+    def local_name(self, wire: str) -> str:
+        """The local name of a peer's topic or service."""
+        if wire in _FIXED:
+            return wire  # nodes read the time, and the core the log, from no other topic
+        renamed = (_renamed(wire, source, target) for source, target in self._in)
+        return next((new for new in renamed if new is not None), self.prefix + wire)
+
+    def wire_name(self, local: str) -> str:
+        """The wire name, for this peer, of a local topic or service."""
+        if local in _FIXED:
+            return local
+        renamed = (_renamed(local, source, target) for source, target in self._out)
+        plain = local[len(self.prefix) :] if local.startswith(self.prefix + "/") else local
+        return next((new for new in renamed if new is not None), plain)
+
+    def wires_of(self, local: str) -> tuple[str, ...]:
+        """The wire names that become this local name, best first."""
+        names = [old for source, target in self._in if (old := _renamed(local, target, source)) is not None]
+        names.append(local if not self.prefix else local.removeprefix(self.prefix))
+        return tuple(n for n in dict.fromkeys(names) if n and self.local_name(n) == local)
+
+    def locals_of(self, wire: str) -> tuple[str, ...]:
+        """The local names that become this wire name, best first."""
+        names = [old for source, target in self._out if (old := _renamed(wire, target, source)) is not None]
+        names += [self.prefix + wire, wire]
+        return tuple(n for n in dict.fromkeys(names) if self.wire_name(n) == wire)
+
+
+class Names:
+    """The names of all peers; one immutable set of rules for all parts, replaced when the rules change.
+
+    Args:
+        rules: All ``[[peer]]`` tables, in the order of the file.
+
+    Attributes:
+        of: ``(peer)``: the names of one peer, by the peer's name.
+    """
+
+    def __init__(self, rules: tuple[PeerRule, ...] = ()) -> None:
+        self.of = lru_cache(config_limits.NAMES_REMEMBERED)(lambda peer: PeerNames(peer, rules))
+
+
+def _filled(renaming: tuple[str, str], peer: str) -> tuple[str, str]:
+    source, target = renaming
+    return source.replace(PEER, peer), target.replace(PEER, peer)
+
+
+def _renamed(name: str, source: str, target: str) -> str | None:
+    """The name as one rule renames it, or with the two exchanged, undoes it; ``None`` if the rule does not fit."""
+    if not source.endswith("/**"):
+        return target if name == source else None
+    stem = source[:-3]
+    if name != stem and not name.startswith(stem + "/"):
+        return None
+    return target[:-3] + name[len(stem) :] or None
+
+
+OWN_SERVICES: Final = "/rmpa/**"
+# Every node has these two services; if they crossed, they would double the graph for no use.
+LOGGERS: Final = ("**/get_loggers", "**/set_logger_level")
+
+
+class ServiceRules:
+    """Judges services, and says how they are called; the rules of topics do not apply to them.
+
+    Args:
+        settings: ``[services]`` and ``[[service]]``.
+    """
+
+    def __init__(self, settings: ServiceSettings) -> None:
+        self._settings = settings
+
+    def judge(self, service: str, node: str) -> PolicyDecision:
+        """Decide whether a service may cross at all.
+
+        The built-in rules go first, then ``services.deny``, then ``services.allow``; what no glob fits may not cross.
+
+        Args:
+            service: Its name in the local graph.
+            node: The node that provides it.
+        """
+        settings = self._settings
+        if is_own(node):
+            return PolicyDecision(False, f"{node} stands for a node of another module, or is the agent itself")
+        if matches(OWN_SERVICES, service):
+            return PolicyDecision(False, "built in: the agent's own services do not cross")
+        if not settings.loggers and matches_any(LOGGERS, service):
+            return PolicyDecision(
+                False, "built in: a node's log is set at home; services.loggers = true lets it cross"
+            )
+        return judge_globs(settings, "services", service)
+
+    def timeout(self, service: str) -> float:
+        """The time-out of a call of a service, in seconds.
+
+        It is that of the first ``[[service]]`` that fits the service's name and says one, else that of
+        ``[services]``.
+        """
+        said = (rule.timeout for rule in self._fitting(service) if rule.timeout is not None)
+        return next(said, self._settings.timeout)
+
+    def has_timeout(self, service: str) -> bool:
+        """Whether a service has another time-out than the built-in one.
+
+        Only agents keep time-outs: a call from node to node has none.
+        """
+        return self.timeout(service) != config_limits.SERVICE_TIMEOUT
+
+    def transport(self, service: str) -> Transport:
+        """The path of a service's calls that this module wants.
+
+        It is that of the first ``[[service]]`` that fits the service's name and says one, else that of
+        ``[services]``.
+        """
+        said = (rule.transport for rule in self._fitting(service) if rule.transport is not None)
+        return next(said, self._settings.transport)
+
+    def _fitting(self, service: str) -> Iterator[ServiceRule]:
+        """The rules ``[[service]]`` that fit a service, in order."""
+        return (rule for rule in self._settings.rules if matches_any(rule.names, service))
+
+
+@dataclass(frozen=True, slots=True)
+class BridgeContext:
+    """The rules of one reading of the settings; made by ``of``.
+
+    Args:
+        settings: The settings that they come from.
+        policy: Which topics may cross.
+        services: Which services may cross, with their time-outs.
+        names: Renames what crosses, for each peer.
+        contracts: The contracts of this module's topics.
+        gate: What each peer may do here.
+    """
+
+    settings: Settings
+    policy: Policy
+    services: ServiceRules
+    names: Names
+    contracts: Contracts
+    gate: PermissionGate
+
+    @classmethod
+    def of(cls, settings: Settings | None = None, gate: PermissionGate = OPEN_GATE) -> BridgeContext:
+        """The rules of these settings; without any, those of a module that sets nothing."""
+        settings = settings if settings is not None else Settings()
+        policy = Policy(settings.policy, settings.peers, settings.time, rosout=settings.rosout)
+        names, services = Names(settings.naming), ServiceRules(settings.services)
+        return cls(settings, policy, services, names, settings.make_contracts(), gate)
+
+    def limit(self, kind: str) -> int:
+        """The most ``topics`` or ``services`` of a module that cross."""
+        return self.settings.limits.topics if kind == "topics" else self.settings.limits.services
+
+
 # A topic and the proxy that publishes it, by their local names.
 Place = tuple[str, str]
 
@@ -314,20 +502,6 @@ class Relay:
         self.instance = ""
         self._origins: dict[Place, tuple[int, Source, Origin]] = {}
         self._places: dict[tuple[int, Source], Place] = {}
-
-    def pass_on(self, peer: int, relay: Identity, source: Source, place: Place, origin: Origin | None) -> None:
-        """Offer a peer's source to other peers, if this module relays.
-
-        Args:
-            peer: The number of the peer that offers it.
-            relay: The identity of that peer.
-            source: The source, by its wire name.
-            place: Its topic and proxy here.
-            origin: Its module and node; ``None``: the peer's own.
-        """
-        if self.enabled:
-            own = Origin(relay.name, str(relay.guid), relay.instance.hex(), source.node, ())
-            self.shown(peer, source, place, origin or own)
 
     def shown(self, peer: int, source: Source, place: Place, origin: Origin) -> None:
         """Register a peer's source that is about to appear in the local graph.
@@ -384,131 +558,3 @@ class Local:
 def may_have(instance: str, origin: Origin) -> bool:
     """Whether a relayed source may be offered to the peer of this instance: not to one that it came from."""
     return instance != origin.instance and instance not in origin.path
-
-
-class RelayPaths:
-    """The receiving side: selects the path to each module, its own link first, else the best relay.
-
-    The best relay has the shortest path; among equal ones, the lowest GUID. A peer counts while it has a link and has
-    told all that it offers.
-
-    Args:
-        may_relay: Whether a peer, by its name, may be a relay at all.
-
-    Attributes:
-        instance: Our own, as 32 hexadecimal digits.
-        reached_here: Instances that this module reaches by itself, outside the mesh: a gateway's sites.
-        lost: The relay that brought a module last, by the names of both, of each that no relay brings any more.
-        _linked: By number of a peer with a link of its own: its name, its instance, and its rank among relays.
-        _ready: The peers that have a link and have told all that they offer.
-        _ways: By instance and relay: the origin as the relay offered it last, and the number of its sources there.
-    """
-
-    def __init__(self, may_relay: Callable[[str], bool] = lambda _: True) -> None:
-        self._may_relay = may_relay
-        self.instance = ""
-        self.reached_here: set[str] = set()
-        self.lost: OrderedDict[str, str] = OrderedDict()
-        self._linked: dict[int, tuple[str, str, int]] = {}
-        self._ready: set[int] = set()
-        self._ways: dict[str, dict[int, tuple[Origin, int]]] = {}
-
-    def __iter__(self) -> Iterator[tuple[Origin, str]]:
-        """Each module that is reached by a relay, and that relay's name."""
-        for instance, ways in self._ways.items():
-            best = self._best(instance)
-            if best is not None and not self._direct(ways[best][0]):
-                yield ways[best][0], self._linked[best][0]
-
-    def __contains__(self, instance: str) -> bool:
-        return instance in self._ways
-
-    def linked(self, peer: int, name: str, instance: str, rank: int) -> set[str]:
-        """Register a linked peer; return the instances whose path may have changed.
-
-        Args:
-            peer: The number of its session.
-            name: Its name.
-            instance: Its run, as 32 hexadecimal digits.
-            rank: Its GUID, as a number.
-        """
-        self._linked[peer] = name, instance, rank
-        return {instance}
-
-    def ready(self, peer: int, *, ready: bool) -> set[str]:
-        """Note whether a peer has a link and has told all; return the instances whose path may have changed."""
-        if ready is (peer in self._ready) or peer not in self._linked:
-            return set()
-        (self._ready.add if ready else self._ready.discard)(peer)
-        return {self._linked[peer][1]} | {instance for instance, ways in self._ways.items() if peer in ways}
-
-    def unlinked(self, peer: int) -> set[str]:
-        """Forget a peer and all paths through it; return the instances whose path may have changed."""
-        self._ready.discard(peer)
-        gone = self._linked.pop(peer, None)
-        changed = {gone[1]} if gone is not None else set()
-        for instance, ways in list(self._ways.items()):
-            if (way := ways.pop(peer, None)) is not None:
-                changed.add(instance)
-                if not ways:
-                    self._lose(way[0], gone)
-        return changed
-
-    def _lose(self, origin: Origin, relay: tuple[str, str, int] | None) -> None:
-        """Note that no relay brings a module any more."""
-        del self._ways[origin.instance]
-        self.lost[origin.name] = relay[0] if relay is not None else ""
-        if len(self.lost) > mesh_limits.MODULES_MAX:
-            self.lost.popitem(last=False)
-
-    def count(self, peer: int, origin: Origin, more: int) -> bool:
-        """Count a source of a module that a peer offers (1) or offers no longer (-1).
-
-        Returns:
-            Whether the best relay to the module has changed.
-        """
-        ours = self.instance in (origin.instance, *origin.path)
-        if ours or peer not in self._linked:
-            return False
-        before, ways = self._best(origin.instance), self._ways.setdefault(origin.instance, {})
-        known, count = ways.pop(peer, (origin, 0))
-        if count + more > 0:
-            ways[peer] = origin if more > 0 else known, count + more
-            self.lost.pop(origin.name, None)
-        if not ways:
-            self._lose(origin, self._linked[peer])
-        return self._best(origin.instance) != before
-
-    def objection(self, origin: Origin) -> str:
-        """Why no relay's source of a module is shown, or empty."""
-        if origin.instance == self.instance:
-            return "it is ours, and came back by a relay"
-        if self.instance in origin.path:
-            return "we passed it on ourselves"
-        if origin.instance in self.reached_here:
-            return f"{origin.name} is reached from here"
-        if self._direct(origin):
-            return f"{origin.name} has a link of its own"
-        return ""
-
-    def why_not(self, peer: int, origin: Origin) -> str:
-        """Why a relayed source of a peer is hidden, or empty."""
-        if why := self.objection(origin):
-            return why
-        best = self._best(origin.instance)
-        if best is not None and best != peer:
-            return f"{origin.name} is reached by way of {self._linked[best][0]}"
-        return ""
-
-    def rank(self, peer: int, origin: Origin | None) -> tuple[bool, int, int, int]:
-        """Sorts the ways to a source: those that work, then links, then relays by their paths, then by GUID."""
-        return peer not in self._ready, len(origin.path) if origin is not None else 0, self._linked[peer][2], peer
-
-    def _direct(self, origin: Origin) -> bool:
-        # Every member of a mesh hears the instances of the others, and may claim one; see Identity.is_same_run.
-        return any(self._linked[peer][:2] == (origin.name, origin.instance) for peer in self._ready)
-
-    def _best(self, instance: str) -> int | None:
-        ways = self._ways.get(instance, {})
-        relays = (peer for peer in ways if self._may_relay(self._linked[peer][0]))
-        return min(relays, key=lambda peer: self.rank(peer, ways[peer][0]), default=None)

@@ -8,14 +8,15 @@ import logging
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from rmpa.bridge.data.quality import PeerClockHistory
 from rmpa.bridge.data.reception import LinkTime
-from rmpa.bridge.peer import PeerRun, PeerState
+from rmpa.bridge.offers import PeerRun, PeerState
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.bridge.proxies import PeerProxies, ProxyNamespaces
 from rmpa.core.log import logged_failure
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.wire.xmlrpc import RosReply
-from rmpa.runtime.loop import MachineTimer, yield_to_data
+from rmpa.runtime.loop import yield_to_data
 from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
@@ -41,13 +42,15 @@ class PeerSession(PeerRun):
         link: Its link, or the last one while it has none.
         proxies: The nodes that stand for its nodes in the local graph; those of the module, whichever peers bring it.
         time: The time base of its link: the offset between its clock and the local one.
-        wait: Seconds from ``away_since`` to ``due``; ``None`` while it has a link.
+        clocks: The estimates of that offset over the last minute.
+        timer: Looks again at what is kept for the peer while it has no link.
     """
 
     link: PeerLink
     proxies: PeerProxies
     time: LinkTime = field(default_factory=LinkTime)
-    wait: float | None = None
+    clocks: PeerClockHistory = field(default_factory=PeerClockHistory)
+    timer: asyncio.TimerHandle | None = None
 
     def instance_of(self, origin: Origin | None) -> str:
         """The run of a module that the link brings, 32 hexadecimal digits: the peer's own without an ``origin``."""
@@ -67,11 +70,6 @@ class PeerSession(PeerRun):
     def own_address(self) -> str:
         """The address at which the peer reaches the nodes of this module; see ``address``."""
         return "127.0.0.1" if self.same_machine else self.link.local_address
-
-    @property
-    def due(self) -> float | None:
-        """When something kept for the absent peer expires next, monotonic seconds; ``None``: nothing does."""
-        return None if self.wait is None else self.away_since + self.wait
 
 
 class Part:
@@ -205,7 +203,6 @@ class PeerSessions:
         self._namespaces = ProxyNamespaces()
         # By run and name of the module: it may be a peer, or reached by relays, or both.
         self._modules: dict[tuple[str, str], PeerProxies] = {}
-        self._timer = MachineTimer(self._next_timer, self._handle_timer)
 
     def __iter__(self) -> Iterator[PeerSession]:
         """Every session, with a link or waiting for one."""
@@ -272,9 +269,10 @@ class PeerSessions:
             old.close(f"{link.name} has another address")
         session = self._waiting_for(link)
         if session is not None:
-            session.link, session.rank, session.wait = link, link.identity.guid.value, None
+            session.link, session.rank = link, link.identity.guid.value
             session.state, session.silent = PeerState.LINKED, False
-            self._timer.arm()
+            if session.timer is not None:
+                session.timer.cancel()
         else:
             session = self._begin(link)
         session.time.resumed_at = lambda: link.resumed_at
@@ -315,48 +313,45 @@ class PeerSessions:
         call_each(self._parts, lambda part: part.link_down(session))
         session.link.routes.clear()
         if session.silent:
-            session.wait = AWAY_GRACE if link.crashed else mesh_limits.SILENT_GRACE
-            self._timer.arm()
+            self._wait(session, AWAY_GRACE if link.crashed else mesh_limits.SILENT_GRACE)
         else:
             self._grace_over(session)
 
+    def _wait(self, session: PeerSession, seconds: float) -> None:
+        """Look at the session of an absent peer again so many seconds after the end of its link."""
+        loop = asyncio.get_running_loop()
+        session.timer = loop.call_at(session.away_since + seconds, self._waited, session, seconds)
+
+    def _waited(self, session: PeerSession, seconds: float) -> None:
+        if session.state is PeerState.SILENT:
+            self._grace_over(session)
+        else:
+            self._outlasted(session, seconds)
+
     def _grace_over(self, session: PeerSession) -> None:
         """Asks the parts what they keep for a peer that is not back; ends the session if they keep nothing."""
-        session.state, session.wait = PeerState.AWAY, 0.0
+        session.state = PeerState.AWAY
         waits: list[bool] = []
         call_each(self._parts, lambda part: waits.append(part.grace_over(session)))
         if any(waits):
-            self._outlasted(session, asyncio.get_running_loop().time())
+            self._outlasted(session, asyncio.get_running_loop().time() - session.away_since)
         else:
             self._end(session)
 
-    def _outlasted(self, session: PeerSession, now: float) -> None:
-        """Lets the parts drop what has expired for an absent peer; ends the session if nothing is left."""
-        seconds = max(now - session.away_since, session.wait or 0.0)
+    def _outlasted(self, session: PeerSession, seconds: float) -> None:
+        """Lets the parts drop what has expired for a peer that is away; ends the session if nothing is left."""
         waits: list[float | None] = []
         call_each(self._parts, lambda part: waits.append(part.outlasted(session, seconds)))
-        session.wait = min((wait for wait in waits if wait is not None), default=None)
-        if session.wait is None:
+        if (wait := min((wait for wait in waits if wait is not None), default=None)) is None:
             self._end(session)
         else:
-            self._timer.arm()
-
-    def _next_timer(self) -> float | None:
-        return min((due for session in self._by_number.values() if (due := session.due) is not None), default=None)
-
-    def _handle_timer(self, now: float) -> None:
-        for session in self:
-            due = session.due
-            if due is not None and due <= now:
-                if session.state is PeerState.SILENT:
-                    self._grace_over(session)
-                else:
-                    self._outlasted(session, now)
+            self._wait(session, wait)
 
     def _end(self, session: PeerSession) -> None:
         """Ends a session for good: the rest of the peer is removed from the local graph."""
-        session.state, session.wait = PeerState.AWAY, None
-        self._timer.arm()
+        session.state = PeerState.AWAY
+        if session.timer is not None:
+            session.timer.cancel()
         self._by_number.pop(session.peer, None)
         if self._by_link.pop(session.link, None) is not None:
             call_each(self._parts, lambda part: part.link_down(session))
@@ -366,7 +361,6 @@ class PeerSessions:
 
     async def close(self) -> None:
         """End every session, and wait until all proxies are closed."""
-        self._timer.close()
         for session in self:
             self._end(session)
         closing = OwnedTasks()
@@ -387,17 +381,14 @@ class PeerSessions:
         if session is not None:
             session.time.set(link.clock_offset, link.clock_error)
 
-    def _depends(self, session: PeerSession) -> bool:
-        """Whether anything of this module needs to know within a second that a peer is gone."""
-        return any(session.link.routes) or any(part.depends(session) for part in self._parts)
-
     def reconcile(self) -> None:
         """Try failed proxies again, let unused links rest, and forget unused namespaces of relayed modules."""
         now = asyncio.get_running_loop().time()
         for session in self.linked():
             yield_to_data()
             if session.linked and now - session.link.touched_at >= mesh_limits.REST_AFTER:
-                session.link.need(needed=self._depends(session))
+                needed = any(session.link.routes) or any(part.depends(session) for part in self._parts)
+                session.link.need(needed=needed)
         linked = {id(session.proxies) for session in self}
         for module, proxies in list(self._modules.items()):
             yield_to_data()

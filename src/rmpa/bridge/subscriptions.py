@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge.graph_part import GraphPart
+from rmpa.bridge.graph_part import GraphPart, go_on
 from rmpa.bridge.messages import (
     Notification,
     Source,
@@ -37,7 +37,7 @@ from rmpa.ros.wire.tcpros import ANY
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.messages import Message, Origin
@@ -198,38 +198,21 @@ class Subscriptions(GraphPart):
         super().__init__(bridge, SubscriptionOffers, SubscriptionImports)
         self.core = bridge.core
         self._shown: dict[Remote[Source], ShownSubscription] = {}
-        self._nodes: dict[str, tuple[str, ...]] = {}
         needs = Needs((Access.SUBSCRIBE,), "the topics: of others the subscription is not shown")
         bridge.rpc.on_notification(SUBSCRIPTIONS, self._told_by_peer, needs)
 
     def flows(self, source: Source, peer: int) -> bool:
         """Whether a topic of a node of this module goes to a peer, by the agents or directly."""
-        topics = self._bridge.topics
+        topics = self.bridge.topics
         granted = (owner for owner, _, _ in topics.direct_exports.of(source.topic, source.node))
         return peer in topics.exports.routes(source) or peer in granted
 
     def _told_by_peer(self, session: PeerSession, args: dict[str, Any]) -> None:
         changes = convert(SUBSCRIPTIONS, args, SubscriptionChanges)
-        self._advertisements.append((session, self.imports.changes(session.peer, changes)))
+        self._advertisements.append((session, self._apply(session, session.link, changes)))
         self.schedule()
         while len(self._advertisements) > limits.SUBSCRIPTIONS_WAITING:
-            self._apply_next()
-
-    def link_down(self, session: PeerSession) -> None:
-        """As of ``GraphPart``."""
-        super().link_down(session)
-        self.exports.link_down(session.peer)
-        self.imports.link_down(session.peer)
-
-    def grace_over(self, session: PeerSession) -> bool:
-        """Remove the peer's subscriptions from the local graph."""
-        self.run(self.imports.gone(session.peer))
-        return False
-
-    def gone(self, session: PeerSession) -> None:
-        """As of ``GraphPart``."""
-        super().gone(session)
-        self.run(self.imports.gone(session.peer))
+            go_on(self._advertisements)
 
     def graph_changed(self, change: GraphChange) -> None:
         """Have the topic of a registration looked at."""
@@ -244,32 +227,25 @@ class Subscriptions(GraphPart):
                 shown.register()
 
     def _names(self) -> Iterable[str]:
-        return (*self._nodes, *self.core.state().subscribers)
+        return (*self.exports.topics, *self.core.state().subscribers)
 
     def _look_at(self, name: str) -> None:
-        before, local = self._nodes.pop(name, ()), self._local(name)
-        if local:
-            self._nodes[name] = tuple(local)
-        for node in dict.fromkeys((*before, *local)):
-            self.exports.put(Source(name, node), local.get(node))
-
-    def _local(self, topic: str) -> Mapping[str, LocalSubscription]:
-        """The subscriptions of this module's nodes to a topic, and those that this agent relays, by node."""
+        """Offer the subscriptions of this module's nodes to a topic, and those that this agent relays."""
         unreachable, found = self.core.unreachable(), {}
-        for node in self.core.subscribers(topic):
-            origin = self._bridge.relay.origin((_place(topic), node)) if is_own(node) else None
+        for node in self.core.subscribers(name):
+            origin = self.bridge.relay.origin((_place(name), node)) if is_own(node) else None
             gone = node in unreachable and unreachable[node].withdrawn
             if origin is not None or not (is_own(node) or node.startswith(MEASURING) or gone):
-                found[node] = LocalSubscription(self.core.type_of(topic, node), origin)
-        return found
+                found[node] = LocalSubscription(self.core.type_of(name, node), origin)
+        self.exports.look(name, found)
 
     def _relayed(self, entry: Remote[Any], proxy: str) -> tuple[Source, Place]:
         return Source(_place(entry.name), entry.node), (_place(entry.name), proxy)
 
     def show(self, entry: Remote[Source]) -> None:
         """Register a peer's subscription at the proxy of its node, in a later turn of the loop."""
-        if (session := self._bridge.sessions.get(entry.peer)) is not None:
-            proxies, node = self._bridge.sessions.proxies(session, entry.node, entry.origin)
+        if (session := self.bridge.sessions.get(entry.peer)) is not None:
+            proxies, node = self.bridge.sessions.proxies(session, entry.node, entry.origin)
             self.pass_on(entry)
             shown, key = ShownSubscription(self, entry), _place(entry.wire.topic)
             self._shown[entry] = shown
@@ -278,7 +254,7 @@ class Subscriptions(GraphPart):
 
     def hide(self, entry: Remote[Source]) -> None:
         """Remove a peer's subscription from the local graph, in a later turn of the loop."""
-        self._bridge.relay.gone(entry.peer, Source(_place(entry.name), entry.node))
+        self.bridge.relay.gone(entry.peer, Source(_place(entry.name), entry.node))
         if (shown := self._shown.pop(entry, None)) is not None:
             shown.release()
 

@@ -18,7 +18,7 @@ from rmpa.bridge.messages import is_crossing_name, is_crossing_type
 from rmpa.bridge.policy import is_outside, service_place
 from rmpa.bridge.services.bodies import LocalService, ServicePool
 from rmpa.bridge.sessions import Part
-from rmpa.bridge.topics.local import own_sources, relayed_sources
+from rmpa.bridge.topics.exports import local_sources
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.core.log import logged_failure
@@ -127,16 +127,15 @@ class MeshSources:
                 on_change(source, there)
 
     def _topic(self, topic: str) -> Iterator[MeshSource]:
-        for node, local in own_sources(self._agent.core, topic).items():
-            if self._may_cross(topic, local.type, node):
-                yield self._own(SourceKind.TOPIC, node, topic, local.type)
-        for proxy, local in relayed_sources(self._agent.core, self._relay, topic).items():
-            shown, origin = self._relay.source((topic, proxy)), local.origin
-            if origin is None or shown is None or is_outside(origin):
+        for node, local in local_sources(self._agent.core, self._relay, topic).items():
+            shown, origin = self._relay.source((topic, node)), local.origin
+            if not self._may_cross(topic, local.type, node if origin is None else origin.node):
                 continue
-            if self._may_cross(topic, local.type, origin.node):
+            if origin is None:
+                yield self._own(SourceKind.TOPIC, node, topic, local.type)
+            elif shown is not None and not is_outside(origin):
                 module = origin.name, origin.instance, origin.node, shown[1].topic
-                yield MeshSource(SourceKind.TOPIC, *module, local.type, topic, proxy)
+                yield MeshSource(SourceKind.TOPIC, *module, local.type, topic, node)
 
     def _service(self, service: str) -> Iterator[MeshSource]:
         for node in self._agent.core.state().services.get(service, {}) if is_crossing_name(service) else ():
@@ -234,7 +233,7 @@ class AgentGraph(Part):
     def attend(self, source: MeshSource, listener: ForeignSource) -> TopicTap:
         """Listen under the name that a foreign node has here, and drop what comes.
 
-        Publishers of actions accept a server by the name of its connections; see ``bridge.topics.local``.
+        Publishers of actions accept a server by the name of its connections; see ``bridge.topics.reports``.
 
         Args:
             source: The topic.

@@ -20,8 +20,7 @@ from rmpa.trust.permissions import asker_name, refusal
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rmpa.bridge.context import BridgeContext
-    from rmpa.bridge.policy import PermissionGate
+    from rmpa.bridge.policy import BridgeContext, PermissionGate
     from rmpa.config.rules import CrossingRule
 
 

@@ -40,8 +40,8 @@ def feed(
 
 def test_nothing_came() -> None:
     s = Quality().summary(clock(), 5.0)
-    assert (s.latency, s.rate, s.bandwidth, s.jitter, s.age) == (None,) * 5
-    assert (s.period.count, s.messages, s.bytes) == (0, 0, 0)
+    assert (s.latency, s.rate, s.bandwidth, s.jitter, s.age, s.period) == (None,) * 6
+    assert (s.messages, s.bytes) == (0, 0)
 
 
 def test_a_clock_that_is_ahead_is_taken_off() -> None:
@@ -81,7 +81,7 @@ def test_the_rate_is_right_from_1_hz_to_100_khz(rate: int, burst: int) -> None:
     now = 0.0
     for number in range(int(seconds * rate)):
         now = (number // burst) * burst / rate + number % burst * 1e-6  # all of a burst at its beginning
-        quality.arrived(now, WALL, WALL, 100)
+        quality.arrived(now, WALL, WALL, 104)  # with the length field
         asked = number in (int(seconds * rate * 0.6), int(seconds * rate) - 1)
         if asked and number > 2:
             for later in (0.0, burst / rate, 0.03):  # at once, before the next burst, behind a pause of our own

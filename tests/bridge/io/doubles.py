@@ -15,7 +15,7 @@ from unittest import mock
 from rmpa.bridge.data.export import ExportFlow, ExportRoute
 from rmpa.bridge.data.route_sender import RouteSender
 from rmpa.bridge.messages import Source
-from rmpa.bridge.peer import PeerRun
+from rmpa.bridge.offers import PeerRun
 from rmpa.core.contract import Contract
 from rmpa.core.outbox import QueuedMessage
 

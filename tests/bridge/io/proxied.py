@@ -17,6 +17,13 @@ from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.publication import Publication
 
 
+class Unjoined(ImportRoute):
+    """A source whose publisher does not see further subscribers."""
+
+    def join(self, _connection: object) -> None:
+        """There is no publisher."""
+
+
 class Proxied:
     """A source of the peer *b*.
 
@@ -38,24 +45,23 @@ class Proxied:
         self.link = link
         nothing = SimpleNamespace(
             demand=lambda _entry, _now, wanted: self.demands.append(wanted),
-            changed=lambda _entry: None,
             listeners_changed=lambda _peer, _source: None,
             request=lambda *_: None,
-            join=lambda *_: None,
         )
-        part: Any = SimpleNamespace(
-            imports=nothing, subscribers=nothing, direct_imports=nothing, joins=nothing, now=self.loop.time
-        )
+        part: Any = SimpleNamespace(imports=nothing, direct_imports=nothing, now=self.loop.time)
+        part.keep_awake = lambda: None
         part.warn = lambda kind, _who, _text: self.occurred.append((self.loop.time(), _kind(kind)))
         pasts: dict[Any, Any] = {}
         part.pasts = lambda _name: pasts
-        shared: Any = SimpleNamespace(core=core, counters=Counters(), relay=SimpleNamespace(enabled=False))
+        sessions = SimpleNamespace(proxies=lambda _session, node, _origin: (self.proxies, node))
+        part.bridge = SimpleNamespace(
+            core=core, counters=Counters(), relay=SimpleNamespace(enabled=False), sessions=sessions
+        )
         self.entry = RemoteTopic(
             peer=1, wire=source, name=source.topic, node=source.node, type=type_name, module=("", "b")
         )
         session = PeerSession(peer=1, name="b", link=link, proxies=self.proxies)
-        self.route = self.entry.route = ImportRoute(shared, part, session, self.entry)
-        self.route.release = lambda: self.proxies.release(source.node, source.topic)
+        self.route = self.entry.route = Unjoined(part, session, self.entry)
 
     @property
     def flow(self) -> ImportFlow:
@@ -65,16 +71,14 @@ class Proxied:
 
     async def publish(self) -> Publication:
         """Show it in the local graph."""
-        self.proxies.hold(self.entry.node, self.entry.name, self.route.ready, self.route.left)
         while self.route.publication is None:
             await asyncio.sleep(0.01)
         return self.route.publication
 
     def opened(self, opened: RouteOpened) -> ImportFlow:
         """Its route is open."""
-        assert self.route.publication is not None
         self.entry.open = True
-        self.route.open(opened, self.route.publication)
+        self.route.open(opened)
         return cast("ImportFlow", self.link.routes[opened.route])
 
     def detach(self, *, missed: bool = False, last: int | None = None) -> None:

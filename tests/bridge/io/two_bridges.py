@@ -301,8 +301,7 @@ class World:
             bridge = side.bridge
             assert not bridge.topics.exports.flows
             assert not any(told.routes for told in bridge.topics.exports.peers.values())
-            assert not bridge.topics.joins._served
-            assert not bridge.topics.outbound._parked
+            assert not bridge.topics.exports._parked
             assert not bridge.topics.imports.flowing
             assert not any(entry.flow for entry in bridge.topics.imports)
             for attached in side.attached:
@@ -324,7 +323,7 @@ def made_up(loop: VirtualLoop) -> Iterator[None]:
         for where in ("proxies", "bridge"):
             stack.enter_context(mock.patch(f"rmpa.bridge.{where}.SlaveNode", Node))
         stack.enter_context(mock.patch("rmpa.bridge.proxies.is_loopback", return_value=False))
-        stack.enter_context(mock.patch("rmpa.bridge.topics.local.PublisherConnection", PublisherConnection))
+        stack.enter_context(mock.patch("rmpa.bridge.topics.exports.PublisherConnection", PublisherConnection))
         for flow in ("export", "reception"):
             wall = SimpleNamespace(time_ns=loop.time_ns)
             stack.enter_context(mock.patch(f"rmpa.bridge.data.{flow}.time", wall))

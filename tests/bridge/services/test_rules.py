@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-from rmpa.bridge.context import Names, ServiceRules
-from rmpa.bridge.policy import Policy
+from rmpa.bridge.policy import Names, Policy, ServiceRules
 from rmpa.config.peer_rules import PeerRule, PolicySettings, ServiceRule
 from rmpa.config.settings import ServiceSettings
 from rmpa.core.contract import Transport

@@ -4,7 +4,6 @@ from typing import Any
 
 import pytest
 
-from rmpa.bridge.context import Names
 from rmpa.bridge.messages import (
     Advertise,
     CloseRoute,
@@ -15,7 +14,7 @@ from rmpa.bridge.messages import (
     Source,
     TopicOffer,
 )
-from rmpa.bridge.policy import Policy
+from rmpa.bridge.policy import Names, Policy
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.settings import LimitSettings

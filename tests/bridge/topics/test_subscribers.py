@@ -24,17 +24,14 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
 from rmpa.bridge.sessions import PeerSession
-from rmpa.bridge.topics import local as module
+from rmpa.bridge.topics import exports as module
 from rmpa.bridge.topics.exports import LocalSource
-from rmpa.bridge.topics.local import (
-    RemoteSubscribers,
-    audience,
-)
-from rmpa.bridge.topics.reports import Mismatches
+from rmpa.bridge.topics.import_route import ImportRoute, RemoteTopic
+from rmpa.bridge.topics.reports import Mismatches, audience
 from rmpa.config.peer_rules import PermissionRule, PolicySettings
 from rmpa.config.settings import TrustSettings
 from rmpa.trust.permissions import Permissions
-from tests.bridge.recorder import Exports, Imports, Send
+from tests.bridge.recorder import Exports, Imports, Send, Warn
 
 # Who listens is told to the peer that publishes; whom a peer tells of is connected to our publisher.
 
@@ -83,6 +80,18 @@ def connected() -> list[str]:
     return sorted(one.what[2] for one in Connection.made if one.running)
 
 
+class Route(ImportRoute):
+    """A source at its proxy, without the proxy."""
+
+    def __init__(self, part: Any, entry: RemoteTopic) -> None:
+        self._part, self.entry = part, entry
+        self._told, self._telling = (), None
+        self.flow = cast("Any", "there")
+
+    def open(self, _opened: RouteOpened) -> None:
+        self._told = ()
+
+
 class World:
     """The plans of one bridge, and one peer."""
 
@@ -94,24 +103,21 @@ class World:
         link = SimpleNamespace(name="base")
         proxies = SimpleNamespace(prefix="/rmpa/base")
         self.peer = cast("PeerSession", SimpleNamespace(peer=1, link=link, proxies=proxies))
-        out: Any = SimpleNamespace(
-            warn=lambda kind, _who, _text: self.warned.append(kind),
+        self.part = SimpleNamespace(
             send=lambda _peer, message: self.sent.append(message),
+            direct_imports=SimpleNamespace(listeners_changed=lambda *_: None),
         )
-        exports, imports = cast("Any", self.exports), cast("Any", self.imports)
-        shared = SimpleNamespace(context=SimpleNamespace(gate=gate))
-        self.presence = RemoteSubscribers(cast("Any", shared), out, exports, imports)
+        cast("Any", self.exports.out).imports = self.imports
         self.exports.link_up(1, "base" if gate.on else "")
         self.imports.link_up(1)
 
     def change(self, source: Source, *listeners: str) -> None:
         """These listen to a source of the peer now."""
         if (entry := self.imports.get(1, source)) is not None:
-            before = entry.route.flow if entry.route is not None else None
-            flow = before if before is not None and before.route == entry.number else None
-            flow = flow or SimpleNamespace(route=entry.number, told=())
-            entry.route = SimpleNamespace(publication=SimpleNamespace(listeners=listeners), flow=flow)
-            self.presence.changed(entry)
+            if not isinstance(entry.route, Route):
+                entry.route = Route(self.part, entry)
+            entry.route.publication = SimpleNamespace(listeners=listeners)
+            entry.route.listeners_changed()
 
     async def changed(self, source: Source, *listeners: str) -> list[object]:
         """Likewise; return what the peer was told."""
@@ -129,7 +135,8 @@ class World:
 
     def told(self, route: int, *nodes: str) -> list[str]:
         """The peer says who listens; return under which names we are connected then."""
-        self.presence.named(self.peer, Audience(route, nodes))
+        done = self.exports.named(self.peer, Audience(route, nodes))
+        self.warned += [one.kind for one in done if isinstance(one, Warn)]
         return connected()
 
 
@@ -237,8 +244,10 @@ class Reports(Mismatches):
         out = SimpleNamespace(
             send=lambda peer, message: self.done.append(Send(peer, message)),
             warn=lambda *args: self.warnings.append(args[2]),
+            exports=exports,
+            imports=imports,
         )
-        super().__init__(cast("Any", out), cast("Any", exports), cast("Any", imports))
+        super().__init__(cast("Any", out))
 
     def hear(self, text: str, subscriber: str = "/viewer") -> None:
         self.reported(BASE, "base", Mismatch(CMD.topic, CMD.node, subscriber, text))

@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from rmpa.bridge.context import BridgeContext
-from rmpa.bridge.policy import OPEN_GATE, PermissionGate
+from rmpa.bridge.policy import OPEN_GATE, BridgeContext, PermissionGate
 from rmpa.config.peer_rules import ServiceRule
 from rmpa.config.rules import CrossingRule
 from rmpa.config.settings import ServiceSettings, Settings

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from rmpa.bridge.data.reception import ImportFlow
-    from rmpa.bridge.messages import Description, OpenRoute, Source
-    from rmpa.bridge.peer import PeerRun
+    from rmpa.bridge.messages import Description, Source
+    from rmpa.bridge.offers import PeerRun
     from rmpa.core.outbox import QueuedMessage
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
@@ -59,6 +59,7 @@ class ExportRoute:
         shared: Whether the publisher was connected before.
         sender: Sends the messages, and keeps those that the peer does not have; ``None`` until the publisher answers.
         audience: The connections to the publisher that stand for the peer's listeners, by their names here.
+        joins: The peer's subscribers that join it, by the numbers of their own routes.
     """
 
     session: PeerRun
@@ -71,6 +72,7 @@ class ExportRoute:
     shared: bool = False
     sender: RouteSender | None = None
     audience: dict[str, TopicConnection] = field(default_factory=dict)
+    joins: dict[int, FlowSender] = field(default_factory=dict)
 
     @property
     def peer(self) -> int:
@@ -92,16 +94,11 @@ class ExportRoute:
         """For how many seconds its messages are kept without a link."""
         return self.contract.resume_window if self.reliable else mesh_limits.SILENT_GRACE
 
-    def open(self, message: OpenRoute, contract: Contract, *, unknown: bool, shared: bool) -> None:
-        """Take what the peer asks for, over its present link."""
-        self.number, self.contract, self.asked = message.route, contract, message.contract
-        self.position = (message.epoch, message.after) if message.epoch else None
-        self.unknown, self.shared = unknown, shared
-
     def dismiss(self) -> None:
-        """Close the connections for the peer's listeners."""
-        for connection in self.audience.values():
-            connection.close()
+        """Close what stands for single subscribers of the peer."""
+        standing: list[TopicConnection | FlowSender] = [*self.audience.values(), *self.joins.values()]
+        for one in standing:
+            one.close()
         self.audience.clear()
 
 
@@ -138,7 +135,6 @@ class ExportFlow:
         self.description: Description | None = None
         self.routes: dict[int, ExportRoute] = {}
         self._senders: tuple[FlowSender, ...] = ()
-        self._joins: list[tuple[RouteSender, FlowSender]] = []
         self.history = HistoryCache()
         self._keeping = False
         self._streaming: dict[FlowSender, tuple[LaneSender, QueuedMessage]] = {}
@@ -210,7 +206,8 @@ class ExportFlow:
 
     def add(self, route: ExportRoute, link: PeerLink, begin: RouteBegin | None = None) -> RouteSender:
         """Send on a route, first the kept messages; ``begin`` is what ``begins`` has said."""
-        self.remove(route)
+        if route.sender is not None:
+            self.remove(route)
         begin, contract = begin or self.begins(route), route.contract
         kind = ReliableRouteSender if route.reliable else RouteSender
         sender = kind(link, route.number, contract, begin.epoch, begin.first, large=self.large)
@@ -227,16 +224,12 @@ class ExportFlow:
 
     def remove(self, route: ExportRoute) -> None:
         """Send on a route no more, and drop its waiting messages."""
-        route.dismiss()
         sender, route.sender = route.sender, None
         if sender is not None:
             sender.close()
-            self._list_senders()
             self._streaming.pop(sender, None)
-            for common, join in list(self._joins):
-                if common is sender:
-                    join.close()
-            self._look_drained()
+        route.dismiss()
+        self.joins_changed()
 
     @property
     def latched(self) -> bytes:
@@ -244,20 +237,14 @@ class ExportFlow:
         kept = self.history.newest(1)
         return kept[0].payload if kept else b""
 
-    def join(self, common: RouteSender, join: FlowSender) -> None:
-        """Let a joining subscriber of a sender's peer see what all get."""
-        self._joins.append((common, join))
-        self._list_senders()
-
-    def leave(self, join: FlowSender) -> None:
-        """The subscriber gets what all get."""
-        self._joins = [one for one in self._joins if one[1] is not join]
+    def joins_changed(self) -> None:
+        """Let those see what all get who join a route, and no others any more."""
         self._list_senders()
         self._look_drained()
 
     def _list_senders(self) -> None:
         own = (route.sender for route in self.routes.values() if route.sender is not None)
-        self._senders = (*own, *(join for _, join in self._joins))
+        self._senders = (*own, *(join for route in self.routes.values() for join in route.joins.values()))
 
     def drain(self, over: Callable[[], None]) -> None:
         """Call ``over`` once all peers have all messages, for the publisher has ended; perhaps at once."""

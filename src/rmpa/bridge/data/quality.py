@@ -19,6 +19,7 @@ from rmpa.core.contract import Liveliness
 from rmpa.core.facts import LatencyInfo
 from rmpa.core.statistics import SampleSpread
 from rmpa.mesh import limits as mesh_limits
+from rmpa.ros.wire.tcpros import LENGTH
 
 if TYPE_CHECKING:
     from rmpa.core.contract import Contract
@@ -237,12 +238,12 @@ _Number = TypeVar("_Number", int, float)
 
 
 class QualitySummary(NamedTuple):
-    """The recent arrivals of one source; seconds, messages and bytes.
+    """The recent arrivals of one source; seconds, messages and bytes without TCPROS's length fields.
 
     Args:
         latency: From the arrival of a message at the publisher's agent to its delivery here; ``None`` where the
             peer's clock is unknown, or nothing came.
-        period: Between messages.
+        period: Between messages; ``None`` before the second one.
         jitter: The period's 99th percentile less its median; ``None`` before the third message.
         rate: Messages a second, over what the ring holds and at least over the last second; a silence longer than
             every period counts, so the rate of a dead source falls.
@@ -253,7 +254,7 @@ class QualitySummary(NamedTuple):
     """
 
     latency: LatencyInfo | None
-    period: SampleSpread
+    period: SampleSpread | None
     jitter: float | None
     rate: float | None
     bandwidth: float | None
@@ -349,13 +350,13 @@ class Quality:
         latencies, error = self._latencies(times, clock, latching=latching) if clock is not None else ([], 0.0)
         return QualitySummary(
             latency=LatencyInfo.of(latencies, last=latencies[-1], error=error) if latencies else None,
-            period=period,
+            period=period if period.count else None,
             jitter=period.p99 - period.p50 if period.count > 1 else None,
             rate=count / elapsed if elapsed > 0 else None,
-            bandwidth=size / elapsed if elapsed > 0 else None,
+            bandwidth=(size - LENGTH.size * count) / elapsed if elapsed > 0 else None,
             age=silence if times else None,
             messages=self.messages,
-            bytes=self.bytes,
+            bytes=self.bytes - LENGTH.size * self.messages,
         )
 
     def _counted(self, times: array[float], now: float) -> tuple[int, int, float]:

@@ -86,7 +86,6 @@ class ImportFlow:
         _sequence: The number of the message that comes in parts; ``None``: there is none.
         _whole: The bytes so far of the message that comes in parts, if it must be delivered whole.
         _held: The end of the wait, the stamp and the bytes of a stale message that waits for a newer one.
-        told: The local subscribers of which the publisher's agent was told on this route; see ``RemoteSubscribers``.
         counts: Messages that were not delivered: ``lost`` in the sender's queue or on a link, ``late`` (behind newer
             ones, or twice), ``stale`` (delayed by an outage, dropped for newer ones), ``expired`` (after their
             lifespan).
@@ -129,7 +128,6 @@ class ImportFlow:
         self._size = self._received = 0
         self._whole: bytearray | None = None
         self._held: tuple[asyncio.TimerHandle, int, bytes] | None = None
-        self.told: tuple[str, ...] = ()
         self._link: PeerLink
         self.route = self.epoch = 0
         self._had = 0
@@ -173,7 +171,6 @@ class ImportFlow:
         """
         position = self.numbering.position()
         self._link, self.route, self.epoch = link, route, epoch
-        self.told = ()
         self.torn()
         self._stop_ack_timer()
         self.numbering.begin(epoch, first)

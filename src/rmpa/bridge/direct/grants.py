@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import (
+from rmpa.bridge.direct.paths import (
     Condition,
     DirectAsk,
     Grant,
@@ -29,7 +29,7 @@ from rmpa.bridge.direct.conditions import (
 )
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.topics.local import compares_names
+from rmpa.bridge.topics.reports import compares_names
 from rmpa.config.peer_rules import Access
 from rmpa.core.contract import Contract, Transport, combine
 from rmpa.core.errors import RemoteProtocolError, RmpaError
@@ -38,19 +38,18 @@ from rmpa.ros.environment import is_loopback
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.wire.slave_api import TCPROS
-from rmpa.ros.wire.tcpros import ANY, parse_service_uri
+from rmpa.ros.wire.tcpros import parse_service_uri
 from rmpa.ros.wire.xmlrpc import RosFault
 from rmpa.runtime.kernel_tcp import connections, end_connections, listening_addresses
 from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.services.books import ServiceExports
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import Exports
-    from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.runtime.kernel_tcp import TcpSocket
 
 _log = logging.getLogger(__name__)
@@ -68,6 +67,7 @@ class Grants(ABC):
 
     Attributes:
         kind: The middle of the names of the messages.
+        interruptions: When peers' subscribers were without a grant because their link was lost.
         _asked: By peer and what it wants: its session, its question, and the answer; ``None`` while that is looked
             for. A peer may ask for thousands, so nothing here passes over those of all peers for one of them.
         _by_node: What ``of`` returns; ``None``: grants have changed since it was made.
@@ -79,6 +79,7 @@ class Grants(ABC):
         self._bridge = bridge
         self._asked: dict[int, dict[Want, _Entry]] = {}
         self._by_node: dict[tuple[str, str], list[tuple[int, str, Grant]]] | None = None
+        self.interruptions: Interruptions = {}
 
     def __iter__(self) -> Iterator[tuple[int, Want, Grant]]:
         """Every grant: peer, what is granted, and where; changes during the iteration are allowed."""
@@ -109,10 +110,7 @@ class Grants(ABC):
     async def _find(self, session: PeerSession, want: Want) -> Grant | Unmet:
         """Where the node listens, if the peer may reach it."""
 
-    def _changed(self, session: PeerSession, want: Want, *, granted: bool) -> None:  # noqa: B027 - of topics alone
-        """A user has got a grant, or has none any more."""
-
-    def _broke(self, want: Want) -> None:  # noqa: B027 - likewise
+    def _broke(self, want: Want) -> None:  # noqa: B027 - of topics alone
         """A peer's user says that its connection ended by itself."""
 
     async def _ask(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
@@ -169,7 +167,8 @@ class Grants(ABC):
             del self._asked[session.peer]
         if isinstance(before, Grant) == isinstance(found, Grant):
             return
-        self._changed(session, want, granted=isinstance(found, Grant))
+        if isinstance(found, Grant):
+            interrupted(self.interruptions, session, want, lasts=False)
         for peer, entries in list(self._asked.items()) if isinstance(before, Grant) else ():
             if peer != session.peer and want in entries and isinstance(entries[want][2], Unmet):
                 self._tell(entries[want][0], want)  # perhaps it was refused because of the user's name
@@ -321,9 +320,6 @@ class TopicGrants(Grants):
     Args:
         bridge: As of ``Grants``.
         exports: Knows what is offered to each peer.
-
-    Attributes:
-        interruptions: When peers' subscribers were without a grant because their link was lost.
     """
 
     kind = "topic"
@@ -335,7 +331,6 @@ class TopicGrants(Grants):
         rpc.on_notification("direct.topic_release", self._released, _RELEASED)
         self._exports = exports
         self.ports = NodePorts()
-        self.interruptions: Interruptions = {}
 
     def graph_changed(self, change: GraphChange) -> None:
         """Have peers ask again for what a registration that came or went touches."""
@@ -349,37 +344,8 @@ class TopicGrants(Grants):
         """As of ``Grants``."""
         for peer, want, _ in self if not session.link.crashed else ():
             if peer == session.peer:
-                self._interrupted(session, want, lasts=True)
+                interrupted(self.interruptions, session, want, lasts=True)
         super().link_down(session)
-
-    def _interrupted(self, session: PeerSession, want: Want, *, lasts: bool) -> None:
-        interrupted(self.interruptions, session.link.name, want, asyncio.get_running_loop().time(), lasts=lasts)
-
-    def _changed(self, session: PeerSession, want: Want, *, granted: bool) -> None:
-        """Have the proxy of a peer's subscriber stand in the graph while it has a grant for the topic."""
-        if granted:
-            self._interrupted(session, want, lasts=False)
-        nodes = sum((peer, one.name, one.user) == (session.peer, want.name, want.user) for peer, one, _ in self)
-        held, topic = f"subscriber of {want.name}", want.name
-        if granted and nodes == 1:
-            session.proxies.hold(
-                want.user, held, lambda proxy: self._register(topic, proxy), lambda proxy: self._leave(topic, proxy)
-            )
-        elif not nodes:
-            session.proxies.release(want.user, held)
-
-    def _register(self, topic: str, proxy: SlaveNode) -> None:
-        self._bridge.core.call("registerSubscriber", proxy.name, topic, ANY, proxy.uri)
-
-    def _leave(self, topic: str, proxy: SlaveNode) -> None:
-        self._bridge.core.call("unregisterSubscriber", proxy.name, topic, proxy.uri)
-
-    def reconcile(self, subscribers: Mapping[str, Mapping[str, str]]) -> None:
-        """Register missing subscribers again: the core has been restarted."""
-        for session, asked, found in self._entries():
-            proxy = session.proxies.get(asked.user) if isinstance(found, Grant) else None
-            if proxy is not None and proxy.name not in subscribers.get(asked.name, {}):
-                self._register(asked.name, proxy)
 
     def _uri(self, want: Want) -> str:
         """The slave API of a publisher now; the exports learn a new one a little later."""

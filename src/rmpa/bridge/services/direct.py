@@ -8,9 +8,8 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, Want, unmet_by_contract, unmet_by_rules
 from rmpa.bridge.direct.grants import end_all
-from rmpa.bridge.direct.paths import Path, Paths
+from rmpa.bridge.direct.paths import Condition, Grant, Path, Paths, Unmet, Want, unmet_by_contract, unmet_by_rules
 from rmpa.bridge.policy import Needs
 from rmpa.core.contract import Contract, Transport
 from rmpa.core.errors import RmpaError

@@ -17,7 +17,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.direct.grants import ServiceGrants
 from rmpa.bridge.graph_part import GraphPart
 from rmpa.bridge.messages import CloseService, OpenService, ServiceClosed, ServiceOpened, Source
-from rmpa.bridge.peer import PeerState
+from rmpa.bridge.offers import PeerState
 from rmpa.bridge.policy import Needs, service_place
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.services.books import ServiceExports, ServiceImports
@@ -147,12 +147,6 @@ class Services(GraphPart):
         for shown in [one for one in self if one.remote.peer == session.peer and (one.waiting or one.asking)]:
             self._want(shown)
 
-    def link_down(self, session: PeerSession) -> None:
-        """Fail the calls under way; the peer's services stay in the graph until ``grace_over`` or ``gone``."""
-        super().link_down(session)
-        self.imports.link_down(session.peer)
-        self.exports.link_down(session.peer)
-
     def grace_over(self, session: PeerSession) -> bool:
         """Remove the peer's services; if its agent has crashed, those that are called directly stay for a time."""
         called = self.direct_imports.called(session.peer)
@@ -167,9 +161,8 @@ class Services(GraphPart):
         return None
 
     def gone(self, session: PeerSession) -> None:
-        """Remove the peer's services, and what else is known of the peer."""
+        """As of ``GraphPart``; what its calls hold is free."""
         super().gone(session)
-        self.run(self.imports.gone(session.peer))
         self._budgets.pop(session.peer, None)
 
     def message(self, session: PeerSession, message: Message) -> bool:
@@ -238,17 +231,17 @@ class Services(GraphPart):
     def _to_relay(self, service: str, providers: Mapping[str, str]) -> LocalService | None:
         """The server of a service that is relayed for another module; ``None`` if there is none."""
         for node, uri in providers.items():
-            if (origin := self._bridge.relay.origin(service_place(service, node))) is not None:
+            if (origin := self.bridge.relay.origin(service_place(service, node))) is not None:
                 return LocalService(node, uri, origin)
         return None
 
     def provide(self, remote: RemoteService) -> None:
         """Register a peer's service in the local graph, at the proxy of the node that provides it."""
         peer, service, node = remote.peer, remote.name, remote.node
-        session = self._bridge.sessions.get(peer)
+        session = self.bridge.sessions.get(peer)
         if session is None:
             return
-        proxies, owner = self._bridge.sessions.proxies(session, node, remote.origin)
+        proxies, owner = self.bridge.sessions.proxies(session, node, remote.origin)
         self.pass_on(remote)
         shown = self._shown[remote] = ShownService(remote, session)
         proxies.hold(owner, f"service {service}", lambda proxy: self._expose(shown, proxy))
@@ -294,7 +287,7 @@ class Services(GraphPart):
 
     def withdraw(self, remote: RemoteService, reason: str) -> None:
         """Remove a peer's service from the local graph; its waiting calls fail with the reason."""
-        self._bridge.relay.gone(remote.peer, Source(f"service {remote.name}", remote.node))
+        self.bridge.relay.gone(remote.peer, Source(f"service {remote.name}", remote.node))
         shown = self._shown.pop(remote, None)
         if shown is None:
             return
@@ -304,7 +297,7 @@ class Services(GraphPart):
         if (proxy := shown.proxy) is not None:
             self._core.call("unregisterService", proxy.name, remote.name, proxy.service_uri)
             proxy.remove_service(remote.name, text)
-        proxies, owner = self._bridge.sessions.proxies(shown.session, remote.node, remote.origin)
+        proxies, owner = self.bridge.sessions.proxies(shown.session, remote.node, remote.origin)
         proxies.release(owner, f"service {remote.name}")
 
     def forget_about(self, remote: RemoteService) -> None:
@@ -365,7 +358,7 @@ class Services(GraphPart):
 
     def ended(self, remote: RemoteService, route: int, reason: str) -> None:
         """A service cannot be called, or no longer: its calls fail with the reason; ``route`` was that of replies."""
-        session = self._bridge.sessions.get(remote.peer)
+        session = self.bridge.sessions.get(remote.peer)
         if session is not None:
             session.link.routes.pop(route, None)
         if (shown := self._shown.get(remote)) is None:
@@ -395,7 +388,7 @@ class Services(GraphPart):
         self.warn(_MISMATCH, f"{shown.remote.name}{caller_id}", text)
         if shown.session.linked:
             args: dict[str, Any] = {"service": shown.remote.wire, "text": text[: limits.CONTROL_TEXT_MAX]}
-            self._bridge.rpc.notify(shown.session, _MISMATCH, args)
+            self.bridge.rpc.notify(shown.session, _MISMATCH, args)
 
     def _told_of_mismatch(self, session: PeerSession, args: dict[str, Any]) -> None:
         text = printable(str(args.get("text", ""))[: limits.CONTROL_TEXT_MAX])

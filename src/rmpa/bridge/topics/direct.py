@@ -12,19 +12,22 @@ from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import (
+from rmpa.bridge.direct.grants import end_all
+from rmpa.bridge.direct.paths import (
+    AGENTS,
+    LOST,
     Condition,
     Grant,
     Interruptions,
+    Path,
+    Paths,
     Unmet,
     Want,
     interrupted,
     unmet_by_rules,
 )
-from rmpa.bridge.direct.grants import end_all
-from rmpa.bridge.direct.paths import AGENTS, LOST, Path, Paths
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.topics.local import compares_names
+from rmpa.bridge.topics.reports import compares_names
 from rmpa.core.contract import Contract, Transport
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import OWN_NODE, is_own
@@ -274,12 +277,9 @@ class TopicPaths(Paths["RemoteTopic"]):
     def _put(self, path: TopicPath, place: tuple[str, int], at: float | None = None) -> None:
         """Note where a subscriber is now; one that is lost is interrupted until it is somewhere again."""
         path.place, path.placed_at = place, self._now() if at is None else at
-        self._interrupted(path, lasts=place is LOST)
+        interrupted(self.interruptions, path.session, path.want, lasts=place is LOST)
         self._place(path)
         self._watch()
-
-    def _interrupted(self, path: TopicPath, *, lasts: bool) -> None:
-        interrupted(self.interruptions, path.session.link.name, path.want, self._now(), lasts=lasts)
 
     def listeners_changed(self, peer: int, source: Source) -> None:
         """Note which subscribers have left the proxy of a source, or have come back to it by themselves."""
@@ -304,7 +304,7 @@ class TopicPaths(Paths["RemoteTopic"]):
             if path.endpoint is not None and session.link.crashed:
                 path.entry.direct = True
             elif path.endpoint is not None:
-                self._interrupted(path, lasts=True)
+                interrupted(self.interruptions, session, path.want, lasts=True)
         super().link_down(session)
 
     def gone(self, session: PeerSession) -> None:
@@ -342,7 +342,7 @@ class TopicPaths(Paths["RemoteTopic"]):
 
     def _decided(self, path: TopicPath) -> None:
         if path.endpoint == path.target is not None:
-            self._interrupted(path, lasts=False)
+            interrupted(self.interruptions, path.session, path.want, lasts=False)
         self._place(path)
         self._watch()
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 from itertools import chain
 from typing import TYPE_CHECKING, Any, cast
 
-from rmpa.bridge.data.quality import PeerClockHistory, QosEventKind, shown_seconds
+from rmpa.bridge.data.quality import QosEventKind, shown_seconds
 from rmpa.bridge.data.route_sender import ReliableRouteSender
-from rmpa.bridge.direct.conditions import Condition, Want, unmet_by_contract
-from rmpa.bridge.direct.paths import AGENTS
+from rmpa.bridge.direct.paths import AGENTS, Condition, Want, unmet_by_contract
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import PolicyDecision
 from rmpa.config.rules import CLOCK
@@ -33,8 +32,8 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.export import ExportRoute
-    from rmpa.bridge.data.quality import QosWatch, QualitySummary
-    from rmpa.bridge.peer import PeerRun
+    from rmpa.bridge.data.quality import QosWatch
+    from rmpa.bridge.offers import PeerRun
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
     from rmpa.bridge.topics.import_route import RemoteTopic
@@ -53,17 +52,13 @@ class TopicFacts:
         self._core = bridge.core
         self._bridge = bridge
         self._clock = SystemClock()
-        # Over the last minute, by the session's number; those of peers that are away for a moment are kept.
-        self._peer_clocks: dict[int, PeerClockHistory] = {}
 
     def follow_clocks(self) -> None:
-        """Record each link's estimate of its peer's clock, once a second; forget peers that are gone."""
-        before, self._peer_clocks = self._peer_clocks, {}
-        for session in self._bridge.sessions:
-            clock = self._peer_clocks[session.peer] = before.get(session.peer) or PeerClockHistory()
+        """Record each link's estimate of its peer's clock, once a second."""
+        for session in self._bridge.sessions.linked():
             offset, error = session.link.clock_offset, session.link.clock_error
-            if offset is not None and error is not None and session.linked:
-                clock.add(offset, error, self._clock.now())
+            if offset is not None and error is not None:
+                session.clocks.add(offset, error, self._clock.now())
 
     def contract(self, topic: str, type_name: str) -> dict[str, ContractTerm]:
         """The terms of a topic's contract by the settings, by key; ``type_name`` may be empty."""
@@ -167,14 +162,13 @@ class TopicFacts:
             problem = entry.problem
         figures = {}
         if flow is not None:
-            clock = self._peer_clocks.get(session.peer) or PeerClockHistory()
             figures = {
                 "oversized": flow.oversized,
                 "oversized_bytes": flow.oversized_bytes,
                 "late": flow.counts["late"] + flow.counts["stale"],
                 "expired": flow.counts["expired"],
                 "lane": flow.lane,
-                **_quality(flow.quality.summary(clock, now, latching=latched)),
+                **flow.quality.summary(session.clocks, now, latching=latched)._asdict(),
             }
         return RouteInfo(
             peer=session.link.name,
@@ -431,14 +425,6 @@ def _transport_name(*, direct: bool, relayed: bool) -> str:
     if direct:
         return "both" if relayed else "direct"
     return "relay" if relayed else ""
-
-
-def _quality(quality: QualitySummary) -> dict[str, Any]:
-    """The fields of a route that its quality gives; bytes without TCPROS's length fields."""
-    known = quality._asdict() | {"bytes": quality.bytes - LENGTH.size * quality.messages}
-    if quality.bandwidth is not None and quality.rate is not None:
-        known["bandwidth"] = quality.bandwidth - LENGTH.size * quality.rate
-    return known | {"period": quality.period if quality.period.count else None}
 
 
 def _events(watch: QosWatch | None, now: float) -> dict[str, Any]:

@@ -11,8 +11,10 @@ from msgspec import UnsetType
 
 from rmpa.bridge import limits
 from rmpa.bridge.data.reception import ImportFlow
-from rmpa.bridge.messages import Source
+from rmpa.bridge.messages import Audience, Source
 from rmpa.bridge.peer_offers import Remote
+from rmpa.bridge.topics.joins import join
+from rmpa.bridge.topics.reports import audience, compares_names, is_watched
 from rmpa.core.contract import Contract, Durability, Reliability
 from rmpa.core.identity import OWN_NODE, serial_add
 from rmpa.mesh import limits as mesh_limits
@@ -22,7 +24,6 @@ from rmpa.ros.wire.tcpros import TopicDescription, printable
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.quality import QosEvent, QosWatch
     from rmpa.bridge.messages import Description, RouteOpened
     from rmpa.bridge.sessions import PeerSession
@@ -133,11 +134,10 @@ class RemoteTopic(Remote[Source]):
 
 
 class ImportRoute(PublicationEvents):
-    """One source on its way to the local subscribers, whichever peer carries it.
+    """One source on its way to the local subscribers, whichever peer carries it; holds a proxy until ``release``.
 
     Args:
-        bridge: The core.
-        part: Knows what subscribers want.
+        part: The part, which is told what subscribers want.
         session: The peer that carries it.
         entry: The source, as that peer offers it; its number is that of the route.
 
@@ -147,34 +147,32 @@ class ImportRoute(PublicationEvents):
         publication: What subscribers connect to; ``None`` before its proxy exists.
         flow: The flow of its route: the open one, or the one that outlived its link.
         on_open: Called when its route is open, where this module has to pass it on since before.
-        release: Lets its proxy go.
+        _pasts, _key: Where its events are remembered.
+        _told: The listeners of which the publisher's agent was told on the route that is open.
     """
 
     __slots__ = (
-        "_bridge",
-        "_key",
-        "_part",
-        "_pasts",
-        "entry",
-        "flow",
-        "node",
-        "on_open",
-        "publication",
-        "release",
-        "session",
-        "topic",
-    )
+        "_bridge", "_key", "_owner", "_part", "_pasts", "_proxies", "_telling", "_told",
+        "entry", "flow", "node", "on_open", "publication", "session", "topic",
+    )  # fmt: skip
 
-    def __init__(self, bridge: Bridge, part: Topics, session: PeerSession, entry: RemoteTopic) -> None:
-        self._bridge, self._part, self.session, self.entry = bridge, part, session, entry
+    def __init__(self, part: Topics, session: PeerSession, entry: RemoteTopic) -> None:
+        self._bridge, self._part, self.session, self.entry = part.bridge, part, session, entry
         self.topic = entry.name
-        # Where its events are remembered, by its names in its module and here: another peer may carry it next.
+        # By its names in its module and here: another peer may carry it next.
         self._pasts, self._key = part.pasts(entry.module[1]), entry.past
         self.node: SlaveNode | None = None
         self.publication: Publication | None = None
-        self.release: Callable[[], None]
         self.flow: ImportFlow | None = None
         self.on_open: Callable[[], object] | None = None
+        self._told: tuple[str, ...] = ()
+        self._telling: asyncio.Handle | None = None
+        self._proxies, self._owner = part.bridge.sessions.proxies(session, entry.node, entry.origin)
+        self._proxies.hold(self._owner, self.topic, self.ready, self.left)
+
+    def release(self) -> None:
+        """Let its proxy go, which unregisters the topic in a later turn of the loop."""
+        self._proxies.release(self._owner, self.topic)
 
     def ready(self, node: SlaveNode) -> None:
         """Register the topic: its proxy exists."""
@@ -218,21 +216,19 @@ class ImportRoute(PublicationEvents):
 
     def listeners_changed(self) -> None:
         """The peer may have to know their names."""
-        self._part.subscribers.changed(self.entry)
+        self._tell_soon()
         self._part.direct_imports.listeners_changed(self.entry.peer, self.entry.wire)
 
     def join(self, connection: SubscriberConnection) -> Receiver | None:
         """The publisher may have something to say to it alone."""
-        return self._part.joins.join(self, connection)
+        flow, publication = self.flow, self.publication
+        if flow is None or publication is None or compares_names(self.entry.type):
+            return None  # clients of actions are seen by their names
+        return join(self._part, self.session, publication, flow, connection)
 
     def request(self, caller: str) -> Awaitable[RosReply | None] | None:
         """A subscriber may get a direct connection."""
         return self._part.direct_imports.request(self.entry.peer, self.entry.wire, caller)
-
-    @property
-    def watch(self) -> QosWatch | None:
-        """The watch of its flow, or of the last one of a reliable source."""
-        return self.flow.watch if self.flow is not None else self._pasts.get(self._key, (None, ""))[0]
 
     def _occurred(self, event: QosEvent) -> None:
         who, text = (
@@ -250,12 +246,15 @@ class ImportRoute(PublicationEvents):
         for delay in limits.CALL_BACK_DELAYS:
             asyncio.get_running_loop().call_later(delay, self.register)
 
-    def open(self, opened: RouteOpened, publication: Publication) -> None:
-        """Take the data of a newly opened route; a reliable flow continues where the last link ended.
+    def open(self, opened: RouteOpened) -> None:
+        """Take the data of a newly opened route, and answer the waiting subscribers with its description.
 
-        The count of a reliable source goes on in any case. Where it cannot know what was lost, that is an event.
+        A reliable flow continues where the last link ended, and its count goes on in any case. Where it cannot know
+        what was lost, that is an event.
         """
-        contract, before = opened.contract, self.flow
+        if (publication := self.publication) is None:
+            return
+        contract, before, self._told = opened.contract, self.flow, ()
         reliable = contract.reliability is Reliability.RELIABLE
         past, missed_at = self._pasts.pop(self._key, (None, ""))
         if before is not None and before.contract.reliability is Reliability.RELIABLE:
@@ -286,6 +285,22 @@ class ImportRoute(PublicationEvents):
         on_open, self.on_open = self.on_open, None
         if on_open is not None:
             on_open()
+        self._part.keep_awake()
+        self._tell_soon()
+
+    def _tell_soon(self) -> None:
+        if self._telling is None and is_watched(self.entry.type):
+            # In the next turn: several changes become one message, and a listener's header is answered first.
+            self._telling = asyncio.get_running_loop().call_soon(self._tell)
+
+    def _tell(self) -> None:
+        """Tell the peer the names of the listeners, where they are others than it was told on this route."""
+        self._telling = None
+        if self.flow is not None and self.publication is not None and self.entry.open:
+            names = audience(self.publication.listeners)
+            if names != self._told:
+                self._told = names
+                self._part.send(self.entry.peer, Audience(self.entry.number, names))
 
     def _flow(self, opened: RouteOpened, publication: Publication, past: QosWatch | None) -> ImportFlow:
         """The flow of a newly opened route: the one that it had, or a new one."""
@@ -311,7 +326,7 @@ class ImportRoute(PublicationEvents):
         return flow
 
     def detach(self, *, missed: bool, last: int | None) -> None:
-        """End the data of its route; see ``Topics.detach``."""
+        """End the data of its route, and forget the latched message: a new route brings it again."""
         if self.flow is not None and self.entry.open and last is not None:
             self.flow.skip(serial_add(last, 1))
             self.flow.numbering.complete = True

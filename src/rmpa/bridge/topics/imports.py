@@ -17,11 +17,10 @@ names; all arguments about the local graph use the names there (``bridge.proxies
 
 from __future__ import annotations
 
-import itertools
+import asyncio
 import math
 import sys
-from heapq import heappop, heappush
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from msgspec import UnsetType
 
@@ -38,7 +37,7 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.peer_offers import ImportBook
 from rmpa.bridge.policy import is_outside
-from rmpa.bridge.topics.import_route import RemoteTopic
+from rmpa.bridge.topics.import_route import ImportRoute, RemoteTopic
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
 from rmpa.core.facts import CONFLICT, CROWDED, DENIED
@@ -52,6 +51,14 @@ if TYPE_CHECKING:
     from rmpa.bridge.topics.import_route import StreamKey
     from rmpa.bridge.topics.part import Topics
 
+_Key = TypeVar("_Key", bound="str | StreamKey")
+
+
+def _take_out(groups: dict[_Key, dict[RemoteTopic, None]], key: _Key, entry: RemoteTopic) -> None:
+    del groups[key][entry]
+    if not groups[key]:
+        del groups[key]
+
 
 class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     """The inbound half of topics.
@@ -59,7 +66,6 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     Attributes:
         _topics: The sources of each peer by their local topic (dicts, for their order).
         _ways: What the peers offer of each source (dicts, for their order).
-        _timers: A heap; an item that is not its source's time any more is skipped.
     """
 
     kind, access = "topics", Access.PUBLISH
@@ -70,8 +76,6 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         self._topics: dict[int, dict[str, dict[RemoteTopic, None]]] = {}
         self._ways: dict[StreamKey, dict[RemoteTopic, None]] = {}
         self._local_types: dict[str, str] = {}
-        self._timers: list[tuple[float, int, RemoteTopic]] = []
-        self._serials = itertools.count()
 
     def __iter__(self) -> Iterator[RemoteTopic]:
         """Every source as a peer offers it; changes during the iteration may be missed."""
@@ -108,8 +112,8 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         """Whether any route is open."""
         return any(entry.open for known in self._peers.values() for entry in known.routes.values())
 
-    def link_away(self, peer: int, *, briefly: bool = False) -> Iterator[None]:
-        """Suspend the routes of a peer that may come back, and drop what does not outlive the link, one by one.
+    def link_away(self, peer: int, *, briefly: bool = False) -> None:
+        """Suspend the routes of a peer that may come back, and drop what does not outlive the link.
 
         Args:
             peer: The peer's number.
@@ -127,25 +131,22 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 self._hand_over(entry)
             if entry.number:
                 # A lingering route has no listener, so it is not continued.
-                self._out.detach(entry, keep=keep and entry.wanted, missed=entry.wanted and not keep)
+                self._detach(entry, keep=keep and entry.wanted, missed=entry.wanted and not keep)
             entry.number, entry.open, entry.until, entry.problem = 0, False, None, "its peer is away"
             if not keep:
                 self._outlived(entry)
-            yield
 
     def waits_for(self, peer: int) -> bool:
         """Whether a source outlives the peer's link: one with a local listener that is reliable or latched."""
         known = self._peers[peer]
         return any(entry.outlives(silent=known.session.silent) for entry in known.entries.values())
 
-    def outages(self, peer: int) -> set[float]:
-        """The outages, in seconds, of the sources that are kept for a peer."""
-        return {entry.outage for entry in self._peers[peer].entries.values()}
-
-    def outlasted(self, peer: int, seconds: float) -> None:
-        """Drop the sources whose outage is over: their peer has been away for ``seconds``."""
-        for entry in [one for one in self._peers[peer].entries.values() if one.outage <= seconds]:
+    def outlasted(self, peer: int, seconds: float) -> set[float]:
+        """Drop the sources whose outage a peer has been away for; return the outages of the others, in seconds."""
+        entries = self._peers[peer].entries
+        for entry in [one for one in entries.values() if one.outage <= seconds]:
             self._outlived(entry)
+        return {entry.outage for entry in entries.values()}
 
     def _outlived(self, entry: RemoteTopic) -> None:
         self._hand_over(entry)
@@ -157,7 +158,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         known = self._peers[peer]
         self._hand_all_over(peer)
         for entry in known.routes.values():
-            self._out.detach(entry, missed=entry.wanted)
+            self._detach(entry, missed=entry.wanted)
         known.routes = {}
 
     def forget(self, peer: int) -> dict[Source, RemoteTopic]:
@@ -168,12 +169,14 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         self._hand_all_over(peer)
         known = self._peers.pop(peer, None)
         self._topics.pop(peer, None)
-        for entry in known.entries.values() if known is not None else ():
-            self._forget_way(entry)
-        self._ways_changed(self.ways.unlinked(peer))
+        if known is None:
+            return {}
+        for entry in known.entries.values():
+            _take_out(self._ways, entry.key, entry)
+        self._ways_changed(self.ways.gone(peer, known.session))
         for other in self.at(CLOCK):
             self._judge(other)
-        return known.entries if known is not None else {}
+        return known.entries
 
     def _entry(self, peer: int, offer: TopicOffer) -> RemoteTopic:
         # Many sources share the names of nodes and types, and each is kept once.
@@ -202,18 +205,9 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         self._topics.setdefault(entry.peer, {}).setdefault(entry.name, {})[entry] = None
         self._ways.setdefault(entry.key, {})[entry] = None
 
-    def _forget_way(self, entry: RemoteTopic) -> None:
-        ways = self._ways[entry.key]
-        del ways[entry]
-        if not ways:
-            del self._ways[entry.key]
-
     def _unlist(self, entry: RemoteTopic) -> None:
-        self._forget_way(entry)
-        topics = self._topics[entry.peer]
-        del topics[entry.name][entry]
-        if not topics[entry.name]:
-            del topics[entry.name]
+        _take_out(self._ways, entry.key, entry)
+        _take_out(self._topics[entry.peer], entry.name, entry)
 
     def local_type(self, topic: str, type_name: str | None) -> None:
         """Set the type with which local nodes publish a topic; ``None`` if none publishes it.
@@ -271,49 +265,44 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         origin, topic = entry.origin, entry.name
         if origin is not None and (why := self.ways.objection(origin)):
             return why, ""
-        if topic == CLOCK:
-            why, conflict = self._why_no_time(entry)
-        elif why := self._why_left_out(entry):
-            conflict = False
-        else:
-            local = self._local_types.get(topic, entry.type)
-            conflict = local != entry.type
-            why = f"its type is {entry.type}, but a local node publishes {topic} as {local}; "
-            why = why + "rename one of the topics or use one type" if conflict else ""
-        if why and not conflict:
+        why, cause = self._why_no_time(entry) if topic == CLOCK else self._why_left_out(entry)
+        if why and not cause:
             return why, ""
-        problem, cause = self._no_place(entry)
-        return (why, CONFLICT) if conflict and cause != DENIED else (problem, cause)
+        problem, reason = self._no_place(entry)
+        return (why, cause) if cause and reason != DENIED else (problem, reason)
 
-    def _why_left_out(self, entry: RemoteTopic) -> str:
-        """Why rules or another source of its node keep a source out, or empty."""
+    def _why_left_out(self, entry: RemoteTopic) -> tuple[str, str]:
+        """Why rules, another source of its node or a local type keep a source out, and the cause; or empty."""
         topic, decision = entry.name, self._out.context.policy.judge(entry.name, entry.type, entry.past.node)
         if why := self._kept_out(entry, decision, entry.wire.topic):
-            return why
+            return why, ""
         if not is_crossing_name(topic):
-            return f"its name here would be {topic}, which is too long"
+            return f"its name here would be {topic}, which is too long", ""
         for other in self._topics[entry.peer][topic]:
             if other.node == entry.node and other is not entry and other.shown:
-                return f"it would be {topic} here, as {other.wire.topic} of this node is already; rename one"
-        return ""
+                return f"it would be {topic} here, as {other.wire.topic} of this node is already; rename one", ""
+        if (local := self._local_types.get(topic, entry.type)) != entry.type:
+            why = f"its type is {entry.type}, but a local node publishes {topic} as {local}; "
+            return why + "rename one of the topics or use one type", CONFLICT
+        return "", ""
 
-    def _why_no_time(self, entry: RemoteTopic) -> tuple[str, bool]:
-        """Why a peer's ``/clock`` is hidden, or empty, and whether that is a conflict.
+    def _why_no_time(self, entry: RemoteTopic) -> tuple[str, str]:
+        """Why a peer's ``/clock`` is hidden, and the cause; or empty.
 
         Time has one source: one node of the followed peer, or one of this module.
         """
         if entry.origin is not None and not is_outside(entry.origin):  # the gateway itself brings what is outside
-            return "time does not come by a relay", False
+            return "time does not come by a relay", ""
         decision = self._out.context.policy.judge_clock(self.peer_name(entry.peer))
         if not decision.allowed:
-            return decision.rule, False
+            return decision.rule, ""
         if CLOCK in self._local_types:
-            return "a node of this module publishes /clock, and time has one source: end that one", True
+            return "a node of this module publishes /clock, and time has one source: end that one", CONFLICT
         for other in self.at(CLOCK):
             if other.shown and other is not entry:
                 name = self.peer_name(other.peer)
-                return f"time comes from {other.node} of {name} already, and has one source", True
-        return "", False
+                return f"time comes from {other.node} of {name} already, and has one source", CONFLICT
+        return "", ""
 
     def _choose(self, entry: RemoteTopic) -> None:
         """Let the best way carry a source, by the facts of now; call it whenever one has changed."""
@@ -327,7 +316,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 way.wanted = False
         if carrier is None and best is not None:
             self._peers[best.peer].show(best)
-            self._out.publish(best)
+            self._publish(best)
         elif carrier is not None and best is None:
             self._hide(carrier)
         elif carrier is not best and carrier is not None and best is not None:
@@ -345,12 +334,66 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         module, name = best.module[1], self.peer_name(best.peer)
         return f"{module} has a link of its own" if best.origin is None else f"{module} is reached by way of {name}"
 
+    def _publish(self, entry: RemoteTopic) -> None:
+        """Publish a peer's source at its proxy, in a later turn of the loop."""
+        if (session := self._out.bridge.sessions.get(entry.peer)) is not None:
+            self._out.pass_on(entry)
+            entry.route = ImportRoute(self._out, session, entry)
+            self._out.direct_imports.shown(entry)
+
+    def _unpublish(self, entry: RemoteTopic) -> None:
+        """Remove a peer's source from the local graph: its data stops at once, its registration in a later turn."""
+        self._out.bridge.relay.gone(entry.peer, entry.wire)
+        self._out.direct_imports.hidden(entry)
+        route, entry.route = entry.route, None
+        if route is not None:
+            route.end(missed=True)
+            route.release()
+
+    def _carry(self, old: RemoteTopic, new: RemoteTopic) -> None:
+        """Let another way carry a source, whose proxy and subscribers stay."""
+        session, route = self._out.bridge.sessions.get(new.peer), old.route
+        if session is not None and route is not None:
+            route.session, route.entry = session, new
+            old.route, new.route = None, route
+            self._out.pass_on(new)
+            self._out.bridge.relay.gone(old.peer, old.wire)
+            self._out.direct_imports.hidden(old)
+            self._out.direct_imports.shown(new)
+            self._out.look((new.name,))
+
+    def _detach(
+        self, entry: RemoteTopic, *, keep: bool = False, missed: bool = False, last: int | None = None
+    ) -> None:
+        """End a route's data; unless ``keep``, the latched message is forgotten (a new route brings it again).
+
+        Args:
+            entry: The source and its route.
+            keep: The link is gone, and the next one will continue after the last message that came.
+            missed: Local nodes still listen, so they miss what is published before a route is open again.
+            last: If the publisher has gone: the sequence of its last message.
+        """
+        if entry.number and (session := self._out.bridge.sessions.get(entry.peer)) is not None:
+            session.link.routes.pop(entry.number, None)
+        if not keep and entry.route is not None:
+            entry.route.detach(missed=missed, last=last)
+
+    def _position(self, entry: RemoteTopic) -> tuple[int, int] | None:
+        """Epoch and last message of a source, behind which a route goes on, by this way or another; or ``None``."""
+        carrier = self.carrier(entry)
+        route = carrier.route if carrier is not None else None
+        if route is None or route.node is None:
+            return None
+        if route.flow is not None:
+            return route.flow.position
+        return self._out.exports.position(Source(route.topic, route.node.name))  # a relay has what its peer has
+
     def _move(self, old: RemoteTopic, new: RemoteTopic) -> None:
         """Let another way carry a source: the subscribers, the position and what is kept for late ones stay."""
         self._peers[old.peer].hide(old)
         self._peers[new.peer].show(new)
         wanted, old.wanted = old.wanted, False
-        self._out.moved(old, new)
+        self._carry(old, new)
         self._close(old)
         if wanted and not new.open and not new.wanted:
             self._wait(new, -math.inf)
@@ -377,7 +420,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     def _retract(self, entry: RemoteTopic) -> None:
         """Take a source out of the local graph, and show those that could not stand beside it."""
         self._peers[entry.peer].hide(entry)
-        self._out.retract(entry)
+        self._unpublish(entry)
         self._show_behind(entry)
 
     def _show_behind(self, entry: RemoteTopic) -> None:
@@ -408,7 +451,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 entry.number, known.routes[known.last_route] = known.last_route, entry
                 entry.until = None  # the peer answers once its publisher has, and that may take long
                 entry.asked = self._out.context.contracts.of(entry.name, entry.type)
-                epoch, after = self._out.position(entry) or (0, 0)
+                epoch, after = self._position(entry) or (0, 0)
                 asked = OpenRoute(entry.number, entry.wire.topic, entry.node, entry.asked, epoch, after)
                 self._out.send(entry.peer, asked)
             case "open" | "idle":
@@ -442,7 +485,8 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         entry.description, entry.contract = message.description, message.contract
         if (carrier := self.carrier(entry)) is not None and carrier is not entry:
             self._move(carrier, entry)
-        self._out.describe(entry, message)
+        if entry.route is not None:
+            entry.route.open(message)
 
     def closed(self, peer: int, message: RouteClosed, now: float) -> None:
         """Handle a route that the peer has refused or closed; ignored if it was closed here meanwhile."""
@@ -454,35 +498,23 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         self._peers[peer].last_route += 1
         return self._peers[peer].last_route
 
-    def next_timer(self) -> float | None:
-        """When ``handle_timer`` is due, monotonic seconds; ``None`` if no timer runs."""
-        while self._timers:
-            until, _, entry = self._timers[0]
-            if entry.until == until and entry.peer in self._peers:
-                return until
-            heappop(self._timers)
-        return None
-
-    def handle_timer(self, now: float) -> None:
-        """Handle due timers, at most ``limits.APPLIED_AT_ONCE``; if some remain, ``next_timer`` is in the past."""
-        for _ in range(limits.APPLIED_AT_ONCE):
-            if (due := self.next_timer()) is None or due > now:
-                return
-            self.follow(heappop(self._timers)[2], now)
-
     def _wait(self, entry: RemoteTopic, until: float) -> None:
-        entry.until = until
-        heappush(self._timers, (until, next(self._serials), entry))
-        self._out.arm_timer()
+        """Follow a source again at a time, in a later turn of the loop, unless it waits for another time by then."""
+        entry.until, loop = until, asyncio.get_running_loop()
+        loop.call_at(max(until, loop.time()), self._waited, entry, until)
+
+    def _waited(self, entry: RemoteTopic, until: float) -> None:
+        if entry.until == until and entry.peer in self._peers:
+            self.follow(entry, max(until, self._out.now()))
 
     def _close(self, entry: RemoteTopic, *, missed: bool = False) -> None:
         """End a source's route in any state; ``missed``: local nodes still listen, and miss messages from now on."""
         if entry.number:
             self._peers[entry.peer].routes.pop(entry.number, None)
             self._out.send(entry.peer, CloseRoute(entry.number))
-            self._out.detach(entry, missed=missed)
+            self._detach(entry, missed=missed)
         elif entry.wanted and entry.until is None:
-            self._out.detach(entry, missed=missed)  # it waited for a new link
+            self._detach(entry, missed=missed)  # it waited for a new link
         entry.number, entry.open, entry.until, entry.backoff = 0, False, None, None
 
     def _fail(self, entry: RemoteTopic, reason: str, now: float, last: int | None = None) -> None:
@@ -492,7 +524,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             self._hand_over(entry)
         # Where its publisher may be there still, the next route goes on behind what has come.
         keep = last is None and entry.wanted and entry.reliable
-        self._out.detach(entry, keep=keep, missed=entry.wanted, last=last)
+        self._detach(entry, keep=keep, missed=entry.wanted, last=last)
         entry.number, entry.open, entry.until, entry.problem = 0, False, None, reason
         self._choose(entry)
         if entry.wanted:

@@ -25,26 +25,22 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits, messages
 from rmpa.bridge.data.route_sender import RouteSender
-from rmpa.bridge.policy import Needs
-from rmpa.bridge.topics.local import compares_names
 from rmpa.core.contract import Contract, History
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_later, serial_add
 from rmpa.core.limits import UINT32_MAX
 from rmpa.core.outbox import ABORT, FIRST, LAST, QueuedMessage
 from rmpa.ros import limits as ros_limits
-from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.export import ExportFlow, ExportRoute
     from rmpa.bridge.data.reception import ImportFlow
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.topics.import_route import ImportRoute
     from rmpa.bridge.topics.part import Topics
-    from rmpa.ros.node.publication import SubscriberConnection
+    from rmpa.mesh.io.link import PeerLink
+    from rmpa.ros.node.publication import Publication, SubscriberConnection
     from rmpa.ros.node.subscription import TopicConnection
     from rmpa.runtime.tls import Buffer
 
@@ -70,13 +66,16 @@ class ServedJoin:
 
     Args:
         flow: What the agent gets of the publisher.
-        common: Sends it to the peer.
+        route: The route to the peer, which has it until everything has arrived.
+        common: Sends what all get.
         own: Sends to the subscriber.
-        over: Called once everything has arrived.
+        link: The link to the peer.
     """
 
-    def __init__(self, flow: ExportFlow, common: RouteSender, own: RouteSender, over: Callable[[], None]) -> None:
-        self._flow, self.common, self.own, self._over = flow, common, own, over
+    def __init__(
+        self, flow: ExportFlow, route: ExportRoute, common: RouteSender, own: RouteSender, link: PeerLink
+    ) -> None:
+        self._flow, self._route, self._common, self.own, self._link = flow, route, common, own, link
         self.connection: TopicConnection | None = None
         self._loop = asyncio.get_running_loop()
         self._last = common.last
@@ -101,7 +100,7 @@ class ServedJoin:
         """Note what all get."""
         if self._ended:
             return 0
-        digest, number, self._busy = _digest(framed), self.common.last, False
+        digest, number, self._busy = _digest(framed), self._common.last, False
         self._came = self._loop.time()
         if self._flow.latching:
             self._latched.append(digest)
@@ -139,8 +138,9 @@ class ServedJoin:
         if not self.drained:
             self.drained = True
             self.own.close()
-            self._over()
-            self._flow.leave(self)
+            del self._route.joins[self.own.route]
+            self._link.close_route(self.own.route)
+            self._flow.joins_changed()
 
     def connected(self, _fields: object) -> None:
         """The publisher has answered: it has ``limits.JOIN_WINDOW`` to say what it has to say."""
@@ -216,12 +216,28 @@ class JoiningSubscriber:
 
     Args:
         connection: The subscriber.
+        publication: What it is connected to.
         flow: The route of all.
-        over: Called at the end.
+        link: The link that has its own route until the end.
+        own: The number of that.
     """
 
-    def __init__(self, connection: SubscriberConnection, flow: ImportFlow, over: Callable[[], None]) -> None:
-        self._connection, self._flow, self._over = connection, flow, over
+    def __init__(
+        self,
+        connection: SubscriberConnection,
+        publication: Publication,
+        flow: ImportFlow,
+        link: PeerLink,
+        own: int,
+    ) -> None:
+        self._connection, self._publication, self._flow, self._link, self._own = (
+            connection,
+            publication,
+            flow,
+            link,
+            own,
+        )
+        link.routes[own] = self
         self._held: dict[int, bytes] = {}
         self._held_bytes = 0
         self._whole = bytearray()
@@ -330,118 +346,64 @@ class JoiningSubscriber:
         if not self.ended:
             self.ended = True
             self._timer.cancel()
-            self._over()
+            self._link.routes.pop(self._own, None)
+            self._publication.joined(self._connection)
 
 
-class Joins:
-    """The joining subscribers, here and at peers.
+def join(
+    part: Topics, session: PeerSession, publication: Publication, flow: ImportFlow, connection: SubscriberConnection
+) -> JoiningSubscriber | None:
+    """Let the publisher see a new subscriber of an open route here; ``None`` if that is not possible."""
+    if not session.linked or flow.contract.max_rate is not None:
+        return None
+    own = part.imports.next_route(session.peer)
+    joining = JoiningSubscriber(connection, publication, flow, session.link, own)
+    args = {"route": flow.route, "own": own, "node": connection.caller_id}
+    part.tasks.start(_ask(part, session, joining, args), f"join {publication.topic}")
+    return joining
 
-    Args:
-        bridge: The peers.
-        topics: Finds and numbers routes, connects to publishers, and names a peer's subscribers.
+
+async def _ask(part: Topics, session: PeerSession, joining: JoiningSubscriber, args: dict[str, Any]) -> None:
+    if joining.ended:  # with its link: the number is one of another route by now
+        return
+    try:
+        after = await part.bridge.rpc.request(session, JOIN, args, limits.JOIN_WINDOW)
+        joining.begin(messages.convert(JOIN, after, messages.Sequence))
+    except RmpaError as error:
+        _log.debug("= %s: a subscriber joins unseen: %s", session.link.name, error)
+        joining.release()
+
+
+def serve(part: Topics, session: PeerSession, args: dict[str, Any]) -> int:
+    """Connect to a publisher for a joining subscriber of a peer; return the number of the last message that all got.
+
+    Raises:
+        RmpaError: That is not possible.
     """
-
-    def __init__(self, bridge: Bridge, topics: Topics) -> None:
-        self._bridge, self._topics = bridge, topics
-        self._served: dict[tuple[int, int], ServedJoin] = {}
-        self._joining: dict[tuple[int, int], JoiningSubscriber] = {}
-        self._tasks = OwnedTasks()
-        bridge.rpc.on_request(JOIN, self._asked, Needs((), "a route that the peer has open"))
-
-    def sender(self, peer: int, number: int) -> RouteSender | None:
-        """What sends to a peer's joining subscriber on this route."""
-        join = self._served.get((peer, number))
-        return join.own if join is not None else None
-
-    def senders(self, peer: int) -> list[RouteSender]:
-        """What sends to the joining subscribers of a peer."""
-        return [join.own for (owner, _), join in self._served.items() if owner == peer]
-
-    def join(self, topic: ImportRoute, connection: SubscriberConnection) -> JoiningSubscriber | None:
-        """Let the publisher see a new subscriber of an open route here; ``None`` if that is not possible.
-
-        Clients of actions are seen by their names.
-        """
-        flow, session, publication = topic.flow, topic.session, topic.publication
-        if flow is None or publication is None or not session.linked or compares_names(topic.entry.type):
-            return None
-        if flow.contract.max_rate is not None:
-            return None
-        own = self._topics.imports.next_route(session.peer)
-        key = session.peer, own
-
-        def over() -> None:
-            del self._joining[key]
-            session.link.routes.pop(own, None)
-            publication.joined(connection)
-
-        joining = self._joining[key] = session.link.routes[own] = JoiningSubscriber(connection, flow, over)
-        args = {"route": flow.route, "own": own, "node": connection.caller_id}
-        self._tasks.start(self._ask(session, joining, args), f"join {topic.topic}")
-        return joining
-
-    async def _ask(self, session: PeerSession, joining: JoiningSubscriber, args: dict[str, Any]) -> None:
-        if joining.ended:  # with its link: the number is one of another route by now
-            return
-        try:
-            after = await self._bridge.rpc.request(session, JOIN, args, limits.JOIN_WINDOW)
-            joining.begin(messages.convert(JOIN, after, messages.Sequence))
-        except RmpaError as error:
-            _log.debug("= %s: a subscriber joins unseen: %s", session.link.name, error)
-            joining.release()
-
-    def _asked(self, session: PeerSession, args: dict[str, Any]) -> int:
-        """Connects to a publisher for a subscriber of a peer; returns the number of the last message that all got.
-
-        Raises:
-            RmpaError: That is not possible.
-        """
-        match args:
-            case {"route": int(number), "own": int(own), "node": str(node)} if 0 < own < limits.SERVICE_ROUTES:
-                key = session.peer, own
-            case _:
-                raise RemoteProtocolError(f"{JOIN} names no route")
-        exports = self._topics.exports
-        route = exports.route(session.peer, number)
-        if route is None or route.sender is None or key in self._served or exports.route(*key) is not None:
-            raise RmpaError(f"route {number} is not open")
-        flow = exports.flows[route.source]
-        if sum(peer == session.peer for peer, _ in self._served) >= limits.JOINS_MAX:
-            raise LimitExceeded("joining subscribers", limits.JOINS_MAX + 1, limits.JOINS_MAX)
-        sender = RouteSender(session.link, own, Contract(history=History.KEEP_ALL), large=flow.large)
-
-        def over() -> None:
-            del self._served[key]
-            session.link.close_route(own)
-
-        join = self._served[key] = ServedJoin(flow, route.sender, sender, over)
-        caller = self._topics.subscribers.name(session, node, route.source.topic) or f"{session.proxies.prefix}/joins"
-        self._connect(route, flow, join, caller)
-        return route.sender.last
-
-    def _connect(self, route: ExportRoute, flow: ExportFlow, join: ServedJoin, caller: str) -> None:
-        _log.debug("> %s: %s joins", route.source, caller)
-        join.connection = self._topics.outbound.connection(
-            route.source,
-            flow.uri,
-            caller,
-            on_message=join.came,
-            on_header=join.connected,
-            on_refused=join.finish,
-            on_lost=join.finish,
-        )
-        flow.join(join.common, join)
-        join.connection.start()
-
-    def link_down(self, peer: int) -> None:
-        """The peer has no link: what is held goes to the subscribers."""
-        for joining in [one for (owner, _), one in self._joining.items() if owner == peer]:
-            joining.release()
-        for served in [one for (owner, _), one in self._served.items() if owner == peer]:
-            served.close()
-
-    def close(self) -> None:
-        """End all."""
-        self._tasks.cancel()
-        for peer in {owner for owner, _ in (*self._joining, *self._served)}:
-            self.link_down(peer)
+    match args:
+        case {"route": int(number), "own": int(own), "node": str(node)} if 0 < own < limits.SERVICE_ROUTES:
+            exports = part.exports
+        case _:
+            raise RemoteProtocolError(f"{JOIN} names no route")
+    route, numbers = exports.route(session.peer, number), [one for of in exports.of(session.peer) for one in of.joins]
+    if route is None or route.sender is None or own in numbers or exports.route(session.peer, own) is not None:
+        raise RmpaError(f"route {number} is not open")
+    if len(numbers) >= limits.JOINS_MAX:
+        raise LimitExceeded("joining subscribers", limits.JOINS_MAX + 1, limits.JOINS_MAX)
+    flow = exports.flows[route.source]
+    sender = RouteSender(session.link, own, Contract(history=History.KEEP_ALL), large=flow.large)
+    served = route.joins[own] = ServedJoin(flow, route, route.sender, sender, session.link)
+    caller = part.exports.listener(session, node, route.source.topic) or f"{session.proxies.prefix}/joins"
+    _log.debug("> %s: %s joins", route.source, caller)
+    served.connection = exports.connection(
+        route.source,
+        flow.uri,
+        caller,
+        on_message=served.came,
+        on_header=served.connected,
+        on_refused=served.finish,
+        on_lost=served.finish,
+    )
+    flow.joins_changed()
+    served.connection.start()
+    return route.sender.last

@@ -10,33 +10,33 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import OrderedDict, deque
+from collections import OrderedDict
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.data.quality import shown_seconds
 from rmpa.bridge.direct.grants import TopicGrants
 from rmpa.bridge.graph_part import GraphPart
-from rmpa.bridge.messages import Audience, CloseRoute, Mismatch, OpenRoute, RouteClosed, RouteOpened, Source
+from rmpa.bridge.messages import Audience, CloseRoute, Mismatch, OpenRoute, RouteClosed, RouteOpened
+from rmpa.bridge.policy import Needs
 from rmpa.bridge.topics.direct import TopicPaths
-from rmpa.bridge.topics.exports import Exports
-from rmpa.bridge.topics.import_route import ImportRoute
+from rmpa.bridge.topics.exports import Exports, local_sources
 from rmpa.bridge.topics.imports import Imports
-from rmpa.bridge.topics.joins import Joins
-from rmpa.bridge.topics.local import LocalSubscriptions, RemoteSubscribers, own_sources, relayed_sources
-from rmpa.bridge.topics.reports import LossReports, Mismatches
+from rmpa.bridge.topics.joins import JOIN, JoiningSubscriber, serve
+from rmpa.bridge.topics.reports import OVERSIZED, Mismatches, oversized_there
 from rmpa.core.contract import Priority, Reliability
 from rmpa.core.identity import is_own
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.runtime.loop import yielding_to_data
+from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.quality import QosWatch
-    from rmpa.bridge.data.route_sender import RouteSender
-    from rmpa.bridge.messages import Message
+    from rmpa.bridge.messages import Message, Source
     from rmpa.bridge.peer_offers import Remote
     from rmpa.bridge.policy import Place
     from rmpa.bridge.sessions import PeerSession
@@ -56,13 +56,9 @@ class Topics(GraphPart):
         bridge: The core, the peers and the rules.
 
     Attributes:
-        outbound: The subscriptions to local publishers.
-        losses: Reports messages that do not reach their listeners.
         mismatches: Reports subscribers whose definition does not fit.
-        subscribers: The names of subscribers, where publishers compare them.
-        joins: The joining subscribers.
+        tasks: Ask for joining subscribers.
         _pasts: By the name of a module: what is remembered of its reliable sources.
-        _nodes: By topic: the nodes that publish it, as it was looked at last.
     """
 
     advertisement = "advertise"
@@ -75,26 +71,20 @@ class Topics(GraphPart):
     def __init__(self, bridge: Bridge) -> None:
         super().__init__(bridge, Exports, Imports)
         self._pasts: OrderedDict[str, Pasts] = OrderedDict()
-        self.losses = LossReports(bridge, self)
-        self.outbound = LocalSubscriptions(bridge, self, bridge.proxy_nodes.publication)
-        self.mismatches = Mismatches(self, self.exports, self.imports)
-        self.subscribers = RemoteSubscribers(bridge, self, self.exports, self.imports)
-        self.joins = Joins(bridge, self)
+        self.mismatches = Mismatches(self)
+        self.tasks = OwnedTasks()
+        bridge.rpc.on_request(JOIN, partial(serve, self), Needs((), "a route that the peer has open"))
+        told = Needs((), "the peer's own topics; a text for the log")
+        bridge.rpc.on_notification(OVERSIZED, partial(oversized_there, self), told)
         self.direct_exports = TopicGrants(bridge, self.exports)
         self.direct_imports = TopicPaths(bridge, self.warn, self.imports)
         self.direct = self.direct_imports, self.direct_exports
-        self._nodes: dict[str, tuple[str, ...]] = {}
         self._ticker: asyncio.TimerHandle | None = None
-
-    def sender(self, peer: int, number: int) -> RouteSender | None:
-        """What sends on a route to a peer, which is a source's or a joining subscriber's."""
-        route = self.exports.route(peer, number)
-        return route.sender if route is not None else self.joins.sender(peer, number)
 
     def watch(self, entry: RemoteTopic) -> QosWatch | None:
         """The watch of a peer's source, or that of the last flow of a reliable one."""
-        if entry.route is not None:
-            return entry.route.watch
+        if entry.flow is not None:
+            return entry.flow.watch
         return self._pasts.get(entry.module[1], {}).get(entry.past, (None, ""))[0]
 
     async def close(self) -> None:
@@ -104,9 +94,8 @@ class Topics(GraphPart):
             self._ticker.cancel()
         await self.direct_imports.close()
         await self.direct_exports.ports.close()
-        self.subscribers.close()
-        self.joins.close()
-        self.outbound.close()
+        self.tasks.cancel()
+        self.exports.close()
 
     def reload(self) -> None:
         """As of ``GraphPart``."""
@@ -118,7 +107,7 @@ class Topics(GraphPart):
         """As of ``GraphPart``; suspended routes may go on."""
         if session.away_since:
             _log.info("= %s is back: reliable topics go on", session.link.name)
-            self.outbound.back(session.peer)
+            self.exports.link_back(session.peer)
         super().link_up(session)
 
     def pasts(self, name: str) -> Pasts:
@@ -130,19 +119,22 @@ class Topics(GraphPart):
 
     def link_down(self, session: PeerSession) -> None:
         """Suspend the peer's routes; after silence its sources stay in the local graph for ``SILENT_GRACE``."""
-        super().link_down(session)
+        for each in self.direct:
+            each.link_down(session)
         peer, flows = session.peer, self.imports.flows(session.peer)
         for flow in flows:
             flow.link_down()
         # Those whose further losses cannot be counted.
         if interrupted := sum(flow.contract.reliability is not Reliability.RELIABLE for flow in flows):
-            self._bridge.counters.add("route.interrupted", interrupted)
-        self.joins.link_down(peer)
+            self.bridge.counters.add("route.interrupted", interrupted)
+        for handler in list(session.link.routes.values()):
+            if isinstance(handler, JoiningSubscriber):
+                handler.release()
         # Without a pause for data: among it could be the peer's new link, which must find all routes suspended.
-        deque(self.exports.link_away(peer, briefly=session.silent), 0)
+        self.exports.link_away(peer, briefly=session.silent)
         if session.silent:
             # Most silences end soon with a new link, so nothing leaves the local graph yet.
-            deque(self.imports.link_away(peer, briefly=True), 0)
+            self.imports.link_away(peer, briefly=True)
 
     def grace_over(self, session: PeerSession) -> bool:
         """Drop the peer's sources that do not outlive their link; return whether any route waits for the peer."""
@@ -150,32 +142,29 @@ class Topics(GraphPart):
         if not self.exports.outage(peer) and not self.imports.waits_for(peer):
             self.imports.detached(peer)
             return False
-        deque(self.imports.link_away(peer), 0)  # without a pause, as in ``link_down``
-        longest = max(*self.imports.outages(peer), self.exports.outage(peer), 0.0)
+        self.imports.link_away(peer)  # without a pause, as in ``link_down``
+        longest = max({*self.imports.outlasted(peer, 0.0), self.exports.outage(peer)})
         _log.info("= %s is away: its reliable topics wait for %s", session.link.name, shown_seconds(longest))
         return True
 
     def outlasted(self, session: PeerSession, seconds: float) -> float | None:
         """Drop sources whose contract's ``outage`` is over; return the next outage that is longer, in seconds."""
-        peer = session.peer
-        self.imports.outlasted(peer, seconds)
-        outages = {*self.imports.outages(peer), self.exports.outage(peer)}
+        outages = {*self.imports.outlasted(session.peer, seconds), self.exports.outage(session.peer)}
         return min((outage for outage in outages if outage > seconds), default=None)
 
     def gone(self, session: PeerSession) -> None:
         """Retract the rest of a peer's sources."""
         peer = session.peer
-        super().gone(session)
-        self.outbound.gone(peer)
+        for each in self.direct:
+            each.gone(session)
         entries = self.imports.forget(peer)
         self.mismatches.peer_gone(session.link.name)
         self.run(self.exports.gone(peer))
-        self._bridge.relay.peer_gone(peer)
+        self.bridge.relay.peer_gone(peer)
         for route in [entry.route for entry in entries.values() if entry.route is not None]:
             route.end(missed=True, gone=False)
             route.release()
-        self._freeing.append(_freed(entries))
-        self.schedule()
+        self.slowly(_freed(entries))
 
     def depends(self, session: PeerSession) -> bool:
         """As of ``GraphPart``; or whether nodes of this module have direct connections to the peer's."""
@@ -186,7 +175,7 @@ class Topics(GraphPart):
         for flow in self.imports.flows(session.peer):
             if flow.contract.priority is not Priority.HIGH:
                 flow.torn()
-        for sender in [*self.exports.senders(session.peer), *self.joins.senders(session.peer)]:
+        for sender in self.exports.senders(session.peer):
             sender.lane_lost()
 
     def message(self, session: PeerSession, message: Message) -> bool:
@@ -205,7 +194,7 @@ class Topics(GraphPart):
             case Mismatch():
                 self.mismatches.reported(peer, session.link.name, message)
             case Audience():
-                self.subscribers.named(session, message)
+                self.exports.named(session, message)
             case _:
                 return False
         return True
@@ -220,29 +209,24 @@ class Topics(GraphPart):
             self.look((change.name,))
 
     def _names(self) -> Iterable[str]:
-        return (*self._nodes, *self._bridge.core.state().publishers)
+        return (*self.exports.topics, *self.bridge.core.state().publishers)
 
     def _look_at(self, name: str) -> None:
-        core, before = self._bridge.core, self._nodes.pop(name, ())
-        local = own_sources(core, name, lambda source: self.exports.description(source) is not None)
-        publishers = local | relayed_sources(core, self._bridge.relay, name)
-        nodes = dict.fromkeys((*before, *publishers))
-        leaving = [node for node in nodes if node not in publishers and self.outbound.leave(Source(name, node))]
-        if publishers or leaving:
-            self._nodes[name] = (*publishers, *leaving)
-        for node in nodes:
-            if node not in leaving:
-                self.exports.put(Source(name, node), publishers.get(node))
-        self.imports.local_type(name, next((one.type for one in reversed(local.values())), None))
+        bridge = self.bridge
+        found = local_sources(
+            bridge.core, bridge.relay, name, lambda source: self.exports.description(source) is not None
+        )
+        self.exports.look(name, found)
+        own = (one.type for one in reversed(found.values()) if one.origin is None)
+        self.imports.local_type(name, next(own, None))
 
     def reconcile(self) -> None:
         """Register missing publications again; topics without local subscribers miss nothing any more."""
-        state, compared = self._bridge.core.state(), self.look_again()
+        state, compared = self.bridge.core.state(), self.look_again()
         for pasts in self._pasts.values():
             for source, (watch, missed_at) in pasts.items():
                 if all(map(is_own, state.subscribers.get(missed_at, ()))):
                     pasts[source] = watch, ""
-        self.direct_exports.reconcile(state.subscribers)
         for entry in yielding_to_data(list(self.imports)) if compared else ():
             if (route := entry.route) is not None and route.is_missing(state.publishers):
                 route.register()
@@ -252,82 +236,17 @@ class Topics(GraphPart):
         self.mismatches.forget_gone()
         self.direct_exports.judge_again(refused=False)
 
-    def position(self, entry: RemoteTopic) -> tuple[int, int] | None:
-        """Epoch and last message of a source, behind which a route goes on, by this way or another; or ``None``."""
-        carrier = self.imports.carrier(entry)
-        route = carrier.route if carrier is not None else None
-        if route is None or route.node is None:
-            return None
-        if route.flow is not None:
-            return route.flow.position
-        return self.exports.position(Source(route.topic, route.node.name))  # a relay has what its peer has
-
-    def publish(self, entry: RemoteTopic) -> None:
-        """Publish a peer's source at its proxy, in a later turn of the loop."""
-        if (session := self._bridge.sessions.get(entry.peer)) is not None:
-            proxies, node = self._bridge.sessions.proxies(session, entry.node, entry.origin)
-            self.pass_on(entry)
-            route = entry.route = ImportRoute(self._bridge, self, session, entry)
-            route.release = lambda: proxies.release(node, route.topic)
-            proxies.hold(node, route.topic, route.ready, route.left)
-            self.direct_imports.shown(entry)
-
-    def moved(self, old: RemoteTopic, new: RemoteTopic) -> None:
-        """Let another way carry a source, whose proxy and subscribers stay."""
-        session, route = self._bridge.sessions.get(new.peer), old.route
-        if session is not None and route is not None:
-            route.session, route.entry = session, new
-            old.route, new.route = None, route
-            self.pass_on(new)
-            self._bridge.relay.gone(old.peer, old.wire)
-            self.direct_imports.hidden(old)
-            self.direct_imports.shown(new)
-            self.look((new.name,))
-
     def _relayed(self, entry: Remote[Any], proxy: str) -> tuple[Source, Place]:
         return entry.wire, (entry.name, proxy)
 
-    def retract(self, entry: RemoteTopic) -> None:
-        """Remove a peer's source from the local graph: its data stops at once, its registration in a later turn."""
-        self._bridge.relay.gone(entry.peer, entry.wire)
-        self.direct_imports.hidden(entry)
-        route, entry.route = entry.route, None
-        if route is not None:
-            route.end(missed=True)
-            route.release()
-
-    def describe(self, entry: RemoteTopic, opened: RouteOpened) -> None:
-        """Prepare for data on a newly opened route, and answer the waiting local subscribers with its description."""
-        if entry.route is not None and entry.route.publication is not None:
-            if self._ticker is None:
-                self._tick_later()
-            entry.route.open(opened, entry.route.publication)
-            self.subscribers.changed(entry)
-
-    def detach(
-        self, entry: RemoteTopic, *, keep: bool = False, missed: bool = False, last: int | None = None
-    ) -> None:
-        """End a route's data; unless ``keep``, the latched message is forgotten (a new route brings it again).
-
-        Args:
-            entry: The source and its route.
-            keep: The link is gone, and the next one will continue after the last message that came.
-            missed: Local nodes still listen, so they miss what is published before a route is open again.
-            last: If the publisher has gone: the sequence of its last message.
-        """
-        if entry.number and (session := self._bridge.sessions.get(entry.peer)) is not None:
-            session.link.routes.pop(entry.number, None)
-        if not keep and entry.route is not None:
-            entry.route.detach(missed=missed, last=last)
-
-    def _tick_later(self) -> None:
-        self._ticker = asyncio.get_running_loop().call_later(STALE_TICK, self._tick)
+    def keep_awake(self) -> None:
+        """Wake up regularly while routes are open, to distinguish a silent link from an agent that slept."""
+        if self._ticker is None and not self._closed and self.imports.flowing:
+            self._ticker = asyncio.get_running_loop().call_later(STALE_TICK, self._tick)
 
     def _tick(self) -> None:
-        """Wake up regularly while routes are open, to distinguish a silent link from an agent that slept."""
         self._ticker = None
-        if not self._closed and self.imports.flowing:
-            self._tick_later()
+        self.keep_awake()
 
 
 def _freed(entries: dict[Source, RemoteTopic]) -> Iterator[None]:

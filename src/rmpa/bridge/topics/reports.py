@@ -1,33 +1,36 @@
-"""What peers and users are told of topics: definitions that do not fit, and messages that do not arrive.
+"""What modules tell each other of topics beside their messages.
 
-Reported are reliable messages that were given up, and messages that are too long to cross: in the log, and to the
-agent at the other end.
+Definitions that do not fit, reliable messages that were given up, messages that are too long to cross: in the log,
+and to the agent at the other end. And which subscribers are told by their names.
+
+Topics of actions are those whose publisher checks the names of its listeners, not only whether there are any. An
+actionlib client accepts a server (``wait_for_server``, ``waitForServer``) when the node that publishes the status
+also listens to the client's goals and cancellations. It compares the caller ids of the connections. Over the mesh,
+one connection of the agent stands for all listeners of a module. For these topics, therefore, the listeners' names
+cross, and the publisher's agent opens one more connection for each, under the listener's name in the publisher's
+graph.
 """
 
 from __future__ import annotations
 
-import asyncio
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.data.quality import shown_seconds
-from rmpa.bridge.messages import Mismatch, Source
-from rmpa.bridge.policy import Needs
+from rmpa.bridge.messages import Mismatch, Source, is_crossing_name
 from rmpa.config.rules import CLOCK
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.identity import OWN_NODE
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
-    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.export import ExportFlow, ExportRoute
-    from rmpa.bridge.peer import PeerRun
+    from rmpa.bridge.offers import PeerRun
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.topics.exports import Exports
-    from rmpa.bridge.topics.imports import Imports
     from rmpa.bridge.topics.part import Topics
 
 # The notification that a publisher sends messages that are too long.
@@ -42,13 +45,11 @@ class Mismatches:
     A subscriber is given by its name: ``/viewer`` here, ``base/viewer`` at the peer ``base``.
 
     Args:
-        out: Sends messages and warns.
-        exports: Finds the local source that a peer means.
-        imports: Knows the peers that have a source.
+        out: The part, which knows the sources of both sides.
     """
 
-    def __init__(self, out: Topics, exports: Exports, imports: Imports) -> None:
-        self._out, self._exports, self._imports = out, exports, imports
+    def __init__(self, out: Topics) -> None:
+        self._out = out
         self._texts: dict[Source, dict[str, str]] = {}
 
     def texts(self, source: Source) -> tuple[str, ...]:
@@ -69,7 +70,7 @@ class Mismatches:
 
     def reported(self, peer: int, name: str, message: Mismatch) -> None:
         """A peer reports that a subscriber there does not fit a local source; an empty text: that it fits now."""
-        source = self._exports.local(peer, Source(message.topic, message.node))
+        source = self._out.exports.local(peer, Source(message.topic, message.node))
         if source is None:
             return  # it went meanwhile
         subscriber = f"{name}{message.subscriber}"
@@ -83,7 +84,7 @@ class Mismatches:
 
     def registration_changed(self, topic: str, subscriber: str) -> None:
         """A local subscriber has gone or has registered again: forget its mismatch, here and at the peers."""
-        for entry in self._imports.at(topic) if self._texts else ():
+        for entry in self._out.imports.at(topic) if self._texts else ():
             if self._texts.get(entry.wire, {}).pop(subscriber, None) is not None:
                 self._out.send(entry.peer, Mismatch(entry.wire.topic, entry.node, subscriber, ""))
 
@@ -96,83 +97,97 @@ class Mismatches:
     def forget_gone(self) -> None:
         """Forget the mismatches of sources that are gone."""
         for source in list(self._texts):
-            if source not in self._exports.offered and not self._imports.knows(source):
+            if source not in self._out.exports.offered and not self._out.imports.knows(source):
                 del self._texts[source]
 
 
-class LossReports:
-    """The reports of losses, sent and received, for all peers.
+def report_given_up(part: Topics, peer: PeerRun, counts: Mapping[Source, int]) -> None:
+    """Report that messages are not kept any more for an absent peer.
 
     Args:
-        bridge: What the parts share.
-        out: Warns of losses, and knows the routes.
+        part: The part, which warns.
+        peer: The peer.
+        counts: By source: how many messages it misses until now.
     """
+    if not (count := sum(counts.values())):
+        return
+    name, seconds = peer.name, part.now() - peer.away_since
+    shown = ", ".join(map(str, islice(counts, _NAMED)))
+    if len(counts) > _NAMED:
+        shown += f" and {len(counts) - _NAMED} others"
+    text = f"{name} has been away for {shown_seconds(seconds)}: {count} messages for it are given up, of {shown} "
+    text += "(the contract's outage is for how long they are kept, "
+    text += f"at most {mesh_limits.RESUME_BYTES_MAX >> 20} MiB over all)"
+    part.bridge.counters.add("message.given_up", count)
+    part.bridge.counters.add("route.given_up", len(counts) - 1)
+    part.warn("route.given_up", name, text)
 
-    def __init__(self, bridge: Bridge, out: Topics) -> None:
-        self._bridge, self._out = bridge, out
-        needs = Needs((), "the peer's own topics; a text for the log")
-        bridge.rpc.on_notification(OVERSIZED, self._oversized_there, needs)
 
-    def given_up(self, peer: PeerRun, counts: Mapping[Source, int]) -> None:
-        """Report that messages are not kept any more for an absent peer.
+def report_missed(part: Topics, route: ExportRoute, count: int) -> None:
+    """Report how many messages of a reliable source a peer that is back has missed."""
+    source, name = route.source, route.session.name
+    part.bridge.counters.add("message.given_up", count)
+    text = f"{source}: {name} has missed {count} messages: it was away for longer than they were kept"
+    part.warn("route.missed", f"{name} {source}", text)
 
-        Args:
-            peer: The peer.
-            counts: By source: how many messages it misses until now.
-        """
-        if not (count := sum(counts.values())):
-            return
-        name, seconds = peer.name, asyncio.get_running_loop().time() - peer.away_since
-        shown = ", ".join(map(str, islice(counts, _NAMED)))
-        if len(counts) > _NAMED:
-            shown += f" and {len(counts) - _NAMED} others"
-        text = f"{name} has been away for {shown_seconds(seconds)}: {count} messages for it are given up, of {shown} "
-        text += "(the contract's outage is for how long they are kept, "
-        text += f"at most {mesh_limits.RESUME_BYTES_MAX >> 20} MiB over all)"
-        self._bridge.counters.add("message.given_up", count)
-        self._bridge.counters.add("route.given_up", len(counts) - 1)
-        self._out.warn("route.given_up", name, text)
 
-    def missed(self, route: ExportRoute, count: int) -> None:
-        """Report how many messages of a reliable source a peer that is back has missed."""
-        source, name = route.source, route.session.name
-        self._bridge.counters.add("message.given_up", count)
-        text = f"{source}: {name} has missed {count} messages: it was away for longer than they were kept"
-        self._out.warn("route.missed", f"{name} {source}", text)
+def report_oversized(part: Topics, source: Source, flow: ExportFlow, size: int) -> None:
+    """Count a message that is too long, and report it in the log and to the peers to which its source flows."""
+    flow.oversized += 1
+    flow.oversized_bytes = size
+    text = f"{source}: a message of {size} bytes is left out, at most {ros_limits.TCPROS_MESSAGE_MAX} cross"
+    part.warn("message.oversized", str(source), f"{text}; others do: send it in parts, or compressed")
+    for route in flow.flowing:
+        tell_oversized(part, route, flow)
 
-    def oversized(self, source: Source, flow: ExportFlow, size: int) -> None:
-        """Count a message that is too long, and report it in the log and to the peers to which its source flows."""
-        flow.oversized += 1
-        flow.oversized_bytes = size
-        text = f"{source}: a message of {size} bytes is left out, at most {ros_limits.TCPROS_MESSAGE_MAX} cross"
-        self._out.warn("message.oversized", str(source), f"{text}; others do: send it in parts, or compressed")
-        for route in flow.flowing:
-            self.tell_oversized(route, flow)
 
-    def tell_oversized(self, route: ExportRoute, flow: ExportFlow) -> None:
-        """Report to one peer how many messages of a source were left out until now, if any."""
-        session, offer = self._bridge.sessions.get(route.peer), self._out.exports.offer(route.peer, route.source)
-        if flow.oversized and session is not None and session.linked and offer is not None:
-            told = {"topic": offer.topic, "node": offer.node, "count": flow.oversized, "size": flow.oversized_bytes}
-            self._bridge.rpc.notify(session, OVERSIZED, told)
+def tell_oversized(part: Topics, route: ExportRoute, flow: ExportFlow) -> None:
+    """Report to one peer how many messages of a source were left out until now, if any."""
+    session = part.bridge.sessions.get(route.peer) if flow.oversized else None
+    if session is not None and session.linked and (offer := part.exports.offer(route.peer, route.source)) is not None:
+        told = {"topic": offer.topic, "node": offer.node, "count": flow.oversized, "size": flow.oversized_bytes}
+        part.bridge.rpc.notify(session, OVERSIZED, told)
 
-    def _oversized_there(self, session: PeerSession, args: dict[str, Any]) -> None:
-        """Takes a peer's report of messages that it left out.
 
-        Raises:
-            RemoteProtocolError: The report names no source, or no numbers above 0.
-        """
-        match args:
-            case {"topic": str(topic), "node": str(node), "count": int(count), "size": int(size)} if (
-                min(count, size) > 0
-            ):
-                source = Source(topic, node)
-            case _:
-                raise RemoteProtocolError(f"{OVERSIZED} names no source, or no number of messages")
-        entry = self._out.imports.get(session.peer, source)
-        flow = entry.flow if entry is not None else None
-        if flow is not None and (count, size) != (flow.oversized, flow.oversized_bytes):
-            flow.oversized, flow.oversized_bytes = count, size
-            who = f"{session.link.name}: {source}"
-            text = f"{who}: its messages of {size} bytes are too long to cross and are left out ({count} until now)"
-            self._out.warn("message.oversized_there", who, text)
+def oversized_there(part: Topics, session: PeerSession, args: dict[str, Any]) -> None:
+    """Take a peer's report of messages that it left out.
+
+    Raises:
+        RemoteProtocolError: The report names no source, or no numbers above 0.
+    """
+    match args:
+        case {"topic": str(topic), "node": str(node), "count": int(count), "size": int(size)} if min(count, size) > 0:
+            source = Source(topic, node)
+        case _:
+            raise RemoteProtocolError(f"{OVERSIZED} names no source, or no number of messages")
+    entry = part.imports.get(session.peer, source)
+    flow = entry.flow if entry is not None else None
+    if flow is not None and (count, size) != (flow.oversized, flow.oversized_bytes):
+        flow.oversized, flow.oversized_bytes = count, size
+        who = f"{session.link.name}: {source}"
+        text = f"{who}: its messages of {size} bytes are too long to cross and are left out ({count} until now)"
+        part.warn("message.oversized_there", who, text)
+
+
+def is_watched(type_name: str) -> bool:
+    """Whether publishers of this type check their listeners' names; judged by type, as topics can be remapped."""
+    return type_name.endswith("ActionGoal") or type_name == "actionlib_msgs/GoalID"
+
+
+def compares_names(type_name: str) -> bool:
+    """Whether a topic is of an action, whose client compares the names in the headers of all five topics.
+
+    rospy's client wants one name as listener of goals and cancellations, and as publisher of status, result and
+    feedback; roscpp's leaves the last two out. So all have to come by the agents, which give a remote node one name.
+    """
+    answers = type_name.endswith(("ActionResult", "ActionFeedback"))
+    return is_watched(type_name) or type_name == "actionlib_msgs/GoalStatusArray" or answers
+
+
+def audience(caller_ids: Iterable[str]) -> tuple[str, ...]:
+    """The listeners to name to a publisher: sorted, without the agent itself, at most ``limits.AUDIENCE_MAX``.
+
+    Proxies are included: they listen to proxies only in a relay, and name listeners of the modules beyond it.
+    """
+    names = {name for name in caller_ids if is_crossing_name(name) and name != OWN_NODE}
+    return tuple(sorted(names)[: limits.AUDIENCE_MAX])

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.bridge.context import BridgeContext
-from rmpa.bridge.policy import Needs
+from rmpa.bridge.policy import BridgeContext, Needs
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import is_global_name

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.topics.local import is_watched
+from rmpa.bridge.topics.reports import is_watched
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RemoteProtocolError
 from rmpa.core.identity import is_type_name
@@ -321,7 +321,7 @@ class SiteActions:
     """Names the action servers of other sites to clients of this one: clients accept a server by its nodes' names.
 
     The five topics of an action cross as all topics do. But a client of actionlib waits for a node that publishes the
-    status *and* listens to goals and cancellations (``bridge.topics.local``). The gateway listens to these for
+    status *and* listens to goals and cancellations (``bridge.topics.reports``). The gateway listens to these for
     all other sites, by one connection. So it opens one more for each server of another site, under the server's name
     here.
 

@@ -25,7 +25,7 @@ from rmpa.runtime.tasks import keep_task
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.context import BridgeContext
+    from rmpa.bridge.policy import BridgeContext
     from rmpa.core.contract import Contract, Contracts
     from rmpa.core.statistics import Counters
     from rmpa.gateway.own_graph import AgentGraph

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -12,8 +11,8 @@ import pytest
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct import grants
-from rmpa.bridge.direct.conditions import Condition, DirectAsk, Grant, Unmet, Want
 from rmpa.bridge.direct.grants import NodePorts, ServiceGrants, TopicGrants
+from rmpa.bridge.direct.paths import Condition, DirectAsk, Grant, Unmet, Want
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import PermissionGate
 from rmpa.config.settings import TrustSettings
@@ -30,24 +29,6 @@ AGAIN = "direct.topic_again"
 AUTO = Contract(transport=Transport.AUTO)
 
 
-class Proxies:
-    """The proxies of one peer, made at once."""
-
-    def __init__(self, prefix: str) -> None:
-        self._prefix = prefix
-        self._users: dict[tuple[str, object], Any] = {}
-
-    def get(self, node: str) -> Any:
-        return SimpleNamespace(name=self._prefix + node, uri="http://10.0.0.1:99/")
-
-    def hold(self, node: str, key: object, ready: Callable[[Any], None], left: Callable[[Any], None]) -> None:
-        self._users[node, key] = left
-        ready(self.get(node))
-
-    def release(self, node: str, key: object) -> None:
-        self._users.pop((node, key))(self.get(node))
-
-
 class Module:
     """The module of /talker, and what its agent told its peers."""
 
@@ -55,7 +36,6 @@ class Module:
         self.publishers = {"/chatter": {"/talker": URI}}
         self.subscribers: dict[str, dict[str, str]] = {}
         self.offered = {SOURCE: SimpleNamespace(type="std_msgs/String", origin=None, uri=URI)}
-        self.registered: list[tuple[str, ...]] = []
         self.suspected: list[str] = []
         self.forgotten: list[str] = []
         self.told: list[tuple[int, str, dict[str, Any]]] = []
@@ -83,7 +63,6 @@ class Module:
                         publishers=lambda topic: self.publishers.get(topic, {}),
                         state=lambda: SimpleNamespace(services=self.services),
                         suspect=self.suspected.append,
-                        call=lambda method, *params: self.registered.append((method, *params)),
                     ),
                     sessions=SimpleNamespace(get=self.sessions.get, linked=self.sessions.values),
                     rpc=SimpleNamespace(
@@ -120,7 +99,6 @@ class Module:
             silent=True,
             same_machine=False,
             address=f"10.0.0.{number}",
-            proxies=Proxies(f"/rmpa/peer{number}"),
         )
 
     def _local(self, _peer: int, source: Source) -> Source | None:
@@ -282,17 +260,3 @@ async def test_a_secured_peer_does_not_learn_of_a_service_that_it_may_not_have(
         assert warnings == expected
     services.server_gone("/add")
     assert [(peer, what) for peer, what, _ in module.told] == ([] if secured else [(1, "direct.service_again")])
-
-
-async def test_a_subscriber_stands_in_the_graph_as_its_proxy_while_it_is_granted(module: Module) -> None:
-    there = ("registerSubscriber", "/rmpa/peer1/viewer", "/chatter", "*", "http://10.0.0.1:99/")
-    gone = ("unregisterSubscriber", "/rmpa/peer1/viewer", "/chatter", "http://10.0.0.1:99/")
-    await module.open()
-    await module.open()
-    assert module.registered == [there]
-    module.sut.reconcile({"/chatter": {"/rmpa/peer1/viewer": "http://10.0.0.1:99/"}})
-    assert module.registered == [there]
-    module.sut.reconcile({})
-    assert module.registered == [there, there], "the core has been restarted"
-    module.close()
-    assert module.registered == [there, there, gone]
