@@ -262,7 +262,7 @@ def _reply_body(data: bytes) -> None:
     taken = body.take(memoryview(data)[5:])
     assert taken == min(size, len(data) - 5)
     assert body.whole == (taken == size)
-    assert not body.whole or b"".join(tcpros.frame_reply(ok, body.data)) == bytes([ok]) + data[1 : 5 + size]
+    assert not body.whole or tcpros.REPLY.pack(ok, size) + body.data == bytes([ok]) + data[1 : 5 + size]
 
 
 def _address(text: str) -> None:
@@ -457,13 +457,12 @@ READERS: Final[dict[str, Row]] = {
     "services": Row(
         [
             Reader(_reply_body),
-            Reader(tcpros.parse_request_length),
             Reader(text(_address)),
             Reader(text(_service_type)),
         ],
         [
-            b"".join(tcpros.frame_reply(True, b"abc")),
-            b"".join(tcpros.frame_reply(False, b"no")),
+            tcpros.REPLY.pack(True, 3) + b"abc",
+            tcpros.REPLY.pack(False, 2) + b"no",
             b"\x01\xff\xff\xff\xff",
             b"rosrpc://127.0.0.1:1234",
             b"int64 a\nint64 b\n---\nint64 sum",
@@ -482,7 +481,7 @@ READERS: Final[dict[str, Row]] = {
         [
             b"",
             bytes(4),
-            tcpros.encode_header(tcpros.subscriber_header("/t", "/s", type_name="a/B", md5sum="0" * 32)),
+            tcpros.encode_header(tcpros.subscriber_header("/t", "/s", tcpros.TopicDescription("a/B", "0" * 32, ""))),
             tcpros.encode_header(tcpros.publisher_header("/t", "/p", _STRING)) + b"\x05\x00\x00\x00hello",
             tcpros.encode_header(tcpros.error_header("no \udcff")),
             tcpros.encode_header(tcpros.client_header("/add", "/c", persistent=True, probe=True)),

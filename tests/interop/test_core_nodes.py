@@ -8,9 +8,8 @@ from typing import Final
 import pytest
 
 from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.core.liveness import name_at
 from rmpa.ros.http.rpc import call, call_api
-from rmpa.ros.node.service_client import probe
+from rmpa.ros.node.ask import name_at, probe
 from rmpa.ros.wire.slave_api import BusLink, read_bus_info
 from rmpa.ros.wire.tcpros import parse_service_uri
 from tests.interop.conftest import ShellFactory

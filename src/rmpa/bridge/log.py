@@ -139,9 +139,7 @@ class ModuleLogs(Part):
             OWN_NODE,
             on_message=received,
             own_uri=node.uri,
-            type_name=LOG.type,
-            md5sum=LOG.md5sum,
-            definition=LOG.definition,
+            wanted=LOG,
             number=node.next_number,
         )
         node.add_subscription(self._subscription)

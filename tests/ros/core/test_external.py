@@ -18,6 +18,7 @@ from rmpa.ros.core.external import MASTER_FAREWELL, MASTER_RETRY, ExternalCore
 from rmpa.ros.core.liveness import Liveness, Unreachable
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.parameters import GraphChange
+from rmpa.ros.node import ask
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
 from tests.waiting import DEADLINE, until
 
@@ -253,9 +254,9 @@ async def test_why_a_node_cannot_be_reached(
             raise error
         return socket.socket()
 
-    monkeypatch.setattr(liveness, "connect", connect)
-    assert await liveness.try_connect("http://10.9.9.9:1234/") == text
-    assert not await liveness.refuses("http://10.9.9.9:1234/")
+    monkeypatch.setattr(ask, "connect", connect)
+    assert await ask.try_connect("http://10.9.9.9:1234/") == text
+    assert not await ask.refuses("http://10.9.9.9:1234/")
 
 
 class Bed:

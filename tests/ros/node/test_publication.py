@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import socket
 import struct
 from collections.abc import AsyncIterator, Callable, Mapping
 
 import pytest
 
+from rmpa.core.statistics import Counters
 from rmpa.ros import limits
 from rmpa.ros.node.listeners import TcprosServer
 from rmpa.ros.node.publication import AcceptedConnection, Publication, PublicationEvents
@@ -23,8 +25,7 @@ class Owner(PublicationEvents):
     def __init__(self, description: TopicDescription | None, **options: int) -> None:
         self.said: list[str] = []
         self.publication = Publication("/t", "/p", description, events=self, **options)
-        self.server = TcprosServer("/p", {"/t": self.publication})
-        self.server.start()
+        self.server = TcprosServer("/p", {"/t": self.publication}, {}, Counters(), itertools.count(1))
 
     def first_subscriber(self) -> None:
         self.said.append("first")
@@ -36,6 +37,8 @@ class Owner(PublicationEvents):
         self.said.append(f"refused {fields['callerid']}: {text}")
 
     async def subscriber(self, *, buffer: int = 0, **fields: str) -> RawSubscriber:
+        if not self.server.address[1]:
+            await self.server.start()
         before = self.publication.subscribers
         link = await RawSubscriber.connect(self.server.address, buffer=buffer, **fields)
         await until(lambda: self.publication.subscribers > before)

@@ -87,7 +87,8 @@ class Node(SlaveNode):
         self._tcpros.address = ("127.0.0.1", 4000)
         self.add_publication(Publication("/t", "/n", TopicDescription("std_msgs/String", "5", "")))
         self.add_publication(Publication("/quiet", "/n"))
-        self.add_subscription(Subscription("/in", "/n", on_message=lambda *_: None, type_name="std_msgs/Empty"))
+        empty = TopicDescription("std_msgs/Empty", "*", "")
+        self.add_subscription(Subscription("/in", "/n", on_message=lambda *_: None, wanted=empty))
 
     def connections(self) -> list[BusConnection]:
         return [

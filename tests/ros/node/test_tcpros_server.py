@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import logging
 import socket
 import struct
@@ -14,10 +15,10 @@ from hypothesis import strategies as st
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.core.statistics import Counters
 from rmpa.ros import limits
-from rmpa.ros.core.liveness import name_at
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node import listeners as shared_listener
-from rmpa.ros.node.listeners import LOOPBACK_REST, LoopbackAddresses, SharedListener, TcprosServer
+from rmpa.ros.node.ask import name_at
+from rmpa.ros.node.listeners import SharedListener, TcprosServer, loopback_addresses
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import encode_header, frame_message
@@ -31,8 +32,7 @@ class Served:
     def __init__(self) -> None:
         self.counters = Counters()
         self.publication = Publication("/t", "/p", STRING)
-        self.server = TcprosServer("/p", {"/t": self.publication}, counters=self.counters)
-        self.server.start()
+        self.server = TcprosServer("/p", {"/t": self.publication}, {}, self.counters, itertools.count(1))
 
     def close(self) -> None:
         self.publication.withdraw()
@@ -42,6 +42,7 @@ class Served:
 @pytest.fixture
 async def served() -> AsyncIterator[Served]:
     made = Served()
+    await made.server.start()
     yield made
     made.close()
 
@@ -103,7 +104,8 @@ async def test_leaving_before_the_header_is_no_error(served: Served, caplog: pyt
         link = await RawSubscriber.dial(served.server.address)
         await link.send(data)
         link.close()
-    await until(lambda: len(served.server._accepted) == 2)
+    patient = await RawSubscriber.connect(served.server.address)
+    assert "error" not in await patient.header(), "those before it have been accepted"
     await until(lambda: not served.server._waiting)
     assert served.counters.as_dict() == {}
     assert caplog.text == ""
@@ -150,7 +152,7 @@ async def test_all_connections_are_bounded_and_closed_ones_do_not_count(
 
 async def test_an_address_in_use_is_a_clear_error(served: Served) -> None:
     with pytest.raises(StartError, match=r"TCPROS server of /q at 127.0.0.1:\d+: "):
-        TcprosServer("/q", {}).start(*served.server.address)
+        await TcprosServer("/q", {}, {}, Counters(), itertools.count(1)).start(*served.server.address)
 
 
 @pytest.mark.trap(3)
@@ -276,34 +278,42 @@ async def test_addresses_that_lead_nowhere_are_found_out(monkeypatch: pytest.Mon
 RESERVED = [IPv4Network("127.0.0.0/16"), IPv4Network("127.255.0.0/16")]
 
 
-def test_ten_thousand_nodes_have_addresses_of_their_own() -> None:
-    addresses = LoopbackAddresses(SALT)
-    given_out = {addresses.take(f"/rmpa/base/node_{n}", 0.0) for n in range(10_000)}
-    assert len(given_out) == len(addresses) == 10_000
+def attached(listener: SharedListener, name: str) -> str:
+    """A node's address; nothing takes its connections."""
+    return listener.attach(name, lambda *_: None, lambda *_: None)
+
+
+async def test_ten_thousand_nodes_have_addresses_of_their_own() -> None:
+    listener = SharedListener(SALT)
+    assert len({attached(listener, f"/rmpa/base/node_{n}") for n in range(10_000)}) == 10_000
 
 
 @given(st.text())
 def test_no_address_is_special(name: str) -> None:
-    address = IPv4Address(LoopbackAddresses(SALT).take(name, 0.0))
+    address = IPv4Address(next(loopback_addresses(SALT, name)))
     assert address in IPv4Network("127.0.0.0/8")
     assert not any(address in network for network in RESERVED)
     assert address.packed[3] not in {0, 255}
 
 
-def test_freeing_what_is_not_in_use_changes_nothing() -> None:
-    addresses = LoopbackAddresses(SALT)
-    addresses.free("127.1.2.3", 0.0)
-    first = addresses.take("/n", 0.0)
-    addresses.free(first, 1.0)
-    addresses.free(first, 50.0)
-    assert addresses.take("/n", 1.0 + LOOPBACK_REST) == first
+async def test_a_freed_address_rests(monkeypatch: pytest.MonkeyPatch) -> None:
+    listener = SharedListener(SALT)
+    listener.detach("127.1.2.3")
+    first = attached(listener, "/n")
+    listener.detach(first)
+    listener.detach(first)
+    second = attached(listener, "/n")
+    assert second != first
+    listener.detach(second)
+    monkeypatch.setattr(shared_listener, "LOOPBACK_REST", 0.0)
+    assert attached(listener, "/n") == first
 
 
-def test_of_too_many_resting_addresses_the_oldest_may_be_used_again(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_of_too_many_resting_addresses_the_oldest_may_be_used_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "LOOPBACK_RESTING_MAX", 2)
-    addresses = LoopbackAddresses(SALT)
-    taken = [addresses.take(f"/n{n}", 0.0) for n in range(3)]
+    listener = SharedListener(SALT)
+    taken = [attached(listener, f"/n{n}") for n in range(3)]
     for address in taken:
-        addresses.free(address, 1.0)
-    assert addresses.take("/n0", 2.0) == taken[0]
-    assert addresses.take("/n1", 2.0) != taken[1]
+        listener.detach(address)
+    assert attached(listener, "/n0") == taken[0]
+    assert attached(listener, "/n1") != taken[1]

@@ -31,8 +31,8 @@ from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.ros.environment import host_of, is_loopback
 from rmpa.ros.http.rpc import call, call_api, is_own_name
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
+from rmpa.ros.node.ask import probe
 from rmpa.ros.node.listeners import local_addresses
-from rmpa.ros.node.service_client import probe
 from rmpa.ros.wire.slave_api import TCPROS, read_bus_info
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply
 from rmpa.runtime.kernel_tcp import connections

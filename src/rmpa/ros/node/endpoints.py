@@ -24,7 +24,7 @@ from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.find import type_of_header
 from rmpa.ros.types.messages import HeaderNumbers, given_values
-from rmpa.ros.wire.tcpros import ANY, LENGTH, frame_message, printable
+from rmpa.ros.wire.tcpros import ANY, LENGTH, TopicDescription, frame_message, printable
 from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rmpa.ros.node.subscription import PublisherConnection
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.types.messages import MessageType, Plain
-    from rmpa.ros.wire.tcpros import Buffer, TopicDescription
+    from rmpa.ros.wire.tcpros import Buffer
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 _log = logging.getLogger(__name__)
@@ -511,9 +511,7 @@ class Subscriber:
             on_refused=self._refused,
             own_uri=own_uri,
             accepts=accepts,
-            type_name=self.type_name,
-            md5sum=kind.md5sum if kind is not None else ANY,
-            definition=kind.definition if kind is not None else "",
+            wanted=kind.describe() if kind is not None else TopicDescription(type_name, ANY, ""),
             nodelay=nodelay,
             number=node.slave.next_number,
         )

@@ -16,7 +16,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.core.identity import is_own
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api
-from rmpa.ros.node.service_client import ask_publisher
+from rmpa.ros.node.ask import ask_publisher
 from rmpa.ros.types.definitions import UnknownTypeError
 from rmpa.ros.types.find import find_message_type, type_of_header
 from rmpa.ros.wire.tcpros import printable
@@ -74,7 +74,7 @@ async def fetch_type(
         try:
             async with asyncio.timeout(FETCH_TYPE_TIMEOUT):
                 uri = str((await call_api(master_uri, "lookupNode", caller_id, node)).value)
-                header = await ask_publisher(uri, where, f"{caller_id}_learns") or {}
+                header = await ask_publisher(uri, where, f"{caller_id}_learns")
             if header.get("type") == name:
                 return FetchedType(await asyncio.to_thread(type_of_header, header), where, node)
         except (RmpaError, OSError) as error:

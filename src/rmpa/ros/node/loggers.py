@@ -1,8 +1,14 @@
-"""The loggers of a node, asked and set by its two services, as rqt_logger_level does (wiki.ros.org/rosconsole)."""
+"""The loggers of a node: its two services, as every roscpp and rospy node has them, served and called.
+
+With ``get_loggers`` and ``set_logger_level`` rqt_logger_level and ``rosservice call /rmpa/set_logger_level rmpa.mesh
+debug`` set the levels of a program's log while it runs (wiki.ros.org/rosconsole). The messages (roscpp/GetLoggers,
+roscpp/SetLoggerLevel) are serialized by hand, because the agent starts without the types' definitions.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import logging
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -11,12 +17,28 @@ from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError, Unreac
 from rmpa.core.identity import OWN_NODE
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.service_client import ServiceConnection
-from rmpa.ros.node.slave_node import GET, LEVELS, SET, pack_text, read_texts
-from rmpa.ros.wire.tcpros import LENGTH
+from rmpa.ros.node.service_server import ServiceEndpoint
+from rmpa.ros.wire.tcpros import LENGTH, ServiceDescription, printable
 
 if TYPE_CHECKING:
-    from rmpa.ros.wire.tcpros import Buffer
+    from collections.abc import Callable, Mapping
 
+    from rmpa.ros.node.service_server import ServiceCall
+    from rmpa.ros.node.slave_node import SlaveNode
+    from rmpa.ros.wire.tcpros import Buffer
+    from rmpa.ros.wire.xmlrpc import RosReply
+
+_log = logging.getLogger(__name__)
+
+GET: Final = ServiceDescription("roscpp/GetLoggers", "32e97e85527d4678a8f9279894bb64b0")
+SET: Final = ServiceDescription("roscpp/SetLoggerLevel", "51da076440d78ca1684d36c868df61ea")
+LEVELS: Final = {
+    "debug": logging.DEBUG,
+    "info": logging.INFO,
+    "warn": logging.WARNING,
+    "error": logging.ERROR,
+    "fatal": logging.CRITICAL,
+}
 # Loggers of one node that are read.
 _LOGGERS_MAX: Final = 1000
 # Seconds that a node has to answer.
@@ -28,6 +50,63 @@ _OWN: Final = ("rosout", "ros")
 # Debian 12: the node crashes at the next use of its loggers (trap 43).
 _LOG4CXX: Final = re.compile(r"liblog4cxx\.so\.(\d+)")
 _LOG4CXX_SAFE: Final = 10
+
+
+class LoggerServices:
+    """The two services of one node.
+
+    Args:
+        node: Serves them.
+        call: Calls the core's master.
+        loggers: The name of Python's logger, by the name that the services show.
+    """
+
+    def __init__(self, node: SlaveNode, call: Callable[..., RosReply], loggers: Mapping[str, str]) -> None:
+        self._node = node
+        self._call = call
+        self._loggers = loggers
+        self._endpoints = (
+            ServiceEndpoint(f"{node.name}/get_loggers", node.name, self._get, description=GET),
+            ServiceEndpoint(f"{node.name}/set_logger_level", node.name, self._set, description=SET),
+        )
+
+    def start(self) -> None:
+        """Serve and register; the node listens already."""
+        node = self._node
+        for endpoint in self._endpoints:
+            node.add_service(endpoint)
+            code, text, _ = self._call("registerService", node.name, endpoint.service, node.service_uri, node.uri)
+            if code != 1:
+                _log.error("! the ROS core does not accept %s: %s [core-refuses]", endpoint.service, text)
+
+    def close(self) -> None:
+        """Unregister, and stop serving."""
+        node = self._node
+        for endpoint in self._endpoints:
+            self._call("unregisterService", node.name, endpoint.service, node.service_uri)
+            node.remove_service(endpoint.service)
+
+    def _get(self, call: ServiceCall) -> None:
+        parts = [LENGTH.pack(len(self._loggers))]
+        for name, logger in self._loggers.items():
+            level = logging.getLogger(logger).getEffectiveLevel()
+            # The highest ROS level that is not above the logger's level.
+            word = next((w for w, number in reversed(LEVELS.items()) if number <= level), "debug")
+            parts += [_packed(name), _packed(word)]
+        call.reply(True, b"".join(parts))
+
+    def _set(self, call: ServiceCall) -> None:
+        name, level = _texts(call.request, 2, "roscpp/SetLoggerLevelRequest")
+        logger, number = self._loggers.get(name), LEVELS.get(level.lower())
+        if logger is None:
+            known = ", ".join(self._loggers)
+            call.fail(f"{self._node.name} has no logger {printable(name)!r}; it has {known}")
+        elif number is None:
+            call.fail(f"{printable(level)!r} is not a level; there are {', '.join(LEVELS)}")
+        else:
+            _log.info("= %s sets the level of %s to %s", printable(call.caller_id), name, level.lower())
+            logging.getLogger(logger).setLevel(number)
+            call.reply(True, b"")
 
 
 async def read_levels(uri: str, api: str, node: str, caller: str) -> dict[str, str]:
@@ -69,7 +148,7 @@ async def set_level(uri: str, node: str, caller: str, logger: str, level: str) -
         raise ConfigError("level", f"{level[:40]!r} is not a level", f"use one of {', '.join(LEVELS)}")
     wanted = (logger,) if logger else ("rmpa",) if node == OWN_NODE else _OWN
     for each in wanted:
-        await _call(uri, f"{node}/set_logger_level", caller, SET.md5sum, pack_text(each) + pack_text(level))
+        await _call(uri, f"{node}/set_logger_level", caller, SET.md5sum, _packed(each) + _packed(level))
     return dict.fromkeys(wanted, level)
 
 
@@ -104,5 +183,28 @@ def _read(body: Buffer) -> dict[str, str]:
     count = LENGTH.unpack_from(body)[0] if len(body) >= LENGTH.size else _LOGGERS_MAX + 1
     if count > _LOGGERS_MAX:
         raise RemoteProtocolError(f"{len(body)} bytes are not a {what} of at most {_LOGGERS_MAX} loggers")
-    texts = read_texts(memoryview(body)[LENGTH.size :], 2 * count, what)
+    texts = _texts(memoryview(body)[LENGTH.size :], 2 * count, what)
     return {name[:256]: level[:16].lower() for name, level in zip(texts[::2], texts[1::2], strict=True)}
+
+
+def _packed(text: str) -> bytes:
+    """A string of a ROS message."""
+    raw = text.encode()
+    return LENGTH.pack(len(raw)) + raw
+
+
+def _texts(raw: Buffer, count: int, what: str) -> list[str]:
+    """The strings of a message ``what`` that has so many, and nothing else.
+
+    Raises:
+        RemoteProtocolError: It is none.
+    """
+    found: list[str] = []
+    at = 0
+    while len(found) < count and at + LENGTH.size <= len(raw):
+        start = at + LENGTH.size
+        at = start + LENGTH.unpack_from(raw, at)[0]
+        found.append(str(raw[start:at], "utf-8", "replace"))
+    if at != len(raw) or len(found) != count:
+        raise RemoteProtocolError(f"{len(raw)} bytes are not a {what}")
+    return found

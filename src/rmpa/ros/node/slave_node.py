@@ -1,11 +1,4 @@
-"""A node's Slave API and the services of its loggers.
-
-``get_loggers`` and ``set_logger_level`` of a node of this process, as every roscpp and rospy node has them.
-
-With them rqt_logger_level and ``rosservice call /rmpa/set_logger_level rmpa.mesh debug`` set the levels of this
-program's log while it runs. The messages (roscpp/GetLoggers, roscpp/SetLoggerLevel) are serialized by hand, because
-the agent starts without rosbags and numpy.
-"""
+"""A node of this process: its Slave API, its topics and its services."""
 
 from __future__ import annotations
 
@@ -13,28 +6,24 @@ import asyncio
 import itertools
 import logging
 import os
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.statistics import Counters
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.node.listeners import TcprosServer
-from rmpa.ros.node.service_server import ServiceEndpoint
 from rmpa.ros.wire.slave_api import METHODS, TCPROS, bus_info, bus_stats, check_call
-from rmpa.ros.wire.tcpros import ANY, LENGTH, ServiceDescription, printable
+from rmpa.ros.wire.tcpros import ANY
 from rmpa.ros.wire.xmlrpc import RosFault
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Mapping
+    from collections.abc import Awaitable, Callable, Iterable
 
     from rmpa.ros.node.listeners import SharedListener
     from rmpa.ros.node.publication import Publication
-    from rmpa.ros.node.service_server import ServiceCall
+    from rmpa.ros.node.service_server import ServiceEndpoint
     from rmpa.ros.node.subscription import TopicConnection
     from rmpa.ros.wire.slave_api import BusConnection
-    from rmpa.ros.wire.tcpros import Buffer
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
-
 
 _log = logging.getLogger(__name__)
 
@@ -127,9 +116,7 @@ class SlaveNode:
         self._taps = taps
         self._elsewhere = elsewhere
         self._http = XmlRpcServer(self._call, host, port, counters=self.counters, name=f"node {name}")
-        self._tcpros = TcprosServer(
-            name, self._publications, services=self._services, counters=self.counters, numbers=self._numbers
-        )
+        self._tcpros = TcprosServer(name, self._publications, self._services, self.counters, self._numbers)
 
     async def start(self) -> None:
         """Listen.
@@ -144,7 +131,7 @@ class SlaveNode:
         else:
             await self._http.start()
             try:
-                self._tcpros.start(self._host)
+                await self._tcpros.start(self._host)
             except BaseException:
                 await self._http.close()
                 raise
@@ -314,94 +301,3 @@ async def _decided(other: Awaitable[RosReply | None], own: list[XmlRpcValue]) ->
 
 async def _as_list(reply: Awaitable[RosReply]) -> XmlRpcValue:
     return list(await reply)
-
-
-GET: Final = ServiceDescription("roscpp/GetLoggers", "32e97e85527d4678a8f9279894bb64b0")
-SET: Final = ServiceDescription("roscpp/SetLoggerLevel", "51da076440d78ca1684d36c868df61ea")
-LEVELS: Final = {
-    "debug": logging.DEBUG,
-    "info": logging.INFO,
-    "warn": logging.WARNING,
-    "error": logging.ERROR,
-    "fatal": logging.CRITICAL,
-}
-
-
-class LoggerServices:
-    """The two services of one node.
-
-    Args:
-        node: Serves them.
-        call: Calls the core's master.
-        loggers: The name of Python's logger, by the name that the services show.
-    """
-
-    def __init__(self, node: SlaveNode, call: Callable[..., RosReply], loggers: Mapping[str, str]) -> None:
-        self._node = node
-        self._call = call
-        self._loggers = loggers
-        self._endpoints = (
-            ServiceEndpoint(f"{node.name}/get_loggers", node.name, self._get, description=GET),
-            ServiceEndpoint(f"{node.name}/set_logger_level", node.name, self._set, description=SET),
-        )
-
-    def start(self) -> None:
-        """Serve and register; the node listens already."""
-        node = self._node
-        for endpoint in self._endpoints:
-            node.add_service(endpoint)
-            code, text, _ = self._call("registerService", node.name, endpoint.service, node.service_uri, node.uri)
-            if code != 1:
-                _log.error("! the ROS core does not accept %s: %s [core-refuses]", endpoint.service, text)
-
-    def close(self) -> None:
-        """Unregister, and stop serving."""
-        node = self._node
-        for endpoint in self._endpoints:
-            self._call("unregisterService", node.name, endpoint.service, node.service_uri)
-            node.remove_service(endpoint.service)
-
-    def _get(self, call: ServiceCall) -> None:
-        parts = [LENGTH.pack(len(self._loggers))]
-        for name, logger in self._loggers.items():
-            level = logging.getLogger(logger).getEffectiveLevel()
-            # The highest ROS level that is not above the logger's level.
-            word = next((w for w, number in reversed(LEVELS.items()) if number <= level), "debug")
-            parts += [pack_text(name), pack_text(word)]
-        call.reply(True, b"".join(parts))
-
-    def _set(self, call: ServiceCall) -> None:
-        name, level = read_texts(call.request, 2, "roscpp/SetLoggerLevelRequest")
-        logger, number = self._loggers.get(name), LEVELS.get(level.lower())
-        if logger is None:
-            known = ", ".join(self._loggers)
-            call.fail(f"{self._node.name} has no logger {printable(name)!r}; it has {known}")
-        elif number is None:
-            call.fail(f"{printable(level)!r} is not a level; there are {', '.join(LEVELS)}")
-        else:
-            _log.info("= %s sets the level of %s to %s", printable(call.caller_id), name, level.lower())
-            logging.getLogger(logger).setLevel(number)
-            call.reply(True, b"")
-
-
-def pack_text(text: str) -> bytes:
-    """A string of a ROS message."""
-    raw = text.encode()
-    return LENGTH.pack(len(raw)) + raw
-
-
-def read_texts(raw: Buffer, count: int, what: str) -> list[str]:
-    """The strings of a message ``what`` that has so many, and nothing else.
-
-    Raises:
-        RemoteProtocolError: It is none.
-    """
-    found: list[str] = []
-    at = 0
-    while len(found) < count and at + LENGTH.size <= len(raw):
-        start = at + LENGTH.size
-        at = start + LENGTH.unpack_from(raw, at)[0]
-        found.append(str(raw[start:at], "utf-8", "replace"))
-    if at != len(raw) or len(found) != count:
-        raise RemoteProtocolError(f"{len(raw)} bytes are not a {what}")
-    return found

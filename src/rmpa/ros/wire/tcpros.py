@@ -76,6 +76,10 @@ class TopicDescription:
         return f"{printable(self.type)}/{printable(self.md5sum)}"
 
 
+# What a subscriber that accepts any type asks for.
+ANYTHING: Final = TopicDescription(ANY, ANY, "")
+
+
 def printable(text: str) -> str:
     """Make received text safe for logs and terminals: replace control characters and surrogates, cut long text."""
     shown = text if len(text) <= _SHOWN else text[:_SHOWN] + "…"
@@ -188,19 +192,17 @@ def split_messages(data: memoryview) -> tuple[list[memoryview], int, int]:
 
 
 def subscriber_header(
-    topic: str, caller_id: str, *, type_name: str = ANY, md5sum: str = ANY, definition: str = "", nodelay: bool = True
+    topic: str, caller_id: str, wanted: TopicDescription = ANYTHING, *, nodelay: bool = True
 ) -> Header:
     """The header of a subscriber; an unknown definition is left out, as roscpp does."""
     fields = {
         "callerid": caller_id,
-        "md5sum": md5sum,
+        "md5sum": wanted.md5sum,
         "tcp_nodelay": "1" if nodelay else "0",
         "topic": topic,
-        "type": type_name,
+        "type": wanted.type,
     }
-    if definition:
-        fields["message_definition"] = definition
-    return fields
+    return fields | ({"message_definition": wanted.definition} if wanted.definition else {})
 
 
 def publisher_header(topic: str, caller_id: str, description: TopicDescription) -> Header:
@@ -394,19 +396,6 @@ def check_server(fields: Mapping[str, str], service: str, md5sum: str = ANY) -> 
     if md5sum not in (ANY, fields["md5sum"]):
         return f"the server of {service} has md5sum [{printable(fields['md5sum'])}], not [{printable(md5sum)}]"
     return None
-
-
-def frame_reply(ok: bool, body: Buffer) -> tuple[bytes, Buffer]:
-    """A reply's head and its body; for ``ok=False`` the body is the text of the error."""
-    return REPLY.pack(ok, len(body)), body
-
-
-def parse_request_length(data: Buffer) -> int | None:
-    """The length of the request that begins here, or ``None`` without enough bytes."""
-    if len(data) < LENGTH.size:
-        return None
-    size: int = LENGTH.unpack_from(data)[0]
-    return size
 
 
 def parse_reply_head(data: Buffer) -> tuple[bool, int] | None:
