@@ -10,7 +10,8 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.statistics import Counters
 from rmpa.ros.http.server import HttpConnection, XmlRpcServer
 from rmpa.ros.wire.http import ResponseParser
-from rmpa.ros.wire.xmlrpc import XmlRpcValue, serialize_call, serialize_response
+from rmpa.ros.wire.xmlrpc import XmlRpcValue, serialize_response
+from tests.ros.documents import serialize_call
 
 _CALL = serialize_call("getPid", ["/x"])
 _REPLY = serialize_response([1, "", 5])

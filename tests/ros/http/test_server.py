@@ -14,8 +14,9 @@ from rmpa.ros import limits
 from rmpa.ros.http.rpc import call
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.wire.http import HTTP_HEADERS_MAX
-from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, parse_response, serialize_call, serialize_response
+from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, parse_response, serialize_response
 from rmpa.runtime.accept import raise_file_limit
+from tests.ros.documents import serialize_call
 
 DEADLINE: Final = 10.0
 

@@ -23,8 +23,7 @@ from rmpa.ros.wire.tcpros import (
     decode_header,
     encode_header,
     frame_message,
-    is_persistent,
-    is_probe,
+    is_set,
     parse_header,
     parse_reply_head,
     parse_service_uri,
@@ -34,7 +33,7 @@ from rmpa.ros.wire.tcpros import (
     split_messages,
     subscriber_header,
 )
-from rmpa.ros.wire.xmlrpc import serialize_call
+from tests.ros.documents import serialize_call
 
 MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
 
@@ -248,11 +247,11 @@ def test_persistent_as_rospy_and_roscpp_write_it() -> None:
     assert client_header("/add", "/c", persistent=True)["persistent"] == "1"
     assert "persistent" not in client_header("/add", "/c")
     for value in ("1", "true", "True", "TRUE"):
-        assert is_persistent({"persistent": value})
+        assert is_set({"persistent": value}, "persistent")
     for value in ("0", "false", "", "yes"):
-        assert not is_persistent({"persistent": value})
-    assert is_probe(client_header("/add", "/c", probe=True))
-    assert not is_probe({})
+        assert not is_set({"persistent": value}, "persistent")
+    assert is_set(client_header("/add", "/c", probe=True), "probe")
+    assert not is_set({}, "probe")
 
 
 def test_a_servers_header_is_not_believed_unseen() -> None:

@@ -21,7 +21,6 @@ from rmpa.ros.wire.tcpros import (
     TopicDescription,
     check_subscriber,
     encode_header,
-    error_header,
     parse_header,
     printable,
     publisher_header,
@@ -122,7 +121,7 @@ class AcceptedConnection(Stream):
 
     def refuse(self, text: str) -> None:
         """Answer with an error header and close; the other side does not try again by itself."""
-        self.send([encode_header(error_header(text))], URGENT)
+        self.send([encode_header({"error": text})], URGENT)
         self.close()
 
     def hang_up(self, *, drain: bool = False) -> None:

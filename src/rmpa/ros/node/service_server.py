@@ -229,7 +229,7 @@ class _ClientConnection:
         self._endpoint = endpoint
         self._connection = connection
         self._loop = asyncio.get_running_loop()
-        self._persistent = tcpros.is_persistent(connection.request)
+        self._persistent = tcpros.is_set(connection.request, "persistent")
         self.opened = self._ended = self._taking = False
         self._body: tcpros.BodyBuffer | None = None
         self._call: ServiceCall | None = None
@@ -252,7 +252,7 @@ class _ClientConnection:
         connection.outbox.set_terms(BODIES, limits.SUBSCRIBER_QUEUE_MESSAGES, spared=True)
         header = tcpros.server_header(endpoint.caller_id, description)
         connection.accept(header, limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SERVICE_MESSAGE_MAX, nodelay=True)
-        if not self._persistent or tcpros.is_probe(connection.request):
+        if not self._persistent or tcpros.is_set(connection.request, "probe"):
             self._watch(connection.bytes_in)
 
     def refuse(self, text: str) -> None:

@@ -247,7 +247,7 @@ class SlaveNode:
                 why = "".join(map(str, reason))
                 _log.info("< %s: asked to shut down: %s", self.name, why)
                 self._on_shutdown(why)
-                return [1, "shutdown", 0] if self._on_kill is None else _as_list(self._on_kill(caller, why))
+                return [1, "shutdown", 0] if self._on_kill is None else self._on_kill(caller, why)
             case "requestTopic", [str(caller), str(topic), list(protocols)]:
                 return self._request_topic(caller, topic, protocols)
             case "publisherUpdate", [_, str(topic), list(publishers)]:
@@ -293,11 +293,7 @@ class SlaveNode:
 
 async def _decided(other: Awaitable[RosReply | None], own: list[XmlRpcValue]) -> XmlRpcValue:
     try:
-        return list(await other or own)
+        return await other or own
     except Exception:  # noqa: BLE001 - the subscriber would not ask again
         _log.exception("! a requestTopic was not decided; answered with the own address")
         return own
-
-
-async def _as_list(reply: Awaitable[RosReply]) -> XmlRpcValue:
-    return list(await reply)

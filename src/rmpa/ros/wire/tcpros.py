@@ -224,11 +224,6 @@ def publisher_header(topic: str, caller_id: str, description: TopicDescription) 
     }
 
 
-def error_header(text: str) -> Header:
-    """The reply to a header that does not match; the connection is closed after it."""
-    return {"error": text}
-
-
 def check_request(fields: Mapping[str, str]) -> str | None:
     """Check the required fields of a received header: an error text for the other side, or ``None``."""
     if "error" in fields:
@@ -301,7 +296,6 @@ def check_publisher(fields: Mapping[str, str], type_name: str = ANY, md5sum: str
 # The head of a reply: the ``ok`` byte and the length of the body.
 REPLY: Final = struct.Struct("<BI")
 _SCHEME: Final = "rosrpc://"
-_TRUE: Final = ("1", "true")
 
 
 @dataclass(frozen=True, slots=True)
@@ -365,14 +359,12 @@ def server_header(caller_id: str, description: ServiceDescription) -> Header:
     }
 
 
-def is_persistent(fields: Mapping[str, str]) -> bool:
-    """Whether a client calls several times over one connection: ``1`` or ``true`` in any case."""
-    return fields.get("persistent", "").lower() in _TRUE
+def is_set(fields: Mapping[str, str], name: str) -> bool:
+    """Whether a client's header has a mark: ``1`` or ``true`` in any case.
 
-
-def is_probe(fields: Mapping[str, str]) -> bool:
-    """Whether a client asks only for the description, and will send no request."""
-    return fields.get("probe", "").lower() in _TRUE
+    ``persistent``: it calls several times over one connection; ``probe``: it asks only for the description.
+    """
+    return fields.get(name, "").lower() in ("1", "true")
 
 
 def check_client(

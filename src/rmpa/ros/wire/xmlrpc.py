@@ -40,11 +40,6 @@ _PIECE: Final = 128
 _SLICE: Final = 57 * 128
 
 
-def legal_text(text: str) -> str:
-    """Replace characters that XML cannot hold by ``?``."""
-    return _ILLEGAL.sub("?", text)
-
-
 def pieces(what: str, value: object) -> Iterator[bytes]:
     """Yield ``<value>…</value>`` in pieces of some KiB; the value must not change meanwhile.
 
@@ -106,8 +101,8 @@ def _open(item: object, end: str) -> tuple[Iterator[object], str, str]:
     """Return the elements of a list or dict, the text before them and the text after them, which ends in ``end``."""
     if type(item) is dict:
         return iter(item.items()), "<value><struct>\n", f"</struct></value>\n{end}"
-    if type(item) in {list, tuple}:
-        return iter(cast("list[object]", item)), "<value><array><data>\n", f"</data></array></value>\n{end}"
+    if isinstance(item, list | tuple):
+        return iter(item), "<value><array><data>\n", f"</data></array></value>\n{end}"
     raise LocalProtocolError(f"cannot be said in XML-RPC: it holds a {type(item).__name__}")
 
 
@@ -363,13 +358,6 @@ _MALFORMED: Final[Sequence[tuple[type[Exception] | tuple[type[Exception], ...], 
 )
 
 
-def parse_call(data: bytes) -> tuple[str, tuple[XmlRpcValue, ...]]:
-    """Read a whole ``methodCall`` document; returns and raises as ``DocumentReader.call``."""
-    reader = DocumentReader()
-    reader.feed(data)
-    return reader.call()
-
-
 def parse_response(data: bytes) -> XmlRpcValue:
     """Read a whole ``methodResponse`` document; returns and raises as ``DocumentReader.response``."""
     reader = DocumentReader()
@@ -398,11 +386,6 @@ def response_pieces(value: XmlRpcValue) -> Iterator[bytes]:
     yield b"</param>\n</params>\n</methodResponse>\n"
 
 
-def serialize_call(method: str, params: Sequence[XmlRpcValue]) -> bytes:
-    """Write a ``methodCall`` document; the errors are those of ``call_pieces``."""
-    return b"".join(call_pieces(method, params))
-
-
 def serialize_response(value: XmlRpcValue) -> bytes:
     """Write a ``methodResponse`` document; the errors are those of ``call_pieces``."""
     return b"".join(response_pieces(value))
@@ -410,5 +393,5 @@ def serialize_response(value: XmlRpcValue) -> bytes:
 
 def serialize_fault(code: int, text: str) -> bytes:
     """Write a fault as a ``methodResponse``; characters that XML cannot hold become ``?``."""
-    body = b"".join(pieces("the fault", {"faultCode": code, "faultString": legal_text(text)}))
+    body = b"".join(pieces("the fault", {"faultCode": code, "faultString": _ILLEGAL.sub("?", text)}))
     return b"%s<methodResponse>\n<fault>\n%s</fault>\n</methodResponse>\n" % (_DECLARATION.encode(), body)
