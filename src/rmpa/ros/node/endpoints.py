@@ -17,7 +17,8 @@ from rmpa.core import limits as core_limits
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
-from rmpa.ros.http.rpc import call_api
+from rmpa.ros.http.rpc import call, call_api
+from rmpa.ros.master.mirror import one_call
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.subscription import Subscription
@@ -42,8 +43,6 @@ _log = logging.getLogger(__name__)
 
 # Time in which an ending node unregisters everything; a master that hangs must not delay it longer.
 NODE_UNREGISTER_TIMEOUT: Final = 3.0
-# Concurrent calls to unregister, each on a connection of its own.
-NODE_UNREGISTER_AT_ONCE: Final = 16
 _REMEDY: Final = "start one (rmpa up, or roscore), or set ROS_MASTER_URI to one that runs"
 _CLOSED: Final = "{} is not published any more: its publisher is closed"
 
@@ -153,24 +152,19 @@ class MasterClient:
             await self.call_master("subscribeParam", self.uri, key)
 
     async def _unregister_all(self) -> None:
-        """Unregister everything, concurrently and with one deadline for a slow master."""
+        """Unregister everything in one call, with one deadline for a slow master."""
         self._ended = True
-        at_once = asyncio.Semaphore(NODE_UNREGISTER_AT_ONCE)
-
-        async def unregister(method: str, *params: XmlRpcValue) -> None:
-            try:
-                async with at_once:
-                    await self.call_master(method, *params)
-            except RmpaError as error:
-                _log.debug("! %s: %s %s: %s", self.name, method, params, error)
-
-        calls = [unregister(f"unregister{entry.kind_name}", entry.key, entry.uri) for entry in self._entries]
-        calls += [unregister("unsubscribeParam", self.uri, key) for key in self._followed]
+        calls = [
+            one_call(f"unregister{entry.kind_name}", (self.name, entry.key, entry.uri)) for entry in self._entries
+        ]
+        calls += [one_call("unsubscribeParam", (self.name, self.uri, key)) for key in self._followed]
         try:
             async with asyncio.timeout(NODE_UNREGISTER_TIMEOUT):
-                await asyncio.gather(*calls, *self._unregistering)
-        except TimeoutError:
-            _log.debug("! %s: the master at %s is slow; not everything is unregistered", self.name, self.master_uri)
+                if calls:
+                    await call(self.master_uri, "system.multicall", calls)
+                await asyncio.gather(*self._unregistering)
+        except (RmpaError, TimeoutError) as error:
+            _log.debug("! %s: not everything is unregistered at %s: %s", self.name, self.master_uri, error)
 
 
 class Service:

@@ -18,7 +18,7 @@ from rmpa.core.identity import OWN_NODE
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.service_server import ServiceEndpoint
-from rmpa.ros.wire.tcpros import LENGTH, ServiceDescription, printable
+from rmpa.ros.wire.tcpros import LENGTH, ServiceDescription, pack_text, printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -92,7 +92,7 @@ class LoggerServices:
             level = logging.getLogger(logger).getEffectiveLevel()
             # The highest ROS level that is not above the logger's level.
             word = next((w for w, number in reversed(LEVELS.items()) if number <= level), "debug")
-            parts += [_packed(name), _packed(word)]
+            parts += [pack_text(name), pack_text(word)]
         call.reply(True, b"".join(parts))
 
     def _set(self, call: ServiceCall) -> None:
@@ -148,7 +148,7 @@ async def set_level(uri: str, node: str, caller: str, logger: str, level: str) -
         raise ConfigError("level", f"{level[:40]!r} is not a level", f"use one of {', '.join(LEVELS)}")
     wanted = (logger,) if logger else ("rmpa",) if node == OWN_NODE else _OWN
     for each in wanted:
-        await _call(uri, f"{node}/set_logger_level", caller, SET.md5sum, _packed(each) + _packed(level))
+        await _call(uri, f"{node}/set_logger_level", caller, SET.md5sum, pack_text(each) + pack_text(level))
     return dict.fromkeys(wanted, level)
 
 
@@ -185,12 +185,6 @@ def _read(body: Buffer) -> dict[str, str]:
         raise RemoteProtocolError(f"{len(body)} bytes are not a {what} of at most {_LOGGERS_MAX} loggers")
     texts = _texts(memoryview(body)[LENGTH.size :], 2 * count, what)
     return {name[:256]: level[:16].lower() for name, level in zip(texts[::2], texts[1::2], strict=True)}
-
-
-def _packed(text: str) -> bytes:
-    """A string of a ROS message."""
-    raw = text.encode()
-    return LENGTH.pack(len(raw)) + raw
 
 
 def _texts(raw: Buffer, count: int, what: str) -> list[str]:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, Union
 from rmpa.core.limits import UINT32_MAX
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import (
-    DefinedType,
     DefinitionError,
     Field,
     MessageError,
@@ -48,7 +47,7 @@ __all__ = ["HeaderNumbers", "MessageError", "MessageType", "Plain", "given_value
 _SEQ: Final = struct.Struct("<I")
 
 
-class MessageType(DefinedType):
+class MessageType:
     """One message type.
 
     Args:

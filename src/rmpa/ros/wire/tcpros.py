@@ -86,6 +86,12 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else "�" for c in shown)
 
 
+def pack_text(text: str) -> bytes:
+    """A string of a message."""
+    data = text.encode(errors="replace")
+    return LENGTH.pack(len(data)) + data
+
+
 def encode_header(fields: Mapping[str, str]) -> bytes:
     """A header with its length, its fields sorted by name as rospy does."""
     parts = []
