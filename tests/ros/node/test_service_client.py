@@ -8,8 +8,9 @@ from collections.abc import AsyncIterator
 import pytest
 
 from rmpa.core.errors import LocalProtocolError, UnreachableError
-from rmpa.ros.node import service_client as module
-from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed, probe
+from rmpa.ros.node import ask
+from rmpa.ros.node.ask import probe
+from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 from rmpa.ros.wire.tcpros import ServiceDescription, encode_header, server_header
 from rmpa.runtime import limits
 from tests.ros.node.peers import RawServer, RawSubscriber
@@ -202,7 +203,7 @@ async def test_reasons_are_those_of_the_network(
             await asyncio.Event().wait()
         raise error or AssertionError
 
-    monkeypatch.setattr(module, "connect", connect)
+    monkeypatch.setattr(ask, "connect", connect)
     assert await probe("192.0.2.1", 1, SERVICE, timeout=0.05) == reason
 
 

@@ -21,7 +21,7 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import Use
 from rmpa.runtime.kernel_tcp import ask_listening_ports
 from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
-from rmpa.runtime.tasks import end_tasks, keep_task, start_task
+from rmpa.runtime.tasks import OwnedTasks, end_tasks, keep_task, start_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -225,7 +225,7 @@ class Notifier:
         self._suspect = suspect
         self._counters = counters
         self._queues: dict[str, _Queue] = {}
-        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._tasks = OwnedTasks()
         self._closed = False
         self._serial = 0
 
@@ -234,7 +234,10 @@ class Notifier:
         if self._closed:
             return
         api, method, name, value = slave_call
-        queue = self._queues.setdefault(api, OrderedDict())
+        queue = self._queues.get(api)
+        if queue is None:
+            queue = self._queues[api] = OrderedDict()
+            self._tasks.start(self._empty(api, queue), f"notify {api}")
         number = 0
         if method == "paramUpdate" and len(queue) < _NOTIFY_COALESCE:
             number = self._serial = self._serial + 1
@@ -244,13 +247,11 @@ class Notifier:
         if len(queue) > limits.NOTIFY_QUEUE_MAX:
             del queue[next(iter(queue))]
             self._counters.add("notify.dropped")
-        if api not in self._tasks:
-            self._tasks[api] = start_task(self._empty(api, queue), f"notify {api}")
 
     async def close(self) -> None:
         """Stop at once; queued notifications are not sent."""
         self._closed = True
-        await end_tasks(*self._tasks.values())
+        await self._tasks.close()
 
     async def _empty(self, api: str, queue: _Queue) -> None:
         backoff = Backoff(_NOTIFY_RETRY_FIRST, _NOTIFY_RETRY_MAX, random.random)
@@ -270,7 +271,7 @@ class Notifier:
                         queue.move_to_end(key, last=False)
                     await asyncio.sleep(backoff.delay())
         finally:
-            del self._queues[api], self._tasks[api]
+            del self._queues[api]
 
     async def _sent(self, api: str, method: str, name: str, value: XmlRpcValue) -> bool:
         """Send one; return whether it need not be sent again."""

@@ -23,7 +23,7 @@ from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.master.parameters import RegistrationKind
-from rmpa.ros.master.registrations import Name, NodeRecord  # noqa: TC001 - msgspec reads the annotations
+from rmpa.ros.master.registrations import Name, NodeRecord
 from rmpa.ros.node.ask import IDENTIFY_ID, name_at
 from rmpa.ros.wire.xmlrpc import RosFault, serialize_response
 from rmpa.runtime.accept import in_thread
@@ -442,11 +442,7 @@ async def _listed(api: str, method: str) -> dict[str, str] | None:
         reply = await call_api(api, method, IDENTIFY_ID)
     except (RosFault, RemoteProtocolError):
         return None
-    if reply.code != 1 or not isinstance(reply.value, list):
+    try:
+        return dict(msgspec.convert(reply.value, list[tuple[Name, str]])) if reply.code == 1 else None
+    except msgspec.ValidationError:
         return None
-    entries = (entry for entry in reply.value if isinstance(entry, list) and len(entry) == 2)
-    return {
-        topic: kind
-        for topic, kind in entries
-        if isinstance(topic, str) and isinstance(kind, str) and topic.startswith("/")
-    }
