@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 
 import pytest
 
-from rmpa.core.errors import StartError
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.slave_node import SlaveNode
@@ -26,12 +25,6 @@ async def node() -> AsyncIterator[SlaveNode]:
     await made.start()
     yield made
     await made.close()
-
-
-async def test_a_port_in_use_is_a_clear_error_and_leaves_nothing_open(node: SlaveNode) -> None:
-    port = int(node.uri.rsplit(":", 1)[1].strip("/"))
-    with pytest.raises(StartError, match=f"port {port} is already in use"):
-        await SlaveNode("/q", "127.0.0.1", "", port=port).start()
 
 
 class Asked(PublicationEvents):

@@ -42,11 +42,6 @@ def test_http_1_0_closes_whatever_it_asks_for() -> None:
     assert parse(data) == [HttpRequest(memoryview(b"x"), "", True)]
 
 
-def test_a_body_in_chunks() -> None:
-    data = ROSPY + b"Transfer-Encoding: chunked\r\n\r\n2\r\nab\r\n1\r\nc\r\n0\r\n\r\n"
-    assert parse(data) == [HttpRequest(memoryview(b"abc"), "", False)]
-
-
 @pytest.mark.parametrize(
     ("data", "status"),
     [

@@ -26,8 +26,8 @@ from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.node.ask import refuses
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief, call_pieces
 from rmpa.runtime.accept import Use
-from rmpa.runtime.loop import yield_to_data, yielding_to_data
-from rmpa.runtime.tasks import end_tasks, keep_task, start_task
+from rmpa.runtime.loop import sleep_to_tick, yield_to_data, yielding_to_data
+from rmpa.runtime.tasks import end_tasks, keep_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -277,6 +277,7 @@ class ExternalCore(Core):
         await self._poll()
         await self._flush()
         self._task = keep_task(self._work, f"looking at the roscore {self.uri}")
+        self._revival = keep_task(self._revive, "ask for nodes that left")
         self.liveness.start()
 
     async def close(self) -> None:
@@ -346,7 +347,6 @@ class ExternalCore(Core):
         self._poll_soon()
 
     async def _work(self) -> None:
-        checked = self._loop.time()
         while True:
             try:
                 await self._flush()
@@ -357,10 +357,6 @@ class ExternalCore(Core):
             except Exception:
                 self._seen = b""
                 raise
-            if self._loop.time() - checked > limits.NODE_CHECK_INTERVAL:
-                checked = self._loop.time()
-                if self._mirror.dead and (self._revival is None or self._revival.done()):
-                    self._revival = start_task(self._revive(dict(self._mirror.dead)), "ask for nodes that left")
             if self._problem or not self._writes:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout_at(self._next_poll):
@@ -531,10 +527,12 @@ class ExternalCore(Core):
         self._mirror.mark_dead(node, api)
         self._report_changes()
 
-    async def _revive(self, dead: Mapping[str, str]) -> None:
+    async def _revive(self) -> None:
         """Check whether nodes that were taken for dead accept connections, and restore those that do."""
-        for node, api in dead.items():
-            if not await refuses(api) and self._mirror.dead.get(node) == api:
-                _log.info("= node %s at %s lives after all", node, api)
-                del self._mirror.dead[node]
-                self._seen = b""
+        while True:
+            await sleep_to_tick(limits.NODE_CHECK_INTERVAL)
+            for node, api in list(self._mirror.dead.items()):
+                if not await refuses(api) and self._mirror.dead.get(node) == api:
+                    _log.info("= node %s at %s lives after all", node, api)
+                    del self._mirror.dead[node]
+                    self._seen = b""

@@ -1,9 +1,9 @@
 """The log of a node: its records on ``/rosout``, and the two services of its loggers, served and called.
 
 Every roscpp and rospy node has both. With ``get_loggers`` and ``set_logger_level`` rqt_logger_level and ``rosservice
-call /rmpa/set_logger_level rmpa.mesh debug`` set the levels of a program's log while it runs (wiki.ros.org/rosconsole).
-The messages (roscpp/GetLoggers, roscpp/SetLoggerLevel) are serialized by hand, because the agent starts without the
-types' definitions.
+call /rmpa/set_logger_level rmpa.mesh debug`` set the levels of a program's log while it runs
+(wiki.ros.org/rosconsole). The messages (roscpp/GetLoggers, roscpp/SetLoggerLevel) are serialized by hand, because the
+agent starts without the types' definitions.
 """
 
 from __future__ import annotations

@@ -97,27 +97,22 @@ class AcceptedConnection(Stream):
         """Messages dropped because the other side is slow."""
         return self.outbox.dropped[_MESSAGES]
 
-    def accept(
-        self, header: Mapping[str, str], queue_messages: int, queue_bytes: int, *, nodelay: bool = False
-    ) -> None:
+    def accept(self, header: Mapping[str, str], *, nodelay: bool = False) -> None:
         """Answer with the reply header; messages may follow. Does nothing if the connection has ended already.
 
         Args:
             header: The reply header.
-            queue_messages: The most messages in the queue of this connection.
-            queue_bytes: The most bytes in the queue; one message always fits.
             nodelay: Whether TCP_NODELAY is set even if the other side did not ask for it.
         """
         if self.closed:  # while it was held; ``on_end`` follows
             return
         if nodelay or self.request.get("tcp_nodelay") == "1":
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.bound(queue_messages, queue_bytes)
         self.send([encode_header(header)], URGENT)
 
-    def bound(self, queue_messages: int, queue_bytes: int) -> None:
-        """Change the bounds of the queue."""
-        self.outbox.set_bounds(queue_messages, queue_bytes)
+    def bound(self, messages: int, size: int = limits.SUBSCRIBER_QUEUE_BYTES) -> None:
+        """Set the most messages and bytes in the queue; one message always fits."""
+        self.outbox.set_bounds(messages, size)
 
     def refuse(self, text: str) -> None:
         """Answer with an error header and close; the other side does not try again by itself."""
@@ -213,7 +208,6 @@ class Publication:
         description: Type, md5 sum, definition and latching, or ``None`` until ``describe()``.
         events: What is called at changes.
         queue_messages: Messages queued for one slow subscriber; above it the oldest is dropped.
-        queue_bytes: Bytes queued for one slow subscriber; one message always fits.
 
     Attributes:
         messages: Messages published.
@@ -230,7 +224,6 @@ class Publication:
         *,
         events: PublicationEvents = _NO_EVENTS,
         queue_messages: int = limits.SUBSCRIBER_QUEUE_MESSAGES,
-        queue_bytes: int = limits.SUBSCRIBER_QUEUE_BYTES,
     ) -> None:
         self.topic = topic
         self.caller_id = caller_id
@@ -242,7 +235,6 @@ class Publication:
         self._keeps = 1
         self._reply = _NOTHING
         self._queue_messages = queue_messages
-        self._queue_bytes = queue_bytes
         self._connections: tuple[SubscriberConnection, ...] = ()
         # What takes messages in the place of subscribers.
         self._joining: dict[SubscriberConnection, Receiver] = {}
@@ -423,7 +415,7 @@ class Publication:
         """Set the bound on messages queued for one slow subscriber."""
         self._queue_messages = min(messages, limits.SUBSCRIBER_QUEUE_MESSAGES)
         for connection in self._connections:
-            connection.bound(self._queue_messages, self._queue_bytes)
+            connection.bound(self._queue_messages)
 
     def keep(self, depth: int) -> None:
         """Set the number of latched messages that are kept for later subscribers."""
@@ -468,7 +460,8 @@ class Publication:
             _log.debug("= %s: holds subscriber %s until the type is known", self.topic, who)
             return True
         _log.debug("> %s: serves subscriber %s at %s", self.topic, who, connection.peer[0])
-        connection.accept(self._reply, self._queue_messages, self._queue_bytes)
+        connection.bound(self._queue_messages)
+        connection.accept(self._reply)
         connection.since = self.messages - len(self.latched)
         for framed in self.latched:
             connection.send((framed,), _MESSAGES)

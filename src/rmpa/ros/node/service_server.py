@@ -251,7 +251,8 @@ class _ClientConnection:
         self.opened = True
         connection.outbox.set_terms(BODIES, limits.SUBSCRIBER_QUEUE_MESSAGES, spared=True)
         header = tcpros.server_header(endpoint.caller_id, description)
-        connection.accept(header, limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SERVICE_MESSAGE_MAX, nodelay=True)
+        connection.bound(limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SERVICE_MESSAGE_MAX)
+        connection.accept(header, nodelay=True)
         if not self._persistent or tcpros.is_set(connection.request, "probe"):
             self._watch(connection.bytes_in)
 

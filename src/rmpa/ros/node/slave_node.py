@@ -68,9 +68,8 @@ class SlaveNode:
         host: The address to listen at, and to register unless ``advertised_host`` is given.
         master_uri: The answer to ``getMasterUri``; the owner sets it later if its master does not listen yet.
         advertised_host: The address to register, if it differs from ``host``.
-        port: The XML-RPC server's; 0 lets the system choose.
-        listener: A started listener that accepts this node's connections and assigns its address; ``host``,
-            ``advertised_host`` and ``port`` are then ignored.
+        listener: A started listener that accepts this node's connections and assigns its address; ``host`` and
+            ``advertised_host`` are then ignored.
         counters: Count refusals.
         on_shutdown: ``(reason)``: the master shuts this node down; the owner has to close it.
         on_param_update: ``(key, value) -> whether the node subscribed to that key``.
@@ -90,7 +89,6 @@ class SlaveNode:
         master_uri: str,
         *,
         advertised_host: str = "",
-        port: int = 0,
         listener: SharedListener | None = None,
         counters: Counters | None = None,
         on_shutdown: Callable[[str], None] = _ignore,
@@ -115,7 +113,7 @@ class SlaveNode:
         self._on_param_update = on_param_update
         self._taps = taps
         self._elsewhere = elsewhere
-        self._http = XmlRpcServer(self._call, host, port, counters=self.counters, name=f"node {name}")
+        self._http = XmlRpcServer(self._call, host, counters=self.counters, name=f"node {name}")
         self._tcpros = TcprosServer(name, self._publications, self._services, self.counters, self._numbers)
 
     async def start(self) -> None:

@@ -356,14 +356,14 @@ class InProcessConnection(TopicConnection):
         self._next = asyncio.get_running_loop().call_later(self._backoff.delay(), self._attach)
         self._on_lost(reason)
 
-    def accept(self, header: Mapping[str, str], _queue_messages: int, _queue_bytes: int) -> None:
+    def accept(self, header: Mapping[str, str]) -> None:
         """Take the publisher's header; messages may follow."""
         if not self.closed:
             self.fields = dict(header)
             self._backoff.reset()
             self._on_header(self.fields)
 
-    def bound(self, _queue_messages: int, _queue_bytes: int) -> None:
+    def bound(self, _messages: int) -> None:
         """Do nothing: there is no queue."""
 
     def refuse(self, text: str) -> None:

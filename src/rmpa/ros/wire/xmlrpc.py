@@ -90,7 +90,8 @@ def _struct(members: Mapping[object, object], depth: int) -> Iterator[str]:
 def _array(items: Iterable[object], depth: int) -> Iterator[str]:
     yield "<value><array><data>\n"
     for item in items:
-        yield from _texts(item, depth)
+        write = _SCALARS.get(type(item))  # here too: arrays are long
+        yield from _texts(item, depth) if write is None else write(item)
     yield "</data></array></value>\n"
 
 
