@@ -14,7 +14,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
-import ipaddress
 import logging
 import socket
 import struct
@@ -491,7 +490,7 @@ async def listen(name: str, host: str, port: int, use: Use) -> socket.socket:
     """
     try:
         address = host, port
-        if not _is_numeric(host):
+        if host.strip("0123456789."):  # a name
             loop = asyncio.get_running_loop()
             found = await loop.getaddrinfo(host, port, family=socket.AF_INET, type=socket.SOCK_STREAM)
             address = str(found[0][4][0]), port
@@ -516,11 +515,3 @@ async def listen(name: str, host: str, port: int, use: Use) -> socket.socket:
         problem = problems.get(error.errno or 0, (error.strerror or str(error), ""))
         raise StartError(f"{name} at {host}:{port}", *problem, code="port-in-use") from error
     return sock
-
-
-def _is_numeric(host: str) -> bool:
-    try:
-        ipaddress.IPv4Address(host)
-    except ValueError:
-        return not host
-    return True

@@ -10,7 +10,7 @@ import time
 from collections import deque
 from collections.abc import Awaitable, Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rmpa.config import limits as config_limits
 from rmpa.core import limits as core_limits
@@ -48,6 +48,7 @@ _CLOSED: Final = "{} is not published any more: its publisher is closed"
 
 Handler = Callable[[Any], "Awaitable[Any] | Any"]
 ParamCallback = Callable[[str, "XmlRpcValue"], None]
+_Entry = TypeVar("_Entry", "Publisher", "Subscriber", "Service")
 
 
 class MasterClient:
@@ -96,8 +97,8 @@ class MasterClient:
         except UnreachableError as error:
             raise UnreachableError("ROS master", f"{self.master_uri} (ROS_MASTER_URI)", _REMEDY) from error
 
-    async def _add(self, entry: Publisher | Subscriber | Service) -> None:
-        """Serve and register.
+    async def _add(self, entry: _Entry) -> _Entry:
+        """Serve and register; return the same.
 
         Raises:
             ValueError: The node has a publisher or service of that name already.
@@ -117,6 +118,7 @@ class MasterClient:
             if not isinstance(error, PeerRefused):  # the master may have registered it
                 self._unregistering.start(self._unregister(entry), f"unregister {entry.key}")
             raise
+        return entry
 
     def _check_open(self) -> None:
         if not self.uri:

@@ -206,9 +206,7 @@ class Node(MasterClient):
             kind = await find_or_fetch(self.master_uri, self.name, kind, resolved)
         description = kind if isinstance(kind, TopicDescription) else kind.describe(latching=latch)
         known = kind if isinstance(kind, MessageType) else None
-        publisher = Publisher(self, resolved, description, known, queue_messages)
-        await self._add(publisher)
-        return publisher
+        return await self._add(Publisher(self, resolved, description, known, queue_messages))
 
     async def subscribe(
         self,
@@ -260,8 +258,7 @@ class Node(MasterClient):
             nodelay=nodelay,
             queue_messages=queue_messages,
         )
-        await self._add(subscriber)
-        return subscriber
+        return await self._add(subscriber)
 
     async def wait_for_message(
         self,
@@ -320,9 +317,7 @@ class Node(MasterClient):
         """
         resolved = self._resolve(name)
         kind = await asyncio.to_thread(find_service_type, kind) if isinstance(kind, str) else kind
-        service = Service(self, resolved, kind, handler, timeout, raw=raw)
-        await self._add(service)
-        return service
+        return await self._add(Service(self, resolved, kind, handler, timeout, raw=raw))
 
     async def lookup_service(self, name: str) -> str:
         """The URI of a service, ``rosrpc://host:port``.
