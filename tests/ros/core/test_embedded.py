@@ -241,7 +241,7 @@ class Logs:
         self.reader = SlaveNode("/reader", "127.0.0.1", core.uri)
         self.log = Publication("/rosout", "/speaker", TopicDescription(LOG.type, LOG.md5sum, "any"))
         self.aggregated = Subscription(
-            AGGREGATED, "/reader", on_message=lambda _, framed: self.heard.append(bytes(framed))
+            AGGREGATED, self.reader, on_message=lambda _, framed: self.heard.append(bytes(framed))
         )
 
     async def __aenter__(self) -> Self:

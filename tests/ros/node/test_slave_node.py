@@ -81,7 +81,7 @@ class Node(SlaveNode):
         self.add_publication(Publication("/t", "/n", TopicDescription("std_msgs/String", "5", "")))
         self.add_publication(Publication("/quiet", "/n"))
         empty = TopicDescription("std_msgs/Empty", "*", "")
-        self.add_subscription(Subscription("/in", "/n", on_message=lambda *_: None, wanted=empty))
+        self.add_subscription(Subscription("/in", self, on_message=lambda *_: None, wanted=empty))
 
     def connections(self) -> list[BusConnection]:
         return [

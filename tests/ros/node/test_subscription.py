@@ -10,6 +10,7 @@ import pytest
 
 from rmpa.core import limits as core_limits
 from rmpa.ros import limits
+from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import PartsTaker, PublisherConnection, Subscription
 from rmpa.ros.wire.tcpros import ANYTHING, TopicDescription, encode_header, frame_message, publisher_header
 from tests.ros.node.peers import MD5, STRING, RawPublisher, RawServer
@@ -241,12 +242,13 @@ class Followed:
     def __init__(self, own_uri: str = "") -> None:
         self.messages: list[tuple[str, bytes]] = []
         self.refused: list[str] = []
+        node = SlaveNode("/s", "127.0.0.1", "")
+        node.uri = own_uri
         self.subscription = Subscription(
             "/t",
-            "/s",
+            node,
             on_message=lambda link, framed: self.messages.append((link.uri, bytes(framed[4:]))),
             on_refused=lambda _, text: self.refused.append(text),
-            own_uri=own_uri,
         )
 
     def close(self) -> None:

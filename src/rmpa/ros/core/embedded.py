@@ -142,12 +142,10 @@ class Rosout:
 
         subscription = Subscription(
             TOPIC,
-            NODE,
+            node,
             on_message=pass_on,
             on_refused=lambda publisher, text: _log.info("! %s is not aggregated: %s", publisher.uri, text),
-            own_uri=node.uri,
             wanted=LOG,
-            number=node.next_number,
         )
         node.add_subscription(subscription)
         core.call("registerPublisher", NODE, AGGREGATED, LOG.type, node.uri)

@@ -481,7 +481,7 @@ class Subscriber:
         *,
         on_bytes: Callable[[memoryview, Mapping[str, str]], None] | None = None,
         type_name: str = ANY,
-        own_uri: str = "",
+        own: bool,
         accepts: Callable[[str], bool] | None = None,
         nodelay: bool,
         queue_messages: int,
@@ -502,14 +502,13 @@ class Subscriber:
         self._ended = False
         self.subscription = Subscription(
             topic,
-            node.name,
+            node.slave,
             on_message=self._message,
             on_refused=self._refused,
-            own_uri=own_uri,
+            own=own,
             accepts=accepts,
             wanted=kind.describe() if kind is not None else TopicDescription(type_name, ANY, ""),
             nodelay=nodelay,
-            number=node.slave.next_number,
         )
 
     @property

@@ -253,7 +253,7 @@ class Node(MasterClient):
             callback,
             on_bytes=on_bytes,
             type_name=type_name,
-            own_uri="" if own else self.uri,
+            own=own,
             accepts=accepts,
             nodelay=nodelay,
             queue_messages=queue_messages,

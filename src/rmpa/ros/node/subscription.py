@@ -25,6 +25,7 @@ from rmpa.runtime.tasks import keep_task
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
+    from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.tcpros import Buffer, Header, TopicDescription
 
     Attach = Callable[["InProcessConnection"], None]
@@ -430,37 +431,35 @@ class Subscription:
 
     Args:
         topic: The topic's global name.
-        caller_id: The node's name.
+        node: The node, which listens already.
         on_message: ``(connection, framed)``; the view is only valid during the call.
         on_refused: ``(connection, text)``.
-        own_uri: The node's slave API, if it is ignored in the list: the node does not subscribe to itself.
+        own: Whether the node subscribes to itself too.
         accepts: Whether the publisher of a slave API is connected to; ``None``: each.
         wanted: The type and md5 sum to ask for, and the definition to send.
         nodelay: Whether to ask for TCP_NODELAY.
-        number: Returns the number of a new connection.
     """
 
     def __init__(
         self,
         topic: str,
-        caller_id: str,
+        node: SlaveNode,
         *,
         on_message: Callable[[PublisherConnection, memoryview], None],
         on_refused: Callable[[PublisherConnection, str], None] = _ignore,
-        own_uri: str = "",
+        own: bool = False,
         accepts: Callable[[str], bool] | None = None,
         wanted: TopicDescription = ANYTHING,
         nodelay: bool = True,
-        number: Callable[[], int] = int,
     ) -> None:
         self.topic = topic
         self.type_name = wanted.type
-        self._connection = partial(PublisherConnection, topic, caller_id=caller_id, wanted=wanted, nodelay=nodelay)
+        self._connection = partial(PublisherConnection, topic, caller_id=node.name, wanted=wanted, nodelay=nodelay)
         self._on_message = on_message
         self._on_refused = on_refused
-        self._own_uri = own_uri
+        self._node = node
+        self._own = own
         self._accepts = accepts
-        self._number = number
         self._connections: dict[str, PublisherConnection] = {}
 
     @property
@@ -484,7 +483,11 @@ class Subscription:
             uris: The slave APIs of the listed publishers.
             keep: Disconnect from none, because the list of a restarted master is incomplete.
         """
-        listed = {uri for uri in uris if uri != self._own_uri and (self._accepts is None or self._accepts(uri))}
+        listed = {
+            uri
+            for uri in uris
+            if (self._own or uri != self._node.uri) and (self._accepts is None or self._accepts(uri))
+        }
         for uri, connection in tuple(self._connections.items()):
             if connection.refused is not None if uri in listed else not keep:
                 self._connections.pop(uri).close()
@@ -501,7 +504,7 @@ class Subscription:
             on_message=lambda framed: self._on_message(connection, framed),
             on_refused=lambda text: self._on_refused(connection, text),
             on_oversized=lambda size: self._oversized(connection, size),
-            number=self._number(),
+            number=self._node.next_number(),
         )
         self._connections[uri] = connection
         connection.start()
