@@ -186,7 +186,7 @@ async def test_junk_from_a_subscriber_is_read_away(known: Owner) -> None:
 
 @pytest.mark.trap(19)
 async def test_slow_subscriber_loses_the_oldest_and_delays_no_other(make: Callable[..., Owner]) -> None:
-    owner = make(STRING, queue_messages=10, queue_bytes=1 << 30)
+    owner = make(STRING, queue_messages=10)
     slow = await owner.subscriber(callerid="/slow", buffer=4096)
     fast = await owner.subscriber(callerid="/fast")
     await slow.header()
@@ -213,11 +213,13 @@ async def test_slow_subscriber_loses_the_oldest_and_delays_no_other(make: Callab
 
 @pytest.mark.trap(19)
 async def test_a_slow_subscriber_holds_no_more_than_its_bytes(make: Callable[..., Owner]) -> None:
-    owner = make(STRING, queue_messages=1000, queue_bytes=1_000_000)
+    owner = make(STRING)
     await owner.subscriber(buffer=4096)
+    (inbound,) = owner.publication._connections
+    assert isinstance(inbound, AcceptedConnection)
+    inbound.bound(1000, 1_000_000)
     for _ in range(200):
         owner.publication.publish_framed(frame_message(bytes(100_000)))
-    (inbound,) = owner.publication._connections
     assert inbound.pending_bytes <= 1_000_000 + 100_004
 
 
@@ -263,7 +265,7 @@ def extend(publication: Publication, *parts: bytes) -> None:
 
 
 async def test_a_slow_subscriber_among_fast_ones_gets_whole_messages_or_none(make: Callable[..., Owner]) -> None:
-    owner = make(STRING, queue_messages=2, queue_bytes=1 << 30)
+    owner = make(STRING, queue_messages=2)
     slow = await owner.subscriber(callerid="/slow", buffer=4096)
     fast = [await owner.subscriber(callerid=f"/fast{n}") for n in range(2)]
     for link in (slow, *fast):

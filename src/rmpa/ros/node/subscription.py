@@ -483,11 +483,8 @@ class Subscription:
             uris: The slave APIs of the listed publishers.
             keep: Disconnect from none, because the list of a restarted master is incomplete.
         """
-        listed = {
-            uri
-            for uri in uris
-            if (self._own or uri != self._node.uri) and (self._accepts is None or self._accepts(uri))
-        }
+        left_out = "" if self._own else self._node.uri
+        listed = {uri for uri in uris if uri != left_out and (self._accepts is None or self._accepts(uri))}
         for uri, connection in tuple(self._connections.items()):
             if connection.refused is not None if uri in listed else not keep:
                 self._connections.pop(uri).close()
