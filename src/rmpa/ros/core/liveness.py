@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
 import random
 import time
@@ -46,6 +47,8 @@ _NOTIFY_RETRY_FIRST: Final = 0.2
 # The longest pause between attempts, while the node is registered.
 _NOTIFY_RETRY_MAX: Final = 3.0
 
+# Slave APIs whose ports are remembered: those of the nodes of some large modules.
+_LOCAL_PORTS_MAX: Final = 16_384
 # Wake-ups in one interval over which the connects to nodes are spread.
 _PORTIONS: Final = 10
 
@@ -97,8 +100,6 @@ class Liveness:
         # The latest call of ``ask_listening_ports`` in a thread.
         self._ports: asyncio.Future[set[int] | None] | None = None
         self._closed = False
-        # The port of each slave API on this machine; ``None`` of the others.
-        self._local_ports: dict[str, int | None] = {}
         self.unreachable: dict[str, Unreachable] = {}
         self.died: deque[tuple[str, float]] = deque(maxlen=_DIED)
         self._slow = asyncio.Semaphore(_NODE_UNREACHABLE_CHECKS)
@@ -141,10 +142,9 @@ class Liveness:
         """The nodes that the kernel's table does not prove to live; the others are noted as reached."""
         nodes = self._nodes()
         self.unreachable = {node: found for node, found in self.unreachable.items() if nodes.get(node) == found.api}
-        before, self._local_ports = self._local_ports, {}
         silent = []
         for node, api in yielding_to_data(nodes.items()):
-            port = self._local_ports[api] = before[api] if api in before else _local_port(api)
+            port = _local_port(api)
             if ports is not None and port in ports:
                 self.tried(node, api, "", 0.0)
             else:
@@ -190,6 +190,7 @@ class Liveness:
             _log.warning(text, node, api, problem)
 
 
+@functools.lru_cache(maxsize=_LOCAL_PORTS_MAX)
 def _local_port(api: str) -> int | None:
     """The port of a slave API that is on this machine by its name; ``None`` of another one."""
     try:
