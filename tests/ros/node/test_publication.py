@@ -1,17 +1,14 @@
 from __future__ import annotations
 
-import contextlib
-import itertools
 import socket
 import struct
 from collections.abc import AsyncIterator, Callable, Mapping
 
 import pytest
 
-from rmpa.core.statistics import Counters
 from rmpa.ros import limits
-from rmpa.ros.node.listeners import TcprosServer
 from rmpa.ros.node.publication import AcceptedConnection, Publication, PublicationEvents
+from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import TopicDescription, frame_message, publisher_header
 from tests.ros.node.peers import LATCHED, STRING, RawSubscriber
 from tests.waiting import until
@@ -20,12 +17,13 @@ OTHER = TopicDescription("std_msgs/Int32", "da5909fbe378aeaf85e547e830cc1bb7", "
 
 
 class Owner(PublicationEvents):
-    """A server with one publication of /t, and what it said."""
+    """A node with one publication of /t, and what it said."""
 
     def __init__(self, description: TopicDescription | None, **options: int) -> None:
         self.said: list[str] = []
         self.publication = Publication("/t", "/p", description, events=self, **options)
-        self.server = TcprosServer("/p", {"/t": self.publication}, {}, Counters(), itertools.count(1))
+        self.node = SlaveNode("/p", "127.0.0.1", "")
+        self.node.add_publication(self.publication)
 
     def first_subscriber(self) -> None:
         self.said.append("first")
@@ -37,23 +35,28 @@ class Owner(PublicationEvents):
         self.said.append(f"refused {fields['callerid']}: {text}")
 
     async def subscriber(self, *, buffer: int = 0, **fields: str) -> RawSubscriber:
-        if not self.server.address[1]:
-            await self.server.start()
+        if not self.node.uri:
+            await self.node.start()
         before = self.publication.subscribers
-        link = await RawSubscriber.connect(self.server.address, buffer=buffer, **fields)
+        address = self.node.address_of("/t")
+        assert address is not None
+        link = await RawSubscriber.connect(address, buffer=buffer, **fields)
         await until(lambda: self.publication.subscribers > before)
         return link
-
-    def close(self) -> None:
-        self.publication.withdraw()
-        self.server.close()
 
 
 @pytest.fixture
 async def make() -> AsyncIterator[Callable[..., Owner]]:
     """Makes owners, which end with the test."""
-    with contextlib.ExitStack() as stack:
-        yield lambda *args, **options: stack.enter_context(contextlib.closing(Owner(*args, **options)))
+    made: list[Owner] = []
+
+    def make(*args: TopicDescription | None, **options: int) -> Owner:
+        made.append(Owner(*args, **options))
+        return made[-1]
+
+    yield make
+    for owner in made:
+        await owner.node.close()
 
 
 @pytest.fixture

@@ -77,7 +77,7 @@ class Node(SlaveNode):
 
         super().__init__("/n", "127.0.0.1", master_uri, on_shutdown=shut_down, on_param_update=follow)
         self.uri = "http://127.0.0.1:5000/"
-        self._tcpros.address = ("127.0.0.1", 4000)
+        self._tcpros_port = 4000
         self.add_publication(Publication("/t", "/n", TopicDescription("std_msgs/String", "5", "")))
         self.add_publication(Publication("/quiet", "/n"))
         empty = TopicDescription("std_msgs/Empty", "*", "")

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import itertools
 import logging
 import socket
 import struct
@@ -18,7 +17,7 @@ from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node import listeners as shared_listener
 from rmpa.ros.node.ask import name_at
-from rmpa.ros.node.listeners import SharedListener, TcprosServer, loopback_addresses
+from rmpa.ros.node.listeners import SharedListener, loopback_addresses
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import encode_header, frame_message
@@ -29,27 +28,30 @@ from tests.waiting import until
 
 
 class Served:
+    """A node that publishes /t."""
+
     def __init__(self) -> None:
         self.counters = Counters()
         self.publication = Publication("/t", "/p", STRING)
-        self.server = TcprosServer("/p", {"/t": self.publication}, {}, self.counters, itertools.count(1))
+        self.node = SlaveNode("/p", "127.0.0.1", "", counters=self.counters)
+        self.node.add_publication(self.publication)
 
-    def close(self) -> None:
-        self.publication.withdraw()
-        self.server.close()
+    @property
+    def address(self) -> tuple[str, int]:
+        return "127.0.0.1", self.node._tcpros_port
 
 
 @pytest.fixture
 async def served() -> AsyncIterator[Served]:
     made = Served()
-    await made.server.start()
+    await made.node.start()
     yield made
-    made.close()
+    await made.node.close()
 
 
 @pytest.mark.trap(7)
 async def test_a_header_may_come_byte_by_byte(served: Served) -> None:
-    link = await RawSubscriber.dial(served.server.address)
+    link = await RawSubscriber.dial(served.address)
     for byte in encode_header({"topic": "/t", "callerid": "/s", "md5sum": "*"}):
         await link.send(bytes([byte]))
     assert (await link.header())["callerid"] == "/p"
@@ -66,7 +68,7 @@ async def test_a_header_may_come_byte_by_byte(served: Served) -> None:
     ],
 )
 async def test_what_is_refused(served: Served, fields: dict[str, str], error: str) -> None:
-    link = await RawSubscriber.connect(served.server.address, buffer=0, **fields)
+    link = await RawSubscriber.connect(served.address, buffer=0, **fields)
     assert await link.header() == {"error": error}
     assert await link.ended()
 
@@ -83,7 +85,7 @@ async def test_malformed_headers_are_counted_and_closed(
     served: Served, data: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING)
-    link = await RawSubscriber.dial(served.server.address)
+    link = await RawSubscriber.dial(served.address)
     await link.send(data)
     assert await link.ended()
     await until(lambda: served.counters["tcpros.refused.malformed"] == 1)
@@ -92,7 +94,7 @@ async def test_malformed_headers_are_counted_and_closed(
 
 @pytest.mark.trap(7)
 async def test_an_empty_header_is_refused_instead_of_held(served: Served) -> None:
-    link = await RawSubscriber.dial(served.server.address)
+    link = await RawSubscriber.dial(served.address)
     await link.send(bytes(4))
     assert "error" in await link.header()
 
@@ -101,12 +103,12 @@ async def test_an_empty_header_is_refused_instead_of_held(served: Served) -> Non
 async def test_leaving_before_the_header_is_no_error(served: Served, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING)
     for data in (b"", b"\x10\x00"):
-        link = await RawSubscriber.dial(served.server.address)
+        link = await RawSubscriber.dial(served.address)
         await link.send(data)
         link.close()
-    patient = await RawSubscriber.connect(served.server.address)
+    patient = await RawSubscriber.connect(served.address)
     assert "error" not in await patient.header(), "those before it have been accepted"
-    await until(lambda: not served.server._waiting)
+    await until(lambda: not served.node._waiting)
     assert served.counters.as_dict() == {}
     assert caplog.text == ""
 
@@ -116,8 +118,8 @@ async def test_silent_connection_blocks_no_other_and_is_closed(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "TCPROS_HANDSHAKE_TIMEOUT", 0.2)
-    silent = await RawSubscriber.dial(served.server.address)
-    other = await RawSubscriber.connect(served.server.address)
+    silent = await RawSubscriber.dial(served.address)
+    other = await RawSubscriber.connect(served.address)
     assert "error" not in await other.header()
     assert await silent.ended()
     assert served.counters["tcpros.refused.silent"] == 1
@@ -126,12 +128,12 @@ async def test_silent_connection_blocks_no_other_and_is_closed(
 
 async def test_connections_without_a_header_are_bounded(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "TCPROS_HANDSHAKES_MAX", 3)
-    links = [await RawSubscriber.dial(served.server.address) for _ in range(4)]
+    links = [await RawSubscriber.dial(served.address) for _ in range(4)]
     assert await links[3].ended()
     assert served.counters["tcpros.refused.full"] == 1
     for link in links:
         link.close()
-    await until(lambda: not served.server._waiting)
+    await until(lambda: not served.node._waiting)
 
 
 async def test_all_connections_are_bounded_and_closed_ones_do_not_count(
@@ -139,10 +141,10 @@ async def test_all_connections_are_bounded_and_closed_ones_do_not_count(
 ) -> None:
     monkeypatch.setattr(limits, "TCPROS_CONNECTIONS_MAX", 3)
     for _ in range(2):
-        links = [await RawSubscriber.connect(served.server.address) for _ in range(3)]
+        links = [await RawSubscriber.connect(served.address) for _ in range(3)]
         for link in links:
             await link.header()
-        surplus = await RawSubscriber.connect(served.server.address)
+        surplus = await RawSubscriber.connect(served.address)
         assert await surplus.ended()
         for link in (*links, surplus):
             link.close()
@@ -150,21 +152,16 @@ async def test_all_connections_are_bounded_and_closed_ones_do_not_count(
     assert served.counters["tcpros.refused.full"] == 2
 
 
-async def test_an_address_in_use_is_a_clear_error(served: Served) -> None:
-    with pytest.raises(StartError, match=r"TCPROS server of /q at 127.0.0.1:\d+: "):
-        await TcprosServer("/q", {}, {}, Counters(), itertools.count(1)).start(*served.server.address)
-
-
 @pytest.mark.trap(3)
 @pytest.mark.parametrize("definition", ["", "another text\n", "string data\n"])
 async def test_a_subscriber_may_or_may_not_send_its_definition(served: Served, definition: str) -> None:
-    link = await RawSubscriber.connect(served.server.address, message_definition=definition)
+    link = await RawSubscriber.connect(served.address, message_definition=definition)
     assert (await link.header())["message_definition"] == "string data\n"
 
 
 @pytest.mark.trap(8)
 async def test_what_comes_in_one_segment_with_the_header_does_no_harm(served: Served) -> None:
-    link = await RawSubscriber.dial(served.server.address)
+    link = await RawSubscriber.dial(served.address)
     header = encode_header({"topic": "/t", "callerid": "/s", "md5sum": "*"})
     await link.send(header + b"a request that should have waited for the reply")
     assert (await link.header())["callerid"] == "/p"
@@ -179,12 +176,12 @@ async def test_a_probe_for_a_service_that_is_gone_is_answered_and_not_logged(
     caplog.set_level(logging.WARNING)
     probe = {"topic": "", "service": "/add", "probe": "1"}
     for _ in range(5):
-        hasty = await RawSubscriber.connect(served.server.address, buffer=0, **probe)
+        hasty = await RawSubscriber.connect(served.address, buffer=0, **probe)
         hasty.close()  # wait_for_service does not read the reply
-    patient = await RawSubscriber.connect(served.server.address, buffer=0, **probe)
+    patient = await RawSubscriber.connect(served.address, buffer=0, **probe)
     assert await patient.header() == {"error": "[/p] does not offer the service [/add]"}
     assert await patient.ended()
-    await until(lambda: not served.server._waiting)
+    await until(lambda: not served.node._waiting)
     assert served.counters.as_dict() == {}
     assert caplog.records == []
 

@@ -1,7 +1,4 @@
-"""The sockets of nodes: one shared port, loopback addresses of proxies, and the TCPROS server.
-
-The addresses of this machine, from which a node chooses the one to register.
-"""
+"""The addresses of nodes: those of this machine, and a loopback address for each proxy at one pair of ports."""
 
 from __future__ import annotations
 
@@ -17,19 +14,14 @@ from typing import TYPE_CHECKING, Final
 import psutil
 
 from rmpa.core.errors import StartError
-from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.ros import limits
-from rmpa.ros.http.server import RESET, ResetConnection, XmlRpcServer, listen
-from rmpa.ros.node.publication import AcceptedConnection
-from rmpa.ros.wire.tcpros import check_request, printable
+from rmpa.ros.http.server import RESET, ResetConnection, XmlRpcServer
 from rmpa.runtime.accept import DESCRIPTORS, Acceptor, Use
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator
 
-    from rmpa.ros.node.publication import Publication
-    from rmpa.ros.node.service_server import ServiceEndpoint
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
     # Takes ownership of an accepted, non-blocking socket; the second argument is the client's address.
@@ -85,122 +77,6 @@ def loopback_addresses(salt: str, name: str) -> Iterator[str]:
         rest, third = divmod(number, _THIRD)
         first, second = divmod(rest % (_FIRST * _SECOND), _SECOND)
         yield f"127.{1 + first}.{second}.{1 + third}"
-
-
-# The listening TCPROS socket of one node. Passes each connection to the publication or service of its header.
-
-
-class TcprosServer:
-    """Accepts connections for the publications and services of one node.
-
-    Args:
-        name: The node's name, for the texts.
-        publications: By topic; read again at each header, so that the owner can change it.
-        services: By name; likewise.
-        counters: Count ``tcpros.refused.*``.
-        numbers: The numbers of connections, shared with the node's outgoing ones.
-
-    Attributes:
-        address: Where the socket listens.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        publications: Mapping[str, Publication],
-        services: Mapping[str, ServiceEndpoint],
-        counters: Counters,
-        numbers: Iterator[int],
-    ) -> None:
-        self._name = name
-        self._publications = publications
-        self._services = services
-        self._refusals = RefusalLog(_log, counters)
-        self._numbers = numbers
-        self._acceptor: Acceptor | None = None
-        self._waiting: dict[AcceptedConnection, asyncio.TimerHandle] = {}
-        self.address: tuple[str, int] = ("", 0)
-
-    async def start(self, host: str = "127.0.0.1", port: int = 0) -> None:
-        """Listen; ``port`` 0 lets the system choose.
-
-        Raises:
-            StartError: The address cannot be used.
-        """
-        name = f"TCPROS server of {self._name}"
-        sock = await listen(name, host, port, Use.DATA)
-        self.address = sock.getsockname()[:2]
-        self._acceptor = Acceptor(sock, self.adopt, name=name)
-        self._acceptor.start()
-
-    def close(self) -> None:
-        """Stop listening, and close the connections without a header; the owner closes the others."""
-        if self._acceptor is not None:
-            self._acceptor.close()
-            self._acceptor = None
-        waiting, self._waiting = self._waiting, {}
-        for connection, timer in waiting.items():
-            timer.cancel()
-            connection.close()
-
-    def adopt(self, sock: socket.socket, _client: tuple[str, int]) -> None:
-        """Serve an accepted connection, of this server's own socket or of one that several nodes share.
-
-        Args:
-            sock: Non-blocking; owned from here on.
-        """
-        try:
-            connection = AcceptedConnection(sock, next(self._numbers), on_header=self._header, on_end=self._ended)
-        except OSError:  # the client has disconnected already
-            sock.close()
-            return
-        served = sum(topic.subscribers for topic in self._publications.values())
-        served += sum(service.clients for service in self._services.values())
-        waiting = len(self._waiting)
-        if served + waiting >= limits.TCPROS_CONNECTIONS_MAX or waiting >= limits.TCPROS_HANDSHAKES_MAX:
-            self._refuse("full", connection, f"too many connections, one from {connection.peer[0]} closed")
-            connection.close()
-            return
-        self._waiting[connection] = asyncio.get_running_loop().call_later(
-            limits.TCPROS_HANDSHAKE_TIMEOUT, self._timed_out, connection
-        )
-
-    def _header(self, connection: AcceptedConnection) -> None:
-        self._waiting.pop(connection).cancel()
-        fields = connection.request
-        problem = check_request(fields)
-        if problem is not None:
-            self._refuse("header", connection, f"a connection from {connection.peer[0]}: {problem}")
-            connection.refuse(problem)
-            return
-        kind = "service" if "service" in fields else "topic"
-        name = fields[kind]
-        taker = self._services.get(name) if kind == "service" else self._publications.get(name)
-        if taker is not None:
-            taker.attach(connection)
-            return
-        # At debug level: the other node may have looked up something that is gone by now.
-        _log.debug("! %s: no %s %s", self._name, kind, printable(name))
-        verb = "does not offer the service" if kind == "service" else "is not a publisher of"
-        connection.refuse(f"[{self._name}] {verb} [{printable(name)}]")
-
-    def _ended(self, connection: AcceptedConnection, error: Exception | None) -> None:
-        """A connection ended before its header was complete, which is normal for rospy, or broke the protocol."""
-        timer = self._waiting.pop(connection, None)
-        if timer is not None:
-            timer.cancel()
-        if error is not None and not isinstance(error, OSError):
-            self._refuse("malformed", connection, f"a connection from {connection.peer[0]}: {error}")
-
-    def _timed_out(self, connection: AcceptedConnection) -> None:
-        del self._waiting[connection]
-        connection.close()
-        text = f"{connection.peer[0]} sent no header within {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s; closed"
-        self._refuse("silent", connection, text)
-
-    def _refuse(self, kind: str, connection: AcceptedConnection, text: str) -> None:
-        now = asyncio.get_running_loop().time()
-        self._refusals.refuse(now, f"tcpros.refused.{kind}", connection.peer[0], f"{self._name}: {text}")
 
 
 # Two listening sockets for any number of nodes. Each node has a loopback address, all have the same two ports.

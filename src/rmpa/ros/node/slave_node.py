@@ -8,14 +8,18 @@ import logging
 import os
 from typing import TYPE_CHECKING, Protocol
 
+from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
-from rmpa.ros.http.server import XmlRpcServer
-from rmpa.ros.node.listeners import TcprosServer
+from rmpa.ros import limits
+from rmpa.ros.http.server import XmlRpcServer, listen
+from rmpa.ros.node.publication import AcceptedConnection
 from rmpa.ros.wire.slave_api import METHODS, TCPROS, bus_info, bus_stats, check_call
-from rmpa.ros.wire.tcpros import ANY
+from rmpa.ros.wire.tcpros import ANY, check_request, printable
 from rmpa.ros.wire.xmlrpc import RosFault
+from rmpa.runtime.accept import Acceptor, Use
 
 if TYPE_CHECKING:
+    import socket
     from collections.abc import Awaitable, Callable, Iterable
 
     from rmpa.ros.node.listeners import SharedListener
@@ -70,7 +74,7 @@ class SlaveNode:
         advertised_host: The address to register, if it differs from ``host``.
         listener: A started listener that accepts this node's connections and assigns its address; ``host`` and
             ``advertised_host`` are then ignored.
-        counters: Count refusals.
+        counters: Count refusals, ``tcpros.refused.*`` among them.
         on_shutdown: ``(reason)``: the master shuts this node down; the owner has to close it.
         on_param_update: ``(key, value) -> whether the node subscribed to that key``.
         on_kill: ``(caller id, reason) -> reply``: awaited after ``on_shutdown`` for the answer to ``shutdown``.
@@ -114,7 +118,11 @@ class SlaveNode:
         self._taps = taps
         self._elsewhere = elsewhere
         self._http = XmlRpcServer(self._call, host, counters=self.counters, name=f"node {name}")
-        self._tcpros = TcprosServer(name, self._publications, self._services, self.counters, self._numbers)
+        self._tcpros_port = 0
+        self._acceptor: Acceptor | None = None
+        # The TCPROS connections whose header has not come.
+        self._waiting: dict[AcceptedConnection, asyncio.TimerHandle] = {}
+        self._refusals = RefusalLog(_log, self.counters)
 
     async def start(self) -> None:
         """Listen.
@@ -123,16 +131,19 @@ class SlaveNode:
             StartError: The address cannot be used.
         """
         if self._listener is not None:
-            self._advertised = self._listener.attach(self.name, self._http.adopt, self._tcpros.adopt)
-            self._http.port, tcpros_port = self._listener.ports
-            self._tcpros.address = (self._advertised, tcpros_port)
+            self._advertised = self._listener.attach(self.name, self._http.adopt, self._adopt)
+            self._http.port, self._tcpros_port = self._listener.ports
         else:
             await self._http.start()
+            name = f"TCPROS server of {self.name}"
             try:
-                await self._tcpros.start(self._host)
+                sock = await listen(name, self._host, 0, Use.DATA)
             except BaseException:
                 await self._http.close()
                 raise
+            self._tcpros_port = sock.getsockname()[1]
+            self._acceptor = Acceptor(sock, self._adopt, name=name)
+            self._acceptor.start()
         self.uri = f"http://{self._advertised}:{self._http.port}/"
 
     async def close(self) -> None:
@@ -147,7 +158,12 @@ class SlaveNode:
         if self._listener is not None and self.uri:
             self._listener.detach(self._advertised)
             self._listener = None  # a second close must not free the next node's address
-        self._tcpros.close()
+        if self._acceptor is not None:
+            self._acceptor.close()
+        waiting, self._waiting = self._waiting, {}
+        for connection, timer in waiting.items():
+            timer.cancel()
+            connection.close()
         await self._http.close()
         await asyncio.gather(*(endpoint.closed() for endpoint in services))
         # The node and its servers are a reference cycle, which must not hold the owner until it is collected.
@@ -190,7 +206,7 @@ class SlaveNode:
     @property
     def service_uri(self) -> str:
         """The URI of this node's services, ``rosrpc://host:port``; only after ``start()``."""
-        return f"rosrpc://{self._advertised}:{self._tcpros.address[1]}"
+        return f"rosrpc://{self._advertised}:{self._tcpros_port}"
 
     def add_service(self, endpoint: ServiceEndpoint) -> None:
         """Serve a service from now on.
@@ -230,7 +246,63 @@ class SlaveNode:
 
     def address_of(self, topic: str) -> tuple[str, int] | None:
         """Host and port for subscribers of a topic; ``None`` if it is not published."""
-        return (self._advertised, self._tcpros.address[1]) if topic in self._publications else None
+        return (self._advertised, self._tcpros_port) if topic in self._publications else None
+
+    def _adopt(self, sock: socket.socket, _client: tuple[str, int]) -> None:
+        """Serve an accepted, non-blocking TCPROS connection; the node owns it from here on."""
+        try:
+            connection = AcceptedConnection(sock, self.next_number(), on_header=self._header, on_end=self._ended)
+        except OSError:  # the client has disconnected already
+            sock.close()
+            return
+        served = sum(topic.subscribers for topic in self._publications.values())
+        served += sum(service.clients for service in self._services.values())
+        waiting = len(self._waiting)
+        if served + waiting >= limits.TCPROS_CONNECTIONS_MAX or waiting >= limits.TCPROS_HANDSHAKES_MAX:
+            self._refuse("full", connection, f"too many connections, one from {connection.peer[0]} closed")
+            connection.close()
+            return
+        self._waiting[connection] = asyncio.get_running_loop().call_later(
+            limits.TCPROS_HANDSHAKE_TIMEOUT, self._timed_out, connection
+        )
+
+    def _header(self, connection: AcceptedConnection) -> None:
+        """Pass a connection to the publication or service of its header."""
+        self._waiting.pop(connection).cancel()
+        fields = connection.request
+        problem = check_request(fields)
+        if problem is not None:
+            self._refuse("header", connection, f"a connection from {connection.peer[0]}: {problem}")
+            connection.refuse(problem)
+            return
+        kind = "service" if "service" in fields else "topic"
+        name = fields[kind]
+        taker = self._services.get(name) if kind == "service" else self._publications.get(name)
+        if taker is not None:
+            taker.attach(connection)
+            return
+        # At debug level: the other node may have looked up something that is gone by now.
+        _log.debug("! %s: no %s %s", self.name, kind, printable(name))
+        verb = "does not offer the service" if kind == "service" else "is not a publisher of"
+        connection.refuse(f"[{self.name}] {verb} [{printable(name)}]")
+
+    def _ended(self, connection: AcceptedConnection, error: Exception | None) -> None:
+        """A connection ended before its header was complete, which is normal for rospy, or broke the protocol."""
+        timer = self._waiting.pop(connection, None)
+        if timer is not None:
+            timer.cancel()
+        if error is not None and not isinstance(error, OSError):
+            self._refuse("malformed", connection, f"a connection from {connection.peer[0]}: {error}")
+
+    def _timed_out(self, connection: AcceptedConnection) -> None:
+        del self._waiting[connection]
+        connection.close()
+        text = f"{connection.peer[0]} sent no header within {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s; closed"
+        self._refuse("silent", connection, text)
+
+    def _refuse(self, kind: str, connection: AcceptedConnection, text: str) -> None:
+        now = asyncio.get_running_loop().time()
+        self._refusals.refuse(now, f"tcpros.refused.{kind}", connection.peer[0], f"{self.name}: {text}")
 
     def _call(
         self, method: str, params: tuple[XmlRpcValue, ...], _client: str
