@@ -108,7 +108,7 @@ async def test_leaving_before_the_header_is_no_error(served: Served, caplog: pyt
         link.close()
     patient = await RawSubscriber.connect(served.address)
     assert "error" not in await patient.header(), "those before it have been accepted"
-    await until(lambda: not served.node._waiting)
+    await until(lambda: not served.node._greetings)
     assert served.counters.as_dict() == {}
     assert caplog.text == ""
 
@@ -133,7 +133,7 @@ async def test_connections_without_a_header_are_bounded(served: Served, monkeypa
     assert served.counters["tcpros.refused.full"] == 1
     for link in links:
         link.close()
-    await until(lambda: not served.node._waiting)
+    await until(lambda: not served.node._greetings)
 
 
 async def test_all_connections_are_bounded_and_closed_ones_do_not_count(
@@ -181,7 +181,7 @@ async def test_a_probe_for_a_service_that_is_gone_is_answered_and_not_logged(
     patient = await RawSubscriber.connect(served.address, buffer=0, **probe)
     assert await patient.header() == {"error": "[/p] does not offer the service [/add]"}
     assert await patient.ended()
-    await until(lambda: not served.node._waiting)
+    await until(lambda: not served.node._greetings)
     assert served.counters.as_dict() == {}
     assert caplog.records == []
 

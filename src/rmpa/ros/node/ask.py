@@ -58,9 +58,13 @@ async def exchange_headers(sock: socket.socket, header: tcpros.Header) -> tcpros
         RemoteProtocolError: What comes is no header, or too large.
         OSError: The connection broke.
     """
-    loop = asyncio.get_running_loop()
-    await loop.sock_sendall(sock, tcpros.encode_header(header))
-    data = b""
+    await asyncio.get_running_loop().sock_sendall(sock, tcpros.encode_header(header))
+    return await read_header(sock)
+
+
+async def read_header(sock: socket.socket) -> tcpros.Header | None:
+    """The connection header that comes, or ``None`` if the other side closes before; errors as above."""
+    loop, data = asyncio.get_running_loop(), b""
     while True:
         fields, _, wanted = tcpros.parse_header(data)
         if fields is not None:

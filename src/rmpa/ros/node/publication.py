@@ -21,7 +21,6 @@ from rmpa.ros.wire.tcpros import (
     TopicDescription,
     check_subscriber,
     encode_header,
-    parse_header,
     printable,
     publisher_header,
 )
@@ -46,7 +45,7 @@ _MESSAGES: Final = 0
 
 
 def _ended(*_: object) -> None:
-    """The ``on_end`` of a connection that no publication has any more."""
+    """The ``on_end`` of a connection that no publication and no service has."""
 
 
 class AcceptedConnection(Stream):
@@ -55,33 +54,24 @@ class AcceptedConnection(Stream):
     Args:
         sock: Accepted, non-blocking; owned from here on.
         number: The node's own number for this connection.
-        on_header: Called once, when ``request`` is known.
-        on_end: Called once when the other side closed the connection or broke the protocol (then with the error); not
-            after ``close()`` or ``refuse()``. The publication or service that takes the connection replaces it.
+        request: The other side's header, which has been read.
 
     Attributes:
         on_data: Gets the bytes after the header, as ``on_bytes`` of a stream; with ``None``, as for subscribers, they
             are dropped.
+        on_end: Called once when the other side closed the connection or broke the protocol (then with the error); not
+            after ``close()`` or ``refuse()``. The publication or service that takes the connection replaces it.
         since: The count of its publication's messages when it was served.
-        request: The other side's header, once received.
     """
 
-    def __init__(
-        self,
-        sock: socket.socket,
-        number: int,
-        *,
-        on_header: Callable[[AcceptedConnection], None],
-        on_end: Callable[[AcceptedConnection, Exception | None], None],
-    ) -> None:
+    def __init__(self, sock: socket.socket, number: int, request: Header) -> None:
         self.number = number
-        self.request: Header = {}
+        self.request = request
         self.info = tcpros_info(sock)
         self.peer: tuple[str, int] = sock.getpeername()[:2]
         self.since = 0
-        self.on_end = on_end
+        self.on_end: Callable[[AcceptedConnection, Exception | None], None] = _ended
         self.on_data: OnBytes | None = None
-        self._on_header: Callable[[AcceptedConnection], None] | None = on_header
         self._socket = sock
         keep_alive(sock)
         outbox = Outbox(limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SUBSCRIBER_QUEUE_BYTES)
@@ -128,19 +118,8 @@ class AcceptedConnection(Stream):
             self.close()
 
     def _take(self, data: memoryview) -> tuple[int, int]:
-        consumed = 0
-        if self._on_header is not None:
-            fields, consumed, wanted = parse_header(data)
-            if fields is None:
-                return 0, wanted
-            self.request = fields
-            on_header, self._on_header = self._on_header, None
-            on_header(self)
-        if self.on_data is None:
-            # A subscriber sends nothing more; reading goes on to detect the end of the stream.
-            return len(data), 0
-        taken, wanted = self.on_data(data[consumed:])
-        return consumed + taken, wanted
+        # A subscriber sends nothing more; reading goes on to detect the end of the stream.
+        return self.on_data(data) if self.on_data is not None else (len(data), 0)
 
 
 class PublicationEvents:

@@ -8,15 +8,18 @@ import logging
 import os
 from typing import TYPE_CHECKING, Protocol
 
+from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.ros import limits
 from rmpa.ros.http.server import XmlRpcServer, listen
+from rmpa.ros.node.ask import read_header
 from rmpa.ros.node.publication import AcceptedConnection
 from rmpa.ros.wire.slave_api import METHODS, TCPROS, bus_info, bus_stats, check_call
 from rmpa.ros.wire.tcpros import ANY, check_request, printable
 from rmpa.ros.wire.xmlrpc import RosFault
 from rmpa.runtime.accept import Acceptor, Use
+from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
     import socket
@@ -120,8 +123,8 @@ class SlaveNode:
         self._http = XmlRpcServer(self._call, host, counters=self.counters, name=f"node {name}")
         self._tcpros_port = 0
         self._acceptor: Acceptor | None = None
-        # The TCPROS connections whose header has not come.
-        self._waiting: dict[AcceptedConnection, asyncio.TimerHandle] = {}
+        # One for each TCPROS connection whose header has not come.
+        self._greetings = OwnedTasks()
         self._refusals = RefusalLog(_log, self.counters)
 
     async def start(self) -> None:
@@ -160,10 +163,7 @@ class SlaveNode:
             self._listener = None  # a second close must not free the next node's address
         if self._acceptor is not None:
             self._acceptor.close()
-        waiting, self._waiting = self._waiting, {}
-        for connection, timer in waiting.items():
-            timer.cancel()
-            connection.close()
+        await self._greetings.close()
         await self._http.close()
         await asyncio.gather(*(endpoint.closed() for endpoint in services))
         # The node and its servers are a reference cycle, which must not hold the owner until it is collected.
@@ -248,31 +248,42 @@ class SlaveNode:
         """Host and port for subscribers of a topic; ``None`` if it is not published."""
         return (self._advertised, self._tcpros_port) if topic in self._publications else None
 
-    def _adopt(self, sock: socket.socket, _client: tuple[str, int]) -> None:
+    def _adopt(self, sock: socket.socket, client: tuple[str, int]) -> None:
         """Serve an accepted, non-blocking TCPROS connection; the node owns it from here on."""
-        try:
-            connection = AcceptedConnection(sock, self.next_number(), on_header=self._header, on_end=self._ended)
-        except OSError:  # the client has disconnected already
-            sock.close()
-            return
         served = sum(topic.subscribers for topic in self._publications.values())
         served += sum(service.clients for service in self._services.values())
-        waiting = len(self._waiting)
+        waiting = len(self._greetings)
         if served + waiting >= limits.TCPROS_CONNECTIONS_MAX or waiting >= limits.TCPROS_HANDSHAKES_MAX:
-            self._refuse("full", connection, f"too many connections, one from {connection.peer[0]} closed")
-            connection.close()
+            self._refuse("full", client[0], f"too many connections, one from {client[0]} closed")
+            sock.close()
             return
-        self._waiting[connection] = asyncio.get_running_loop().call_later(
-            limits.TCPROS_HANDSHAKE_TIMEOUT, self._timed_out, connection
-        )
+        self._greetings.start(self._greet(sock, client[0]), f"header of a connection to {self.name}")
 
-    def _header(self, connection: AcceptedConnection) -> None:
-        """Pass a connection to the publication or service of its header."""
-        self._waiting.pop(connection).cancel()
+    async def _greet(self, sock: socket.socket, who: str) -> None:
+        """Wait for the header of a connection, and pass it to the publication or service that it names."""
+        connection = None
+        try:
+            async with asyncio.timeout(limits.TCPROS_HANDSHAKE_TIMEOUT):
+                request = await read_header(sock)
+            if request is not None:
+                connection = AcceptedConnection(sock, self.next_number(), request)
+        except TimeoutError:
+            self._refuse("silent", who, f"{who} sent no header within {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s; closed")
+        except RemoteProtocolError as error:
+            self._refuse("malformed", who, f"a connection from {who}: {error}")
+        except OSError:
+            pass  # the client has disconnected already, which is normal for rospy
+        finally:
+            if connection is None:
+                sock.close()
+        if connection is not None:
+            self._attach(connection)
+
+    def _attach(self, connection: AcceptedConnection) -> None:
         fields = connection.request
         problem = check_request(fields)
         if problem is not None:
-            self._refuse("header", connection, f"a connection from {connection.peer[0]}: {problem}")
+            self._refuse("header", connection.peer[0], f"a connection from {connection.peer[0]}: {problem}")
             connection.refuse(problem)
             return
         kind = "service" if "service" in fields else "topic"
@@ -286,23 +297,9 @@ class SlaveNode:
         verb = "does not offer the service" if kind == "service" else "is not a publisher of"
         connection.refuse(f"[{self.name}] {verb} [{printable(name)}]")
 
-    def _ended(self, connection: AcceptedConnection, error: Exception | None) -> None:
-        """A connection ended before its header was complete, which is normal for rospy, or broke the protocol."""
-        timer = self._waiting.pop(connection, None)
-        if timer is not None:
-            timer.cancel()
-        if error is not None and not isinstance(error, OSError):
-            self._refuse("malformed", connection, f"a connection from {connection.peer[0]}: {error}")
-
-    def _timed_out(self, connection: AcceptedConnection) -> None:
-        del self._waiting[connection]
-        connection.close()
-        text = f"{connection.peer[0]} sent no header within {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s; closed"
-        self._refuse("silent", connection, text)
-
-    def _refuse(self, kind: str, connection: AcceptedConnection, text: str) -> None:
+    def _refuse(self, kind: str, who: str, text: str) -> None:
         now = asyncio.get_running_loop().time()
-        self._refusals.refuse(now, f"tcpros.refused.{kind}", connection.peer[0], f"{self.name}: {text}")
+        self._refusals.refuse(now, f"tcpros.refused.{kind}", who, f"{self.name}: {text}")
 
     def _call(
         self, method: str, params: tuple[XmlRpcValue, ...], _client: str
