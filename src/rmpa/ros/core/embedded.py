@@ -21,7 +21,7 @@ from rmpa.ros.core.state import CoreState
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.parameters import RegistrationKind
-from rmpa.ros.node.loggers import LoggerServices
+from rmpa.ros.node.loggers import serve_loggers
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import PublisherConnection, Subscription
@@ -151,7 +151,7 @@ class Rosout:
         core.call("registerPublisher", NODE, AGGREGATED, LOG.type, node.uri)
         core.call("registerSubscriber", NODE, TOPIC, LOG.type, node.uri)
         subscription.update(list(core.publishers(TOPIC).values()))
-        LoggerServices(node, core.call, _LOGGERS).start()
+        serve_loggers(node, core.call, _LOGGERS)
 
     def _node_at(self, uri: str) -> str:
         """The publishing node with a slave API."""

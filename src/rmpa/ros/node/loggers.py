@@ -14,6 +14,7 @@ import logging
 import re
 import sys
 from collections import deque
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -71,59 +72,42 @@ def _level_of(number: int) -> int:
     return max(0, sum(level <= number for level in LEVELS.values()) - 1)
 
 
-class LoggerServices:
-    """The two services of one node.
+def serve_loggers(node: SlaveNode, call: Callable[..., RosReply], loggers: Mapping[str, str]) -> None:
+    """Serve the two services of a node's loggers, and register them; the node listens already.
 
     Args:
-        node: Serves them.
+        node: Serves them, until it is closed.
         call: Calls the core's master.
         loggers: The name of Python's logger, by the name that the services show.
     """
+    for name, serve, description in (("get_loggers", _get, GET), ("set_logger_level", _set, SET)):
+        service = f"{node.name}/{name}"
+        node.add_service(ServiceEndpoint(service, node.name, partial(serve, loggers), description=description))
+        code, text, _ = call("registerService", node.name, service, node.service_uri, node.uri)
+        if code != 1:
+            _log.error("! the ROS core does not accept %s: %s [core-refuses]", service, text)
 
-    def __init__(self, node: SlaveNode, call: Callable[..., RosReply], loggers: Mapping[str, str]) -> None:
-        self._node = node
-        self._call = call
-        self._loggers = loggers
-        self._endpoints = (
-            ServiceEndpoint(f"{node.name}/get_loggers", node.name, self._get, description=GET),
-            ServiceEndpoint(f"{node.name}/set_logger_level", node.name, self._set, description=SET),
-        )
 
-    def start(self) -> None:
-        """Serve and register; the node listens already."""
-        node = self._node
-        for endpoint in self._endpoints:
-            node.add_service(endpoint)
-            code, text, _ = self._call("registerService", node.name, endpoint.service, node.service_uri, node.uri)
-            if code != 1:
-                _log.error("! the ROS core does not accept %s: %s [core-refuses]", endpoint.service, text)
+def _get(loggers: Mapping[str, str], call: ServiceCall) -> None:
+    parts = [LENGTH.pack(len(loggers))]
+    for name, logger in loggers.items():
+        level = _level_of(logging.getLogger(logger).getEffectiveLevel())
+        parts += [pack_text(name), pack_text(list(LEVELS)[level])]
+    call.reply(True, b"".join(parts))
 
-    def close(self) -> None:
-        """Unregister, and stop serving."""
-        node = self._node
-        for endpoint in self._endpoints:
-            self._call("unregisterService", node.name, endpoint.service, node.service_uri)
-            node.remove_service(endpoint.service)
 
-    def _get(self, call: ServiceCall) -> None:
-        parts = [LENGTH.pack(len(self._loggers))]
-        for name, logger in self._loggers.items():
-            level = _level_of(logging.getLogger(logger).getEffectiveLevel())
-            parts += [pack_text(name), pack_text(list(LEVELS)[level])]
-        call.reply(True, b"".join(parts))
-
-    def _set(self, call: ServiceCall) -> None:
-        name, level = _texts(call.request, 2, "roscpp/SetLoggerLevelRequest")
-        logger, number = self._loggers.get(name), LEVELS.get(level.lower())
-        if logger is None:
-            known = ", ".join(self._loggers)
-            call.fail(f"{self._node.name} has no logger {printable(name)!r}; it has {known}")
-        elif number is None:
-            call.fail(f"{printable(level)!r} is not a level; there are {', '.join(LEVELS)}")
-        else:
-            _log.info("= %s sets the level of %s to %s", printable(call.caller_id), name, level.lower())
-            logging.getLogger(logger).setLevel(number)
-            call.reply(True, b"")
+def _set(loggers: Mapping[str, str], call: ServiceCall) -> None:
+    name, level = _texts(call.request, 2, "roscpp/SetLoggerLevelRequest")
+    logger, number = loggers.get(name), LEVELS.get(level.lower())
+    if logger is None:
+        node = call.service.rpartition("/")[0]
+        call.fail(f"{node} has no logger {printable(name)!r}; it has {', '.join(loggers)}")
+    elif number is None:
+        call.fail(f"{printable(level)!r} is not a level; there are {', '.join(LEVELS)}")
+    else:
+        _log.info("= %s sets the level of %s to %s", printable(call.caller_id), name, level.lower())
+        logging.getLogger(logger).setLevel(number)
+        call.reply(True, b"")
 
 
 async def read_levels(uri: str, api: str, node: str, caller: str) -> dict[str, str]:
