@@ -58,8 +58,8 @@ class _Wire(asyncio.Transport):
         pass
 
 
-def _answer(method: str, params: tuple[XmlRpcValue, ...], client: str) -> XmlRpcValue:
-    return [1, method, [client, len(params)]]
+def _answer(method: str, params: tuple[XmlRpcValue, ...]) -> XmlRpcValue:
+    return [1, method, [len(params)]]
 
 
 async def _serve(data: bytes) -> None:

@@ -128,10 +128,10 @@ async def test_stopped_master_holds_up_nothing(master: RosCore, monkeypatch: pyt
     monkeypatch.setattr("rmpa.ros.core.external.MASTER_TIMEOUT", 0.2)
     stopped = asyncio.Event()
 
-    async def answer(method: str, params: tuple[XmlRpcValue, ...], client: str) -> XmlRpcValue:
+    async def answer(method: str, params: tuple[XmlRpcValue, ...]) -> XmlRpcValue:
         if stopped.is_set():
             await asyncio.sleep(DEADLINE)
-        return master._answer(method, params, client)
+        return master._answer(method, params)
 
     async with serving(answer) as uri, external(uri) as core:
         stopped.set()
@@ -156,9 +156,9 @@ async def test_stopped_master_holds_up_nothing(master: RosCore, monkeypatch: pyt
 async def test_malformed_master_is_reported_and_polled_again(master: RosCore, wrong: Any) -> None:
     talking = asyncio.Event()
 
-    def answer(method: str, params: tuple[XmlRpcValue, ...], client: str) -> XmlRpcValue:
+    def answer(method: str, params: tuple[XmlRpcValue, ...]) -> XmlRpcValue:
         if not talking.is_set():
-            return master._answer(method, params, client)
+            return master._answer(method, params)
         if isinstance(wrong, RosFault):
             raise wrong
         answered: XmlRpcValue = wrong

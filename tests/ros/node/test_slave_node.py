@@ -91,7 +91,7 @@ class Node(SlaveNode):
         ]
 
     def ask(self, method: str, *params: XmlRpcValue) -> list[XmlRpcValue]:
-        answer = self._call(method, params, "127.0.0.1")
+        answer = self._call(method, params)
         assert isinstance(answer, list)
         return answer
 

@@ -331,7 +331,7 @@ class RosCore(Core):
     def restored(self) -> str:
         return self.stored.summary() if self.stored is not None else ""
 
-    def _answer(self, method: str, params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
+    def _answer(self, method: str, params: tuple[XmlRpcValue, ...]) -> XmlRpcValue:
         try:
             return self._api.answer(method, params)
         finally:

@@ -57,10 +57,10 @@ _PIECE: Final = 16 * KIB
 # Seconds; the least duration in the pace of a call.
 _MOMENT: Final = 1e-3
 
-# ``(method, params, address of the client) -> value``, at once or awaited.
+# ``(method, params) -> value``, at once or awaited.
 #
 # A ``RosFault`` raised becomes a fault. ``ResetConnection``, raised at once, resets the connection.
-Handler = Callable[[str, tuple[XmlRpcValue, ...], str], XmlRpcValue | Awaitable[XmlRpcValue]]
+Handler = Callable[[str, tuple[XmlRpcValue, ...]], XmlRpcValue | Awaitable[XmlRpcValue]]
 
 
 class ResetConnection(Exception):  # noqa: N818 - the name says what the handler wants
@@ -76,11 +76,12 @@ class HttpConnection(asyncio.Protocol):
     Attributes:
         client: The client's address.
         requests: Parses what is received.
+        task: Answers a call that is not answered at once.
         begun: When the call began that is unfinished, or whose answer is not read yet, by the loop's clock.
     """
 
     _transport: asyncio.Transport
-    _task: asyncio.Task[None] | None = None
+    task: asyncio.Task[None] | None = None
     _more: asyncio.Handle | None = None
     _timer: asyncio.TimerHandle | None = None
     _unread = memoryview(b"")
@@ -97,12 +98,7 @@ class HttpConnection(asyncio.Protocol):
     @property
     def idle(self) -> bool:
         """Whether no request is being received or answered, and no answer is unread."""
-        return not (self.requests.receiving or self._waiting or self._task or self._transport.get_write_buffer_size())
-
-    @property
-    def answering(self) -> bool:
-        """Whether a call is being answered."""
-        return self._task is not None
+        return not (self.requests.receiving or self._waiting or self.task or self._transport.get_write_buffer_size())
 
     def pace(self, now: float) -> float:
         """Bytes a second of an unfinished call; 0 for a client that does not read its answer."""
@@ -129,13 +125,13 @@ class HttpConnection(asyncio.Protocol):
         """Give up the call that is being answered."""
         self._server.remove(self)
         self.requests.close()
-        for pending in (self._timer, self._task, self._more):
+        for pending in (self._timer, self.task, self._more):
             if pending is not None:
                 pending.cancel()
 
     def data_received(self, data: bytes) -> None:
         """Parse received bytes, later if a call is being answered; drop the rest of a refused request."""
-        if not self._closing or self._task is not None:
+        if not self._closing or self.task is not None:
             self._unread = memoryview(bytes(self._unread) + data if self._unread else data)
             if self._more is None:
                 self._advance()
@@ -145,7 +141,7 @@ class HttpConnection(asyncio.Protocol):
         self._eof = True
         if self._more is None:
             self._advance()
-        return self._task is not None or self._more is not None
+        return self.task is not None or self._more is not None
 
     def pause_writing(self) -> None:
         """Read no more calls, because the client does not read its answers."""
@@ -159,7 +155,7 @@ class HttpConnection(asyncio.Protocol):
 
     def _adjust_reading(self) -> None:
         """Pause reading while a call is being answered, requests wait, or the client does not read its answers."""
-        if self._task is not None or self._more is not None or self._writing_paused:
+        if self.task is not None or self._more is not None or self._writing_paused:
             self._transport.pause_reading()
         else:
             self._transport.resume_reading()
@@ -171,7 +167,7 @@ class HttpConnection(asyncio.Protocol):
         self._timer = self._loop.call_later(seconds, self._late)
 
     def _late(self) -> None:
-        if self._task is not None:
+        if self.task is not None:
             self._expect(limits.HTTP_IDLE_TIMEOUT)
             return
         if self.requests.receiving:
@@ -186,10 +182,10 @@ class HttpConnection(asyncio.Protocol):
     def _advance(self) -> None:
         """Take the next request; further ones received with it follow in later turns of the event loop."""
         self._more = None
-        while self._task is None and not self._closing:
+        while self.task is None and not self._closing:
             if self._waiting:
                 self._take(self._waiting.popleft())
-                if not (self.answering or self._closing) and (self._waiting or self._unread):
+                if not (self.task or self._closing) and (self._waiting or self._unread):
                     self._more = self._loop.call_soon(self._advance)
                     break
             elif self._unread:
@@ -227,11 +223,11 @@ class HttpConnection(asyncio.Protocol):
             yield_to_data()
             self._reply(end.value)
         else:
-            self._task = start_task(self._wait(_rest(answer)), "answer a call")
+            self.task = start_task(self._wait(_rest(answer)), "answer a call")
 
     async def _wait(self, answer: Awaitable[bytes]) -> None:
         body = await answer
-        self._task = None
+        self.task = None
         self._reply(body)
         self._advance()
 
@@ -257,7 +253,7 @@ class HttpConnection(asyncio.Protocol):
     def close_when_answered(self) -> None:
         """Close now, or after the answer to the call under way."""
         self._closing = True
-        if self._task is None:
+        if self.task is None:
             self._close()
 
     def _close(self) -> None:
@@ -375,7 +371,7 @@ class XmlRpcServer:
         the one that is idle for longest, whose client reconnects by itself; else the slowest.
         """
         now = asyncio.get_running_loop().time()
-        oldest = list(islice((one for one in self._connections if not one.answering), _EVICTED_OF))
+        oldest = list(islice((one for one in self._connections if one.task is None), _EVICTED_OF))
         idle = next((one for one in oldest if one.idle), None)
         slow = [one for one in oldest if not one.idle and one.slow(now)]
         evicted = min(slow or oldest, key=lambda one: one.pace(now), default=None)
@@ -402,7 +398,7 @@ class XmlRpcServer:
         """
         now = asyncio.get_running_loop().time()
         while sum(one.requests.reserved for one in self._connections) + size > limits.HTTP_BODIES_MAX:
-            slow = [one for one in self._connections if one.requests.reserved and not one.answering and one.slow(now)]
+            slow = [one for one in self._connections if one.requests.reserved and one.task is None and one.slow(now)]
             slowest = min(slow, key=lambda one: one.pace(now), default=connection)
             if slowest is connection:
                 return False
@@ -437,7 +433,7 @@ class XmlRpcServer:
         if _log.isEnabledFor(logging.DEBUG):
             _log.debug("< %s %s%s", connection.client, method, brief(params))
         try:
-            value = self._handler(method, params, connection.client)
+            value = self._handler(method, params)
             if isinstance(value, Awaitable):
                 await asyncio.sleep(0)  # so that a task awaits it: see ``_take``
                 value = await value

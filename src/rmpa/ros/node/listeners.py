@@ -231,7 +231,7 @@ class SharedListener:
             del self._nodes[address]
 
 
-def _former_node(method: str, _params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
+def _former_node(method: str, _params: tuple[XmlRpcValue, ...]) -> XmlRpcValue:
     """Reset the connection, by which ``rosnode`` and others know a dead node; an error in the answer stops them.
 
     Answered are ``requestTopic``, which rospy repeats twice a minute after a reset until its process ends,

@@ -301,9 +301,7 @@ class SlaveNode:
         now = asyncio.get_running_loop().time()
         self._refusals.refuse(now, f"tcpros.refused.{kind}", who, f"{self.name}: {text}")
 
-    def _call(
-        self, method: str, params: tuple[XmlRpcValue, ...], _client: str
-    ) -> XmlRpcValue | Awaitable[XmlRpcValue]:
+    def _call(self, method: str, params: tuple[XmlRpcValue, ...]) -> XmlRpcValue | Awaitable[XmlRpcValue]:
         if method not in METHODS:
             raise RosFault(-1, f"{self.name} has no method {method}")
         problem = check_call(method, params)
