@@ -239,7 +239,7 @@ class RosCore(Core):
         self._api = MasterApi("", os.getpid(), self._shutdown_requested, yielder=yielding_to_data)
         super().__init__("", self._api.registrations, self._api.registrations.nodes)
         self._server = XmlRpcServer(self._answer, host, port, counters=self.counters, name="ROS core", use=Use.CORE)
-        self._notifier = Notifier(self.registrations, self.suspect, self.counters)
+        self._notifier = Notifier(self)
         self._rosout = Rosout(self, host, self._advertised) if rosout else None
         # Topics and slave APIs of withdrawn publishers, and when.
         self._withdrawn: dict[tuple[str, str], float] = {}

@@ -27,9 +27,10 @@ from rmpa.ros.wire.tcpros import LENGTH, ServiceDescription, pack_text, printabl
 from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Callable, Mapping
 
     from rmpa.ros.node.endpoints import Publisher
+    from rmpa.ros.node.node import Node
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.tcpros import Buffer
@@ -211,18 +212,12 @@ class RosoutHandler(logging.Handler):
     A program that does not configure ``logging`` sees them on standard error too.
 
     Args:
-        name: The node's name.
-        advertise: ``Node.advertise``.
-        topics: The topics that the node publishes.
+        node: The node; each message has the topics that it publishes.
     """
 
-    def __init__(
-        self, name: str, advertise: Callable[..., Awaitable[Publisher]], topics: Callable[[], list[str]]
-    ) -> None:
+    def __init__(self, node: Node) -> None:
         super().__init__()
-        self._node = name
-        self._advertise = advertise
-        self._topics = topics
+        self._node = node
         self._loop = asyncio.get_running_loop()
         self._waiting: deque[dict[str, object]] = deque(maxlen=_RECORDS_MAX)
         self._publisher: Publisher | None = None
@@ -236,7 +231,7 @@ class RosoutHandler(logging.Handler):
         fields: dict[str, object] = {
             "header": {"stamp": record.created},
             "level": 1 << _level_of(record.levelno),
-            "name": self._node,
+            "name": self._node.name,
             "msg": text,
             "file": record.pathname,
             "function": record.funcName or "",
@@ -257,15 +252,15 @@ class RosoutHandler(logging.Handler):
         if self._publisher is not None:
             self._publish(self._publisher)
         elif self._task is None:
-            self._task = keep_task(self._start, f"rosout of {self._node}")
+            self._task = keep_task(self._start, f"rosout of {self._node.name}")
 
     async def _start(self) -> None:
         publisher: Publisher | None = None
         while publisher is None:
             try:
-                publisher = await self._advertise(_ROSOUT, _LOG_TYPE, latch=True)
+                publisher = await self._node.advertise(_ROSOUT, _LOG_TYPE, latch=True)
             except RmpaError as error:
-                _log.debug("! %s: %s", self._node, error)
+                _log.debug("! %s: %s", self._node.name, error)
                 await asyncio.sleep(_RETRY)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_SUBSCRIBED_WITHIN):
@@ -275,4 +270,4 @@ class RosoutHandler(logging.Handler):
 
     def _publish(self, publisher: Publisher) -> None:
         while self._waiting:
-            publisher.publish(topics=self._topics(), **self._waiting.popleft())
+            publisher.publish(topics=sorted(self._node.slave.publications()), **self._waiting.popleft())

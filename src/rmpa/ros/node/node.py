@@ -505,14 +505,10 @@ class Node(MasterClient):
         Without a handler they go to standard error. First read it inside of the ``async with``; it may be used in any
         thread then. Its level is INFO unless the program sets another.
         """
-
-        def topics() -> list[str]:
-            return sorted(entry.key for entry in self._entries if isinstance(entry, Publisher))
-
         logger = logging.getLogger("rosout" + self.name.replace("/", "."))
         if logger.level == logging.NOTSET:
             logger.setLevel(logging.INFO)
-        self._rosout = RosoutHandler(self.name, self.advertise, topics)
+        self._rosout = RosoutHandler(self)
         logger.addHandler(self._rosout)
         return logger
 
