@@ -14,13 +14,7 @@ import os
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.errors import (
-    OutOfDescriptors,
-    PeerRefused,
-    RemoteProtocolError,
-    RmpaError,
-    UnreachableError,
-)
+from rmpa.core.errors import OutOfDescriptors, PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.environment import NodeConnection, NodePing
 from rmpa.ros.http.rpc import call, call_api, connect, split_uri

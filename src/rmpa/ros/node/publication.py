@@ -17,13 +17,7 @@ from rmpa.core.outbox import URGENT, Outbox
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import keep_alive, tcpros_info
 from rmpa.ros.wire.slave_api import OUTBOUND, BusConnection
-from rmpa.ros.wire.tcpros import (
-    TopicDescription,
-    check_subscriber,
-    encode_header,
-    printable,
-    publisher_header,
-)
+from rmpa.ros.wire.tcpros import TopicDescription, check_subscriber, encode_header, printable, publisher_header
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.stream import Stream
 
