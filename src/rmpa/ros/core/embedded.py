@@ -183,24 +183,20 @@ class Rosout:
 
     async def _restart(self) -> None:
         warned = False
-        while self._node is None:
+        while True:
             if (holder := self._core.registrations.node_api(NODE)) is not None:
                 if not warned:
                     _log.warning(
                         "= another node has the name %s, at %s; ours waits until it ends [name-taken]", NODE, holder
                     )
                     warned = True
-                with contextlib.suppress(TimeoutError):
-                    # The end of a node that only subscribed to parameters is not reported, so it is polled for.
-                    async with asyncio.timeout(ROSOUT_LOOK):
-                        await self._changed.wait()
-                self._changed.clear()
-                continue
-            try:
-                await self._begin()
-            except (RmpaError, OSError) as error:
-                _log.error("! %s cannot be started again; it is tried again: %s [cannot-start]", NODE, error)
-                await asyncio.sleep(ROSOUT_LOOK)
+            else:
+                try:
+                    await self._begin()
+                    break
+                except (RmpaError, OSError) as error:
+                    _log.error("! %s cannot be started again; it is tried again: %s [cannot-start]", NODE, error)
+            await asyncio.sleep(ROSOUT_LOOK)
         self._core.counters.add("rosout.restarted")
         _log.info("= %s is back at %s", NODE, self.uri)
 
