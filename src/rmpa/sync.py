@@ -127,7 +127,7 @@ def _waiting(
     """A method of ``Node`` with the same arguments, which waits for the result."""
 
     @functools.wraps(method)
-    def call(node: SyncNode, *args: _P.args, **kwargs: _P.kwargs) -> _T:
+    def call(node: SyncNode, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
         return node._wait_for(method(node._open_node, *args, **kwargs))  # noqa: SLF001 - of this file
 
     return call

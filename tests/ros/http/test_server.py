@@ -283,7 +283,10 @@ async def test_unread_answers_block_no_other_client(server: XmlRpcServer, monkey
     async with client(server) as one, client(server) as other:
         for c in (one, other):
             c.writer.write(post(serialize_call("echo", ["x" * 8_000_000])))
-        unread = lambda: [one._transport.get_write_buffer_size() for one in server._connections]  # noqa: E731
+
+        def unread() -> list[int]:
+            return [one._transport.get_write_buffer_size() for one in server._connections]
+
         while server.counters["xmlrpc.calls"] < 2 or not all(unread()):
             await asyncio.sleep(0.001)
         assert await call(f"http://127.0.0.1:{server.port}/", "echo", 1) == [1, "echo", [1]]

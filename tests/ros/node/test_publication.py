@@ -50,8 +50,8 @@ async def make() -> AsyncIterator[Callable[..., Owner]]:
     """Makes owners, which end with the test."""
     made: list[Owner] = []
 
-    def make(*args: TopicDescription | None, **options: int) -> Owner:
-        made.append(Owner(*args, **options))
+    def make(description: TopicDescription | None, **options: int) -> Owner:
+        made.append(Owner(description, **options))
         return made[-1]
 
     yield make

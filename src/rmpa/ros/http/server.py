@@ -17,11 +17,10 @@ import errno
 import logging
 import socket
 import struct
-import types
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine, Generator
 from itertools import islice
-from typing import Final
+from typing import Any, Final
 
 from rmpa.core.errors import RemoteProtocolError, StartError
 from rmpa.core.limits import KIB
@@ -76,12 +75,11 @@ class HttpConnection(asyncio.Protocol):
     Attributes:
         client: The client's address.
         requests: Parses what is received.
-        task: Answers a call that is not answered at once.
         begun: When the call began that is unfinished, or whose answer is not read yet, by the loop's clock.
     """
 
     _transport: asyncio.Transport
-    task: asyncio.Task[None] | None = None
+    _task: asyncio.Task[None] | None = None
     _more: asyncio.Handle | None = None
     _timer: asyncio.TimerHandle | None = None
     _unread = memoryview(b"")
@@ -98,7 +96,12 @@ class HttpConnection(asyncio.Protocol):
     @property
     def idle(self) -> bool:
         """Whether no request is being received or answered, and no answer is unread."""
-        return not (self.requests.receiving or self._waiting or self.task or self._transport.get_write_buffer_size())
+        return not (self.requests.receiving or self._waiting or self._task or self._transport.get_write_buffer_size())
+
+    @property
+    def answering(self) -> bool:
+        """Whether a call is being answered."""
+        return self._task is not None
 
     def pace(self, now: float) -> float:
         """Bytes a second of an unfinished call; 0 for a client that does not read its answer."""
@@ -125,13 +128,13 @@ class HttpConnection(asyncio.Protocol):
         """Give up the call that is being answered."""
         self._server.remove(self)
         self.requests.close()
-        for pending in (self._timer, self.task, self._more):
+        for pending in (self._timer, self._task, self._more):
             if pending is not None:
                 pending.cancel()
 
     def data_received(self, data: bytes) -> None:
         """Parse received bytes, later if a call is being answered; drop the rest of a refused request."""
-        if not self._closing or self.task is not None:
+        if not self._closing or self._task is not None:
             self._unread = memoryview(bytes(self._unread) + data if self._unread else data)
             if self._more is None:
                 self._advance()
@@ -141,7 +144,7 @@ class HttpConnection(asyncio.Protocol):
         self._eof = True
         if self._more is None:
             self._advance()
-        return self.task is not None or self._more is not None
+        return self._task is not None or self._more is not None
 
     def pause_writing(self) -> None:
         """Read no more calls, because the client does not read its answers."""
@@ -155,7 +158,7 @@ class HttpConnection(asyncio.Protocol):
 
     def _adjust_reading(self) -> None:
         """Pause reading while a call is being answered, requests wait, or the client does not read its answers."""
-        if self.task is not None or self._more is not None or self._writing_paused:
+        if self._task is not None or self._more is not None or self._writing_paused:
             self._transport.pause_reading()
         else:
             self._transport.resume_reading()
@@ -167,7 +170,7 @@ class HttpConnection(asyncio.Protocol):
         self._timer = self._loop.call_later(seconds, self._late)
 
     def _late(self) -> None:
-        if self.task is not None:
+        if self._task is not None:
             self._expect(limits.HTTP_IDLE_TIMEOUT)
             return
         if self.requests.receiving:
@@ -182,10 +185,10 @@ class HttpConnection(asyncio.Protocol):
     def _advance(self) -> None:
         """Take the next request; further ones received with it follow in later turns of the event loop."""
         self._more = None
-        while self.task is None and not self._closing:
+        while self._task is None and not self._closing:
             if self._waiting:
                 self._take(self._waiting.popleft())
-                if not (self.task or self._closing) and (self._waiting or self._unread):
+                if not (self.answering or self._closing) and (self._waiting or self._unread):
                     self._more = self._loop.call_soon(self._advance)
                     break
             elif self._unread:
@@ -223,11 +226,12 @@ class HttpConnection(asyncio.Protocol):
             yield_to_data()
             self._reply(end.value)
         else:
-            self.task = start_task(self._wait(_rest(answer)), "answer a call")
+            self._task = start_task(self._wait(_Begun(answer)), "answer a call")
 
     async def _wait(self, answer: Awaitable[bytes]) -> None:
+        await asyncio.sleep(0)  # at which it has stopped
         body = await answer
-        self.task = None
+        self._task = None
         self._reply(body)
         self._advance()
 
@@ -253,7 +257,7 @@ class HttpConnection(asyncio.Protocol):
     def close_when_answered(self) -> None:
         """Close now, or after the answer to the call under way."""
         self._closing = True
-        if self.task is None:
+        if self._task is None:
             self._close()
 
     def _close(self) -> None:
@@ -371,7 +375,7 @@ class XmlRpcServer:
         the one that is idle for longest, whose client reconnects by itself; else the slowest.
         """
         now = asyncio.get_running_loop().time()
-        oldest = list(islice((one for one in self._connections if one.task is None), _EVICTED_OF))
+        oldest = list(islice((one for one in self._connections if not one.answering), _EVICTED_OF))
         idle = next((one for one in oldest if one.idle), None)
         slow = [one for one in oldest if not one.idle and one.slow(now)]
         evicted = min(slow or oldest, key=lambda one: one.pace(now), default=None)
@@ -398,7 +402,7 @@ class XmlRpcServer:
         """
         now = asyncio.get_running_loop().time()
         while sum(one.requests.reserved for one in self._connections) + size > limits.HTTP_BODIES_MAX:
-            slow = [one for one in self._connections if one.requests.reserved and one.task is None and one.slow(now)]
+            slow = [one for one in self._connections if one.requests.reserved and not one.answering and one.slow(now)]
             slowest = min(slow, key=lambda one: one.pace(now), default=connection)
             if slowest is connection:
                 return False
@@ -467,15 +471,14 @@ async def _written(value: XmlRpcValue) -> bytes:
     return b"".join(pieces)
 
 
-@types.coroutine
-def _rest(answer: Coroutine[None, None, bytes]) -> Generator[None, None, bytes]:
-    """What is left of an answer that has stopped at its first ``asyncio.sleep(0)``, to be awaited in a task."""
-    try:
-        yield
-    except BaseException:
-        answer.close()
-        raise
-    return (yield from answer)
+class _Begun:
+    """A coroutine that has stopped at an ``asyncio.sleep(0)``, to be awaited for the rest of it."""
+
+    def __init__(self, coroutine: Coroutine[Any, Any, bytes]) -> None:
+        self._coroutine = coroutine
+
+    def __await__(self) -> Generator[Any, None, bytes]:
+        return self._coroutine.__await__()
 
 
 async def listen(name: str, host: str, port: int, use: Use) -> socket.socket:
