@@ -14,6 +14,7 @@ and run in threads, so that they may wait too: each subscription has a thread, e
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 import os
 import signal
@@ -21,7 +22,7 @@ import sys
 import threading
 from concurrent.futures import CancelledError, Future
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, Final, ParamSpec, Self, TypeVar
 
 from rmpa.config.limits import SERVICE_TIMEOUT
 from rmpa.core.errors import RmpaError
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
+_P = ParamSpec("_P")
 
 # Messages that wait for a callback; above it the oldest is dropped.
 _QUEUE: Final = 100
@@ -119,6 +121,18 @@ class SyncPublisher:
         return self._node._wait_for(wait())  # noqa: SLF001 - of this file
 
 
+def _waiting(
+    method: Callable[Concatenate[Node, _P], Coroutine[Any, Any, _T]],
+) -> Callable[Concatenate[SyncNode, _P], _T]:
+    """A method of ``Node`` with the same arguments, which waits for the result."""
+
+    @functools.wraps(method)
+    def call(node: SyncNode, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        return node._wait_for(method(node._open_node, *args, **kwargs))  # noqa: SLF001 - of this file
+
+    return call
+
+
 class SyncNode:
     """A node for scripts; made by ``connect``.
 
@@ -135,14 +149,10 @@ class SyncNode:
     """
 
     def __init__(self, name: str, *, master_uri: str, anonymous: bool, argv: Sequence[str]) -> None:
-        self._arguments: dict[str, Any] = {
-            "name": name,
-            "master_uri": master_uri,
-            "anonymous": anonymous,
-            "argv": argv,
-        }
+        self._name = name
+        self._make = functools.partial(Node, name, master_uri=master_uri, anonymous=anonymous, argv=argv)
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._thread = threading.Thread(target=self._run, name=f"rmpa {name}", daemon=True)
+        self._thread: threading.Thread | None = None
         self._node: Node | None = None
         self._stopped = threading.Event()
         self._pid = 0
@@ -159,9 +169,10 @@ class SyncNode:
             RmpaError: The node was opened before.
         """
         if self._pid:
-            raise RmpaError(f"{self._arguments['name']} was opened before: make another with rmpa.connect(...)")
+            raise RmpaError(f"{self._name} was opened before: make another with rmpa.connect(...)")
         self._pid = os.getpid()
         self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name=f"rmpa {self._name}", daemon=True)
         self._thread.start()
         try:
             self._node = self._wait_for(self._open())
@@ -255,10 +266,6 @@ class SyncNode:
         """
         return self._wait_for(self._open_node.wait_for_message(topic, kind, timeout)).message
 
-    def get_published_topics(self) -> list[tuple[str, str]]:
-        """Topics that have a publisher, with their types."""
-        return self._wait_for(self._open_node.get_published_topics())
-
     def advertise_service(
         self, name: str, kind: str, handler: Callable[[Any], Any], *, timeout: float = SERVICE_TIMEOUT
     ) -> Callable[[], None]:
@@ -293,32 +300,17 @@ class SyncNode:
         made = self._wait_for(self._open_node.advertise_service(name, kind, handle, timeout=timeout))
         return lambda: self._end_of(made)
 
-    def wait_for_service(self, name: str, timeout: float | None = None) -> None:
-        """Wait until a service answers; raises UnreachableError where it does not in time."""
-        self._wait_for(self._open_node.wait_for_service(name, timeout))
-
-    def call_service(
-        self, name: str, kind: str, request: object = None, timeout: float | None = SERVICE_TIMEOUT
-    ) -> Any:
-        """Call a service, and return its response; see ``rmpa.Node.call_service``."""
-        return self._wait_for(self._open_node.call_service(name, kind, request, timeout))
+    get_published_topics = _waiting(Node.get_published_topics)
+    wait_for_service = _waiting(Node.wait_for_service)
+    call_service = _waiting(Node.call_service)
+    set_param = _waiting(Node.set_param)
+    has_param = _waiting(Node.has_param)
+    delete_param = _waiting(Node.delete_param)
 
     def get_param(self, key: str, default: Any = _NO_DEFAULT) -> Any:
         """A parameter's value, or ``default`` where one is given and the parameter does not exist."""
         given = {} if default is _NO_DEFAULT else {"default": default}
         return self._wait_for(self._open_node.get_param(key, **given))
-
-    def set_param(self, key: str, value: XmlRpcValue) -> None:
-        """Set a parameter."""
-        self._wait_for(self._open_node.set_param(key, value))
-
-    def has_param(self, key: str) -> bool:
-        """Whether a parameter exists."""
-        return self._wait_for(self._open_node.has_param(key))
-
-    def delete_param(self, key: str) -> None:
-        """Delete a parameter."""
-        self._wait_for(self._open_node.delete_param(key))
 
     def follow_param(self, key: str, callback: ParamCallback) -> XmlRpcValue:
         """Call ``callback(key, value)`` in a thread with each change; return the present value, ``{}`` for none.
@@ -391,28 +383,20 @@ class SyncNode:
     @property
     def _open_node(self) -> Node:
         if self._node is None:
-            raise RmpaError(f"{self._arguments['name']} is not open: write `with rmpa.connect(...) as node:`")
+            raise RmpaError(f"{self._name} is not open: write `with rmpa.connect(...) as node:`")
         return self._node
 
     async def _open(self) -> Node:
-        node = Node(**self._arguments, on_shutdown=lambda _reason: self._stopped.set())
-        await node.__aenter__()
-        return node
-
-    def _run(self) -> None:
-        """Run the event loop, in a thread of its own."""
-        if self._loop is not None:
-            self._loop.run_forever()
+        return await self._make(on_shutdown=lambda _reason: self._stopped.set()).__aenter__()
 
     def _check_process(self) -> None:
         if self._pid and self._pid != os.getpid():  # the loop's thread is not in a forked process
-            name = self._arguments["name"]
-            raise RmpaError(f"{name} belongs to process {self._pid}: a forked process makes a node of its own")
+            raise RmpaError(f"{self._name} belongs to process {self._pid}: a forked process makes a node of its own")
 
     def _running(self) -> asyncio.AbstractEventLoop:
         self._check_process()
         if self._loop is None:
-            raise RmpaError(f"{self._arguments['name']} is closed")
+            raise RmpaError(f"{self._name} is closed")
         return self._loop
 
     def _wait_for(self, coroutine: Coroutine[Any, Any, _T], /, within: float | None = None) -> _T:
@@ -430,7 +414,7 @@ class SyncNode:
         try:
             return future.result(within)
         except CancelledError:
-            raise RmpaError(f"{self._arguments['name']} is closed") from None
+            raise RmpaError(f"{self._name} is closed") from None
         except (RmpaError, ValueError) as error:  # what happened in the loop is no help to a script's author
             raise error.with_traceback(None) from None
         except BaseException:
@@ -467,7 +451,7 @@ class SyncNode:
         """End the loop and its thread; calls that still wait get an error."""
         self._stopped.set()
         loop, self._loop = self._loop, None
-        if loop is None:
+        if loop is None or self._thread is None:
             return
 
         async def cancel() -> None:

@@ -30,11 +30,11 @@ from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.listeners import SharedListener
 from rmpa.ros.node.subscription import PublisherConnection
 from rmpa.ros.wire.tcpros import encode_header, subscriber_header
-from rmpa.ros.wire.xmlrpc import serialize_call
 from rmpa.runtime import accept as descriptors
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import DESCRIPTORS
 from tests.agent.test_agent import node, running, until
+from tests.ros.documents import serialize_call
 from tests.runtime.descriptors_left import descriptors_left
 
 if TYPE_CHECKING:

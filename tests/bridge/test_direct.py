@@ -324,7 +324,7 @@ async def pair() -> AsyncIterator[Pair]:
     await made.talker.start()
     await made.viewer.start()
     made.talker.add_publication(made.publication)
-    made.viewer.add_subscription(Subscription("/t", "/viewer", on_message=lambda *_: None))
+    made.viewer.add_subscription(Subscription("/t", made.viewer, on_message=lambda *_: None))
     assert await publisher_update(made.viewer.uri, "/t", [made.talker.uri])
     await until(lambda: made.publication.listeners)
     yield made

@@ -45,6 +45,7 @@ from rmpa.trust.tokens import (
     decode_message,
     encode_message,
 )
+from tests.ros.documents import parse_call, serialize_call
 
 _BASE: Final = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")
 _OURS: Final = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
@@ -220,7 +221,7 @@ def _header(data: bytes) -> Any:
 def _check_header(fields: Any) -> None:
     if fields is None:
         return
-    tcpros.is_persistent(fields), tcpros.is_probe(fields)
+    tcpros.is_set(fields, "persistent")
     for problem in (
         tcpros.check_subscriber(fields, "/t", "/p", _STRING),
         tcpros.check_publisher(fields, "a/B", "0" * 32),
@@ -262,7 +263,7 @@ def _reply_body(data: bytes) -> None:
     taken = body.take(memoryview(data)[5:])
     assert taken == min(size, len(data) - 5)
     assert body.whole == (taken == size)
-    assert not body.whole or b"".join(tcpros.frame_reply(ok, body.data)) == bytes([ok]) + data[1 : 5 + size]
+    assert not body.whole or tcpros.REPLY.pack(ok, size) + body.data == bytes([ok]) + data[1 : 5 + size]
 
 
 def _address(text: str) -> None:
@@ -457,13 +458,12 @@ READERS: Final[dict[str, Row]] = {
     "services": Row(
         [
             Reader(_reply_body),
-            Reader(tcpros.parse_request_length),
             Reader(text(_address)),
             Reader(text(_service_type)),
         ],
         [
-            b"".join(tcpros.frame_reply(True, b"abc")),
-            b"".join(tcpros.frame_reply(False, b"no")),
+            tcpros.REPLY.pack(True, 3) + b"abc",
+            tcpros.REPLY.pack(False, 2) + b"no",
             b"\x01\xff\xff\xff\xff",
             b"rosrpc://127.0.0.1:1234",
             b"int64 a\nint64 b\n---\nint64 sum",
@@ -482,9 +482,9 @@ READERS: Final[dict[str, Row]] = {
         [
             b"",
             bytes(4),
-            tcpros.encode_header(tcpros.subscriber_header("/t", "/s", type_name="a/B", md5sum="0" * 32)),
+            tcpros.encode_header(tcpros.subscriber_header("/t", "/s", tcpros.TopicDescription("a/B", "0" * 32, ""))),
             tcpros.encode_header(tcpros.publisher_header("/t", "/p", _STRING)) + b"\x05\x00\x00\x00hello",
-            tcpros.encode_header(tcpros.error_header("no \udcff")),
+            tcpros.encode_header({"error": "no \udcff"}),
             tcpros.encode_header(tcpros.client_header("/add", "/c", persistent=True, probe=True)),
             tcpros.encode_header(tcpros.server_header("/s", _ADD)),
         ],
@@ -505,9 +505,9 @@ READERS: Final[dict[str, Row]] = {
     ),
     "trailer": Row([Reader(_trailer)], [bytes(31), bytes(64), _SIGNED, _SIGNED[:-1], _SIGNED + b"x", _SIGNED[32:]]),
     "xmlrpc": Row(
-        [Reader(xmlrpc.parse_call), Reader(xmlrpc.parse_response)],
+        [Reader(parse_call), Reader(xmlrpc.parse_response)],
         [
-            xmlrpc.serialize_call("setParam", ("/n", "/p", {"a": [1, 2.5, True, "x", b"y"], "b": {}})),
+            serialize_call("setParam", ("/n", "/p", {"a": [1, 2.5, True, "x", b"y"], "b": {}})),
             xmlrpc.serialize_response([1, "ok", [["/rosout", ["/talker"]]]]),
             xmlrpc.serialize_fault(1, "no such method"),
             b"<methodCall><methodName>m</methodName><params><param><value>untyped</value></param></params></methodCall>",

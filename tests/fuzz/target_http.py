@@ -10,7 +10,8 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.statistics import Counters
 from rmpa.ros.http.server import HttpConnection, XmlRpcServer
 from rmpa.ros.wire.http import ResponseParser
-from rmpa.ros.wire.xmlrpc import XmlRpcValue, serialize_call, serialize_response
+from rmpa.ros.wire.xmlrpc import XmlRpcValue, serialize_response
+from tests.ros.documents import serialize_call
 
 _CALL = serialize_call("getPid", ["/x"])
 _REPLY = serialize_response([1, "", 5])
@@ -57,8 +58,8 @@ class _Wire(asyncio.Transport):
         pass
 
 
-def _answer(method: str, params: tuple[XmlRpcValue, ...], client: str) -> XmlRpcValue:
-    return [1, method, [client, len(params)]]
+def _answer(method: str, params: tuple[XmlRpcValue, ...]) -> XmlRpcValue:
+    return [1, method, [len(params)]]
 
 
 async def _serve(data: bytes) -> None:

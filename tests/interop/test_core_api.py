@@ -36,7 +36,7 @@ class Slave:
         await self.server.start()
         return f"http://127.0.0.1:{self.server.port}/"
 
-    async def _answer(self, method: str, params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
+    async def _answer(self, method: str, params: tuple[XmlRpcValue, ...]) -> XmlRpcValue:
         async with self.news:
             match (method, params):
                 case ("getName", _):

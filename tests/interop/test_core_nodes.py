@@ -8,10 +8,9 @@ from typing import Final
 import pytest
 
 from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.core.liveness import name_at
 from rmpa.ros.http.rpc import call, call_api
-from rmpa.ros.node.service_client import probe
-from rmpa.ros.wire.slave_api import BusLink, read_bus_info
+from rmpa.ros.node.ask import name_at, probe
+from rmpa.ros.wire.slave_api import BusConnection, read_bus_info
 from rmpa.ros.wire.tcpros import parse_service_uri
 from tests.interop.conftest import ShellFactory
 from tests.interop.ros import Ros
@@ -144,7 +143,7 @@ def uri_of(core: RosCore, node: str) -> str:
     return next(nodes[node] for nodes in (*state.publishers.values(), *state.subscribers.values()) if nodes.get(node))
 
 
-async def links(core: RosCore, node: str) -> list[BusLink]:
+async def links(core: RosCore, node: str) -> list[BusConnection]:
     """A node's connections of the topic."""
     return [one for one in read_bus_info(await call(uri_of(core, node), "getBusInfo", "/t")) if one.topic == TOPIC]
 

@@ -20,8 +20,8 @@ from rmpa.resource.node import ResourceNode
 from rmpa.resource.processes import NodeState, command_of
 from rmpa.resource.resource import Resource
 from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.executables import find_executable
 from rmpa.ros.node.node import Node
+from rmpa.ros.types.installed import find_executable
 from rmpa.runtime.programs import ProgramMark, ResourceRun, end_program, figures
 from tests.resource.rig import ARRAY, OK, WARN, status
 from tests.waiting import until

@@ -52,7 +52,7 @@ from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is
 from rmpa.ros.http.rpc import call_api, is_own_name
 from rmpa.ros.http.server import listen
 from rmpa.ros.node.listeners import local_addresses
-from rmpa.ros.node.slave_node import LoggerServices
+from rmpa.ros.node.loggers import serve_loggers
 from rmpa.runtime import realtime
 from rmpa.runtime.accept import Use, open_mesh_port
 from rmpa.runtime.kernel_tcp import may_end_connections
@@ -498,9 +498,7 @@ class Agent:
             diagnostics = Diagnostics(self._facts, self.snapshots)
             diagnostics.start()
             undo.callback(diagnostics.close)
-            loggers = LoggerServices(self.bridge.node, self.core.call, _LOGGERS)
-            loggers.start()
-            undo.callback(loggers.close)
+            serve_loggers(self.bridge.node, self.core.call, _LOGGERS)
             await self.network.start()
             undo.push_async_callback(self.network.close)
             await self.control.start()

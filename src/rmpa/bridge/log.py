@@ -134,16 +134,7 @@ class ModuleLogs(Part):
             nodes = self._core.publishers(topic).items()
             self._take(next((name for name, uri in nodes if uri == publisher.uri), AGGREGATED), framed)
 
-        self._subscription = Subscription(
-            topic,
-            OWN_NODE,
-            on_message=received,
-            own_uri=node.uri,
-            type_name=LOG.type,
-            md5sum=LOG.md5sum,
-            definition=LOG.definition,
-            number=node.next_number,
-        )
+        self._subscription = Subscription(topic, node, on_message=received, wanted=LOG)
         node.add_subscription(self._subscription)
         self._register(self._subscription)
 

@@ -20,7 +20,7 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import OWN_NODE, is_global_name, is_own, matches_any, proxied_node
 from rmpa.ros import limits as ros_limits
-from rmpa.ros.core.liveness import MASTER_ID, end_node, node_connections, ping_node
+from rmpa.ros.core.liveness import MASTER_ID
 from rmpa.ros.environment import (
     NodeCost,
     NodeFacts,
@@ -31,9 +31,10 @@ from rmpa.ros.environment import (
     is_loopback,
     list_nodes,
 )
+from rmpa.ros.node.ask import end_node, node_connections, ping_node
 from rmpa.ros.node.listeners import local_addresses
+from rmpa.ros.node.loggers import GET
 from rmpa.ros.node.service_server import ServiceEndpoint
-from rmpa.ros.node.slave_node import GET
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.ros.wire.xmlrpc import RosReply
 from rmpa.runtime.loop import yielding_to_data

@@ -17,9 +17,9 @@ from rmpa.cli.options import FiniteRange, Options, argument, flag, graph_verb
 from rmpa.cli.output import printable
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.core.identity import proxied_node
-from rmpa.ros.core.liveness import ping_node
 from rmpa.ros.environment import NodeFacts, describe_node
 from rmpa.ros.http.rpc import call_api
+from rmpa.ros.node.ask import ping_node
 
 if TYPE_CHECKING:
     from rmpa.resource.checking import Misfit

@@ -208,13 +208,14 @@ async def _version(node: Node, topic: str, found: MessageType | str) -> MessageT
         return await find_or_fetch(node.master_uri, node.name, found, topic)
     if found.source:
         there = await fetch_type(node.master_uri, node.name, found.name, topic=topic, elsewhere=False)
-        if there is not None and there.kind.md5sum != found.md5sum:
+        if there is not None and there[0].md5sum != found.md5sum:
+            kind, _, publisher = there
             warn(
-                f"{there.node} publishes {topic} with another version of {found.name} (md5 {there.kind.md5sum}) "
-                f"than {found.source} has ({found.md5sum}); that of {there.node} is used",
+                f"{publisher} publishes {topic} with another version of {found.name} (md5 {kind.md5sum}) "
+                f"than {found.source} has ({found.md5sum}); that of {publisher} is used",
                 "type-mismatch",
             )
-            return there.kind
+            return kind
     return found
 
 

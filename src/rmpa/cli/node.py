@@ -18,12 +18,11 @@ from rmpa.core.identity import is_own, proxied_node, proxied_peer
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.control_client import ControlClient
 from rmpa.ros import limits as ros_limits
-from rmpa.ros.core.liveness import end_node, ping_node
 from rmpa.ros.environment import NodeFacts, NodeLine, NodePing, PeerNodes, describe_node, list_nodes
 from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.master.mirror import lookup_calls, read_lookups
-from rmpa.ros.node.loggers import read_levels, set_level
-from rmpa.ros.node.slave_node import LEVELS
+from rmpa.ros.node.ask import end_node, ping_node
+from rmpa.ros.node.loggers import LEVELS, read_levels, set_level
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

@@ -134,8 +134,8 @@ class ResourceNode:
             return False
         if learnt is None:
             return False
-        output.known = learnt.kind
-        whence = printable(learnt.node), printable(learnt.topic)
+        output.known, topic, publisher = learnt
+        whence = printable(publisher), printable(topic)
         _log.info("= %s: %s is learnt from %s, which publishes %s", name, output.type_name, *whence)
         return True
 

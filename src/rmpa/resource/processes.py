@@ -24,9 +24,9 @@ from rmpa.resource import limits
 from rmpa.resource.declare import RestartPolicy
 from rmpa.resource.runtime import LifecycleState, RuntimePart
 from rmpa.ros.environment import host_of, is_loopback
-from rmpa.ros.executables import find_executable, find_program
 from rmpa.ros.http.rpc import call_api, is_own_name
 from rmpa.ros.node.listeners import local_addresses
+from rmpa.ros.types.installed import find_executable, find_program
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.programs import (
     LOGS,

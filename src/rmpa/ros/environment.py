@@ -21,8 +21,9 @@ from rmpa.core.errors import ConfigError
 from rmpa.core.identity import is_legal_name, resolve_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
+    from rmpa.core.timers import Yielder
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 DEFAULT_MASTER_URI: Final = "http://localhost:11311"
@@ -308,7 +309,7 @@ def list_nodes(
     services: Mapping[str, Collection[str]],
     uris: Mapping[str, str],
     problems: Mapping[str, str],
-    yielder: Callable[[Iterable[Collection[str]]], Iterable[Collection[str]]] = iter,
+    yielder: Yielder = iter,
 ) -> tuple[NodeLine, ...]:
     """List every node of a graph, sorted by name.
 

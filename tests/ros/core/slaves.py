@@ -46,7 +46,7 @@ class Slave:
         """The lists of publishers that it was told, by topic."""
         return [(params[1], params[2]) for method, params in self.calls if method == "publisherUpdate"]
 
-    async def _answer(self, method: str, params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
+    async def _answer(self, method: str, params: tuple[XmlRpcValue, ...]) -> XmlRpcValue:
         match method:
             case "getName" if self.name:
                 await self.go.wait()

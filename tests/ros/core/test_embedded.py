@@ -10,9 +10,9 @@ import pytest
 from rmpa.core.errors import StartError
 from rmpa.ros import limits
 from rmpa.ros.core import liveness
-from rmpa.ros.core import liveness as identify
 from rmpa.ros.core.embedded import AGGREGATED, LOG, RosCore
 from rmpa.ros.http.rpc import call, call_api
+from rmpa.ros.node import ask
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription
@@ -134,13 +134,13 @@ async def test_node_without_get_name_is_identified_by_its_header(monkeypatch: py
     await node.start()
     node.add_publication(Publication("/rosout", "/like_roscpp", TopicDescription(LOG.type, LOG.md5sum, "")))
 
-    async def no_get_name(uri: str, method: str, *params: XmlRpcValue, use: Use) -> object:
+    async def no_get_name(uri: str, method: str, *params: XmlRpcValue, timeout: float = 3.0, use: Use) -> object:
         if method == "getName":
             raise RosFault(-1, "getName: unknown method name")
-        return await call_api(uri, method, *params, use=use)
+        return await call_api(uri, method, *params, timeout=timeout, use=use)
 
-    monkeypatch.setattr(identify, "call_api", no_get_name)
-    assert await identify.name_at(node.uri, ["/t"]) == "/like_roscpp"
+    monkeypatch.setattr(ask, "call_api", no_get_name)
+    assert await ask.name_at(node.uri, ["/t"]) == "/like_roscpp"
     await node.close()
 
 
@@ -185,7 +185,7 @@ async def test_withdrawn_publishers_are_forgotten(core: RosCore, monkeypatch: py
     for number in range(100):
         core.call("registerPublisher", "/p", f"/t{number}", STRING, "http://127.0.0.1:1/")
         core.call("unregisterPublisher", "/p", f"/t{number}", "http://127.0.0.1:1/")
-    assert len(core._returned._withdrawn) == 10
+    assert len(core._withdrawn) == 10
 
 
 async def test_a_node_that_came_back_meanwhile_is_not_purged(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -241,7 +241,7 @@ class Logs:
         self.reader = SlaveNode("/reader", "127.0.0.1", core.uri)
         self.log = Publication("/rosout", "/speaker", TopicDescription(LOG.type, LOG.md5sum, "any"))
         self.aggregated = Subscription(
-            AGGREGATED, "/reader", on_message=lambda _, framed: self.heard.append(bytes(framed))
+            AGGREGATED, self.reader, on_message=lambda _, framed: self.heard.append(bytes(framed))
         )
 
     async def __aenter__(self) -> Self:

@@ -18,6 +18,7 @@ from rmpa.ros.core.external import MASTER_FAREWELL, MASTER_RETRY, ExternalCore
 from rmpa.ros.core.liveness import Liveness, Unreachable
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.parameters import GraphChange
+from rmpa.ros.node import ask
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
 from tests.waiting import DEADLINE, until
 
@@ -127,10 +128,10 @@ async def test_stopped_master_holds_up_nothing(master: RosCore, monkeypatch: pyt
     monkeypatch.setattr("rmpa.ros.core.external.MASTER_TIMEOUT", 0.2)
     stopped = asyncio.Event()
 
-    async def answer(method: str, params: tuple[XmlRpcValue, ...], client: str) -> XmlRpcValue:
+    async def answer(method: str, params: tuple[XmlRpcValue, ...]) -> XmlRpcValue:
         if stopped.is_set():
             await asyncio.sleep(DEADLINE)
-        return master._answer(method, params, client)
+        return master._answer(method, params)
 
     async with serving(answer) as uri, external(uri) as core:
         stopped.set()
@@ -155,9 +156,9 @@ async def test_stopped_master_holds_up_nothing(master: RosCore, monkeypatch: pyt
 async def test_malformed_master_is_reported_and_polled_again(master: RosCore, wrong: Any) -> None:
     talking = asyncio.Event()
 
-    def answer(method: str, params: tuple[XmlRpcValue, ...], client: str) -> XmlRpcValue:
+    def answer(method: str, params: tuple[XmlRpcValue, ...]) -> XmlRpcValue:
         if not talking.is_set():
-            return master._answer(method, params, client)
+            return master._answer(method, params)
         if isinstance(wrong, RosFault):
             raise wrong
         answered: XmlRpcValue = wrong
@@ -253,9 +254,9 @@ async def test_why_a_node_cannot_be_reached(
             raise error
         return socket.socket()
 
-    monkeypatch.setattr(liveness, "connect", connect)
-    assert await liveness.try_connect("http://10.9.9.9:1234/") == text
-    assert not await liveness.refuses("http://10.9.9.9:1234/")
+    monkeypatch.setattr(ask, "connect", connect)
+    assert await ask.try_connect("http://10.9.9.9:1234/") == text
+    assert not await ask.refuses("http://10.9.9.9:1234/")
 
 
 class Bed:

@@ -282,7 +282,7 @@ def test_multicall() -> None:
     ]  # fmt: skip
     answers = api.answer("system.multicall", [calls])
     assert isinstance(answers, list)
-    assert answers[1] == [[1, "the value of /p", 1]]
+    assert answers[1] == [(1, "the value of /p", 1)]
     for fault in answers[2:]:
         assert isinstance(fault, dict)
         assert fault["faultCode"] == 1

@@ -153,7 +153,7 @@ class RawPublisher(RawServer):
         """The slave API."""
         return f"http://127.0.0.1:{self._server.port}/"
 
-    def _call(self, method: str, params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
+    def _call(self, method: str, params: tuple[XmlRpcValue, ...]) -> XmlRpcValue:
         assert method == "requestTopic"
         self.asked.append(params)
         return self.answer if self.answer is not None else [1, "ready", ["TCPROS", "127.0.0.1", self.port]]

@@ -9,7 +9,6 @@ import pytest
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
-from rmpa.ros.node.endpoints import NODE_UNREGISTER_AT_ONCE
 from rmpa.ros.node.node import Node, Received
 from rmpa.ros.types.definitions import DefinitionError
 from rmpa.ros.types.messages import MessageError, MessageType
@@ -365,14 +364,14 @@ async def test_a_master_that_hangs_does_not_keep_a_node_from_its_end(
             await one.advertise(f"/out{number}", "std_msgs/String")
         begun: list[str] = []
 
-        async def hanging(method: str, *_params: Any) -> Any:
+        async def hanging(_uri: str, method: str, *_params: Any) -> Any:
             begun.append(method)
             await asyncio.Event().wait()
 
-        monkeypatch.setattr(one, "call_master", hanging)
+        monkeypatch.setattr("rmpa.ros.node.endpoints.call", hanging)
         async with asyncio.timeout(DEADLINE):
             await one.close()
-    assert len(begun) == NODE_UNREGISTER_AT_ONCE
+    assert begun == ["system.multicall"]
     assert one.stopped.is_set()
 
 

@@ -192,7 +192,7 @@ def nothing_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
 
 async def learnt(core: RosCore, topic: str = "", *, elsewhere: bool = True) -> tuple[str, str, str] | None:
     found = await fetch_type(core.uri, "/asker", NAME, topic=topic, elsewhere=elsewhere)
-    return (found.node, found.topic, found.kind.md5sum) if found is not None else None
+    return (found[2], found[1], found[0].md5sum) if found is not None else None
 
 
 async def test_type_is_fetched_from_a_publisher(core: RosCore) -> None:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import contextlib
 import socket
 import struct
 from collections.abc import AsyncIterator, Callable, Mapping
@@ -8,8 +7,8 @@ from collections.abc import AsyncIterator, Callable, Mapping
 import pytest
 
 from rmpa.ros import limits
-from rmpa.ros.node.listeners import TcprosServer
 from rmpa.ros.node.publication import AcceptedConnection, Publication, PublicationEvents
+from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import TopicDescription, frame_message, publisher_header
 from tests.ros.node.peers import LATCHED, STRING, RawSubscriber
 from tests.waiting import until
@@ -18,13 +17,13 @@ OTHER = TopicDescription("std_msgs/Int32", "da5909fbe378aeaf85e547e830cc1bb7", "
 
 
 class Owner(PublicationEvents):
-    """A server with one publication of /t, and what it said."""
+    """A node with one publication of /t, and what it said."""
 
     def __init__(self, description: TopicDescription | None, **options: int) -> None:
         self.said: list[str] = []
         self.publication = Publication("/t", "/p", description, events=self, **options)
-        self.server = TcprosServer("/p", {"/t": self.publication})
-        self.server.start()
+        self.node = SlaveNode("/p", "127.0.0.1", "")
+        self.node.add_publication(self.publication)
 
     def first_subscriber(self) -> None:
         self.said.append("first")
@@ -36,21 +35,28 @@ class Owner(PublicationEvents):
         self.said.append(f"refused {fields['callerid']}: {text}")
 
     async def subscriber(self, *, buffer: int = 0, **fields: str) -> RawSubscriber:
+        if not self.node.uri:
+            await self.node.start()
         before = self.publication.subscribers
-        link = await RawSubscriber.connect(self.server.address, buffer=buffer, **fields)
+        address = self.node.address_of("/t")
+        assert address is not None
+        link = await RawSubscriber.connect(address, buffer=buffer, **fields)
         await until(lambda: self.publication.subscribers > before)
         return link
-
-    def close(self) -> None:
-        self.publication.withdraw()
-        self.server.close()
 
 
 @pytest.fixture
 async def make() -> AsyncIterator[Callable[..., Owner]]:
     """Makes owners, which end with the test."""
-    with contextlib.ExitStack() as stack:
-        yield lambda *args, **options: stack.enter_context(contextlib.closing(Owner(*args, **options)))
+    made: list[Owner] = []
+
+    def make(description: TopicDescription | None, **options: int) -> Owner:
+        made.append(Owner(description, **options))
+        return made[-1]
+
+    yield make
+    for owner in made:
+        await owner.node.close()
 
 
 @pytest.fixture
@@ -183,7 +189,7 @@ async def test_junk_from_a_subscriber_is_read_away(known: Owner) -> None:
 
 @pytest.mark.trap(19)
 async def test_slow_subscriber_loses_the_oldest_and_delays_no_other(make: Callable[..., Owner]) -> None:
-    owner = make(STRING, queue_messages=10, queue_bytes=1 << 30)
+    owner = make(STRING, queue_messages=10)
     slow = await owner.subscriber(callerid="/slow", buffer=4096)
     fast = await owner.subscriber(callerid="/fast")
     await slow.header()
@@ -210,11 +216,13 @@ async def test_slow_subscriber_loses_the_oldest_and_delays_no_other(make: Callab
 
 @pytest.mark.trap(19)
 async def test_a_slow_subscriber_holds_no_more_than_its_bytes(make: Callable[..., Owner]) -> None:
-    owner = make(STRING, queue_messages=1000, queue_bytes=1_000_000)
+    owner = make(STRING)
     await owner.subscriber(buffer=4096)
+    (inbound,) = owner.publication._connections
+    assert isinstance(inbound, AcceptedConnection)
+    inbound.bound(1000, 1_000_000)
     for _ in range(200):
         owner.publication.publish_framed(frame_message(bytes(100_000)))
-    (inbound,) = owner.publication._connections
     assert inbound.pending_bytes <= 1_000_000 + 100_004
 
 
@@ -260,7 +268,7 @@ def extend(publication: Publication, *parts: bytes) -> None:
 
 
 async def test_a_slow_subscriber_among_fast_ones_gets_whole_messages_or_none(make: Callable[..., Owner]) -> None:
-    owner = make(STRING, queue_messages=2, queue_bytes=1 << 30)
+    owner = make(STRING, queue_messages=2)
     slow = await owner.subscriber(callerid="/slow", buffer=4096)
     fast = [await owner.subscriber(callerid=f"/fast{n}") for n in range(2)]
     for link in (slow, *fast):

@@ -8,9 +8,10 @@ from collections.abc import AsyncIterator
 import pytest
 
 from rmpa.core.errors import LocalProtocolError, UnreachableError
-from rmpa.ros.node import service_client as module
-from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed, probe
-from rmpa.ros.wire.tcpros import ServiceDescription, encode_header, error_header, server_header
+from rmpa.ros.node import ask
+from rmpa.ros.node.ask import probe
+from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
+from rmpa.ros.wire.tcpros import ServiceDescription, encode_header, server_header
 from rmpa.runtime import limits
 from tests.ros.node.peers import RawServer, RawSubscriber
 from tests.runtime.descriptors_left import descriptors_left
@@ -135,7 +136,7 @@ async def test_nobody_there(server: Server) -> None:
 
 
 def refusal(text: str) -> bytes:
-    return encode_header(error_header(text))
+    return encode_header({"error": text})
 
 
 ANSWER = encode_header(HEADER)
@@ -154,7 +155,7 @@ NO_NODE = "the program that listens there is no ROS node"
         (encode_header({**HEADER, "callerid": "/camera\n"}), "/talker", "another node listens there: /camera�"),
         # An error counts only if it names the node.
         (refusal(OF_ROSPY.format("/talker")), "/talker", ""),
-        (encode_header({**error_header(OF_ROSCPP), "callerid": "/talker"}), "/talker", ""),
+        (encode_header({"error": OF_ROSCPP, "callerid": "/talker"}), "/talker", ""),
         (refusal(OF_ROSCPP), "/talker", UNEXPECTED + OF_ROSCPP),
         (refusal(OF_ROSCPP), "", UNEXPECTED + OF_ROSCPP),
         (
@@ -202,7 +203,7 @@ async def test_reasons_are_those_of_the_network(
             await asyncio.Event().wait()
         raise error or AssertionError
 
-    monkeypatch.setattr(module, "connect", connect)
+    monkeypatch.setattr(ask, "connect", connect)
     assert await probe("192.0.2.1", 1, SERVICE, timeout=0.05) == reason
 
 

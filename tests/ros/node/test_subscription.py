@@ -10,8 +10,9 @@ import pytest
 
 from rmpa.core import limits as core_limits
 from rmpa.ros import limits
+from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import PartsTaker, PublisherConnection, Subscription
-from rmpa.ros.wire.tcpros import TopicDescription, encode_header, frame_message, publisher_header
+from rmpa.ros.wire.tcpros import ANYTHING, TopicDescription, encode_header, frame_message, publisher_header
 from tests.ros.node.peers import MD5, STRING, RawPublisher, RawServer
 from tests.waiting import until
 
@@ -36,7 +37,7 @@ class Said:
 
     made: ClassVar[list[Said]] = []
 
-    def __init__(self, uri: str, *, on_parts: PartsTaker | None = None, **options: str) -> None:
+    def __init__(self, uri: str, *, on_parts: PartsTaker | None = None, wanted: TopicDescription = ANYTHING) -> None:
         self.headers: list[Mapping[str, str]] = []
         self.messages: list[bytes] = []
         self.refused: list[str] = []
@@ -52,8 +53,7 @@ class Said:
             on_refused=self.refused.append,
             on_lost=self.lost.append,
             on_oversized=self.oversized.append,
-            type_name=options.get("type_name", "*"),
-            md5sum=options.get("md5sum", "*"),
+            wanted=wanted,
         )
         self.link.start()
         self.made.append(self)
@@ -138,7 +138,7 @@ async def test_an_error_header_is_final(publisher: RawPublisher) -> None:
 @pytest.mark.trap(1)
 async def test_a_publisher_with_another_md5_sum_is_not_believed(publisher: RawPublisher) -> None:
     publisher.description = TopicDescription("std_msgs/Int32", "0" * 32, "int32 data")
-    said = Said(publisher.uri, type_name="std_msgs/String", md5sum=MD5)
+    said = Said(publisher.uri, wanted=TopicDescription("std_msgs/String", MD5, ""))
     link, _ = await publisher.serve()
     await link.send(frame_message(b"poison"))
     await until(lambda: said.refused)
@@ -242,12 +242,13 @@ class Followed:
     def __init__(self, own_uri: str = "") -> None:
         self.messages: list[tuple[str, bytes]] = []
         self.refused: list[str] = []
+        node = SlaveNode("/s", "127.0.0.1", "")
+        node.uri = own_uri
         self.subscription = Subscription(
             "/t",
-            "/s",
+            node,
             on_message=lambda link, framed: self.messages.append((link.uri, bytes(framed[4:]))),
             on_refused=lambda _, text: self.refused.append(text),
-            own_uri=own_uri,
         )
 
     def close(self) -> None:

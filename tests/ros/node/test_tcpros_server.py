@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.core.statistics import Counters
 from rmpa.ros import limits
-from rmpa.ros.core.liveness import name_at
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node import listeners as shared_listener
-from rmpa.ros.node.listeners import LOOPBACK_REST, LoopbackAddresses, SharedListener, TcprosServer
+from rmpa.ros.node.ask import name_at
+from rmpa.ros.node.listeners import SharedListener, loopback_addresses
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import encode_header, frame_message
@@ -28,27 +28,30 @@ from tests.waiting import until
 
 
 class Served:
+    """A node that publishes /t."""
+
     def __init__(self) -> None:
         self.counters = Counters()
         self.publication = Publication("/t", "/p", STRING)
-        self.server = TcprosServer("/p", {"/t": self.publication}, counters=self.counters)
-        self.server.start()
+        self.node = SlaveNode("/p", "127.0.0.1", "", counters=self.counters)
+        self.node.add_publication(self.publication)
 
-    def close(self) -> None:
-        self.publication.withdraw()
-        self.server.close()
+    @property
+    def address(self) -> tuple[str, int]:
+        return "127.0.0.1", self.node._tcpros_port
 
 
 @pytest.fixture
 async def served() -> AsyncIterator[Served]:
     made = Served()
+    await made.node.start()
     yield made
-    made.close()
+    await made.node.close()
 
 
 @pytest.mark.trap(7)
 async def test_a_header_may_come_byte_by_byte(served: Served) -> None:
-    link = await RawSubscriber.dial(served.server.address)
+    link = await RawSubscriber.dial(served.address)
     for byte in encode_header({"topic": "/t", "callerid": "/s", "md5sum": "*"}):
         await link.send(bytes([byte]))
     assert (await link.header())["callerid"] == "/p"
@@ -65,7 +68,7 @@ async def test_a_header_may_come_byte_by_byte(served: Served) -> None:
     ],
 )
 async def test_what_is_refused(served: Served, fields: dict[str, str], error: str) -> None:
-    link = await RawSubscriber.connect(served.server.address, buffer=0, **fields)
+    link = await RawSubscriber.connect(served.address, buffer=0, **fields)
     assert await link.header() == {"error": error}
     assert await link.ended()
 
@@ -82,7 +85,7 @@ async def test_malformed_headers_are_counted_and_closed(
     served: Served, data: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING)
-    link = await RawSubscriber.dial(served.server.address)
+    link = await RawSubscriber.dial(served.address)
     await link.send(data)
     assert await link.ended()
     await until(lambda: served.counters["tcpros.refused.malformed"] == 1)
@@ -91,7 +94,7 @@ async def test_malformed_headers_are_counted_and_closed(
 
 @pytest.mark.trap(7)
 async def test_an_empty_header_is_refused_instead_of_held(served: Served) -> None:
-    link = await RawSubscriber.dial(served.server.address)
+    link = await RawSubscriber.dial(served.address)
     await link.send(bytes(4))
     assert "error" in await link.header()
 
@@ -100,11 +103,12 @@ async def test_an_empty_header_is_refused_instead_of_held(served: Served) -> Non
 async def test_leaving_before_the_header_is_no_error(served: Served, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING)
     for data in (b"", b"\x10\x00"):
-        link = await RawSubscriber.dial(served.server.address)
+        link = await RawSubscriber.dial(served.address)
         await link.send(data)
         link.close()
-    await until(lambda: len(served.server._accepted) == 2)
-    await until(lambda: not served.server._waiting)
+    patient = await RawSubscriber.connect(served.address)
+    assert "error" not in await patient.header(), "those before it have been accepted"
+    await until(lambda: not served.node._greetings)
     assert served.counters.as_dict() == {}
     assert caplog.text == ""
 
@@ -114,8 +118,8 @@ async def test_silent_connection_blocks_no_other_and_is_closed(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "TCPROS_HANDSHAKE_TIMEOUT", 0.2)
-    silent = await RawSubscriber.dial(served.server.address)
-    other = await RawSubscriber.connect(served.server.address)
+    silent = await RawSubscriber.dial(served.address)
+    other = await RawSubscriber.connect(served.address)
     assert "error" not in await other.header()
     assert await silent.ended()
     assert served.counters["tcpros.refused.silent"] == 1
@@ -124,12 +128,12 @@ async def test_silent_connection_blocks_no_other_and_is_closed(
 
 async def test_connections_without_a_header_are_bounded(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "TCPROS_HANDSHAKES_MAX", 3)
-    links = [await RawSubscriber.dial(served.server.address) for _ in range(4)]
+    links = [await RawSubscriber.dial(served.address) for _ in range(4)]
     assert await links[3].ended()
     assert served.counters["tcpros.refused.full"] == 1
     for link in links:
         link.close()
-    await until(lambda: not served.server._waiting)
+    await until(lambda: not served.node._greetings)
 
 
 async def test_all_connections_are_bounded_and_closed_ones_do_not_count(
@@ -137,10 +141,10 @@ async def test_all_connections_are_bounded_and_closed_ones_do_not_count(
 ) -> None:
     monkeypatch.setattr(limits, "TCPROS_CONNECTIONS_MAX", 3)
     for _ in range(2):
-        links = [await RawSubscriber.connect(served.server.address) for _ in range(3)]
+        links = [await RawSubscriber.connect(served.address) for _ in range(3)]
         for link in links:
             await link.header()
-        surplus = await RawSubscriber.connect(served.server.address)
+        surplus = await RawSubscriber.connect(served.address)
         assert await surplus.ended()
         for link in (*links, surplus):
             link.close()
@@ -148,21 +152,16 @@ async def test_all_connections_are_bounded_and_closed_ones_do_not_count(
     assert served.counters["tcpros.refused.full"] == 2
 
 
-async def test_an_address_in_use_is_a_clear_error(served: Served) -> None:
-    with pytest.raises(StartError, match=r"TCPROS server of /q at 127.0.0.1:\d+: "):
-        TcprosServer("/q", {}).start(*served.server.address)
-
-
 @pytest.mark.trap(3)
 @pytest.mark.parametrize("definition", ["", "another text\n", "string data\n"])
 async def test_a_subscriber_may_or_may_not_send_its_definition(served: Served, definition: str) -> None:
-    link = await RawSubscriber.connect(served.server.address, message_definition=definition)
+    link = await RawSubscriber.connect(served.address, message_definition=definition)
     assert (await link.header())["message_definition"] == "string data\n"
 
 
 @pytest.mark.trap(8)
 async def test_what_comes_in_one_segment_with_the_header_does_no_harm(served: Served) -> None:
-    link = await RawSubscriber.dial(served.server.address)
+    link = await RawSubscriber.dial(served.address)
     header = encode_header({"topic": "/t", "callerid": "/s", "md5sum": "*"})
     await link.send(header + b"a request that should have waited for the reply")
     assert (await link.header())["callerid"] == "/p"
@@ -177,12 +176,12 @@ async def test_a_probe_for_a_service_that_is_gone_is_answered_and_not_logged(
     caplog.set_level(logging.WARNING)
     probe = {"topic": "", "service": "/add", "probe": "1"}
     for _ in range(5):
-        hasty = await RawSubscriber.connect(served.server.address, buffer=0, **probe)
+        hasty = await RawSubscriber.connect(served.address, buffer=0, **probe)
         hasty.close()  # wait_for_service does not read the reply
-    patient = await RawSubscriber.connect(served.server.address, buffer=0, **probe)
+    patient = await RawSubscriber.connect(served.address, buffer=0, **probe)
     assert await patient.header() == {"error": "[/p] does not offer the service [/add]"}
     assert await patient.ended()
-    await until(lambda: not served.server._waiting)
+    await until(lambda: not served.node._greetings)
     assert served.counters.as_dict() == {}
     assert caplog.records == []
 
@@ -276,34 +275,42 @@ async def test_addresses_that_lead_nowhere_are_found_out(monkeypatch: pytest.Mon
 RESERVED = [IPv4Network("127.0.0.0/16"), IPv4Network("127.255.0.0/16")]
 
 
-def test_ten_thousand_nodes_have_addresses_of_their_own() -> None:
-    addresses = LoopbackAddresses(SALT)
-    given_out = {addresses.take(f"/rmpa/base/node_{n}", 0.0) for n in range(10_000)}
-    assert len(given_out) == len(addresses) == 10_000
+def attached(listener: SharedListener, name: str) -> str:
+    """A node's address; nothing takes its connections."""
+    return listener.attach(name, lambda *_: None, lambda *_: None)
+
+
+async def test_ten_thousand_nodes_have_addresses_of_their_own() -> None:
+    listener = SharedListener(SALT)
+    assert len({attached(listener, f"/rmpa/base/node_{n}") for n in range(10_000)}) == 10_000
 
 
 @given(st.text())
 def test_no_address_is_special(name: str) -> None:
-    address = IPv4Address(LoopbackAddresses(SALT).take(name, 0.0))
+    address = IPv4Address(next(loopback_addresses(SALT, name)))
     assert address in IPv4Network("127.0.0.0/8")
     assert not any(address in network for network in RESERVED)
     assert address.packed[3] not in {0, 255}
 
 
-def test_freeing_what_is_not_in_use_changes_nothing() -> None:
-    addresses = LoopbackAddresses(SALT)
-    addresses.free("127.1.2.3", 0.0)
-    first = addresses.take("/n", 0.0)
-    addresses.free(first, 1.0)
-    addresses.free(first, 50.0)
-    assert addresses.take("/n", 1.0 + LOOPBACK_REST) == first
+async def test_a_freed_address_rests(monkeypatch: pytest.MonkeyPatch) -> None:
+    listener = SharedListener(SALT)
+    listener.detach("127.1.2.3")
+    first = attached(listener, "/n")
+    listener.detach(first)
+    listener.detach(first)
+    second = attached(listener, "/n")
+    assert second != first
+    listener.detach(second)
+    monkeypatch.setattr(shared_listener, "LOOPBACK_REST", 0.0)
+    assert attached(listener, "/n") == first
 
 
-def test_of_too_many_resting_addresses_the_oldest_may_be_used_again(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_of_too_many_resting_addresses_the_oldest_may_be_used_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "LOOPBACK_RESTING_MAX", 2)
-    addresses = LoopbackAddresses(SALT)
-    taken = [addresses.take(f"/n{n}", 0.0) for n in range(3)]
+    listener = SharedListener(SALT)
+    taken = [attached(listener, f"/n{n}") for n in range(3)]
     for address in taken:
-        addresses.free(address, 1.0)
-    assert addresses.take("/n0", 2.0) == taken[0]
-    assert addresses.take("/n1", 2.0) != taken[1]
+        listener.detach(address)
+    assert attached(listener, "/n0") == taken[0]
+    assert attached(listener, "/n1") != taken[1]

@@ -26,10 +26,10 @@ STRING: Final = "992ce8a1687cec8c8bd883ec73ca41d1"
 def no_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Nothing is installed but what a test puts to ``opt``."""
     nothing_installed(tmp_path, monkeypatch)
-    header_types._missing.clear()
+    header_types._searched.cache_clear()
     yield
     packages_below.cache_clear()
-    header_types._missing.clear()
+    header_types._searched.cache_clear()
 
 
 def sums(name: str, **environ: Path | str) -> str:
@@ -251,24 +251,6 @@ def test_a_version_that_is_missing_is_remembered_too(tmp_path: Path, monkeypatch
         package(tmp_path / "my_msgs", msg_A="int8 b")
     looks.now += 1.01 * TYPE_MISSING
     assert type_of_header(header).md5sum == header["md5sum"]
-
-
-def test_what_is_missing_is_remembered_up_to_a_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path))
-    monkeypatch.setattr(limits, "TYPES_MISSING_MAX", 3)
-    looks = Looks(monkeypatch)
-
-    def look(number: int) -> int:
-        before = looks.walks
-        with pytest.raises(UnknownTypeError):
-            type_of_header({"type": f"no_msgs/T{number}", "md5sum": STRING})
-        return looks.walks - before
-
-    for number in range(4):
-        look(number)
-    assert len(header_types._missing) == 3
-    assert [look(3), look(2), look(1)] == [0, 0, 0]
-    assert look(0) > 0, "the oldest gave way"
 
 
 @pytest.mark.skipif(not Path("/usr/share/actionlib/msg").is_dir(), reason="ROS 1 is not installed (no actionlib)")

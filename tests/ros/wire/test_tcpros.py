@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from rmpa.core.errors import ConfigError, LimitExceeded, RemoteProtocolError
 from rmpa.core.limits import KIB
 from rmpa.ros import limits
-from rmpa.ros.wire.http import CallBody, call_name, too_large, too_many
+from rmpa.ros.wire.http import call_name, too_large, too_many
 from rmpa.ros.wire.tcpros import (
+    REPLY,
     BodyBuffer,
     ServiceDescription,
     TopicDescription,
@@ -22,12 +23,9 @@ from rmpa.ros.wire.tcpros import (
     decode_header,
     encode_header,
     frame_message,
-    frame_reply,
-    is_persistent,
-    is_probe,
+    is_set,
     parse_header,
     parse_reply_head,
-    parse_request_length,
     parse_service_uri,
     printable,
     publisher_header,
@@ -35,7 +33,7 @@ from rmpa.ros.wire.tcpros import (
     split_messages,
     subscriber_header,
 )
-from rmpa.ros.wire.xmlrpc import serialize_call
+from tests.ros.documents import serialize_call
 
 MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
 
@@ -146,7 +144,7 @@ def test_impossible_length_differs_from_too_long_message(size: int) -> None:
         split_messages(memoryview(struct.pack("<I", limits.TCPROS_LENGTH_MAX)))
 
 
-SUBSCRIBER = subscriber_header("/t", "/s", type_name="std_msgs/String", md5sum=MD5)
+SUBSCRIBER = subscriber_header("/t", "/s", TopicDescription("std_msgs/String", MD5, ""))
 
 
 @pytest.mark.trap(1, 4)
@@ -249,11 +247,11 @@ def test_persistent_as_rospy_and_roscpp_write_it() -> None:
     assert client_header("/add", "/c", persistent=True)["persistent"] == "1"
     assert "persistent" not in client_header("/add", "/c")
     for value in ("1", "true", "True", "TRUE"):
-        assert is_persistent({"persistent": value})
+        assert is_set({"persistent": value}, "persistent")
     for value in ("0", "false", "", "yes"):
-        assert not is_persistent({"persistent": value})
-    assert is_probe(client_header("/add", "/c", probe=True))
-    assert not is_probe({})
+        assert not is_set({"persistent": value}, "persistent")
+    assert is_set(client_header("/add", "/c", probe=True), "probe")
+    assert not is_set({}, "probe")
 
 
 def test_a_servers_header_is_not_believed_unseen() -> None:
@@ -270,15 +268,11 @@ def test_a_servers_header_is_not_believed_unseen() -> None:
 
 @pytest.mark.trap(25)
 def test_golden_replies() -> None:
-    assert b"".join(frame_reply(True, b"abc")) == b"\x01\x03\x00\x00\x00abc"
-    assert b"".join(frame_reply(False, b"no")) == b"\x00\x02\x00\x00\x00no"
-    assert b"".join(frame_reply(False, b"")) == b"\x00\x00\x00\x00\x00"
+    assert REPLY.pack(True, 3) + b"abc" == b"\x01\x03\x00\x00\x00abc"
     assert parse_reply_head(b"\x01\x03\x00\x00\x00abc") == (True, 3)
     assert parse_reply_head(b"\x00\x02\x00\x00\x00") == (False, 2)
     for size in range(5):
         assert parse_reply_head(b"\x01\x03\x00\x00\x00"[:size]) is None
-    assert parse_request_length(b"\x08\x00\x00\x00") == 8
-    assert parse_request_length(b"\x08\x00\x00") is None
 
 
 def test_a_claim_beyond_the_limit_is_not_believed() -> None:
@@ -350,23 +344,3 @@ def test_the_texts_name_the_call_the_sizes_and_the_remedy() -> None:
     begin = serialize_call("setParam", ["/loader", "/map", "x"])
     assert all(part in too_large(begin, 70_000_000) for part in ("/map", "70000000", "64 MiB", "one by one"))
     assert all(part in too_many(begin, 70_000_000) for part in ("/map", "70000000", "256 MiB", "again"))
-
-
-@given(st.lists(st.binary(max_size=300), max_size=20), st.integers(100, 2000), st.booleans())
-def test_any_parts_within_the_bound_come_out_whole(parts: list[bytes], limit: int, room: bool) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(limits, "HTTP_BODY_MAX", limit)
-        patch.setattr(limits, "HTTP_BODY_INLINE", 100)
-        body = CallBody(lambda _: room)
-        for part in parts:
-            body.add(part)
-            assert len(body._data) <= max(limit, 4 * KIB)
-        whole = b"".join(parts)
-        assert body.size == len(whole)
-        data, refusal = body.end()
-        if len(whole) <= 100 or (len(whole) <= limit and room):
-            assert (bytes(data), refusal) == (whole, "")
-        else:
-            assert whole.startswith(bytes(data))
-            assert str(len(whole)) in refusal
-        assert (body.size, body.why) == (0, None), "the next one begins anew"

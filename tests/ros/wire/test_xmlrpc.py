@@ -15,12 +15,11 @@ from rmpa.ros.wire.xmlrpc import (
     DocumentReader,
     RosFault,
     XmlRpcValue,
-    parse_call,
     parse_response,
-    serialize_call,
     serialize_fault,
     serialize_response,
 )
+from tests.ros.documents import parse_call, serialize_call
 
 GOLDEN_CALL = b"""<?xml version='1.0'?>
 <methodCall>

@@ -34,8 +34,8 @@ from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.ros.environment import host_of, is_loopback
 from rmpa.ros.http.rpc import call, call_api, is_own_name
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
+from rmpa.ros.node.ask import probe
 from rmpa.ros.node.listeners import local_addresses
-from rmpa.ros.node.service_client import probe
 from rmpa.ros.wire.slave_api import TCPROS, read_bus_info
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply
 from rmpa.runtime.kernel_tcp import connections
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.import_route import RemoteTopic
     from rmpa.bridge.topics.imports import Imports
-    from rmpa.ros.wire.slave_api import BusLink
+    from rmpa.ros.wire.slave_api import BusConnection
 
     TopicPath = Path[RemoteTopic]
 
@@ -81,7 +81,7 @@ async def publisher_update(uri: str, topic: str, publishers: Sequence[str]) -> b
     return reply.code == 1
 
 
-async def bus_links(uri: str, topic: str) -> list[BusLink] | None:
+async def bus_links(uri: str, topic: str) -> list[BusConnection] | None:
     """The connections of a subscriber for one topic; ``None`` if it does not answer."""
     try:
         value = await call(uri, "getBusInfo", OWN_NODE, timeout=limits.DIRECT_NODE_TIMEOUT)
@@ -125,7 +125,7 @@ def standing(address: str) -> dict[int, set[int]]:
     return found
 
 
-async def end_link(link: BusLink) -> str:
+async def end_link(link: BusConnection) -> str:
     """End a connection of a subscriber to a publisher, if it still stands; wait until it is gone.
 
     Args:

@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_own
-from rmpa.core.statistics import Counters
 from rmpa.ros import limits
-from rmpa.ros.core.external import LOOPBACK, Core, GraphLog
-from rmpa.ros.core.liveness import Liveness, Notifier
+from rmpa.ros.core.external import Core
+from rmpa.ros.core.liveness import Notifier
 from rmpa.ros.core.state import CoreState
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.parameters import RegistrationKind
+from rmpa.ros.node.loggers import serve_loggers
 from rmpa.ros.node.publication import Publication
-from rmpa.ros.node.slave_node import LoggerServices, SlaveNode
+from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import PublisherConnection, Subscription
 from rmpa.ros.types.definitions import known_description
 from rmpa.ros.wire.log import renamed
@@ -43,7 +43,7 @@ _log = logging.getLogger(__name__)
 # Seconds within which a publisher that was withdrawn and is registered again, with the same URI, has its topic's list
 # of publishers repeated: a busy subscriber may not have read yet that its old connection ended.
 WITHDRAWN_LATELY: Final = 5.0
-# Seconds from a publisher's return until the list is repeated, with those of the topics that return meanwhile.
+# Seconds from a publisher's return until the list is repeated.
 PUBLISHERS_AGAIN: Final = 2.0
 # Withdrawn publishers that are remembered; the oldest is forgotten first.
 WITHDRAWN_KEPT: Final = 16_384
@@ -67,51 +67,6 @@ ROS_DISTRO: Final = "noetic\n"
 ROS_VERSION: Final = "1.15.15\n"
 
 
-class ReturnedPublishers:
-    """Repeats the list of a topic's publishers after one of them was withdrawn and soon registered again.
-
-    A rospy subscriber that gets the new list before it has read the end of its connection to that publisher takes
-    itself for connected, and would never connect again. Lists that bring nothing new change nothing at a node.
-
-    Args:
-        repeat: Called in the loop with the topics whose list of publishers is to be sent to their subscribers again.
-    """
-
-    def __init__(self, repeat: Callable[[list[str]], None]) -> None:
-        self._repeat = repeat
-        self._withdrawn: dict[tuple[str, str], float] = {}
-        self._returned: dict[str, None] = {}
-        self._timer: asyncio.TimerHandle | None = None
-
-    def graph_changed(self, change: GraphChange) -> None:
-        """Take in one change of the graph."""
-        if change.kind is not RegistrationKind.PUBLISHER:
-            return
-        loop = asyncio.get_running_loop()
-        now = loop.time()
-        key = change.name, change.api
-        at = self._withdrawn.pop(key, None)
-        if not change.added:
-            self._withdrawn[key] = now
-            if len(self._withdrawn) > WITHDRAWN_KEPT:
-                del self._withdrawn[next(iter(self._withdrawn))]
-        elif at is not None and now - at <= WITHDRAWN_LATELY:
-            self._returned[change.name] = None
-            if self._timer is None:
-                self._timer = loop.call_later(PUBLISHERS_AGAIN, self._due)
-
-    def close(self) -> None:
-        """Repeat nothing any more."""
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-
-    def _due(self) -> None:
-        topics, self._returned = list(self._returned), {}
-        self._timer = None
-        self._repeat(topics)
-
-
 class Rosout:
     """The node ``/rosout``: forwards the log messages of all nodes to ``/rosout_agg`` (wiki.ros.org/rosout).
 
@@ -130,7 +85,6 @@ class Rosout:
         self._host = host
         self._advertised = advertised_host
         self._node: SlaveNode | None = None
-        self._loggers: LoggerServices | None = None
         self._keeper: asyncio.Task[None] | None = None
         self._changed = asyncio.Event()
         self._publishers: Mapping[str, str] = {}
@@ -188,21 +142,16 @@ class Rosout:
 
         subscription = Subscription(
             TOPIC,
-            NODE,
+            node,
             on_message=pass_on,
             on_refused=lambda publisher, text: _log.info("! %s is not aggregated: %s", publisher.uri, text),
-            own_uri=node.uri,
-            type_name=LOG.type,
-            md5sum=LOG.md5sum,
-            definition=LOG.definition,
-            number=node.next_number,
+            wanted=LOG,
         )
         node.add_subscription(subscription)
         core.call("registerPublisher", NODE, AGGREGATED, LOG.type, node.uri)
         core.call("registerSubscriber", NODE, TOPIC, LOG.type, node.uri)
         subscription.update(list(core.publishers(TOPIC).values()))
-        self._loggers = LoggerServices(node, core.call, _LOGGERS)
-        self._loggers.start()
+        serve_loggers(node, core.call, _LOGGERS)
 
     def _node_at(self, uri: str) -> str:
         """The publishing node with a slave API."""
@@ -213,17 +162,13 @@ class Rosout:
 
     async def _end(self) -> None:
         node, self._node = self._node, None
-        if node is None:
-            return
-        if self._loggers is not None:
-            self._loggers.close()
-        self._core.call("unregisterSubscriber", NODE, TOPIC, node.uri)
-        self._core.call("unregisterPublisher", NODE, AGGREGATED, node.uri)
-        await node.close()
+        if node is not None:
+            self._core.purge(NODE, node.uri)
+            await node.close()
 
     def _killed(self, reason: str) -> None:
         _log.info("= %s was asked to end (%s)", NODE, reason)
-        self._core.call("unregisterPublisher", NODE, AGGREGATED, self.uri)  # which is noticed as any such change
+        self._core.purge(NODE, self.uri)  # which is noticed as any such change
 
     async def _keep(self) -> None:
         while True:
@@ -238,24 +183,20 @@ class Rosout:
 
     async def _restart(self) -> None:
         warned = False
-        while self._node is None:
+        while True:
             if (holder := self._core.registrations.node_api(NODE)) is not None:
                 if not warned:
                     _log.warning(
                         "= another node has the name %s, at %s; ours waits until it ends [name-taken]", NODE, holder
                     )
                     warned = True
-                with contextlib.suppress(TimeoutError):
-                    # The end of a node that only subscribed to parameters is not reported, so it is polled for.
-                    async with asyncio.timeout(ROSOUT_LOOK):
-                        await self._changed.wait()
-                self._changed.clear()
-                continue
-            try:
-                await self._begin()
-            except (RmpaError, OSError) as error:
-                _log.error("! %s cannot be started again; it is tried again: %s [cannot-start]", NODE, error)
-                await asyncio.sleep(ROSOUT_LOOK)
+            else:
+                try:
+                    await self._begin()
+                    break
+                except (RmpaError, OSError) as error:
+                    _log.error("! %s cannot be started again; it is tried again: %s [cannot-start]", NODE, error)
+            await asyncio.sleep(ROSOUT_LOOK)
         self._core.counters.add("rosout.restarted")
         _log.info("= %s is back at %s", NODE, self.uri)
 
@@ -268,7 +209,6 @@ class RosCore(Core):
         port: 0 lets the system choose.
         advertised_host: The host in ``uri``; default: ``host``, or this machine's name where ``host`` is 0.0.0.0.
         rosout: Whether to aggregate ``/rosout``.
-        counters: Where refusals, calls and notifications are counted.
         on_shutdown: ``(reason)``: a client called ``shutdown``; the owner closes the core then.
         state: The file that stores registrations and parameters for the next run; ``None`` stores nothing.
         keep: When the content of the file is restored; see ``CoreState``.
@@ -285,26 +225,21 @@ class RosCore(Core):
         *,
         advertised_host: str = "",
         rosout: bool = True,
-        counters: Counters | None = None,
         on_shutdown: Callable[[str], None] | None = None,
         state: Path | None = None,
         keep: str = "auto",
         temporary: Callable[[str], bool] = lambda _: False,
     ) -> None:
-        self.counters = counters if counters is not None else Counters()
-        self.uri, self.node_host, self.node_address = "", LOOPBACK, LOOPBACK
-        self.listeners = [GraphLog().note]
-        self._host = host
         self._advertised = advertised_host or (os.uname().nodename if host in {"", "0.0.0.0"} else host)  # noqa: S104
         self._on_shutdown = on_shutdown
         self._api = MasterApi("", os.getpid(), self._shutdown_requested, yielder=yielding_to_data)
-        self.registrations = self._api.registrations
+        super().__init__("", self._api.registrations, self._api.registrations.nodes)
         self._server = XmlRpcServer(self._answer, host, port, counters=self.counters, name="ROS core", use=Use.CORE)
-        self._notifier = Notifier(self.registrations, self.suspect, self.counters)
-        self.liveness = Liveness(nodes=self.registrations.nodes, on_dead=self._dead)
+        self._notifier = Notifier(self)
         self._rosout = Rosout(self, host, self._advertised) if rosout else None
-        self._returned = ReturnedPublishers(self._repeat_publishers)
-        self.on_change(self._returned.graph_changed)
+        # Topics and slave APIs of withdrawn publishers, and when.
+        self._withdrawn: dict[tuple[str, str], float] = {}
+        self.on_change(self._publisher_changed)
         self.stored: CoreState | None = None
         if state is not None:
             own = {NODE, CALLER_ID}
@@ -346,7 +281,6 @@ class RosCore(Core):
         """Close /rosout, then the tasks that call nodes, then the server; then write the last state."""
         if self._rosout is not None:
             await self._rosout.close()
-        self._returned.close()
         await self._notifier.close()
         await self.liveness.close()
         await self._server.close()
@@ -393,7 +327,7 @@ class RosCore(Core):
     def restored(self) -> str:
         return self.stored.summary() if self.stored is not None else ""
 
-    def _answer(self, method: str, params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
+    def _answer(self, method: str, params: tuple[XmlRpcValue, ...]) -> XmlRpcValue:
         try:
             return self._api.answer(method, params)
         finally:
@@ -408,15 +342,37 @@ class RosCore(Core):
             self._notifier.add(call)
         self.report(changes)
 
-    def _repeat_publishers(self, topics: list[str]) -> None:
-        for topic in yielding_to_data(topics):  # a thousand peers that return have 20,000
-            self._api.registrations.notify_subscribers(topic)
+    def _publisher_changed(self, change: GraphChange) -> None:
+        """Repeat the list of a topic's publishers after one of them was withdrawn and soon registered again.
+
+        A rospy subscriber that gets the new list before it has read the end of its connection to that publisher takes
+        itself for connected, and would never connect again. Lists that bring nothing new change nothing at a node.
+        """
+        if change.kind is not RegistrationKind.PUBLISHER:
+            return
+        loop = asyncio.get_running_loop()
+        key = change.name, change.api
+        at = self._withdrawn.pop(key, None)
+        if not change.added:
+            self._withdrawn[key] = loop.time()
+            if len(self._withdrawn) > WITHDRAWN_KEPT:
+                del self._withdrawn[next(iter(self._withdrawn))]
+        elif at is not None and loop.time() - at <= WITHDRAWN_LATELY:
+            loop.call_later(PUBLISHERS_AGAIN, self._repeat_publishers, change.name)
+
+    def _repeat_publishers(self, topic: str) -> None:
+        self.registrations.notify_subscribers(topic)
         self._carry_out()
 
+    def purge(self, node: str, api: str) -> bool:
+        """Remove all registrations of a node; return whether there was one of that name with this slave API."""
+        there = self.registrations.purge(node, api)
+        self._carry_out()
+        return there
+
     def _dead(self, node: str, api: str) -> None:
-        if self._api.registrations.purge(node, api):
+        if self.purge(node, api):
             self.counters.add("node.dead")
-            self._carry_out()
 
     def _shutdown_requested(self, reason: str) -> None:
         if self._on_shutdown is not None:

@@ -10,22 +10,24 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+from abc import ABC, abstractmethod
 from collections import deque
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.core.facts import UnreachableInfo
 from rmpa.core.log import logged_failure
 from rmpa.core.statistics import Counters
 from rmpa.ros import limits
-from rmpa.ros.core.liveness import Liveness, refuses
+from rmpa.ros.core.liveness import Liveness
 from rmpa.ros.http.rpc import call, call_api, exchange, read_response
 from rmpa.ros.master import mirror
 from rmpa.ros.master.parameters import RegistrationKind
+from rmpa.ros.node.ask import refuses
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief, call_pieces
 from rmpa.runtime.accept import Use
-from rmpa.runtime.loop import yield_to_data, yielding_to_data
-from rmpa.runtime.tasks import end_tasks, keep_task, start_task
+from rmpa.runtime.loop import sleep_to_tick, yield_to_data, yielding_to_data
+from rmpa.runtime.tasks import end_tasks, keep_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -67,36 +69,15 @@ _MASTER_WRITES_AT_ONCE: Final = 64
 LOOPBACK: Final = "127.0.0.1"
 
 
-class GraphLog:
-    """Logs the changes of a graph: each one at debug, and at most once a second one line about all."""
-
-    def __init__(self) -> None:
-        self._changes: list[GraphChange] = []
-
-    def note(self, change: GraphChange) -> None:
-        """Log a change."""
-        _log.debug("= %s", change)
-        if not self._changes:
-            asyncio.get_running_loop().call_later(_GRAPH_LINE, self._tell)
-        self._changes.append(change)
-
-    def _tell(self) -> None:
-        changes, self._changes = self._changes, []
-        if len(changes) == 1:
-            _log.info("= %s", changes[0])
-            return
-        more = sum(change.added for change in changes)
-        nodes = list(dict.fromkeys(change.node for change in changes))
-        names = ", ".join(nodes[:_GRAPH_NODES]) + (", …" if len(nodes) > _GRAPH_NODES else "")
-        _log.info("= %d registrations more, %d less, of %d nodes: %s", more, len(changes) - more, len(nodes), names)
-
-
-class Core(Protocol):
+class Core(ABC):
     """The local graph: read at any time, changed by ``call``, observed by ``on_change``.
+
+    Args:
+        registrations: The local graph's tables, or a copy of a real roscore's.
+        nodes: The nodes that are checked, with their slave APIs.
 
     Attributes:
         counters: Counts what goes wrong.
-        registrations: The local graph's tables, or a copy of a real roscore's.
         liveness: Checks the graph's nodes.
         listeners: Called after each change.
         uri: The master's URI: ``ROS_MASTER_URI`` of the nodes of this graph.
@@ -104,14 +85,18 @@ class Core(Protocol):
         node_address: The address of the agent's own nodes that is registered in this graph.
     """
 
-    counters: Counters
-    registrations: Registrations
-    liveness: Liveness
-    listeners: list[Callable[[GraphChange], None]]
-    uri: str
-    node_host: str
-    node_address: str
+    node_host = node_address = LOOPBACK
 
+    def __init__(self, uri: str, registrations: Registrations, nodes: Callable[[], dict[str, str]]) -> None:
+        self.uri = uri
+        self.registrations = registrations
+        self.counters = Counters()
+        self.liveness = Liveness(nodes=nodes, on_dead=self._dead)
+        self.listeners: list[Callable[[GraphChange], None]] = []
+        # The changes of the next line of the log.
+        self._changes: list[GraphChange] = []
+
+    @abstractmethod
     async def start(self) -> None:
         """Start the core, or connect to it.
 
@@ -119,9 +104,11 @@ class Core(Protocol):
             StartError: The core cannot be started with these settings.
         """
 
+    @abstractmethod
     async def close(self) -> None:
         """Unregister what the agent registered; an embedded core ends."""
 
+    @abstractmethod
     def call(self, method: str, *params: XmlRpcValue) -> RosReply:
         """Register or unregister, or write a parameter, as over XML-RPC but without waiting.
 
@@ -132,6 +119,7 @@ class Core(Protocol):
             ``(code, status, value)``; the value must not be changed, nor may ``params`` be afterwards.
         """
 
+    @abstractmethod
     async def ask(self, method: str, *params: XmlRpcValue) -> RosReply:
         """Call any method, after all previous ``call``s, and wait for the master's own answer.
 
@@ -163,11 +151,32 @@ class Core(Protocol):
         self.listeners.append(callback)
 
     def report(self, changes: Iterable[GraphChange]) -> None:
-        """Call the listeners with each change, in order; an exception of one is logged, and affects no other."""
+        """Call the listeners with each change, in order; an exception of one is logged, and affects no other.
+
+        Each change is logged at debug level, and at most once a second one line about all.
+        """
         for change in changes:
+            _log.debug("= %s", change)
+            if not self._changes:
+                asyncio.get_running_loop().call_later(_GRAPH_LINE, self._tell)
+            self._changes.append(change)
             for callback in self.listeners:
                 with logged_failure(_log, "a listener failed at %s", change):
                     callback(change)
+
+    def _tell(self) -> None:
+        changes, self._changes = self._changes, []
+        if len(changes) == 1:
+            _log.info("= %s", changes[0])
+            return
+        more = sum(change.added for change in changes)
+        nodes = list(dict.fromkeys(change.node for change in changes))
+        names = ", ".join(nodes[:_GRAPH_NODES]) + (", …" if len(nodes) > _GRAPH_NODES else "")
+        _log.info("= %d registrations more, %d less, of %d nodes: %s", more, len(changes) - more, len(nodes), names)
+
+    @abstractmethod
+    def _dead(self, node: str, api: str) -> None:
+        """Take the registrations of a node that is dead."""
 
     def on_lookup(self, callback: Callable[[str, str, str, str], str]) -> bool:  # noqa: ARG002 - for the embedded core
         """Let ``callback`` answer ``lookupService`` for each caller.
@@ -210,6 +219,7 @@ class Core(Protocol):
 
     def notes(self) -> tuple[str, ...]:
         """Problems that the user should know of, such as a master that does not answer."""
+        return ()
 
     def restored(self) -> str:
         """Where the core stores its state and what it restored, for people; empty for nothing."""
@@ -228,7 +238,6 @@ class ExternalCore(Core):
         own_node: The agent's own node, which asks the master.
         node_host: The address at which the agent's nodes listen.
         node_address: The address of the agent's nodes that is registered.
-        counters: ``master.looks``, ``node.dead``.
     """
 
     def __init__(
@@ -238,15 +247,11 @@ class ExternalCore(Core):
         own_node: str,
         node_host: str = LOOPBACK,
         node_address: str = LOOPBACK,
-        counters: Counters | None = None,
     ) -> None:
-        self.counters = counters if counters is not None else Counters()
-        self.uri, self.node_host, self.node_address = uri, node_host, node_address
-        self._own_node = own_node
         self._mirror = mirror.Mirror(yielder=yielding_to_data)
-        self.liveness = Liveness(nodes=self._mirror.others, on_dead=self._dead)
-        self.registrations = self._mirror.registrations
-        self.listeners = [GraphLog().note]
+        super().__init__(uri, self._mirror.registrations, self._mirror.others)
+        self.node_host, self.node_address = node_host, node_address
+        self._own_node = own_node
         self._writes: deque[mirror.Call] = deque()
         self._written = asyncio.Event()
         self._written.set()
@@ -272,6 +277,7 @@ class ExternalCore(Core):
         await self._poll()
         await self._flush()
         self._task = keep_task(self._work, f"looking at the roscore {self.uri}")
+        self._revival = keep_task(self._revive, "ask for nodes that left")
         self.liveness.start()
 
     async def close(self) -> None:
@@ -341,7 +347,6 @@ class ExternalCore(Core):
         self._poll_soon()
 
     async def _work(self) -> None:
-        checked = self._loop.time()
         while True:
             try:
                 await self._flush()
@@ -352,10 +357,6 @@ class ExternalCore(Core):
             except Exception:
                 self._seen = b""
                 raise
-            if self._loop.time() - checked > limits.NODE_CHECK_INTERVAL:
-                checked = self._loop.time()
-                if self._mirror.dead and (self._revival is None or self._revival.done()):
-                    self._revival = start_task(self._revive(dict(self._mirror.dead)), "ask for nodes that left")
             if self._problem or not self._writes:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout_at(self._next_poll):
@@ -526,10 +527,12 @@ class ExternalCore(Core):
         self._mirror.mark_dead(node, api)
         self._report_changes()
 
-    async def _revive(self, dead: Mapping[str, str]) -> None:
+    async def _revive(self) -> None:
         """Check whether nodes that were taken for dead accept connections, and restore those that do."""
-        for node, api in dead.items():
-            if not await refuses(api) and self._mirror.dead.get(node) == api:
-                _log.info("= node %s at %s lives after all", node, api)
-                del self._mirror.dead[node]
-                self._seen = b""
+        while True:
+            await sleep_to_tick(limits.NODE_CHECK_INTERVAL)
+            for node, api in list(self._mirror.dead.items()):
+                if not await refuses(api) and self._mirror.dead.get(node) == api:
+                    _log.info("= node %s at %s lives after all", node, api)
+                    del self._mirror.dead[node]
+                    self._seen = b""

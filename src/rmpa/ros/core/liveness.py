@@ -1,53 +1,40 @@
-"""Which nodes live: the node at an address, pings, and the notices of changes to nodes."""
+"""Which nodes live, and the notices of changes to nodes."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
-import os
 import random
 import time
 from collections import OrderedDict, deque
 from dataclasses import dataclass
-from itertools import islice
 from typing import TYPE_CHECKING, Final, TypeAlias, cast
 
-from rmpa.core.errors import (
-    LocalProtocolError,
-    OutOfDescriptors,
-    PeerRefused,
-    RemoteProtocolError,
-    RmpaError,
-    UnreachableError,
-)
+from rmpa.core.errors import LocalProtocolError, OutOfDescriptors, RemoteProtocolError, UnreachableError
 from rmpa.core.timers import Backoff
 from rmpa.ros import limits
-from rmpa.ros.environment import NodeConnection, NodePing
-from rmpa.ros.http.rpc import call, call_api, connect, is_own_name, split_uri
-from rmpa.ros.node.service_client import ask_publisher
-from rmpa.ros.wire.slave_api import read_bus_info
-from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue
+from rmpa.ros.http.rpc import call, is_own_name, split_uri
+from rmpa.ros.node.ask import name_at, refuses, try_connect
+from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.accept import Use, is_shortage
+from rmpa.runtime.accept import Use
 from rmpa.runtime.kernel_tcp import ask_listening_ports
 from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
-from rmpa.runtime.tasks import end_tasks, keep_task, start_task
+from rmpa.runtime.tasks import OwnedTasks, end_tasks, keep_task, start_task
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable
 
-    from rmpa.core.statistics import Counters
+    from rmpa.ros.core.external import Core
     from rmpa.ros.master.parameters import SlaveCall
-    from rmpa.ros.master.registrations import Registrations
 
 _log = logging.getLogger(__name__)
 
 # Time between the two refused connects that prove a node dead: it may be restarting its server.
 NODE_RECHECK_DELAY: Final = 0.2
 
-# Time for a connection that only shows that a node is there.
-_CONNECT_TIMEOUT: Final = 3.0
 # Nodes that died and are remembered: those who look once in some seconds learn of each.
 _DIED: Final = 64
 # Concurrent attempts to reach unreachable nodes: each may hold a thread of the resolver for seconds.
@@ -58,50 +45,11 @@ _NOTIFY_COALESCE: Final = 64
 _NOTIFY_RETRY_FIRST: Final = 0.2
 # The longest pause between attempts, while the node is registered.
 _NOTIFY_RETRY_MAX: Final = 3.0
-# Seconds between two checks whether a node that was asked to end has ended.
-_NODE_KILL_LOOK: Final = 0.2
-# Connections of one node that are told: some 80 kB in one answer, and more than can be read.
-_NODE_CONNECTIONS_SHOWN: Final = 500
 
-_CALLER_ID: Final = "/rmpa_identify"
-_TOPICS_ASKED: Final = 2
+# Slave APIs whose ports are remembered: those of the nodes of some large modules.
+_LOCAL_PORTS_MAX: Final = 16_384
 # Wake-ups in one interval over which the connects to nodes are spread.
 _PORTIONS: Final = 10
-
-
-async def name_at(api: str, topics: Sequence[str] = ()) -> str | None:
-    """Ask the node with this slave API for its name.
-
-    rospy has ``getName``. roscpp has not, but sends its name in the header of every topic that it publishes, and
-    every node publishes ``/rosout``.
-
-    Args:
-        api: The slave API's URI.
-        topics: Other topics that the node may publish.
-
-    Returns:
-        Its name, or ``None`` if it cannot be found out.
-
-    Raises:
-        UnreachableError: The slave API does not answer.
-    """
-    try:
-        reply = await call_api(api, "getName", _CALLER_ID, use=Use.CORE)
-    except (RosFault, RemoteProtocolError):
-        pass
-    else:
-        if reply.code == 1 and isinstance(reply.value, str):
-            return reply.value
-    for topic in dict.fromkeys(["/rosout", *topics][:_TOPICS_ASKED]):
-        try:
-            async with asyncio.timeout(limits.SLAVE_CALL_TIMEOUT):
-                fields = await ask_publisher(api, topic, _CALLER_ID, Use.CORE)
-        except (RosFault, RemoteProtocolError, OSError) as error:
-            _log.debug("= %s does not tell its name for %s: %s", api, topic, error)
-            continue
-        if fields is not None and "callerid" in fields:
-            return fields["callerid"]
-    return None
 
 
 # Nodes that died without unregistering. A killed node leaves its registrations behind, and roscpp does so even on
@@ -151,8 +99,6 @@ class Liveness:
         # The latest call of ``ask_listening_ports`` in a thread.
         self._ports: asyncio.Future[set[int] | None] | None = None
         self._closed = False
-        # The port of each slave API on this machine; ``None`` of the others.
-        self._local_ports: dict[str, int | None] = {}
         self.unreachable: dict[str, Unreachable] = {}
         self.died: deque[tuple[str, float]] = deque(maxlen=_DIED)
         self._slow = asyncio.Semaphore(_NODE_UNREACHABLE_CHECKS)
@@ -195,10 +141,9 @@ class Liveness:
         """The nodes that the kernel's table does not prove to live; the others are noted as reached."""
         nodes = self._nodes()
         self.unreachable = {node: found for node, found in self.unreachable.items() if nodes.get(node) == found.api}
-        before, self._local_ports = self._local_ports, {}
         silent = []
         for node, api in yielding_to_data(nodes.items()):
-            port = self._local_ports[api] = before[api] if api in before else _local_port(api)
+            port = _local_port(api)
             if ports is not None and port in ports:
                 self.tried(node, api, "", 0.0)
             else:
@@ -244,6 +189,7 @@ class Liveness:
             _log.warning(text, node, api, problem)
 
 
+@functools.lru_cache(maxsize=_LOCAL_PORTS_MAX)
 def _local_port(api: str) -> int | None:
     """The port of a slave API that is on this machine by its name; ``None`` of another one."""
     try:
@@ -251,120 +197,6 @@ def _local_port(api: str) -> int | None:
     except UnreachableError:
         return None  # the attempt to connect reports the reason
     return port if is_own_name(host) or host.startswith("127.") else None
-
-
-async def refuses(api: str) -> bool:
-    """Whether connects to a slave API are refused; ``False`` where that cannot be found out."""
-    try:
-        await try_connect(api)
-    except OutOfDescriptors:
-        pass
-    except ConnectionRefusedError:
-        return True
-    return False
-
-
-async def try_connect(api: str) -> str:
-    """Connect to a slave API and close the connection; return why it cannot be reached, or an empty text.
-
-    Raises:
-        ConnectionRefusedError: Nothing listens at that address.
-        OutOfDescriptors: No file descriptor is left for the attempt.
-    """
-    try:
-        host, port, _ = split_uri(api)
-        async with asyncio.timeout(_CONNECT_TIMEOUT):
-            sock = await connect(host, port, Use.CORE)
-    except ConnectionRefusedError:
-        raise
-    except TimeoutError:
-        return f"no answer in {_CONNECT_TIMEOUT:g} s"
-    except UnreachableError as error:
-        return error.remedy or str(error)
-    except OSError as error:
-        if is_shortage(error):
-            raise OutOfDescriptors("node", api) from error
-        return os.strerror(error.errno) if error.errno else str(error)
-    sock.close()
-    return ""
-
-
-async def ping_node(node: str, uri: str, caller_id: str) -> NodePing:
-    """Ask a node for its process id, and measure the time of the call.
-
-    Args:
-        node: Its name, for errors.
-        uri: Its slave API.
-        caller_id: The asking node's name.
-
-    Raises:
-        UnreachableError: The node does not answer.
-        PeerRefused: The node answers with an error.
-        RemoteProtocolError: The answer is malformed.
-    """
-    loop = asyncio.get_running_loop()
-    begin = loop.time()
-    reply = await _call(node, uri, "getPid", caller_id)
-    if reply.code != 1 or not isinstance(reply.value, int):
-        raise PeerRefused(node, reply.status or "it does not say its process id")
-    return NodePing(uri=uri, time=loop.time() - begin, pid=reply.value)
-
-
-async def node_connections(uri: str, caller_id: str, names: Mapping[str, str]) -> tuple[NodeConnection, ...] | None:
-    """Ask a node for its connections; ``None`` if it does not answer.
-
-    Args:
-        uri: Its slave API.
-        caller_id: The asking node's name.
-        names: Nodes by their slave APIs: of a publisher a subscriber knows that address alone.
-    """
-    try:
-        links = read_bus_info(await call(uri, "getBusInfo", caller_id))
-    except (RmpaError, RosFault):
-        return None
-    found = (NodeConnection(one.topic, one.inbound, names.get(one.other, one.other), one.connected) for one in links)
-    return tuple(islice(found, _NODE_CONNECTIONS_SHOWN))
-
-
-async def end_node(node: str, uri: str, caller_id: str, reason: str) -> bool:
-    """Ask a node to end, and wait up to ``limits.NODE_KILL_WAIT`` until it has.
-
-    Args:
-        node: Its name, for errors.
-        uri: Its slave API.
-        caller_id: The asking node's name.
-        reason: For the node's log.
-
-    Returns:
-        Whether nothing listens at its slave API any more.
-
-    Raises:
-        UnreachableError: The node does not answer, and its port does not refuse connections.
-        PeerRefused: The node refuses.
-        RemoteProtocolError: The answer is malformed.
-    """
-    try:
-        reply = await _call(node, uri, "shutdown", caller_id, reason)
-    except (UnreachableError, RemoteProtocolError):
-        # A node may end before it answers.
-        if not await refuses(uri):
-            raise
-        return True
-    if reply.code != 1:
-        raise PeerRefused(node, reply.status or "it does not end")
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(limits.NODE_KILL_WAIT):
-            while not await refuses(uri):  # noqa: ASYNC110 - the port of another process
-                await asyncio.sleep(_NODE_KILL_LOOK)
-            return True
-    return False
-
-
-async def _call(node: str, uri: str, method: str, *params: str) -> RosReply:
-    try:
-        return await call_api(uri, method, *params)
-    except RosFault as error:
-        raise PeerRefused(node, error.text) from error
 
 
 # The master's calls of slaves. rosmaster has three threads for all slaves, so three stopped nodes stop every
@@ -383,17 +215,14 @@ class Notifier:
     """One queue for each slave API, emptied by a task that runs while there is something in it.
 
     Args:
-        registrations: The master's tables: a failed notification is not sent again once no node has its slave API.
-        suspect: Called with each node of a slave API that did not answer: it may be dead.
-        counters: ``notify.sent``, ``notify.failed``, ``notify.dropped``.
+        core: The master's core. A failed notification is not sent again once no node has its slave API; each node of
+            one that did not answer may be dead. Counts ``notify.sent``, ``notify.failed`` and ``notify.dropped``.
     """
 
-    def __init__(self, registrations: Registrations, suspect: Callable[[str], None], counters: Counters) -> None:
-        self._registrations = registrations
-        self._suspect = suspect
-        self._counters = counters
+    def __init__(self, core: Core) -> None:
+        self._core = core
         self._queues: dict[str, _Queue] = {}
-        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._tasks = OwnedTasks()
         self._closed = False
         self._serial = 0
 
@@ -402,7 +231,10 @@ class Notifier:
         if self._closed:
             return
         api, method, name, value = slave_call
-        queue = self._queues.setdefault(api, OrderedDict())
+        queue = self._queues.get(api)
+        if queue is None:
+            queue = self._queues[api] = OrderedDict()
+            self._tasks.start(self._empty(api, queue), f"notify {api}")
         number = 0
         if method == "paramUpdate" and len(queue) < _NOTIFY_COALESCE:
             number = self._serial = self._serial + 1
@@ -411,14 +243,12 @@ class Notifier:
         queue[method, name, number] = value
         if len(queue) > limits.NOTIFY_QUEUE_MAX:
             del queue[next(iter(queue))]
-            self._counters.add("notify.dropped")
-        if api not in self._tasks:
-            self._tasks[api] = start_task(self._empty(api, queue), f"notify {api}")
+            self._core.counters.add("notify.dropped")
 
     async def close(self) -> None:
         """Stop at once; queued notifications are not sent."""
         self._closed = True
-        await end_tasks(*self._tasks.values())
+        await self._tasks.close()
 
     async def _empty(self, api: str, queue: _Queue) -> None:
         backoff = Backoff(_NOTIFY_RETRY_FIRST, _NOTIFY_RETRY_MAX, random.random)
@@ -430,7 +260,7 @@ class Notifier:
                     backoff.reset()
                 elif method == "shutdown":
                     continue
-                elif not self._registrations.nodes_at(api):
+                elif not self._core.registrations.nodes_at(api):
                     queue.clear()
                 else:
                     if key not in queue:
@@ -438,7 +268,7 @@ class Notifier:
                         queue.move_to_end(key, last=False)
                     await asyncio.sleep(backoff.delay())
         finally:
-            del self._queues[api], self._tasks[api]
+            del self._queues[api]
 
     async def _sent(self, api: str, method: str, name: str, value: XmlRpcValue) -> bool:
         """Send one; return whether it need not be sent again."""
@@ -450,26 +280,26 @@ class Notifier:
                 # Given up earlier it might be carried out behind the next one, which is newer.
                 await call(api, method, MASTER_ID, name, value, timeout=limits.TCPROS_CONNECT_TIMEOUT, use=Use.CORE)
         except (UnreachableError, RosFault, RemoteProtocolError, LocalProtocolError) as error:
-            self._counters.add("notify.failed")
+            self._core.counters.add("notify.failed")
             # A shortage is this process's, and is reported elsewhere: the node may be well.
             short = isinstance(error, OutOfDescriptors)
             _log.log(logging.DEBUG if short else logging.INFO, "! %s: %s", api, error)
             if isinstance(error, UnreachableError) and not short:
-                for node in self._registrations.nodes_at(api):
-                    self._suspect(node)
+                for node in self._core.registrations.nodes_at(api):
+                    self._core.suspect(node)
             # Else the node got it, or never will: sending again would not help.
             return not isinstance(error, UnreachableError)
-        self._counters.add("notify.sent")
+        self._core.counters.add("notify.sent")
         return True
 
     async def _shut_down(self, api: str, node: str, topics: XmlRpcValue) -> None:
         """Ask a node whose name another node has taken to end, unless its address is another node's by now."""
         found = await name_at(api, cast("list[str]", topics))
         if found is None:
-            found = next(iter(self._registrations.nodes_at(api)), None)
+            found = next(iter(self._core.registrations.nodes_at(api)), None)
         if found is not None and found != node:
             _log.info("= %s is not asked to end: %s is at %s now", node, found, api)
-            self._counters.add("notify.stale")
+            self._core.counters.add("notify.stale")
             return
         _log.warning("> %s at %s is asked to end: another node has its name [node-killed]", node, api)
         await call(api, "shutdown", MASTER_ID, f"[{node}] Reason: new node registered with same name", use=Use.CORE)

@@ -21,10 +21,10 @@ import msgspec
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.ros import limits
-from rmpa.ros.core.liveness import name_at
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.master.parameters import RegistrationKind
-from rmpa.ros.master.registrations import Name, NodeRecord  # noqa: TC001 - msgspec reads the annotations
+from rmpa.ros.master.registrations import Name, NodeRecord
+from rmpa.ros.node.ask import IDENTIFY_ID, name_at
 from rmpa.ros.wire.xmlrpc import RosFault, serialize_response
 from rmpa.runtime.accept import in_thread
 from rmpa.runtime.files import replace_file, set_aside
@@ -48,7 +48,6 @@ CORE_STATE_RETRY: Final = 5.0
 # The longest pause after a write, in seconds.
 _CORE_STATE_REST: Final = 10.0
 _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
-_CALLER_ID: Final = "/rmpa_identify"
 _SIMULATED: Final = "use_sim_time"
 # A MessagePack extension: XML-RPC's dates have no time zone, and MessagePack's have one.
 _DATE: Final = 1
@@ -440,14 +439,10 @@ def _keys(node: NodeRecord, kind: RegistrationKind) -> set[str]:
 async def _listed(api: str, method: str) -> dict[str, str] | None:
     """The topics and types of a node's own list; ``None`` if it does not tell."""
     try:
-        reply = await call_api(api, method, _CALLER_ID)
+        reply = await call_api(api, method, IDENTIFY_ID)
     except (RosFault, RemoteProtocolError):
         return None
-    if reply.code != 1 or not isinstance(reply.value, list):
+    try:
+        return dict(msgspec.convert(reply.value, list[tuple[Name, str]])) if reply.code == 1 else None
+    except msgspec.ValidationError:
         return None
-    entries = (entry for entry in reply.value if isinstance(entry, list) and len(entry) == 2)
-    return {
-        topic: kind
-        for topic, kind in entries
-        if isinstance(topic, str) and isinstance(kind, str) and topic.startswith("/")
-    }

@@ -14,23 +14,22 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
-import ipaddress
 import logging
 import socket
 import struct
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Coroutine, Generator
 from itertools import islice
-from typing import Final
+from typing import Any, Final
 
-from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, StartError
+from rmpa.core.errors import RemoteProtocolError, StartError
 from rmpa.core.limits import KIB
 from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import read_large, slices
-from rmpa.ros.wire.http import CONTINUE, HttpRefusal, HttpRequest, RequestParser, response_head
-from rmpa.ros.wire.xmlrpc import DocumentReader, RosFault, XmlRpcValue, brief, response_pieces, serialize_fault
+from rmpa.ros.wire.http import CONTINUE, HttpRequest, RequestParser, response_head
+from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, brief, response_pieces, serialize_fault
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import DESCRIPTORS, Acceptor, Use, open_files_advice
 from rmpa.runtime.kernel_tcp import program_at
@@ -57,10 +56,10 @@ _PIECE: Final = 16 * KIB
 # Seconds; the least duration in the pace of a call.
 _MOMENT: Final = 1e-3
 
-# ``(method, params, address of the client) -> value``, at once or awaited.
+# ``(method, params) -> value``, at once or awaited.
 #
 # A ``RosFault`` raised becomes a fault. ``ResetConnection``, raised at once, resets the connection.
-Handler = Callable[[str, tuple[XmlRpcValue, ...], str], XmlRpcValue | Awaitable[XmlRpcValue]]
+Handler = Callable[[str, tuple[XmlRpcValue, ...]], XmlRpcValue | Awaitable[XmlRpcValue]]
 
 
 class ResetConnection(Exception):  # noqa: N818 - the name says what the handler wants
@@ -75,6 +74,7 @@ class HttpConnection(asyncio.Protocol):
 
     Attributes:
         client: The client's address.
+        requests: Parses what is received.
         begun: When the call began that is unfinished, or whose answer is not read yet, by the loop's clock.
     """
 
@@ -89,38 +89,23 @@ class HttpConnection(asyncio.Protocol):
     def __init__(self, server: XmlRpcServer) -> None:
         self._server = server
         self._loop = asyncio.get_running_loop()
-        self._requests = RequestParser(lambda size: server.reserve(self, size), self._begin)
-        self._waiting: deque[HttpRequest | HttpRefusal] = deque()
+        self.requests = RequestParser(lambda size: server.reserve(self, size), self._begin)
+        self._waiting: deque[HttpRequest] = deque()
         self.begun = self._loop.time()
 
     @property
     def idle(self) -> bool:
         """Whether no request is being received or answered, and no answer is unread."""
-        return not (self.receiving or self._waiting or self._task or self.pending)
+        return not (self.requests.receiving or self._waiting or self._task or self._transport.get_write_buffer_size())
 
     @property
     def answering(self) -> bool:
         """Whether a call is being answered."""
         return self._task is not None
 
-    @property
-    def receiving(self) -> bool:
-        """Whether a part of a request is received, and the rest is not."""
-        return self._requests.receiving
-
-    @property
-    def reserved(self) -> int:
-        """Bytes reserved for the connection's call."""
-        return self._requests.body.reserved
-
-    @property
-    def pending(self) -> int:
-        """Bytes of answers that wait to be sent, because the client does not read them."""
-        return self._transport.get_write_buffer_size()
-
     def pace(self, now: float) -> float:
         """Bytes a second of an unfinished call; 0 for a client that does not read its answer."""
-        received = self._requests.body.size if self.receiving else 0
+        received = self.requests.size if self.requests.receiving else 0
         return received / max(now - self.begun, _MOMENT)
 
     def slow(self, now: float) -> bool:
@@ -142,7 +127,7 @@ class HttpConnection(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - asyncio's interface
         """Give up the call that is being answered."""
         self._server.remove(self)
-        self._requests.close()
+        self.requests.close()
         for pending in (self._timer, self._task, self._more):
             if pending is not None:
                 pending.cancel()
@@ -188,7 +173,7 @@ class HttpConnection(asyncio.Protocol):
         if self._task is not None:
             self._expect(limits.HTTP_IDLE_TIMEOUT)
             return
-        if self.receiving:
+        if self.requests.receiving:
             self._server.refuse("http.timeout", self, "a request was not finished in time")
         self.abort()
 
@@ -208,63 +193,65 @@ class HttpConnection(asyncio.Protocol):
                     break
             elif self._unread:
                 piece, self._unread = self._unread[:_PIECE], self._unread[_PIECE:]
-                self._waiting += self._requests.feed(piece)
-                if self._requests.expects_continue and not self._waiting:
-                    self._requests.expects_continue = False
+                self._waiting += self.requests.feed(piece)
+                if self.requests.expects_continue and not self._waiting:
+                    self.requests.expects_continue = False
                     self._transport.write(CONTINUE)
                 if not self._waiting:
                     yield_to_data()
             elif self._eof:
-                self._waiting += self._requests.feed_eof()
+                self._waiting += self.requests.feed_eof()
                 if not self._waiting:
                     self.close_when_answered()
             else:
                 break
         self._adjust_reading()
 
-    def _take(self, request: HttpRequest | HttpRefusal) -> None:
-        if isinstance(request, HttpRefusal):
+    def _take(self, request: HttpRequest) -> None:
+        self._closing = request.close
+        if request.refusal:
+            self._server.refuse(request.counter, self, request.refusal)
+        if request.status != 200:
             self._reject(request)
             return
-        self._closing = request.close
         self._server.touch(self)
         if request.refusal:
-            self._server.refuse("http.too_large", self, request.refusal)
             self._reply(serialize_fault(-1, request.refusal))
             return
         yield_to_data()
         answer = self._server.answer(request.body, self)
-        yield_to_data()
-        if isinstance(answer, bytes):
-            self._reply(answer)
+        try:
+            answer.send(None)
+        except StopIteration as end:
+            yield_to_data()
+            self._reply(end.value)
         else:
-            self._task = start_task(self._wait(answer), "answer a call")
+            self._task = start_task(self._wait(_Begun(answer)), "answer a call")
 
     async def _wait(self, answer: Awaitable[bytes]) -> None:
+        await asyncio.sleep(0)  # at which it has stopped
         body = await answer
         self._task = None
         self._reply(body)
         self._advance()
 
     def _reply(self, body: bytes) -> None:
-        self._requests.body.reserved = 0
+        self.requests.reserved = 0
         if self._transport.is_closing():
             return
         self._transport.write(response_head(200, len(body), close=self._closing) + body)
         if self._closing:
             self._close()
         else:
-            self._expect(limits.HTTP_REQUEST_TIMEOUT if self.receiving else limits.HTTP_IDLE_TIMEOUT)
+            self._expect(limits.HTTP_REQUEST_TIMEOUT if self.requests.receiving else limits.HTTP_IDLE_TIMEOUT)
 
-    def _reject(self, refusal: HttpRefusal) -> None:
+    def _reject(self, request: HttpRequest) -> None:
         """Answer with an HTTP error and half-close; reading goes on for a moment: closing would lose the answer."""
-        self._server.refuse(refusal.counter, self, refusal.text)
-        self._closing = True
         if not self._transport.is_closing():
-            body = f"{refusal.text}\n".encode()
-            self._transport.write(response_head(refusal.status, len(body), close=True) + body)
+            body = f"{request.refusal}\n".encode()
+            self._transport.write(response_head(request.status, len(body), close=True) + body)
             self._transport.write_eof()
-            self._requests.receiving = False
+            self.requests.receiving = False
             self._expect(runtime_limits.DRAIN_TIMEOUT)
 
     def close_when_answered(self) -> None:
@@ -414,8 +401,8 @@ class XmlRpcServer:
         The slowest other calls are closed for it.
         """
         now = asyncio.get_running_loop().time()
-        while sum(one.reserved for one in self._connections) + size > limits.HTTP_BODIES_MAX:
-            slow = [one for one in self._connections if one.reserved and not one.answering and one.slow(now)]
+        while sum(one.requests.reserved for one in self._connections) + size > limits.HTTP_BODIES_MAX:
+            slow = [one for one in self._connections if one.requests.reserved and not one.answering and one.slow(now)]
             slowest = min(slow, key=lambda one: one.pace(now), default=connection)
             if slowest is connection:
                 return False
@@ -439,86 +426,59 @@ class XmlRpcServer:
         now = asyncio.get_running_loop().time()
         self._refusals.refuse(now, name, connection.client, f"{self._name}: {connection.client}: {text}")
 
-    def answer(self, body: memoryview, connection: HttpConnection) -> bytes | Awaitable[bytes]:
-        """Answer one call: at once, unless the handler has to wait, or there is much to read or write."""
-        if len(body) > limits.HTTP_BODY_INLINE:
-            return self._answer_large(body, connection)
-        reader = DocumentReader()
-        try:
-            for piece in slices(body):
-                reader.feed(piece)
-                yield_to_data()
-            method, params = reader.call()
-        except RemoteProtocolError as error:
-            return self._malformed(error, connection)
-        return self._dispatch(method, params, connection)
-
-    async def _answer_large(self, body: memoryview, connection: HttpConnection) -> bytes:
+    async def answer(self, body: memoryview, connection: HttpConnection) -> bytes:
+        """Answer one call: without waiting, unless the handler has to wait, or there is much to read or write."""
         try:
             method, params = (await read_large(slices(body))).call()
         except RemoteProtocolError as error:
-            return self._malformed(error, connection)
-        answer = self._dispatch(method, params, connection)
-        return answer if isinstance(answer, bytes) else await answer
-
-    def _malformed(self, error: RemoteProtocolError, connection: HttpConnection) -> bytes:
-        self.refuse("xmlrpc.malformed", connection, f"refused a call: {error}")
-        return serialize_fault(1, str(error))
-
-    def _dispatch(
-        self, method: str, params: tuple[XmlRpcValue, ...], connection: HttpConnection
-    ) -> bytes | Awaitable[bytes]:
+            self.refuse("xmlrpc.malformed", connection, f"refused a call: {error}")
+            return serialize_fault(1, str(error))
         self.counters.add("xmlrpc.calls")
         if _log.isEnabledFor(logging.DEBUG):
             _log.debug("< %s %s%s", connection.client, method, brief(params))
         try:
-            value = self._handler(method, params, connection.client)
+            value = self._handler(method, params)
+            if isinstance(value, Awaitable):
+                await asyncio.sleep(0)  # so that a task awaits it: see ``_take``
+                value = await value
+            return await _written(value)
         except ResetConnection:
             connection.reset()
             return b""
+        except RosFault as fault:
+            return serialize_fault(fault.number, fault.text)
         except Exception as error:  # noqa: BLE001 - the top of a call: the caller gets an answer in any case
-            return self._failed(method, error)
-        if isinstance(value, Awaitable):
-            return self._answer_later(method, value)
-        return self._respond(method, value)
+            self.counters.add("xmlrpc.failed")
+            _log.error("! %s: %s failed", self._name, method, exc_info=error)
+            return serialize_fault(1, f"{method} failed here: {type(error).__name__}: {error}")
 
-    async def _answer_later(self, method: str, value: Awaitable[XmlRpcValue]) -> bytes:
-        try:
-            answer = self._respond(method, await value)
-        except Exception as error:  # noqa: BLE001 - as above
-            return self._failed(method, error)
-        return answer if isinstance(answer, bytes) else await answer
 
-    def _respond(self, method: str, value: XmlRpcValue) -> bytes | Awaitable[bytes]:
-        written: list[bytes] = []
-        size = 0
-        rest = response_pieces(value)
-        try:
-            for piece in rest:
-                written.append(piece)
-                size += len(piece)
-                if size > limits.HTTP_BODY_INLINE:
-                    return self._respond_large(method, written, rest)
-                yield_to_data()
-        except LocalProtocolError as error:
-            return self._failed(method, error)
-        return b"".join(written)
+async def _written(value: XmlRpcValue) -> bytes:
+    """The document of a response; other callbacks run between the pieces of a large one.
 
-    async def _respond_large(self, method: str, written: list[bytes], rest: Iterator[bytes]) -> bytes:
-        try:
-            for piece in rest:
-                written.append(piece)
-                await asyncio.sleep(0)
-        except LocalProtocolError as error:
-            return self._failed(method, error)
-        return b"".join(written)
+    Raises:
+        LocalProtocolError: The value cannot be written.
+    """
+    pieces: list[bytes] = []
+    size = 0
+    for piece in response_pieces(value):
+        pieces.append(piece)
+        size += len(piece)
+        if size > limits.HTTP_BODY_INLINE:
+            await asyncio.sleep(0)
+        else:
+            yield_to_data()
+    return b"".join(pieces)
 
-    def _failed(self, method: str, error: Exception) -> bytes:
-        if isinstance(error, RosFault):
-            return serialize_fault(error.number, error.text)
-        self.counters.add("xmlrpc.failed")
-        _log.error("! %s: %s failed", self._name, method, exc_info=error)
-        return serialize_fault(1, f"{method} failed here: {type(error).__name__}: {error}")
+
+class _Begun:
+    """A coroutine that has stopped at an ``asyncio.sleep(0)``, to be awaited for the rest of it."""
+
+    def __init__(self, coroutine: Coroutine[Any, Any, bytes]) -> None:
+        self._coroutine = coroutine
+
+    def __await__(self) -> Generator[Any, None, bytes]:
+        return self._coroutine.__await__()
 
 
 async def listen(name: str, host: str, port: int, use: Use) -> socket.socket:
@@ -529,7 +489,7 @@ async def listen(name: str, host: str, port: int, use: Use) -> socket.socket:
     """
     try:
         address = host, port
-        if not _is_numeric(host):
+        if host.strip("0123456789."):  # a name
             loop = asyncio.get_running_loop()
             found = await loop.getaddrinfo(host, port, family=socket.AF_INET, type=socket.SOCK_STREAM)
             address = str(found[0][4][0]), port
@@ -554,11 +514,3 @@ async def listen(name: str, host: str, port: int, use: Use) -> socket.socket:
         problem = problems.get(error.errno or 0, (error.strerror or str(error), ""))
         raise StartError(f"{name} at {host}:{port}", *problem, code="port-in-use") from error
     return sock
-
-
-def _is_numeric(host: str) -> bool:
-    try:
-        ipaddress.IPv4Address(host)
-    except ValueError:
-        return not host
-    return True

@@ -131,7 +131,7 @@ class MasterApi:
         if method == "system.listMethods":
             return sorted([*self._methods, "system.listMethods", "system.multicall"])
         if method != "system.multicall":
-            return list(self.call(method, arguments))
+            return self.call(method, arguments)
         match arguments:
             case [list(calls)] | [tuple(calls)]:
                 return [self._one_of_many(call) for call in calls]

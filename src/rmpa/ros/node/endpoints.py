@@ -10,21 +10,22 @@ import time
 from collections import deque
 from collections.abc import Awaitable, Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rmpa.config import limits as config_limits
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
-from rmpa.ros.http.rpc import call_api
+from rmpa.ros.http.rpc import call, call_api
+from rmpa.ros.master.mirror import one_call
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.find import type_of_header
 from rmpa.ros.types.messages import HeaderNumbers, given_values
-from rmpa.ros.wire.tcpros import ANY, LENGTH, frame_message, printable
+from rmpa.ros.wire.tcpros import ANY, LENGTH, TopicDescription, frame_message, printable
 from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
@@ -35,20 +36,19 @@ if TYPE_CHECKING:
     from rmpa.ros.node.subscription import PublisherConnection
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.types.messages import MessageType, Plain
-    from rmpa.ros.wire.tcpros import Buffer, TopicDescription
+    from rmpa.ros.wire.tcpros import Buffer
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 _log = logging.getLogger(__name__)
 
 # Time in which an ending node unregisters everything; a master that hangs must not delay it longer.
 NODE_UNREGISTER_TIMEOUT: Final = 3.0
-# Concurrent calls to unregister, each on a connection of its own.
-NODE_UNREGISTER_AT_ONCE: Final = 16
 _REMEDY: Final = "start one (rmpa up, or roscore), or set ROS_MASTER_URI to one that runs"
 _CLOSED: Final = "{} is not published any more: its publisher is closed"
 
 Handler = Callable[[Any], "Awaitable[Any] | Any"]
 ParamCallback = Callable[[str, "XmlRpcValue"], None]
+_Entry = TypeVar("_Entry", "Publisher", "Subscriber", "Service")
 
 
 class MasterClient:
@@ -97,8 +97,8 @@ class MasterClient:
         except UnreachableError as error:
             raise UnreachableError("ROS master", f"{self.master_uri} (ROS_MASTER_URI)", _REMEDY) from error
 
-    async def _add(self, entry: Publisher | Subscriber | Service) -> None:
-        """Serve and register.
+    async def _add(self, entry: _Entry) -> _Entry:
+        """Serve and register; return the same.
 
         Raises:
             ValueError: The node has a publisher or service of that name already.
@@ -118,6 +118,7 @@ class MasterClient:
             if not isinstance(error, PeerRefused):  # the master may have registered it
                 self._unregistering.start(self._unregister(entry), f"unregister {entry.key}")
             raise
+        return entry
 
     def _check_open(self) -> None:
         if not self.uri:
@@ -153,24 +154,19 @@ class MasterClient:
             await self.call_master("subscribeParam", self.uri, key)
 
     async def _unregister_all(self) -> None:
-        """Unregister everything, concurrently and with one deadline for a slow master."""
+        """Unregister everything in one call, with one deadline for a slow master."""
         self._ended = True
-        at_once = asyncio.Semaphore(NODE_UNREGISTER_AT_ONCE)
-
-        async def unregister(method: str, *params: XmlRpcValue) -> None:
-            try:
-                async with at_once:
-                    await self.call_master(method, *params)
-            except RmpaError as error:
-                _log.debug("! %s: %s %s: %s", self.name, method, params, error)
-
-        calls = [unregister(f"unregister{entry.kind_name}", entry.key, entry.uri) for entry in self._entries]
-        calls += [unregister("unsubscribeParam", self.uri, key) for key in self._followed]
+        calls = [
+            one_call(f"unregister{entry.kind_name}", (self.name, entry.key, entry.uri)) for entry in self._entries
+        ]
+        calls += [one_call("unsubscribeParam", (self.name, self.uri, key)) for key in self._followed]
         try:
             async with asyncio.timeout(NODE_UNREGISTER_TIMEOUT):
-                await asyncio.gather(*calls, *self._unregistering)
-        except TimeoutError:
-            _log.debug("! %s: the master at %s is slow; not everything is unregistered", self.name, self.master_uri)
+                if calls:
+                    await call(self.master_uri, "system.multicall", calls)
+                await asyncio.gather(*self._unregistering)
+        except (RmpaError, TimeoutError) as error:
+            _log.debug("! %s: not everything is unregistered at %s: %s", self.name, self.master_uri, error)
 
 
 class Service:
@@ -485,7 +481,7 @@ class Subscriber:
         *,
         on_bytes: Callable[[memoryview, Mapping[str, str]], None] | None = None,
         type_name: str = ANY,
-        own_uri: str = "",
+        own: bool,
         accepts: Callable[[str], bool] | None = None,
         nodelay: bool,
         queue_messages: int,
@@ -506,16 +502,13 @@ class Subscriber:
         self._ended = False
         self.subscription = Subscription(
             topic,
-            node.name,
+            node.slave,
             on_message=self._message,
             on_refused=self._refused,
-            own_uri=own_uri,
+            own=own,
             accepts=accepts,
-            type_name=self.type_name,
-            md5sum=kind.md5sum if kind is not None else ANY,
-            definition=kind.definition if kind is not None else "",
+            wanted=kind.describe() if kind is not None else TopicDescription(type_name, ANY, ""),
             nodelay=nodelay,
-            number=node.slave.next_number,
         )
 
     @property

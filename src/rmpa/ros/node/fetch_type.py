@@ -9,21 +9,21 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
+
+import msgspec
 
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import is_own
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api
-from rmpa.ros.node.service_client import ask_publisher
+from rmpa.ros.node.ask import ask_publisher
 from rmpa.ros.types.definitions import UnknownTypeError
 from rmpa.ros.types.find import find_message_type, type_of_header
 from rmpa.ros.wire.tcpros import printable
 
 if TYPE_CHECKING:
     from rmpa.ros.types.messages import MessageType
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 _log = logging.getLogger(__name__)
 
@@ -31,24 +31,9 @@ _log = logging.getLogger(__name__)
 FETCH_TYPE_TIMEOUT: Final = 3.0
 
 
-@dataclass(frozen=True, slots=True)
-class FetchedType:
-    """A type from a publisher's header.
-
-    Args:
-        kind: The type.
-        topic: The publisher's topic.
-        node: The publisher's name.
-    """
-
-    kind: MessageType
-    topic: str
-    node: str
-
-
 async def fetch_type(
     master_uri: str, caller_id: str, name: str, *, topic: str = "", elsewhere: bool = True
-) -> FetchedType | None:
+) -> tuple[MessageType, str, str] | None:
     """Ask up to ``limits.FETCH_TYPE_PUBLISHERS`` publishers of a type for its definition, one after the other.
 
     Args:
@@ -59,7 +44,8 @@ async def fetch_type(
         elsewhere: Whether publishers of other topics are asked, too, after those of ``topic``.
 
     Returns:
-        ``None`` where no publisher of that type sent a definition.
+        The type, and the topic and the name of its publisher; ``None`` where no publisher of that type sent a
+        definition.
 
     Raises:
         UnreachableError: The master does not answer.
@@ -74,9 +60,9 @@ async def fetch_type(
         try:
             async with asyncio.timeout(FETCH_TYPE_TIMEOUT):
                 uri = str((await call_api(master_uri, "lookupNode", caller_id, node)).value)
-                header = await ask_publisher(uri, where, f"{caller_id}_learns") or {}
+                header = await ask_publisher(uri, where, f"{caller_id}_learns")
             if header.get("type") == name:
-                return FetchedType(await asyncio.to_thread(type_of_header, header), where, node)
+                return await asyncio.to_thread(type_of_header, header), where, node
         except (RmpaError, OSError) as error:
             _log.debug("! %s from %s: %s", name, node, printable(str(error)))
     return None
@@ -115,28 +101,22 @@ async def find_or_fetch(master_uri: str, caller_id: str, name: str, topic: str =
     except UnknownTypeError as error:
         if not error.fetchable:
             raise
-        unknown = error
-    learnt = await fetch_type(master_uri, caller_id, name, topic=topic)
-    if learnt is None:
-        unknown.problem += f"; no publisher at {master_uri} tells it"
-        raise unknown
-    _log.info("= %s is learnt from %s, which publishes %s", name, printable(learnt.node), printable(learnt.topic))
-    return learnt.kind
+        learnt = await fetch_type(master_uri, caller_id, name, topic=topic)
+        if learnt is None:
+            error.problem += f"; no publisher at {master_uri} tells it"
+            raise
+    kind, where, node = learnt
+    _log.info("= %s is learnt from %s, which publishes %s", name, printable(node), printable(where))
+    return kind
 
 
 async def _publishers(master_uri: str, caller_id: str, name: str) -> list[tuple[str, str]]:
     """(topic, node) pairs of all publishers of a type."""
     state = (await call_api(master_uri, "getSystemState", caller_id)).value
     types = (await call_api(master_uri, "getTopicTypes", caller_id)).value
-    topics = {str(pair[0]) for pair in _pairs(types) if pair[1] == name}
-    publishers = _pairs(state[0]) if isinstance(state, list) and state else []
-    return [
-        (str(topic), str(node))
-        for topic, nodes in publishers
-        if topic in topics and isinstance(nodes, list)
-        for node in nodes
-    ]
-
-
-def _pairs(value: XmlRpcValue) -> list[list[XmlRpcValue]]:
-    return [pair for pair in value if isinstance(pair, list) and len(pair) == 2] if isinstance(value, list) else []
+    try:
+        publishers = msgspec.convert(state, list[list[tuple[str, list[str]]]])[0]
+        topics = {topic for topic, kind in msgspec.convert(types, list[tuple[str, str]]) if kind == name}
+    except (msgspec.ValidationError, IndexError):  # a master that does not answer as one does
+        return []
+    return [(topic, node) for topic, nodes in publishers if topic in topics for node in nodes]

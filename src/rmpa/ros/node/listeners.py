@@ -1,7 +1,4 @@
-"""The sockets of nodes: one shared port, loopback addresses of proxies, and the TCPROS server.
-
-The addresses of this machine, from which a node chooses the one to register.
-"""
+"""The addresses of nodes: those of this machine, and a loopback address for each proxy at one pair of ports."""
 
 from __future__ import annotations
 
@@ -17,19 +14,14 @@ from typing import TYPE_CHECKING, Final
 import psutil
 
 from rmpa.core.errors import StartError
-from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.ros import limits
 from rmpa.ros.http.server import RESET, ResetConnection, XmlRpcServer
-from rmpa.ros.node.publication import AcceptedConnection
-from rmpa.ros.wire.tcpros import check_request, printable
-from rmpa.runtime.accept import DESCRIPTORS, Acceptor, Use, is_shortage, open_files_advice
+from rmpa.runtime.accept import DESCRIPTORS, Acceptor, Use
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator
 
-    from rmpa.ros.node.publication import Publication
-    from rmpa.ros.node.service_server import ServiceEndpoint
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
     # Takes ownership of an accepted, non-blocking socket; the second argument is the client's address.
@@ -42,8 +34,6 @@ SHARED_PROBE_TIMEOUT: Final = 1.0
 # Time before a freed loopback address is used again: three times the 20 s for which roscpp dials an old one.
 LOOPBACK_REST: Final = 60.0
 
-# Length of the listen queue: all subscribers of a restarted node connect at once.
-_TCPROS_BACKLOG: Final = 128
 # Listen queue of all proxies' one socket: all subscribers of a restarted agent connect at once.
 _SHARED_BACKLOG: Final = 4096
 
@@ -71,199 +61,22 @@ _SECOND: Final = 256
 _THIRD: Final = 254
 
 
-class LoopbackAddresses:
-    """The loopback addresses in use, and those freed a short while ago.
+def loopback_addresses(salt: str, name: str) -> Iterator[str]:
+    """The addresses that a node may have, the one that it prefers first; there are 16 million.
 
     An address is a hash of the node's name: it is the same after a restart, and hardly ever another node's, so a
-    client with an old address is refused instead of reaching the wrong node. A freed address is not used again for
-    ``LOOPBACK_REST``, even for the same node: rospy takes a URI that it has just lost for one that it still
-    has, and does not reconnect.
+    client with an old address is refused instead of reaching the wrong node.
 
     Args:
         salt: Distinguishes nodes of one name in several graphs of this machine, such as the master's URI.
+        name: The node's name.
     """
-
-    def __init__(self, salt: str) -> None:
-        self._salt = salt
-        self._used: set[str] = set()
-        self._resting: OrderedDict[str, float] = OrderedDict()
-
-    def __len__(self) -> int:
-        """Addresses in use."""
-        return len(self._used)
-
-    def take(self, name: str, now: float) -> str:
-        """Assign an address to a node.
-
-        Args:
-            name: The node's name.
-            now: Monotonic seconds.
-        """
-        self._release_rested(now)
-        # There are 16 million addresses, and far fewer nodes and resting ones (LOOPBACK_RESTING_MAX).
-        address = next(a for a in self._candidates(name) if a not in self._used and a not in self._resting)
-        self._used.add(address)
-        return address
-
-    def free(self, address: str, now: float) -> None:
-        """Free an address; nothing happens if it is not in use.
-
-        Args:
-            address: As ``take`` gave it.
-            now: Monotonic seconds.
-        """
-        if address in self._used:
-            self._used.remove(address)
-            self._resting[address] = now
-            self._release_rested(now)
-
-    def _release_rested(self, now: float) -> None:
-        """Release addresses that rested long enough, and the oldest of too many."""
-        while self._resting:
-            since = next(iter(self._resting.values()))
-            if now - since < LOOPBACK_REST and len(self._resting) <= limits.LOOPBACK_RESTING_MAX:
-                return
-            self._resting.popitem(last=False)
-
-    def _candidates(self, name: str) -> Iterator[str]:
-        for attempt in itertools.count():
-            text = f"{self._salt}\0{name}\0{attempt}"
-            number = int.from_bytes(hashlib.blake2s(text.encode(errors="backslashreplace"), digest_size=8).digest())
-            rest, third = divmod(number, _THIRD)
-            first, second = divmod(rest % (_FIRST * _SECOND), _SECOND)
-            yield f"127.{1 + first}.{second}.{1 + third}"
-
-
-# The listening TCPROS socket of one node. Passes each connection to the publication or service of its header.
-
-
-class TcprosServer:
-    """Accepts connections for the publications and services of one node.
-
-    Args:
-        name: The node's name, for the texts.
-        publications: By topic; read again at each header, so that the owner can change it.
-        counters: Count ``tcpros.refused.*``.
-        numbers: The numbers of connections, shared with the node's outgoing ones.
-        services: By name; read again at each header.
-
-    Attributes:
-        address: Where the socket listens.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        publications: Mapping[str, Publication],
-        *,
-        services: Mapping[str, ServiceEndpoint] | None = None,
-        counters: Counters | None = None,
-        numbers: Iterator[int] | None = None,
-    ) -> None:
-        self._name = name
-        self._publications = publications
-        self._services = services if services is not None else {}
-        self._refusals = RefusalLog(_log, counters if counters is not None else Counters())
-        self._numbers = numbers if numbers is not None else itertools.count(1)
-        self._acceptor: Acceptor | None = None
-        self._waiting: dict[AcceptedConnection, asyncio.TimerHandle] = {}
-        self._accepted: set[AcceptedConnection] = set()
-        self._forget_at = 16
-        self.address: tuple[str, int] = ("", 0)
-
-    def start(self, host: str = "127.0.0.1", port: int = 0) -> None:
-        """Listen; ``port`` 0 lets the system choose.
-
-        Raises:
-            StartError: The address cannot be used.
-        """
-        name = f"TCPROS server of {self._name}"
-        try:
-            with contextlib.ExitStack() as on_error:
-                family = socket.AF_INET6 if ":" in host else socket.AF_INET
-                sock = on_error.enter_context(DESCRIPTORS.open_socket(Use.DATA, family, what=name))
-                sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                sock.bind((host, port))
-                sock.listen(_TCPROS_BACKLOG)
-                on_error.pop_all()
-        except OSError as error:
-            problem = ("no file descriptors left", open_files_advice()) if is_shortage(error) else (str(error),)
-            raise StartError(f"{name} at {host}:{port}", *problem, code="port-in-use") from error
-        self.address = sock.getsockname()[:2]
-        self._acceptor = Acceptor(sock, self.adopt, name=name)
-        self._acceptor.start()
-
-    def close(self) -> None:
-        """Stop listening, and close the connections without a header; the owner closes the others."""
-        if self._acceptor is not None:
-            self._acceptor.close()
-            self._acceptor = None
-        waiting, self._waiting = self._waiting, {}
-        for connection, timer in waiting.items():
-            timer.cancel()
-            connection.close()
-        self._accepted.clear()  # breaks a reference cycle
-
-    def adopt(self, sock: socket.socket, _client: tuple[str, int]) -> None:
-        """Serve an accepted connection, of this server's own socket or of one that several nodes share.
-
-        Args:
-            sock: Non-blocking; owned from here on.
-        """
-        try:
-            connection = AcceptedConnection(sock, next(self._numbers), on_header=self._header, on_end=self._ended)
-        except OSError:  # the client has disconnected already
-            sock.close()
-            return
-        if len(self._accepted) >= min(self._forget_at, limits.TCPROS_CONNECTIONS_MAX):
-            # Closed connections, which publications do not report, may be half of all.
-            self._accepted = {one for one in self._accepted if not one.closed}
-            self._forget_at = 2 * len(self._accepted) + 16
-        if len(self._accepted) >= limits.TCPROS_CONNECTIONS_MAX or len(self._waiting) >= limits.TCPROS_HANDSHAKES_MAX:
-            self._refuse("full", connection, f"too many connections, one from {connection.peer[0]} closed")
-            connection.close()
-            return
-        self._accepted.add(connection)
-        self._waiting[connection] = asyncio.get_running_loop().call_later(
-            limits.TCPROS_HANDSHAKE_TIMEOUT, self._timed_out, connection
-        )
-
-    def _header(self, connection: AcceptedConnection) -> None:
-        self._waiting.pop(connection).cancel()
-        fields = connection.request
-        problem = check_request(fields)
-        if problem is not None:
-            self._refuse("header", connection, f"a connection from {connection.peer[0]}: {problem}")
-            connection.refuse(problem)
-            return
-        kind = "service" if "service" in fields else "topic"
-        name = fields[kind]
-        taker = self._services.get(name) if kind == "service" else self._publications.get(name)
-        if taker is not None:
-            taker.attach(connection)
-            return
-        # At debug level: the other node may have looked up something that is gone by now.
-        _log.debug("! %s: no %s %s", self._name, kind, printable(name))
-        verb = "does not offer the service" if kind == "service" else "is not a publisher of"
-        connection.refuse(f"[{self._name}] {verb} [{printable(name)}]")
-
-    def _ended(self, connection: AcceptedConnection, error: Exception | None) -> None:
-        """A connection ended before its header was complete, which is normal for rospy, or broke the protocol."""
-        timer = self._waiting.pop(connection, None)
-        if timer is not None:
-            timer.cancel()
-        if error is not None and not isinstance(error, OSError):
-            self._refuse("malformed", connection, f"a connection from {connection.peer[0]}: {error}")
-
-    def _timed_out(self, connection: AcceptedConnection) -> None:
-        del self._waiting[connection]
-        connection.close()
-        text = f"{connection.peer[0]} sent no header within {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s; closed"
-        self._refuse("silent", connection, text)
-
-    def _refuse(self, kind: str, connection: AcceptedConnection, text: str) -> None:
-        now = asyncio.get_running_loop().time()
-        self._refusals.refuse(now, f"tcpros.refused.{kind}", connection.peer[0], f"{self._name}: {text}")
+    for attempt in itertools.count():
+        text = f"{salt}\0{name}\0{attempt}"
+        number = int.from_bytes(hashlib.blake2s(text.encode(errors="backslashreplace"), digest_size=8).digest())
+        rest, third = divmod(number, _THIRD)
+        first, second = divmod(rest % (_FIRST * _SECOND), _SECOND)
+        yield f"127.{1 + first}.{second}.{1 + third}"
 
 
 # Two listening sockets for any number of nodes. Each node has a loopback address, all have the same two ports.
@@ -279,6 +92,9 @@ _DEVICE: Final = b"lo"
 class SharedListener:
     """The two sockets, and the nodes by address.
 
+    A freed address is not used again for ``LOOPBACK_REST``, even for the same node: rospy takes a URI that it has
+    just lost for one that it still has, and does not reconnect.
+
     Args:
         salt: Distinguishes nodes of one name in several graphs of this machine: the master's URI.
         counters: ``address.unknown.xmlrpc``, ``address.unknown.tcpros``: connections to addresses without a node.
@@ -290,7 +106,8 @@ class SharedListener:
     def __init__(self, salt: str, *, counters: Counters | None = None) -> None:
         self._counters = counters if counters is not None else Counters()
         self._salt = salt
-        self._addresses = LoopbackAddresses(salt)
+        # Addresses that were freed a short while ago, and when; the oldest first.
+        self._resting: OrderedDict[str, float] = OrderedDict()
         # By address: what takes the connections to the XML-RPC port, and those to the TCPROS port.
         self._nodes: dict[str, tuple[Adopt, Adopt]] = {}
         self._acceptors: list[Acceptor] = []
@@ -306,7 +123,7 @@ class SharedListener:
         try:
             self.ports = self._listen(0, "XML-RPC of the proxies"), self._listen(1, "TCPROS of the proxies")
             # Containers, sandboxes and firewalls differ, so one connection is tried.
-            await self._test_address(LoopbackAddresses(self._salt).take("", 0.0))
+            await self._test_address(next(loopback_addresses(self._salt, "")))
         except BaseException as error:
             await self.close()
             if isinstance(error, OSError):
@@ -322,7 +139,7 @@ class SharedListener:
         await self._strays.close()
 
     def attach(self, name: str, http: Adopt, tcpros: Adopt) -> str:
-        """Assign an address to a node; only between ``start()`` and ``close()``.
+        """Assign an address to a node.
 
         Args:
             name: The node's name.
@@ -332,14 +149,26 @@ class SharedListener:
         Returns:
             The address; the ports are ``ports``.
         """
-        address = self._addresses.take(name, asyncio.get_running_loop().time())
+        self._release_rested()
+        candidates = loopback_addresses(self._salt, name)
+        address = next(each for each in candidates if each not in self._nodes and each not in self._resting)
         self._nodes[address] = http, tcpros
         return address
 
     def detach(self, address: str) -> None:
-        """Free an address; the node closes its connections itself."""
-        self._nodes.pop(address, None)
-        self._addresses.free(address, asyncio.get_running_loop().time())
+        """Free an address; the node closes its connections itself. Nothing happens if no node has it."""
+        if self._nodes.pop(address, None) is not None:
+            self._resting[address] = asyncio.get_running_loop().time()
+            self._release_rested()
+
+    def _release_rested(self) -> None:
+        """Release addresses that rested long enough, and the oldest of too many."""
+        now = asyncio.get_running_loop().time()
+        while self._resting:
+            since = next(iter(self._resting.values()))
+            if now - since < LOOPBACK_REST and len(self._resting) <= limits.LOOPBACK_RESTING_MAX:
+                return
+            self._resting.popitem(last=False)
 
     def _listen(self, which: int, name: str) -> int:
         """Bind one of the two sockets and accept; return its port.
@@ -402,7 +231,7 @@ class SharedListener:
             del self._nodes[address]
 
 
-def _former_node(method: str, _params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
+def _former_node(method: str, _params: tuple[XmlRpcValue, ...]) -> XmlRpcValue:
     """Reset the connection, by which ``rosnode`` and others know a dead node; an error in the answer stops them.
 
     Answered are ``requestTopic``, which rospy repeats twice a minute after a reset until its process ends,

@@ -1,9 +1,20 @@
-"""The loggers of a node, asked and set by its two services, as rqt_logger_level does (wiki.ros.org/rosconsole)."""
+"""The log of a node: its records on ``/rosout``, and the two services of its loggers, served and called.
+
+Every roscpp and rospy node has both. With ``get_loggers`` and ``set_logger_level`` rqt_logger_level and ``rosservice
+call /rmpa/set_logger_level rmpa.mesh debug`` set the levels of a program's log while it runs
+(wiki.ros.org/rosconsole). The messages (roscpp/GetLoggers, roscpp/SetLoggerLevel) are serialized by hand, because the
+agent starts without the types' definitions.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import logging
 import re
+import sys
+from collections import deque
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -11,12 +22,31 @@ from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError, Unreac
 from rmpa.core.identity import OWN_NODE
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.service_client import ServiceConnection
-from rmpa.ros.node.slave_node import GET, LEVELS, SET, pack_text, read_texts
-from rmpa.ros.wire.tcpros import LENGTH
+from rmpa.ros.node.service_server import ServiceEndpoint
+from rmpa.ros.wire.tcpros import LENGTH, ServiceDescription, pack_text, printable
+from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
-    from rmpa.ros.wire.tcpros import Buffer
+    from collections.abc import Callable, Mapping
 
+    from rmpa.ros.node.endpoints import Publisher
+    from rmpa.ros.node.node import Node
+    from rmpa.ros.node.service_server import ServiceCall
+    from rmpa.ros.node.slave_node import SlaveNode
+    from rmpa.ros.wire.tcpros import Buffer
+    from rmpa.ros.wire.xmlrpc import RosReply
+
+_log = logging.getLogger(__name__)
+
+GET: Final = ServiceDescription("roscpp/GetLoggers", "32e97e85527d4678a8f9279894bb64b0")
+SET: Final = ServiceDescription("roscpp/SetLoggerLevel", "51da076440d78ca1684d36c868df61ea")
+LEVELS: Final = {
+    "debug": logging.DEBUG,
+    "info": logging.INFO,
+    "warn": logging.WARNING,
+    "error": logging.ERROR,
+    "fatal": logging.CRITICAL,
+}
 # Loggers of one node that are read.
 _LOGGERS_MAX: Final = 1000
 # Seconds that a node has to answer.
@@ -28,6 +58,57 @@ _OWN: Final = ("rosout", "ros")
 # Debian 12: the node crashes at the next use of its loggers (trap 43).
 _LOG4CXX: Final = re.compile(r"liblog4cxx\.so\.(\d+)")
 _LOG4CXX_SAFE: Final = 10
+_ROSOUT: Final = "/rosout"
+_LOG_TYPE: Final = "rosgraph_msgs/Log"
+# Records that wait for the connection of the core's /rosout; above it the oldest is dropped.
+_RECORDS_MAX: Final = 1000
+# Time in which the core's /rosout connects: what is published before that would be lost.
+_SUBSCRIBED_WITHIN: Final = 1.0
+# Time between two attempts to register at a master that does not answer.
+_RETRY: Final = 1.0
+
+
+def _level_of(number: int) -> int:
+    """The highest of ``LEVELS``, from 0 on, that is not above a level of Python's."""
+    return max(0, sum(level <= number for level in LEVELS.values()) - 1)
+
+
+def serve_loggers(node: SlaveNode, call: Callable[..., RosReply], loggers: Mapping[str, str]) -> None:
+    """Serve the two services of a node's loggers, and register them; the node listens already.
+
+    Args:
+        node: Serves them, until it is closed.
+        call: Calls the core's master.
+        loggers: The name of Python's logger, by the name that the services show.
+    """
+    for name, serve, description in (("get_loggers", _get, GET), ("set_logger_level", _set, SET)):
+        service = f"{node.name}/{name}"
+        node.add_service(ServiceEndpoint(service, node.name, partial(serve, loggers), description=description))
+        code, text, _ = call("registerService", node.name, service, node.service_uri, node.uri)
+        if code != 1:
+            _log.error("! the ROS core does not accept %s: %s [core-refuses]", service, text)
+
+
+def _get(loggers: Mapping[str, str], call: ServiceCall) -> None:
+    parts = [LENGTH.pack(len(loggers))]
+    for name, logger in loggers.items():
+        level = _level_of(logging.getLogger(logger).getEffectiveLevel())
+        parts += [pack_text(name), pack_text(list(LEVELS)[level])]
+    call.reply(True, b"".join(parts))
+
+
+def _set(loggers: Mapping[str, str], call: ServiceCall) -> None:
+    name, level = _texts(call.request, 2, "roscpp/SetLoggerLevelRequest")
+    logger, number = loggers.get(name), LEVELS.get(level.lower())
+    if logger is None:
+        node = call.service.rpartition("/")[0]
+        call.fail(f"{node} has no logger {printable(name)!r}; it has {', '.join(loggers)}")
+    elif number is None:
+        call.fail(f"{printable(level)!r} is not a level; there are {', '.join(LEVELS)}")
+    else:
+        _log.info("= %s sets the level of %s to %s", printable(call.caller_id), name, level.lower())
+        logging.getLogger(logger).setLevel(number)
+        call.reply(True, b"")
 
 
 async def read_levels(uri: str, api: str, node: str, caller: str) -> dict[str, str]:
@@ -104,5 +185,89 @@ def _read(body: Buffer) -> dict[str, str]:
     count = LENGTH.unpack_from(body)[0] if len(body) >= LENGTH.size else _LOGGERS_MAX + 1
     if count > _LOGGERS_MAX:
         raise RemoteProtocolError(f"{len(body)} bytes are not a {what} of at most {_LOGGERS_MAX} loggers")
-    texts = read_texts(memoryview(body)[LENGTH.size :], 2 * count, what)
+    texts = _texts(memoryview(body)[LENGTH.size :], 2 * count, what)
     return {name[:256]: level[:16].lower() for name, level in zip(texts[::2], texts[1::2], strict=True)}
+
+
+def _texts(raw: Buffer, count: int, what: str) -> list[str]:
+    """The strings of a message ``what`` that has so many, and nothing else.
+
+    Raises:
+        RemoteProtocolError: It is none.
+    """
+    found: list[str] = []
+    at = 0
+    while len(found) < count and at + LENGTH.size <= len(raw):
+        start = at + LENGTH.size
+        at = start + LENGTH.unpack_from(raw, at)[0]
+        found.append(str(raw[start:at], "utf-8", "replace"))
+    if at != len(raw) or len(found) != count:
+        raise RemoteProtocolError(f"{len(raw)} bytes are not a {what}")
+    return found
+
+
+class RosoutHandler(logging.Handler):
+    """Publishes records on ``/rosout``; records may come from any thread.
+
+    A program that does not configure ``logging`` sees them on standard error too.
+
+    Args:
+        node: The node; each message has the topics that it publishes.
+    """
+
+    def __init__(self, node: Node) -> None:
+        super().__init__()
+        self._node = node
+        self._loop = asyncio.get_running_loop()
+        self._waiting: deque[dict[str, object]] = deque(maxlen=_RECORDS_MAX)
+        self._publisher: Publisher | None = None
+        self._task: asyncio.Task[None] | None = None
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Publish a record."""
+        text = self.format(record)
+        if not logging.getLogger().handlers:
+            print(f"[{record.levelname}] [{record.created:.6f}]: {text}", file=sys.stderr)
+        fields: dict[str, object] = {
+            "header": {"stamp": record.created},
+            "level": 1 << _level_of(record.levelno),
+            "name": self._node.name,
+            "msg": text,
+            "file": record.pathname,
+            "function": record.funcName or "",
+            "line": record.lineno,
+        }
+        with contextlib.suppress(RuntimeError):  # the loop is closed: the program ends
+            self._loop.call_soon_threadsafe(self._take, fields)
+
+    async def drained(self) -> None:
+        """Wait until what has been logged is published, for a moment at the most."""
+        await asyncio.sleep(0)  # what other calls have put into the loop comes first
+        if self._task is not None:
+            await asyncio.wait([self._task], timeout=_SUBSCRIBED_WITHIN)
+            self._task.cancel()
+
+    def _take(self, fields: dict[str, object]) -> None:
+        self._waiting.append(fields)
+        if self._publisher is not None:
+            self._publish(self._publisher)
+        elif self._task is None:
+            self._task = keep_task(self._start, f"rosout of {self._node.name}")
+
+    async def _start(self) -> None:
+        publisher: Publisher | None = None
+        while publisher is None:
+            try:
+                publisher = await self._node.advertise(_ROSOUT, _LOG_TYPE, latch=True)
+            except RmpaError as error:
+                _log.debug("! %s: %s", self._node.name, error)
+                await asyncio.sleep(_RETRY)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_SUBSCRIBED_WITHIN):
+                await publisher.wait_for_subscriber()
+        self._publisher = publisher
+        self._publish(publisher)
+
+    def _publish(self, publisher: Publisher) -> None:
+        while self._waiting:
+            publisher.publish(topics=sorted(self._node.slave.publications()), **self._waiting.popleft())

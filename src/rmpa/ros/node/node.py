@@ -40,7 +40,7 @@ from rmpa.ros.node.endpoints import (
 )
 from rmpa.ros.node.fetch_type import find_here, find_or_fetch
 from rmpa.ros.node.listeners import local_addresses
-from rmpa.ros.node.rosout import RosoutHandler
+from rmpa.ros.node.loggers import RosoutHandler
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.types.find import find_service_type
@@ -206,9 +206,7 @@ class Node(MasterClient):
             kind = await find_or_fetch(self.master_uri, self.name, kind, resolved)
         description = kind if isinstance(kind, TopicDescription) else kind.describe(latching=latch)
         known = kind if isinstance(kind, MessageType) else None
-        publisher = Publisher(self, resolved, description, known, queue_messages)
-        await self._add(publisher)
-        return publisher
+        return await self._add(Publisher(self, resolved, description, known, queue_messages))
 
     async def subscribe(
         self,
@@ -255,13 +253,12 @@ class Node(MasterClient):
             callback,
             on_bytes=on_bytes,
             type_name=type_name,
-            own_uri="" if own else self.uri,
+            own=own,
             accepts=accepts,
             nodelay=nodelay,
             queue_messages=queue_messages,
         )
-        await self._add(subscriber)
-        return subscriber
+        return await self._add(subscriber)
 
     async def wait_for_message(
         self,
@@ -320,9 +317,7 @@ class Node(MasterClient):
         """
         resolved = self._resolve(name)
         kind = await asyncio.to_thread(find_service_type, kind) if isinstance(kind, str) else kind
-        service = Service(self, resolved, kind, handler, timeout, raw=raw)
-        await self._add(service)
-        return service
+        return await self._add(Service(self, resolved, kind, handler, timeout, raw=raw))
 
     async def lookup_service(self, name: str) -> str:
         """The URI of a service, ``rosrpc://host:port``.
@@ -510,14 +505,10 @@ class Node(MasterClient):
         Without a handler they go to standard error. First read it inside of the ``async with``; it may be used in any
         thread then. Its level is INFO unless the program sets another.
         """
-
-        def topics() -> list[str]:
-            return sorted(entry.key for entry in self._entries if isinstance(entry, Publisher))
-
         logger = logging.getLogger("rosout" + self.name.replace("/", "."))
         if logger.level == logging.NOTSET:
             logger.setLevel(logging.INFO)
-        self._rosout = RosoutHandler(self.name, self.advertise, topics)
+        self._rosout = RosoutHandler(self)
         logger.addHandler(self._rosout)
         return logger
 

@@ -17,15 +17,7 @@ from rmpa.core.outbox import URGENT, Outbox
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import keep_alive, tcpros_info
 from rmpa.ros.wire.slave_api import OUTBOUND, BusConnection
-from rmpa.ros.wire.tcpros import (
-    TopicDescription,
-    check_subscriber,
-    encode_header,
-    error_header,
-    parse_header,
-    printable,
-    publisher_header,
-)
+from rmpa.ros.wire.tcpros import TopicDescription, check_subscriber, encode_header, printable, publisher_header
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.stream import Stream
 
@@ -47,7 +39,7 @@ _MESSAGES: Final = 0
 
 
 def _ended(*_: object) -> None:
-    """The ``on_end`` of a connection that no publication has any more."""
+    """The ``on_end`` of a connection that no publication and no service has."""
 
 
 class AcceptedConnection(Stream):
@@ -56,33 +48,24 @@ class AcceptedConnection(Stream):
     Args:
         sock: Accepted, non-blocking; owned from here on.
         number: The node's own number for this connection.
-        on_header: Called once, when ``request`` is known.
-        on_end: Called once when the other side closed the connection or broke the protocol (then with the error); not
-            after ``close()`` or ``refuse()``. The publication or service that takes the connection replaces it.
+        request: The other side's header, which has been read.
 
     Attributes:
         on_data: Gets the bytes after the header, as ``on_bytes`` of a stream; with ``None``, as for subscribers, they
             are dropped.
+        on_end: Called once when the other side closed the connection or broke the protocol (then with the error); not
+            after ``close()`` or ``refuse()``. The publication or service that takes the connection replaces it.
         since: The count of its publication's messages when it was served.
-        request: The other side's header, once received.
     """
 
-    def __init__(
-        self,
-        sock: socket.socket,
-        number: int,
-        *,
-        on_header: Callable[[AcceptedConnection], None],
-        on_end: Callable[[AcceptedConnection, Exception | None], None],
-    ) -> None:
+    def __init__(self, sock: socket.socket, number: int, request: Header) -> None:
         self.number = number
-        self.request: Header = {}
+        self.request = request
         self.info = tcpros_info(sock)
         self.peer: tuple[str, int] = sock.getpeername()[:2]
         self.since = 0
-        self.on_end = on_end
+        self.on_end: Callable[[AcceptedConnection, Exception | None], None] = _ended
         self.on_data: OnBytes | None = None
-        self._on_header: Callable[[AcceptedConnection], None] | None = on_header
         self._socket = sock
         keep_alive(sock)
         outbox = Outbox(limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SUBSCRIBER_QUEUE_BYTES)
@@ -98,31 +81,26 @@ class AcceptedConnection(Stream):
         """Messages dropped because the other side is slow."""
         return self.outbox.dropped[_MESSAGES]
 
-    def accept(
-        self, header: Mapping[str, str], queue_messages: int, queue_bytes: int, *, nodelay: bool = False
-    ) -> None:
+    def accept(self, header: Mapping[str, str], *, nodelay: bool = False) -> None:
         """Answer with the reply header; messages may follow. Does nothing if the connection has ended already.
 
         Args:
             header: The reply header.
-            queue_messages: The most messages in the queue of this connection.
-            queue_bytes: The most bytes in the queue; one message always fits.
             nodelay: Whether TCP_NODELAY is set even if the other side did not ask for it.
         """
         if self.closed:  # while it was held; ``on_end`` follows
             return
         if nodelay or self.request.get("tcp_nodelay") == "1":
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.bound(queue_messages, queue_bytes)
         self.send([encode_header(header)], URGENT)
 
-    def bound(self, queue_messages: int, queue_bytes: int) -> None:
-        """Change the bounds of the queue."""
-        self.outbox.set_bounds(queue_messages, queue_bytes)
+    def bound(self, messages: int, size: int = limits.SUBSCRIBER_QUEUE_BYTES) -> None:
+        """Set the most messages and bytes in the queue; one message always fits."""
+        self.outbox.set_bounds(messages, size)
 
     def refuse(self, text: str) -> None:
         """Answer with an error header and close; the other side does not try again by itself."""
-        self.send([encode_header(error_header(text))], URGENT)
+        self.send([encode_header({"error": text})], URGENT)
         self.close()
 
     def hang_up(self, *, drain: bool = False) -> None:
@@ -134,19 +112,8 @@ class AcceptedConnection(Stream):
             self.close()
 
     def _take(self, data: memoryview) -> tuple[int, int]:
-        consumed = 0
-        if self._on_header is not None:
-            fields, consumed, wanted = parse_header(data)
-            if fields is None:
-                return 0, wanted
-            self.request = fields
-            on_header, self._on_header = self._on_header, None
-            on_header(self)
-        if self.on_data is None:
-            # A subscriber sends nothing more; reading goes on to detect the end of the stream.
-            return len(data), 0
-        taken, wanted = self.on_data(data[consumed:])
-        return consumed + taken, wanted
+        # A subscriber sends nothing more; reading goes on to detect the end of the stream.
+        return self.on_data(data) if self.on_data is not None else (len(data), 0)
 
 
 class PublicationEvents:
@@ -214,7 +181,6 @@ class Publication:
         description: Type, md5 sum, definition and latching, or ``None`` until ``describe()``.
         events: What is called at changes.
         queue_messages: Messages queued for one slow subscriber; above it the oldest is dropped.
-        queue_bytes: Bytes queued for one slow subscriber; one message always fits.
 
     Attributes:
         messages: Messages published.
@@ -231,7 +197,6 @@ class Publication:
         *,
         events: PublicationEvents = _NO_EVENTS,
         queue_messages: int = limits.SUBSCRIBER_QUEUE_MESSAGES,
-        queue_bytes: int = limits.SUBSCRIBER_QUEUE_BYTES,
     ) -> None:
         self.topic = topic
         self.caller_id = caller_id
@@ -243,7 +208,6 @@ class Publication:
         self._keeps = 1
         self._reply = _NOTHING
         self._queue_messages = queue_messages
-        self._queue_bytes = queue_bytes
         self._connections: tuple[SubscriberConnection, ...] = ()
         # What takes messages in the place of subscribers.
         self._joining: dict[SubscriberConnection, Receiver] = {}
@@ -424,7 +388,7 @@ class Publication:
         """Set the bound on messages queued for one slow subscriber."""
         self._queue_messages = min(messages, limits.SUBSCRIBER_QUEUE_MESSAGES)
         for connection in self._connections:
-            connection.bound(self._queue_messages, self._queue_bytes)
+            connection.bound(self._queue_messages)
 
     def keep(self, depth: int) -> None:
         """Set the number of latched messages that are kept for later subscribers."""
@@ -469,7 +433,8 @@ class Publication:
             _log.debug("= %s: holds subscriber %s until the type is known", self.topic, who)
             return True
         _log.debug("> %s: serves subscriber %s at %s", self.topic, who, connection.peer[0])
-        connection.accept(self._reply, self._queue_messages, self._queue_bytes)
+        connection.bound(self._queue_messages)
+        connection.accept(self._reply)
         connection.since = self.messages - len(self.latched)
         for framed in self.latched:
             connection.send((framed,), _MESSAGES)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Self
 
 from rmpa.core.errors import (
     LocalProtocolError,
@@ -20,13 +19,12 @@ from rmpa.core.errors import (
 )
 from rmpa.core.outbox import Outbox
 from rmpa.ros import limits
-from rmpa.ros.http.rpc import call_api, connect, keep_alive
-from rmpa.ros.node.service_server import BODIES, INLINE, send_large
+from rmpa.ros.http.rpc import connect, keep_alive
+from rmpa.ros.node.ask import exchange_headers
+from rmpa.ros.node.service_server import BODIES, send_body
 from rmpa.ros.wire import tcpros
-from rmpa.ros.wire.slave_api import TCPROS
-from rmpa.runtime.accept import OUT_OF_DESCRIPTORS, Use, is_shortage
+from rmpa.runtime.accept import OUT_OF_DESCRIPTORS
 from rmpa.runtime.stream import Stream
-from rmpa.runtime.tasks import start_task
 
 Done = Callable[["tuple[bool, bytes | bytearray] | ServiceFailed"], None]
 
@@ -71,7 +69,6 @@ class ServiceConnection:
         self._timer: asyncio.TimerHandle | None = None
         self._body: tcpros.BodyBuffer | None = None
         self._ok = False
-        self._sending: asyncio.Task[None] | None = None
         outbox = Outbox(limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SERVICE_MESSAGE_MAX)
         outbox.set_terms(BODIES, limits.SUBSCRIBER_QUEUE_MESSAGES, spared=True)
         self._stream = Stream(sock, on_bytes=self._take, on_close=self._ended, outbox=outbox)
@@ -121,8 +118,7 @@ class ServiceConnection:
                 sock = await connect(host, port)
                 try:
                     keep_alive(sock)
-                    fields = _checked(await exchange_headers(sock, header), service, md5sum)
-                    return cls(sock, service, fields, on_closed)
+                    fields = await exchange_headers(sock, header)
                 except BaseException:
                     sock.close()
                     raise
@@ -134,6 +130,14 @@ class ServiceConnection:
                 remedy = "`rmpa doctor` says what to do"
                 raise OutOfDescriptors(f"server of service {service}", uri, remedy) from error
             raise UnreachableError(f"server of service {service}", f"{uri} ({error})") from error
+        if fields is None:
+            sock.close()
+            raise RemoteProtocolError(f"the server of {service} closed before its header")
+        if problem := tcpros.check_server(fields, service, md5sum):
+            sock.close()
+            server = tcpros.printable(fields.get("callerid", "")) or "its server"
+            raise PeerRefused(f"service {service}: {server}", problem, code="service-failed")
+        return cls(sock, service, fields, on_closed)
 
     @property
     def description(self) -> tcpros.ServiceDescription:
@@ -153,7 +157,7 @@ class ServiceConnection:
     @property
     def busy(self) -> bool:
         """Whether a call is under way."""
-        return self._done is not None or self._sending is not None
+        return self._done is not None
 
     async def call(
         self,
@@ -189,8 +193,7 @@ class ServiceConnection:
     def request(self, body: tcpros.Buffer, done: Done, timeout: float | None = None) -> None:
         """Send a request without waiting: ``done`` is called once in the event loop, with the reply or the error.
 
-        A ``body`` larger than ``service_stream.INLINE`` must not change until then. ``timeout`` is in seconds;
-        ``None`` waits for ever.
+        A large ``body`` must not change until then (``send_body``). ``timeout`` is in seconds; ``None``: no limit.
 
         Raises:
             LocalProtocolError: Another call is under way.
@@ -208,11 +211,7 @@ class ServiceConnection:
         self._done = done
         if timeout is not None:
             self._timer = self._loop.call_later(timeout, self._timed_out, timeout)
-        head = tcpros.LENGTH.pack(len(body))
-        if len(body) > INLINE:
-            self._sending = start_task(self._send_large(head, body), f"request of {self.service}")
-        else:
-            self._stream.send([head, body], BODIES)
+        send_body(self._stream, tcpros.LENGTH.pack(len(body)), body)
 
     def close(self) -> None:
         """Close at once; a call under way fails before this returns."""
@@ -228,29 +227,20 @@ class ServiceConnection:
         except OSError:
             return True
 
-    async def _send_large(self, head: bytes, body: tcpros.Buffer) -> None:
-        try:
-            await send_large(self._stream, head, body)
-        finally:
-            self._sending = None
-
     def _take(self, data: memoryview) -> tuple[int, int]:
         if self._done is None:
             raise RemoteProtocolError(f"the server of {self.service} sent {len(data)} bytes that were not asked for")
-        at, body = 0, self._body
-        if body is None:
+        at = 0
+        if self._body is None:
             head = tcpros.parse_reply_head(data)
             if head is None:
                 return 0, tcpros.REPLY.size
             self._ok, size = head
-            end = tcpros.REPLY.size + size
-            if len(data) >= end:
-                self._answered((self._ok, bytes(data[tcpros.REPLY.size : end])))
-                return end, 0
-            at, body = tcpros.REPLY.size, tcpros.BodyBuffer(size)
+            at, self._body = tcpros.REPLY.size, tcpros.BodyBuffer(size)
+        body = self._body
         at += body.take(data[at:])
-        self._body = None if body.whole else body
         if body.whole:
+            self._body = None
             self._answered((self._ok, body.data))
         return at, 0
 
@@ -275,136 +265,9 @@ class ServiceConnection:
     def _stop(self, problem: str) -> None:
         self._stream.close()
         self._body = None
-        if self._sending is not None:
-            self._sending.cancel()
         on_closed, self._on_closed = self._on_closed, None
         if self._done is not None:
             self._answered(ServiceFailed(self.service, problem))
         if on_closed is not None:
             with contextlib.suppress(RmpaError):
                 on_closed()
-
-
-def _checked(fields: tcpros.Header | None, service: str, md5sum: str) -> tcpros.Header:
-    if fields is None:
-        raise RemoteProtocolError(f"the server of {service} closed before its header")
-    problem = tcpros.check_server(fields, service, md5sum)
-    if problem is not None:
-        server = tcpros.printable(fields.get("callerid", "")) or "its server"
-        raise PeerRefused(f"service {service}: {server}", problem, code="service-failed")
-    return fields
-
-
-# Finds out whether the TCPROS server of a node can be reached, without a trace at that node. rospy reads the header
-# of a connection in the thread that accepts, so that one that says nothing shuts out all others (trap 11); and it
-# logs a warning for each connection whose header does not come, or is for a topic or service that it does not have. A
-# service's probe (wiki.ros.org/ROS/TCPROS, section 1.1; what ``wait_for_service`` sends) avoids both: its header
-# leaves with the connect, and the node answers with its own header and closes.
-
-
-_CALLER_ID: Final = "/rmpa"
-
-
-async def probe(
-    address: str,
-    port: int,
-    service: str,
-    *,
-    timeout: float,  # noqa: ASYNC109 - the result names it
-    node: str = "",
-) -> str:
-    """Connect to a node's TCPROS server, and let it answer.
-
-    A header with ``error`` counts as an answer of ``node`` only if it names that node, by ``callerid`` or as rospy's
-    text does: any other TCPROS server that has taken the port says the same.
-
-    Args:
-        address: An IPv4 address.
-        port: The port of the server, as ``requestTopic`` and ``lookupService`` tell it.
-        service: A service of the node: every rospy and roscpp node has ``NODE/get_loggers``. If it has none, or
-            another node is there, that node logs an error. With an empty text nothing is sent, and the connection is
-            closed at once: it shows that a program listens there, and rospy logs a warning.
-        timeout: Seconds for all of it.
-        node: The node that is expected; empty accepts any.
-
-    Returns:
-        An empty text if the server answers, else the reason, ready to read.
-    """
-    sock: socket.socket | None = None
-    try:
-        async with asyncio.timeout(timeout):
-            sock = await connect(address, port)
-            if not service:
-                return ""
-            header = tcpros.client_header(service, _CALLER_ID, probe=True)
-            return _judge(await exchange_headers(sock, header), node)
-    except TimeoutError:
-        return f"no answer within {timeout:g} s" if sock is None else f"connected, but no answer within {timeout:g} s"
-    except RemoteProtocolError:
-        return "the program that listens there is no ROS node"
-    except UnreachableError as error:
-        return str(error)
-    except OSError as error:
-        if is_shortage(error):
-            return "no file descriptor is left for the attempt; `rmpa doctor` says what to do"
-        text = os.strerror(error.errno) if error.errno else str(error)
-        return text[:1].lower() + text[1:]
-    finally:
-        if sock is not None:
-            sock.close()
-
-
-async def exchange_headers(sock: socket.socket, header: tcpros.Header) -> tcpros.Header | None:
-    """Send a connection header, and return the one that comes, or ``None`` if the other side closes before.
-
-    Args:
-        sock: A non-blocking connection.
-        header: The fields to send.
-
-    Raises:
-        RemoteProtocolError: What comes is no header, or too large.
-        OSError: The connection broke.
-    """
-    loop = asyncio.get_running_loop()
-    await loop.sock_sendall(sock, tcpros.encode_header(header))
-    data = b""
-    while True:
-        fields, _, wanted = tcpros.parse_header(data)
-        if fields is not None:
-            return fields
-        chunk = await loop.sock_recv(sock, wanted - len(data))  # what follows the header is left to the caller
-        if not chunk:
-            return None
-        data += chunk
-
-
-async def ask_publisher(uri: str, topic: str, caller_id: str, use: Use = Use.DATA) -> tcpros.Header | None:
-    """Connect to a publisher, and return the header that it answers; ``None`` where it sends none.
-
-    Args:
-        uri: Its slave API.
-        topic: The topic.
-        caller_id: The asking node. It must not be that of a subscriber of the topic: a rospy publisher keeps one
-            connection for each caller id.
-        use: The purpose of the connection.
-
-    Raises:
-        RmpaError: The publisher does not answer as one does.
-        OSError: The connection fails.
-    """
-    match await call_api(uri, "requestTopic", caller_id, topic, [[TCPROS]], use=use):
-        case (1, _, [protocol, str(host), int(port)]) if protocol == TCPROS:
-            with await connect(host, port, use) as sock:
-                return await exchange_headers(sock, tcpros.subscriber_header(topic, caller_id))
-    return None
-
-
-def _judge(fields: tcpros.Header | None, node: str) -> str:
-    if fields is None:
-        return "the program that listens there closed the connection without an answer"
-    name, error = fields.get("callerid", ""), fields.get("error")
-    if node and name and name != node:
-        return f"another node listens there: {tcpros.printable(name)}"
-    if error is None or (node and (name == node or error.startswith(f"[{node}] "))):
-        return ""
-    return f"a ROS node listens there, but not the expected one: {tcpros.printable(error)}"

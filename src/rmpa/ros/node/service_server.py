@@ -14,7 +14,6 @@ from rmpa.core.log import logged_failure
 from rmpa.ros import limits
 from rmpa.ros.wire import tcpros
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.loop import yield_to_data
 from rmpa.runtime.tasks import start_task
 
 if TYPE_CHECKING:
@@ -31,24 +30,20 @@ SERVICE_STALL: Final = 30.0
 
 # The outbox key of requests and responses.
 BODIES: Final = 0
-# Larger bodies are sent in parts: to copy 64 MiB into a queue would hold up the event loop for 30 ms.
-INLINE: Final = 256 * KIB
-_PART: Final = 256 * KIB
+# Larger bodies wait where they are: to copy 64 MiB into a queue would hold up the event loop for 30 ms.
+_INLINE: Final = 256 * KIB
 
 
-async def send_large(stream: Stream, head: bytes, body: tcpros.Buffer) -> None:
-    """Send a body that is larger than ``INLINE``; ends early when the stream is closed."""
-    message = stream.open(BODIES, len(head) + len(body))
-    stream.extend(message, head)
-    view = memoryview(body)
-    for start in range(0, len(view), _PART):
-        stream.extend(message, view[start : start + _PART])
-        while stream.pending_bytes and not stream.closed:
-            await stream.drained()
-        if stream.closed:
-            return
-        yield_to_data()
-        await asyncio.sleep(0)
+def send_body(stream: Stream, head: bytes, body: tcpros.Buffer) -> None:
+    """Send a request or a response; one of more than ``_INLINE`` bytes must not change until it is sent."""
+    if len(body) <= _INLINE:
+        stream.send([head, body], BODIES)
+    elif not stream.closed:
+        stream.pump()  # what is collected goes first
+        stream.outbox.push(head, BODIES, pinned=True)
+        # A view may be valid during this call only.
+        stream.outbox.push(bytes(body) if isinstance(body, memoryview) else body, BODIES, pinned=True)
+        stream.pump()
 
 
 Describe = Callable[[], Awaitable[tcpros.ServiceDescription | str]]
@@ -150,6 +145,11 @@ class ServiceEndpoint:
         self._describing: asyncio.Task[None] | None = None
         self._empty: asyncio.Future[None] | None = None
 
+    @property
+    def clients(self) -> int:
+        """Connections."""
+        return len(self._clients)
+
     def attach(self, connection: AcceptedConnection) -> None:
         """Take a connection whose header names this service and has the required fields."""
         client = _ClientConnection(self, connection)
@@ -229,7 +229,7 @@ class _ClientConnection:
         self._endpoint = endpoint
         self._connection = connection
         self._loop = asyncio.get_running_loop()
-        self._persistent = tcpros.is_persistent(connection.request)
+        self._persistent = tcpros.is_set(connection.request, "persistent")
         self.opened = self._ended = self._taking = False
         self._body: tcpros.BodyBuffer | None = None
         self._call: ServiceCall | None = None
@@ -251,8 +251,9 @@ class _ClientConnection:
         self.opened = True
         connection.outbox.set_terms(BODIES, limits.SUBSCRIBER_QUEUE_MESSAGES, spared=True)
         header = tcpros.server_header(endpoint.caller_id, description)
-        connection.accept(header, limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SERVICE_MESSAGE_MAX, nodelay=True)
-        if not self._persistent or tcpros.is_probe(connection.request):
+        connection.bound(limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SERVICE_MESSAGE_MAX)
+        connection.accept(header, nodelay=True)
+        if not self._persistent or tcpros.is_set(connection.request, "probe"):
             self._watch(connection.bytes_in)
 
     def refuse(self, text: str) -> None:
@@ -299,7 +300,7 @@ class _ClientConnection:
 
     def _step(self, data: memoryview) -> tuple[int, int]:
         """Consume a request, a part of a large one, or a part of one that is too large."""
-        at, body = 0, self._body
+        at = 0
         if self._discard:
             count = min(self._discard, len(data))
             self._discard -= count
@@ -307,23 +308,21 @@ class _ClientConnection:
                 self._stop_timer()
                 self._proceed()
             return count, 0
-        if body is None:
+        if self._body is None:
             if not self.opened or self._call is not None or self._sending is not None:
                 # One request at a time; at most one more is buffered.
                 if len(data) > limits.SERVICE_MESSAGE_MAX + tcpros.LENGTH.size:
                     raise LimitExceeded("what was sent ahead of a reply", len(data), limits.SERVICE_MESSAGE_MAX)
                 return 0, 0
-            size = tcpros.parse_request_length(data)
-            if size is None:
-                return 0, tcpros.LENGTH.size
             at = tcpros.LENGTH.size
+            if len(data) < at:
+                return 0, at
+            (size,) = tcpros.LENGTH.unpack_from(data)
             if size > limits.SERVICE_MESSAGE_MAX:
                 self._too_large(size)
                 return at, 0
-            if len(data) >= at + size:
-                self._start_call(bytes(data[at : at + size]))
-                return at + size, 0
-            body = self._body = tcpros.BodyBuffer(size)
+            self._body = tcpros.BodyBuffer(size)
+        body = self._body
         at += body.take(data[at:])
         if body.whole:
             self._body = None
@@ -372,25 +371,18 @@ class _ClientConnection:
             text = f"response of {size} bytes of service [{self._endpoint.service}] exceeds the limit of "
             body = f"{text}{limits.SERVICE_MESSAGE_MAX}".encode()
         self._endpoint.failed += not ok
-        head, body = tcpros.frame_reply(ok, body)
-        if len(body) > INLINE:
-            # A view may be valid during this call only.
-            self._send(head, bytes(body) if isinstance(body, memoryview) else body)
-            return
-        self._connection.send([head, body], BODIES)
+        send_body(self._connection, tcpros.REPLY.pack(ok, len(body)), body)
         if self._connection.pending_bytes:
-            self._send()  # no request is read from a client that does not read its replies
+            self._wait_until_sent()  # no request is read from a client that does not read its replies
         else:
             self._proceed()
 
-    def _send(self, head: bytes = b"", body: tcpros.Buffer = b"") -> None:
-        self._sending = start_task(self._finish(head, body), f"response of {self._endpoint.service}")
+    def _wait_until_sent(self) -> None:
+        self._sending = start_task(self._finish(), f"response of {self._endpoint.service}")
 
-    async def _finish(self, head: bytes, body: tcpros.Buffer) -> None:
-        """Send a large reply, if there is one; once all is sent close, or go on with the next request."""
+    async def _finish(self) -> None:
+        """Once all is sent close, or go on with the next request."""
         try:
-            if head:
-                await send_large(self._connection, head, body)
             while self._connection.pending_bytes and not self._connection.closed:
                 await self._connection.drained()
         finally:
@@ -408,7 +400,7 @@ class _ClientConnection:
             self.resume()
         else:
             # Not closed at once: a reply made during the read of another connection is only sent at the end of that.
-            self._send()
+            self._wait_until_sent()
 
     def resume(self) -> None:
         """Take what is buffered, unless this is within the read that would take it."""

@@ -1,11 +1,4 @@
-"""A node's Slave API and the services of its loggers.
-
-``get_loggers`` and ``set_logger_level`` of a node of this process, as every roscpp and rospy node has them.
-
-With them rqt_logger_level and ``rosservice call /rmpa/set_logger_level rmpa.mesh debug`` set the levels of this
-program's log while it runs. The messages (roscpp/GetLoggers, roscpp/SetLoggerLevel) are serialized by hand, because
-the agent starts without rosbags and numpy.
-"""
+"""A node of this process: its Slave API, its topics and its services."""
 
 from __future__ import annotations
 
@@ -13,28 +6,31 @@ import asyncio
 import itertools
 import logging
 import os
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
-from rmpa.ros.http.server import XmlRpcServer
-from rmpa.ros.node.listeners import TcprosServer
-from rmpa.ros.node.service_server import ServiceEndpoint
+from rmpa.ros import limits
+from rmpa.ros.http.server import XmlRpcServer, listen
+from rmpa.ros.node.ask import read_header
+from rmpa.ros.node.publication import AcceptedConnection
 from rmpa.ros.wire.slave_api import METHODS, TCPROS, bus_info, bus_stats, check_call
-from rmpa.ros.wire.tcpros import ANY, LENGTH, ServiceDescription, printable
+from rmpa.ros.wire.tcpros import ANY, check_request, printable
 from rmpa.ros.wire.xmlrpc import RosFault
+from rmpa.runtime.accept import Acceptor, Use
+from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Mapping
+    import socket
+    from collections.abc import Awaitable, Callable, Iterable
 
     from rmpa.ros.node.listeners import SharedListener
     from rmpa.ros.node.publication import Publication
-    from rmpa.ros.node.service_server import ServiceCall
+    from rmpa.ros.node.service_server import ServiceEndpoint
     from rmpa.ros.node.subscription import TopicConnection
     from rmpa.ros.wire.slave_api import BusConnection
-    from rmpa.ros.wire.tcpros import Buffer
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
-
 
 _log = logging.getLogger(__name__)
 
@@ -79,10 +75,9 @@ class SlaveNode:
         host: The address to listen at, and to register unless ``advertised_host`` is given.
         master_uri: The answer to ``getMasterUri``; the owner sets it later if its master does not listen yet.
         advertised_host: The address to register, if it differs from ``host``.
-        port: The XML-RPC server's; 0 lets the system choose.
-        listener: A started listener that accepts this node's connections and assigns its address; ``host``,
-            ``advertised_host`` and ``port`` are then ignored.
-        counters: Count refusals.
+        listener: A started listener that accepts this node's connections and assigns its address; ``host`` and
+            ``advertised_host`` are then ignored.
+        counters: Count refusals, ``tcpros.refused.*`` among them.
         on_shutdown: ``(reason)``: the master shuts this node down; the owner has to close it.
         on_param_update: ``(key, value) -> whether the node subscribed to that key``.
         on_kill: ``(caller id, reason) -> reply``: awaited after ``on_shutdown`` for the answer to ``shutdown``.
@@ -101,7 +96,6 @@ class SlaveNode:
         master_uri: str,
         *,
         advertised_host: str = "",
-        port: int = 0,
         listener: SharedListener | None = None,
         counters: Counters | None = None,
         on_shutdown: Callable[[str], None] = _ignore,
@@ -126,10 +120,12 @@ class SlaveNode:
         self._on_param_update = on_param_update
         self._taps = taps
         self._elsewhere = elsewhere
-        self._http = XmlRpcServer(self._call, host, port, counters=self.counters, name=f"node {name}")
-        self._tcpros = TcprosServer(
-            name, self._publications, services=self._services, counters=self.counters, numbers=self._numbers
-        )
+        self._http = XmlRpcServer(self._call, host, counters=self.counters, name=f"node {name}")
+        self._tcpros_port = 0
+        self._acceptor: Acceptor | None = None
+        # One for each TCPROS connection whose header has not come.
+        self._greetings = OwnedTasks()
+        self._refusals = RefusalLog(_log, self.counters)
 
     async def start(self) -> None:
         """Listen.
@@ -138,16 +134,19 @@ class SlaveNode:
             StartError: The address cannot be used.
         """
         if self._listener is not None:
-            self._advertised = self._listener.attach(self.name, self._http.adopt, self._tcpros.adopt)
-            self._http.port, tcpros_port = self._listener.ports
-            self._tcpros.address = (self._advertised, tcpros_port)
+            self._advertised = self._listener.attach(self.name, self._http.adopt, self._adopt)
+            self._http.port, self._tcpros_port = self._listener.ports
         else:
             await self._http.start()
+            name = f"TCPROS server of {self.name}"
             try:
-                self._tcpros.start(self._host)
+                sock = await listen(name, self._host, 0, Use.DATA)
             except BaseException:
                 await self._http.close()
                 raise
+            self._tcpros_port = sock.getsockname()[1]
+            self._acceptor = Acceptor(sock, self._adopt, name=name)
+            self._acceptor.start()
         self.uri = f"http://{self._advertised}:{self._http.port}/"
 
     async def close(self) -> None:
@@ -162,7 +161,9 @@ class SlaveNode:
         if self._listener is not None and self.uri:
             self._listener.detach(self._advertised)
             self._listener = None  # a second close must not free the next node's address
-        self._tcpros.close()
+        if self._acceptor is not None:
+            self._acceptor.close()
+        await self._greetings.close()
         await self._http.close()
         await asyncio.gather(*(endpoint.closed() for endpoint in services))
         # The node and its servers are a reference cycle, which must not hold the owner until it is collected.
@@ -205,7 +206,7 @@ class SlaveNode:
     @property
     def service_uri(self) -> str:
         """The URI of this node's services, ``rosrpc://host:port``; only after ``start()``."""
-        return f"rosrpc://{self._advertised}:{self._tcpros.address[1]}"
+        return f"rosrpc://{self._advertised}:{self._tcpros_port}"
 
     def add_service(self, endpoint: ServiceEndpoint) -> None:
         """Serve a service from now on.
@@ -245,11 +246,62 @@ class SlaveNode:
 
     def address_of(self, topic: str) -> tuple[str, int] | None:
         """Host and port for subscribers of a topic; ``None`` if it is not published."""
-        return (self._advertised, self._tcpros.address[1]) if topic in self._publications else None
+        return (self._advertised, self._tcpros_port) if topic in self._publications else None
 
-    def _call(
-        self, method: str, params: tuple[XmlRpcValue, ...], _client: str
-    ) -> XmlRpcValue | Awaitable[XmlRpcValue]:
+    def _adopt(self, sock: socket.socket, client: tuple[str, int]) -> None:
+        """Serve an accepted, non-blocking TCPROS connection; the node owns it from here on."""
+        served = sum(topic.subscribers for topic in self._publications.values())
+        served += sum(service.clients for service in self._services.values())
+        waiting = len(self._greetings)
+        if served + waiting >= limits.TCPROS_CONNECTIONS_MAX or waiting >= limits.TCPROS_HANDSHAKES_MAX:
+            self._refuse("full", client[0], f"too many connections, one from {client[0]} closed")
+            sock.close()
+            return
+        self._greetings.start(self._greet(sock, client[0]), f"header of a connection to {self.name}")
+
+    async def _greet(self, sock: socket.socket, who: str) -> None:
+        """Wait for the header of a connection, and pass it to the publication or service that it names."""
+        connection = None
+        try:
+            async with asyncio.timeout(limits.TCPROS_HANDSHAKE_TIMEOUT):
+                request = await read_header(sock)
+            if request is not None:
+                connection = AcceptedConnection(sock, self.next_number(), request)
+        except TimeoutError:
+            self._refuse("silent", who, f"{who} sent no header within {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s; closed")
+        except RemoteProtocolError as error:
+            self._refuse("malformed", who, f"a connection from {who}: {error}")
+        except OSError:
+            pass  # the client has disconnected already, which is normal for rospy
+        finally:
+            if connection is None:
+                sock.close()
+        if connection is not None:
+            self._attach(connection)
+
+    def _attach(self, connection: AcceptedConnection) -> None:
+        fields = connection.request
+        problem = check_request(fields)
+        if problem is not None:
+            self._refuse("header", connection.peer[0], f"a connection from {connection.peer[0]}: {problem}")
+            connection.refuse(problem)
+            return
+        kind = "service" if "service" in fields else "topic"
+        name = fields[kind]
+        taker = self._services.get(name) if kind == "service" else self._publications.get(name)
+        if taker is not None:
+            taker.attach(connection)
+            return
+        # At debug level: the other node may have looked up something that is gone by now.
+        _log.debug("! %s: no %s %s", self.name, kind, printable(name))
+        verb = "does not offer the service" if kind == "service" else "is not a publisher of"
+        connection.refuse(f"[{self.name}] {verb} [{printable(name)}]")
+
+    def _refuse(self, kind: str, who: str, text: str) -> None:
+        now = asyncio.get_running_loop().time()
+        self._refusals.refuse(now, f"tcpros.refused.{kind}", who, f"{self.name}: {text}")
+
+    def _call(self, method: str, params: tuple[XmlRpcValue, ...]) -> XmlRpcValue | Awaitable[XmlRpcValue]:
         if method not in METHODS:
             raise RosFault(-1, f"{self.name} has no method {method}")
         problem = check_call(method, params)
@@ -260,7 +312,7 @@ class SlaveNode:
                 why = "".join(map(str, reason))
                 _log.info("< %s: asked to shut down: %s", self.name, why)
                 self._on_shutdown(why)
-                return [1, "shutdown", 0] if self._on_kill is None else _as_list(self._on_kill(caller, why))
+                return [1, "shutdown", 0] if self._on_kill is None else self._on_kill(caller, why)
             case "requestTopic", [str(caller), str(topic), list(protocols)]:
                 return self._request_topic(caller, topic, protocols)
             case "publisherUpdate", [_, str(topic), list(publishers)]:
@@ -306,102 +358,7 @@ class SlaveNode:
 
 async def _decided(other: Awaitable[RosReply | None], own: list[XmlRpcValue]) -> XmlRpcValue:
     try:
-        return list(await other or own)
+        return await other or own
     except Exception:  # noqa: BLE001 - the subscriber would not ask again
         _log.exception("! a requestTopic was not decided; answered with the own address")
         return own
-
-
-async def _as_list(reply: Awaitable[RosReply]) -> XmlRpcValue:
-    return list(await reply)
-
-
-GET: Final = ServiceDescription("roscpp/GetLoggers", "32e97e85527d4678a8f9279894bb64b0")
-SET: Final = ServiceDescription("roscpp/SetLoggerLevel", "51da076440d78ca1684d36c868df61ea")
-LEVELS: Final = {
-    "debug": logging.DEBUG,
-    "info": logging.INFO,
-    "warn": logging.WARNING,
-    "error": logging.ERROR,
-    "fatal": logging.CRITICAL,
-}
-
-
-class LoggerServices:
-    """The two services of one node.
-
-    Args:
-        node: Serves them.
-        call: Calls the core's master.
-        loggers: The name of Python's logger, by the name that the services show.
-    """
-
-    def __init__(self, node: SlaveNode, call: Callable[..., RosReply], loggers: Mapping[str, str]) -> None:
-        self._node = node
-        self._call = call
-        self._loggers = loggers
-        self._endpoints = (
-            ServiceEndpoint(f"{node.name}/get_loggers", node.name, self._get, description=GET),
-            ServiceEndpoint(f"{node.name}/set_logger_level", node.name, self._set, description=SET),
-        )
-
-    def start(self) -> None:
-        """Serve and register; the node listens already."""
-        node = self._node
-        for endpoint in self._endpoints:
-            node.add_service(endpoint)
-            code, text, _ = self._call("registerService", node.name, endpoint.service, node.service_uri, node.uri)
-            if code != 1:
-                _log.error("! the ROS core does not accept %s: %s [core-refuses]", endpoint.service, text)
-
-    def close(self) -> None:
-        """Unregister, and stop serving."""
-        node = self._node
-        for endpoint in self._endpoints:
-            self._call("unregisterService", node.name, endpoint.service, node.service_uri)
-            node.remove_service(endpoint.service)
-
-    def _get(self, call: ServiceCall) -> None:
-        parts = [LENGTH.pack(len(self._loggers))]
-        for name, logger in self._loggers.items():
-            level = logging.getLogger(logger).getEffectiveLevel()
-            # The highest ROS level that is not above the logger's level.
-            word = next((w for w, number in reversed(LEVELS.items()) if number <= level), "debug")
-            parts += [pack_text(name), pack_text(word)]
-        call.reply(True, b"".join(parts))
-
-    def _set(self, call: ServiceCall) -> None:
-        name, level = read_texts(call.request, 2, "roscpp/SetLoggerLevelRequest")
-        logger, number = self._loggers.get(name), LEVELS.get(level.lower())
-        if logger is None:
-            known = ", ".join(self._loggers)
-            call.fail(f"{self._node.name} has no logger {printable(name)!r}; it has {known}")
-        elif number is None:
-            call.fail(f"{printable(level)!r} is not a level; there are {', '.join(LEVELS)}")
-        else:
-            _log.info("= %s sets the level of %s to %s", printable(call.caller_id), name, level.lower())
-            logging.getLogger(logger).setLevel(number)
-            call.reply(True, b"")
-
-
-def pack_text(text: str) -> bytes:
-    """A string of a ROS message."""
-    raw = text.encode()
-    return LENGTH.pack(len(raw)) + raw
-
-
-def read_texts(raw: Buffer, count: int, what: str) -> list[str]:
-    """The strings of a message ``what`` that has so many, and nothing else.
-
-    Raises:
-        RemoteProtocolError: It is none.
-    """
-    found: list[str] = []
-    at = 0
-    while len(found) < count and at + LENGTH.size <= len(raw):
-        start = at + LENGTH.size
-        at = start + LENGTH.unpack_from(raw, at)[0]
-        found.append(str(raw[start:at], "utf-8", "replace"))
-    if at != len(raw) or len(found) != count:
-        raise RemoteProtocolError(f"{len(raw)} bytes are not a {what}")
-    return found

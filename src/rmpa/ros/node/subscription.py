@@ -11,30 +11,22 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
-from rmpa.core.outbox import URGENT, Outbox, QueuedMessage
+from rmpa.core.outbox import Outbox, QueuedMessage
 from rmpa.core.timers import Backoff
 from rmpa.ros import limits
-from rmpa.ros.http.rpc import call_api, connect, keep_alive, tcpros_info
-from rmpa.ros.wire.slave_api import INBOUND, TCPROS, BusConnection
-from rmpa.ros.wire.tcpros import (
-    ANY,
-    LENGTH,
-    check_publisher,
-    encode_header,
-    parse_header,
-    printable,
-    split_messages,
-    subscriber_header,
-)
+from rmpa.ros.http.rpc import connect, keep_alive, tcpros_info
+from rmpa.ros.node.ask import exchange_headers, request_topic
+from rmpa.ros.wire.slave_api import INBOUND, BusConnection
+from rmpa.ros.wire.tcpros import ANYTHING, LENGTH, check_publisher, split_messages, subscriber_header
 from rmpa.runtime.accept import is_shortage
 from rmpa.runtime.stream import Stream
 from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
-    import socket
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from rmpa.ros.wire.tcpros import Buffer, Header
+    from rmpa.ros.node.slave_node import SlaveNode
+    from rmpa.ros.wire.tcpros import Buffer, Header, TopicDescription
 
     Attach = Callable[["InProcessConnection"], None]
 
@@ -44,7 +36,6 @@ _log = logging.getLogger(__name__)
 TCPROS_RETRY_FIRST: Final = 0.1
 # The longest pause between attempts, while the graph lists the publisher.
 TCPROS_RETRY_MAX: Final = 2.0
-_PORT_MAX: Final = 65535
 
 
 def _ignore(*_: object) -> None:
@@ -87,9 +78,7 @@ class TopicConnection(ABC):
         on_lost: ``(reason)``: the connection failed or ended; it is tried again with back-off. An incomplete message
             is dropped.
         on_oversized: ``(size)``: a message of more than ``limits.TCPROS_MESSAGE_MAX`` begins; it is read and dropped.
-        type_name: The type to ask for.
-        md5sum: The md5 sum to ask for; ``*`` accepts any.
-        definition: The definition to send, if known.
+        wanted: The type and md5 sum to ask for, and the definition to send, if known.
         nodelay: Whether to ask for TCP_NODELAY on the publisher's side.
         number: The connection's number within the node, for ``getBusInfo``.
         find: Returns ``Publication.attach`` while there is one at that address, if it is one of this process.
@@ -118,9 +107,7 @@ class TopicConnection(ABC):
         on_refused: Callable[[str], None] = _ignore,
         on_lost: Callable[[str], None] = _ignore,
         on_oversized: Callable[[int], None] = _ignore,
-        type_name: str = ANY,
-        md5sum: str = ANY,
-        definition: str = "",
+        wanted: TopicDescription = ANYTHING,
         nodelay: bool = True,
         number: int = 0,
         find: Callable[[], Attach | None] = lambda: None,
@@ -128,9 +115,7 @@ class TopicConnection(ABC):
         self.topic = topic
         self.uri = uri
         self.number = number
-        self.request = subscriber_header(
-            topic, caller_id, type_name=type_name, md5sum=md5sum, definition=definition, nodelay=nodelay
-        )
+        self.request = subscriber_header(topic, caller_id, wanted, nodelay=nodelay)
         self.fields: Header = {}
         self.messages = self.bytes = self.oversized = 0
         self.refused: str | None = None
@@ -141,8 +126,9 @@ class TopicConnection(ABC):
         self._on_lost = on_lost
         self._on_oversized = on_oversized
         self._find = find
-        # Bytes to come of a message that is taken in parts.
+        # Bytes to come of a message that comes in parts, and what takes them as they come.
         self._left = 0
+        self._taker: PartsTaker | None = None
         self._backoff = Backoff(TCPROS_RETRY_FIRST, TCPROS_RETRY_MAX, random.random)
         self._closed = False
 
@@ -159,6 +145,23 @@ class TopicConnection(ABC):
     def close(self) -> None:
         """Disconnect at once; no callback is called any more."""
 
+    def _lose(self) -> None:
+        """Note that there is no connection; the message in progress is dropped."""
+        self.fields = {}
+        self._abort()
+
+    def _begin(self, size: int, taker: PartsTaker | None) -> None:
+        """Begin a message that comes in parts."""
+        self._left, self._taker = size, taker
+        if taker is not None:
+            taker.begin(size)
+
+    def _abort(self) -> None:
+        """Drop the message in progress, whose rest will not come."""
+        left, self._left = self._left, 0
+        if left and self._taker is not None:
+            self._taker.abort()
+
     def connection(self) -> BusConnection:
         """The connection's row in ``getBusInfo`` and ``getBusStats``."""
         return BusConnection(
@@ -172,9 +175,6 @@ class PublisherConnection(TopicConnection):
     _stream: Stream | None = None
     _task: asyncio.Task[None] | None = None
     _ended: asyncio.Future[Exception | None]
-    _handshake: asyncio.Timeout
-    # Whether the message in progress is too long, and dropped.
-    _skips = False
 
     def start(self) -> None:
         """Connect, in a task of its own."""
@@ -204,54 +204,37 @@ class PublisherConnection(TopicConnection):
 
     async def _attempt(self) -> str:
         """Connect and wait until the connection ends; return the reason."""
+        within, ended = limits.TCPROS_CONNECT_TIMEOUT, None
         try:
-            host, port = await self._request_topic()
-            async with asyncio.timeout(limits.TCPROS_CONNECT_TIMEOUT):
-                sock = await connect(host, port)
-            self._open(sock)
+            address = await request_topic(self.uri, self.topic, self.request["callerid"], timeout=within)
+            async with asyncio.timeout(within):
+                sock = await connect(*address)
         except TimeoutError:
-            return f"no TCPROS server answers in {limits.TCPROS_CONNECT_TIMEOUT:g} s"
+            return f"no TCPROS server answers in {within:g} s"
         except (OSError, RmpaError) as error:
             return OUT_OF_FILES if is_shortage(error) else str(error)
         try:
-            async with asyncio.timeout(limits.TCPROS_CONNECT_TIMEOUT) as self._handshake:
+            keep_alive(sock)
+            self.info = tcpros_info(sock)
+            # At once: a rospy node accepts no other connection while it waits for a header.
+            async with asyncio.timeout(within):
+                fields = await exchange_headers(sock, self.request)
+            if fields is not None and self._accepts(fields):
+                self._ended = asyncio.get_running_loop().create_future()
+                self._stream = Stream(sock, on_bytes=self._take, on_close=self._end, outbox=Outbox(1, 1))
                 ended = await self._ended
         except TimeoutError:
-            return f"no header from the publisher in {limits.TCPROS_CONNECT_TIMEOUT:g} s"
+            return f"no header from the publisher in {within:g} s"
+        except (OSError, RemoteProtocolError) as error:
+            ended = error
         finally:
             self._drop()
+            sock.close()
         self.malformed = isinstance(ended, RemoteProtocolError)
         return str(ended) if ended is not None else "the publisher closed the connection"
 
-    async def _request_topic(self) -> tuple[str, int]:
-        params = self.request["callerid"], self.topic, [[TCPROS]]
-        reply = await call_api(self.uri, "requestTopic", *params, timeout=limits.TCPROS_CONNECT_TIMEOUT)
-        match reply.value:
-            case [str(protocol), str(host), int(port)] if reply.code == 1 and protocol == TCPROS:
-                if 0 < port <= _PORT_MAX:
-                    return host, port
-        raise RemoteProtocolError(f"{self.uri} answers requestTopic with {reply.code}: {printable(reply.status)}")
-
-    def _open(self, sock: socket.socket) -> None:
-        try:
-            keep_alive(sock)
-            self.info = tcpros_info(sock)
-        except OSError:  # the publisher has disconnected already
-            sock.close()
-            raise
-        self._ended = asyncio.get_running_loop().create_future()
-        outbox = Outbox(1, limits.TCPROS_HEADER_MAX)
-        self._stream = Stream(sock, on_bytes=self._take, on_close=self._end, outbox=outbox)
-        # At once: a rospy node accepts no other connection while it waits for a header.
-        self._stream.send([encode_header(self.request)], URGENT)
-
     def _take(self, data: memoryview) -> tuple[int, int]:
         at = 0
-        if not self.fields:
-            fields, at, wanted = parse_header(data)
-            if fields is None:
-                return 0, wanted
-            self._accept_header(fields)
         while self.fields:  # a callback may close the connection
             if self._left:
                 at += self._take_part(data[at:])
@@ -260,7 +243,9 @@ class PublisherConnection(TopicConnection):
             try:
                 messages, consumed, wanted = split_messages(data[at:])
             except LimitExceeded as error:
-                self._begin(LENGTH.size + error.claimed, skip=True)
+                self._begin(LENGTH.size + error.claimed, None)
+                self.oversized += 1
+                self._on_oversized(error.claimed)
                 continue
             for message in messages:
                 if self._closed:
@@ -270,53 +255,40 @@ class PublisherConnection(TopicConnection):
                 self._on_message(message)
             at += consumed
             if self._parts is not None and wanted > core_limits.CUT_THROUGH_BYTES and not self._closed:
-                self._begin(wanted, skip=False)
+                self._begin(wanted, self._parts)
             elif wanted > LENGTH.size or len(data) - at < LENGTH.size:  # else a message that is too long follows
                 return at, wanted
         return len(data), 0
-
-    def _begin(self, size: int, *, skip: bool) -> None:
-        """Begin a message that is taken in parts, or one that is too long and dropped."""
-        self._left, self._skips = size, skip
-        if skip:
-            self.oversized += 1
-            self._on_oversized(size - LENGTH.size)
-        elif self._parts is not None:
-            self._parts.begin(size)
 
     def _take_part(self, data: memoryview) -> int:
         """Pass on, or drop, the received bytes of the message in progress; return their number."""
         count = min(self._left, len(data))
         self._left -= count
         self.bytes += count
-        if self._parts is not None and not self._skips:
+        if self._taker is not None:
             self.messages += not self._left
-            self._parts.part(data[:count])
+            self._taker.part(data[:count])
         return count
 
-    def _accept_header(self, fields: Header) -> None:
+    def _accepts(self, fields: Header) -> bool:
+        """Take the publisher's header; return whether messages follow."""
         problem = check_publisher(fields, self.request["type"], self.request["md5sum"])
         if problem is None:
             self.fields = fields
-            self._handshake.reschedule(None)
             _log.debug("= %s: connected to publisher %s", self.topic, self.uri)
             self._on_header(fields)
-            return
+            return self.connected  # the callback may close the connection
         self.refused = problem
-        self._drop()
-        self._end(None)
         _log.debug("! %s: publisher %s refuses: %s", self.topic, self.uri, problem)
         self._on_refused(problem)
+        return False
 
     def _end(self, error: Exception | None) -> None:
         if not self._ended.done():
             self._ended.set_result(error)
 
     def _drop(self) -> None:
-        self.fields = {}
-        left, self._left = self._left, 0
-        if left and self._parts is not None and not self._skips:
-            self._parts.abort()
+        self._lose()
         if self._stream is not None:
             self._stream.close()
             self._stream = None
@@ -340,7 +312,7 @@ class InProcessConnection(TopicConnection):
     closed = True
     since = 0
     # What has come of a message in parts, for a subscriber that takes it whole.
-    _whole: bytearray | None = None
+    _whole: bytearray
     _next: asyncio.Handle | None = None
 
     on_end: Callable[[InProcessConnection, Exception | None], None]
@@ -378,23 +350,21 @@ class InProcessConnection(TopicConnection):
             attach(self)
 
     def _detach(self) -> None:
-        self.closed, self.fields = True, {}
-        left, self._left = self._left, 0
-        if left and self._parts is not None and self._whole is None:
-            self._parts.abort()
+        self.closed = True
+        self._lose()
 
     def _lost(self, reason: str) -> None:
         self._next = asyncio.get_running_loop().call_later(self._backoff.delay(), self._attach)
         self._on_lost(reason)
 
-    def accept(self, header: Mapping[str, str], _queue_messages: int, _queue_bytes: int) -> None:
+    def accept(self, header: Mapping[str, str]) -> None:
         """Take the publisher's header; messages may follow."""
         if not self.closed:
             self.fields = dict(header)
             self._backoff.reset()
             self._on_header(self.fields)
 
-    def bound(self, _queue_messages: int, _queue_bytes: int) -> None:
+    def bound(self, _messages: int) -> None:
         """Do nothing: there is no queue."""
 
     def refuse(self, text: str) -> None:
@@ -427,11 +397,8 @@ class InProcessConnection(TopicConnection):
     def open(self, key: int, size: int) -> QueuedMessage:
         """Begin a message of ``size`` bytes that comes in parts."""
         if not self.closed:
-            self._left = size
             self._whole = bytearray()
-            if self._parts is not None and size > core_limits.CUT_THROUGH_BYTES:
-                self._whole = None
-                self._parts.begin(size)
+            self._begin(size, self._parts if size > core_limits.CUT_THROUGH_BYTES else None)
         return QueuedMessage(key, size)
 
     def extend(self, _message: QueuedMessage, part: Buffer) -> int:
@@ -441,20 +408,18 @@ class InProcessConnection(TopicConnection):
         self._left -= len(part)
         self.bytes += len(part)
         self.messages += not self._left
-        if self._whole is not None:
-            self._whole += part
-            if not self._left:
-                # Not used again: the subscriber may send it on, and then it is read until the read ends.
-                self._on_message(memoryview(self._whole))
-        elif self._parts is not None:
-            self._parts.part(memoryview(part))
+        if self._taker is not None:
+            self._taker.part(memoryview(part))
+            return 0
+        self._whole += part
+        if not self._left:
+            # Not used again: the subscriber may send it on, and then it is read until the read ends.
+            self._on_message(memoryview(self._whole))
         return 0
 
     def abandon(self, _message: QueuedMessage) -> bool:
         """Drop the message in progress, whose rest will not come; the connection goes on."""
-        left, self._left = self._left, 0
-        if left and self._parts is not None and self._whole is None:
-            self._parts.abort()
+        self._abort()
         return False
 
 
@@ -466,49 +431,35 @@ class Subscription:
 
     Args:
         topic: The topic's global name.
-        caller_id: The node's name.
+        node: The node, which listens already.
         on_message: ``(connection, framed)``; the view is only valid during the call.
         on_refused: ``(connection, text)``.
-        own_uri: The node's slave API, if it is ignored in the list: the node does not subscribe to itself.
+        own: Whether the node subscribes to itself too.
         accepts: Whether the publisher of a slave API is connected to; ``None``: each.
-        type_name: The type to ask for.
-        md5sum: The md5 sum to ask for.
-        definition: The definition to send.
+        wanted: The type and md5 sum to ask for, and the definition to send.
         nodelay: Whether to ask for TCP_NODELAY.
-        number: Returns the number of a new connection.
     """
 
     def __init__(
         self,
         topic: str,
-        caller_id: str,
+        node: SlaveNode,
         *,
         on_message: Callable[[PublisherConnection, memoryview], None],
         on_refused: Callable[[PublisherConnection, str], None] = _ignore,
-        own_uri: str = "",
+        own: bool = False,
         accepts: Callable[[str], bool] | None = None,
-        type_name: str = ANY,
-        md5sum: str = ANY,
-        definition: str = "",
+        wanted: TopicDescription = ANYTHING,
         nodelay: bool = True,
-        number: Callable[[], int] = int,
     ) -> None:
         self.topic = topic
-        self.type_name = type_name
-        self._connection = partial(
-            PublisherConnection,
-            topic,
-            caller_id=caller_id,
-            type_name=type_name,
-            md5sum=md5sum,
-            definition=definition,
-            nodelay=nodelay,
-        )
+        self.type_name = wanted.type
+        self._connection = partial(PublisherConnection, topic, caller_id=node.name, wanted=wanted, nodelay=nodelay)
         self._on_message = on_message
         self._on_refused = on_refused
-        self._own_uri = own_uri
+        self._node = node
+        self._own = own
         self._accepts = accepts
-        self._number = number
         self._connections: dict[str, PublisherConnection] = {}
 
     @property
@@ -532,7 +483,8 @@ class Subscription:
             uris: The slave APIs of the listed publishers.
             keep: Disconnect from none, because the list of a restarted master is incomplete.
         """
-        listed = {uri for uri in uris if uri != self._own_uri and (self._accepts is None or self._accepts(uri))}
+        left_out = "" if self._own else self._node.uri
+        listed = {uri for uri in uris if uri != left_out and (self._accepts is None or self._accepts(uri))}
         for uri, connection in tuple(self._connections.items()):
             if connection.refused is not None if uri in listed else not keep:
                 self._connections.pop(uri).close()
@@ -549,7 +501,7 @@ class Subscription:
             on_message=lambda framed: self._on_message(connection, framed),
             on_refused=lambda text: self._on_refused(connection, text),
             on_oversized=lambda size: self._oversized(connection, size),
-            number=self._number(),
+            number=self._node.next_number(),
         )
         self._connections[uri] = connection
         connection.start()

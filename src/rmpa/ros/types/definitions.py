@@ -20,7 +20,7 @@ from rmpa.core.errors import LimitExceeded, RmpaError
 from rmpa.core.identity import is_type_name
 from rmpa.core.limits import UINT32_MAX
 from rmpa.ros import limits
-from rmpa.ros.wire.tcpros import TopicDescription
+from rmpa.ros.wire.tcpros import LENGTH, TopicDescription, pack_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -67,13 +67,6 @@ class MessageError(RmpaError):
     """A value does not fit a message type, or bytes are not a message of it."""
 
     code = "invalid-message"
-
-
-class DefinedType:
-    """What codecs of a message type are made of: its name and its full text."""
-
-    name: str
-    definition: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -334,7 +327,6 @@ def known_description(name: str) -> TopicDescription:
 
 
 ARRAY_TYPE: Final = "diagnostic_msgs/DiagnosticArray"
-_LENGTH: Final = struct.Struct("<I")
 _ARRAY_HEADER: Final = struct.Struct("<III")
 _SECOND: Final = 1_000_000_000
 
@@ -368,10 +360,10 @@ class DiagnosticStatus:
 
     def serialize(self) -> bytes:
         """Serialize the status as one element of the array."""
-        parts = [bytes((self.level,)), *map(_text, (self.name, self.message, self.hardware_id))]
-        parts.append(_LENGTH.pack(len(self.values)))
+        parts = [bytes((self.level,)), *map(pack_text, (self.name, self.message, self.hardware_id))]
+        parts.append(LENGTH.pack(len(self.values)))
         for key, value in self.values.items():
-            parts += (_text(key), _text(value))
+            parts += (pack_text(key), pack_text(value))
         return b"".join(parts)
 
 
@@ -385,11 +377,6 @@ def frame_array(sequence: int, stamp_ns: int, statuses: Iterable[bytes]) -> byte
     """
     elements = tuple(statuses)
     seconds, nanoseconds = divmod(stamp_ns, _SECOND)
-    header = _ARRAY_HEADER.pack(sequence & UINT32_MAX, seconds & UINT32_MAX, nanoseconds) + _text("")
-    body = b"".join((header, _LENGTH.pack(len(elements)), *elements))
-    return _LENGTH.pack(len(body)) + body
-
-
-def _text(text: str) -> bytes:
-    data = text.encode(errors="replace")
-    return _LENGTH.pack(len(data)) + data
+    header = _ARRAY_HEADER.pack(sequence & UINT32_MAX, seconds & UINT32_MAX, nanoseconds) + pack_text("")
+    body = b"".join((header, LENGTH.pack(len(elements)), *elements))
+    return LENGTH.pack(len(body)) + body

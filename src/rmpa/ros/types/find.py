@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import functools
 import os
-import threading
-from collections import OrderedDict
 from time import monotonic
 from typing import TYPE_CHECKING, Final, NoReturn, TypeVar
 
@@ -29,7 +27,7 @@ from rmpa.ros.types.installed import (
     known_services,
     packages_below,
 )
-from rmpa.ros.types.messages import MessageType
+from rmpa.ros.types.messages import MessageType, learnt_type
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -114,7 +112,7 @@ def _message(name: str, found: Found | None, path: SearchPath) -> MessageType:
     text, embedded, where = found
     known = {name: definitions.Specification.parse(name, text)}
     _complete(name, known, embedded, path, "message type")
-    made = _built_message(name, definitions.full_text(name, known), str(where))
+    made = learnt_type(name, definitions.full_text(name, known), str(where))
     if definitions.known_text(name) is not None and (ours := MessageType(name)).md5sum == made.md5sum:
         return ours  # its serialization code may be generated already
     return made
@@ -128,12 +126,6 @@ def _service(name: str, found: Found | None, path: SearchPath) -> ServiceType:
     _complete(name, known, embedded, path, "service type")
     inner = tuple((each, its.text) for each, its in known.items())
     return _built_service(name, text, inner, str(where))
-
-
-# Types are cached by their text, with their serialization code, which takes some 10 ms to generate.
-@functools.lru_cache(maxsize=limits.TYPES_FOUND_MAX)
-def _built_message(name: str, definition: str, source: str) -> MessageType:
-    return MessageType(name, definitions.parse_definition(name, definition), source)
 
 
 @functools.lru_cache(maxsize=limits.TYPES_FOUND_MAX)
@@ -198,11 +190,6 @@ def _unknown(name: str, path: SearchPath, kind: str) -> NoReturn:
 # Finds the message type of a connection header; results are cached, so it can be called for each message.
 
 
-# Types that were not found: the time of the search (monotonic seconds) and the error; the oldest first.
-_missing: OrderedDict[tuple[str, str, SearchPath], tuple[float, RmpaError]] = OrderedDict()
-_missing_lock: Final = threading.Lock()
-
-
 @functools.lru_cache(maxsize=limits.TYPES_FOUND_MAX)
 def _with_sum(name: str, md5: str, path: SearchPath) -> MessageType:
     # With a sum the result stays valid when the files change.
@@ -212,8 +199,8 @@ def _with_sum(name: str, md5: str, path: SearchPath) -> MessageType:
 def type_of_header(fields: Mapping[str, str]) -> MessageType:
     """The message type of a publisher's connection header: from its definition, else as found on this machine.
 
-    May be called for each message: results are cached, and a failed search is not repeated within
-    ``TYPE_MISSING`` seconds.
+    May be called for each message: results are cached, and a failed search is repeated after ``TYPE_MISSING`` seconds
+    at the most.
 
     Raises:
         DefinitionError: As for ``MessageType.learn`` and ``find_message_type``.
@@ -222,17 +209,16 @@ def type_of_header(fields: Mapping[str, str]) -> MessageType:
     definition = fields.get("message_definition", "")
     if definition or md5 == EMPTY_MD5:
         return MessageType.learn(name, definition, md5)
-    key = name, md5, SearchPath.read(os.environ)
-    with _missing_lock:
-        when, error = _missing.get(key, (0.0, None))
-    if error is not None and monotonic() - when < TYPE_MISSING:
-        raise error.with_traceback(None)  # the traceback would grow with each message
+    found = _searched(name, md5, SearchPath.read(os.environ), int(monotonic() / TYPE_MISSING))
+    if isinstance(found, RmpaError):
+        raise found.with_traceback(None)  # the traceback would grow with each message
+    return found
+
+
+@functools.lru_cache(maxsize=limits.TYPES_FOUND_MAX)
+def _searched(name: str, md5: str, path: SearchPath, _period: int) -> MessageType | RmpaError:
+    """What a search found in a period of time, or its error."""
     try:
-        return _with_sum(*key)
-    except RmpaError as problem:
-        with _missing_lock:
-            _missing[key] = monotonic(), problem
-            _missing.move_to_end(key)
-            while len(_missing) > limits.TYPES_MISSING_MAX:
-                _missing.popitem(last=False)
-        raise
+        return _with_sum(name, md5, path)
+    except RmpaError as error:
+        return error

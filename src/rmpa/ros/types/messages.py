@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, Union
 from rmpa.core.limits import UINT32_MAX
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import (
-    DefinedType,
     DefinitionError,
     Field,
     MessageError,
@@ -35,8 +34,8 @@ if TYPE_CHECKING:
 
     from rmpa.ros.wire.tcpros import Buffer
 
-# Message types from publishers' headers in the cache of a process; the least recently used is dropped.
-_RECEIVED_TYPES_MAX: Final = 256
+# Message types from texts in the cache of a process; the least recently used is dropped.
+_LEARNT_TYPES_MAX: Final = 512
 
 # A value of YAML or JSON.
 Plain: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type
@@ -48,7 +47,7 @@ __all__ = ["HeaderNumbers", "MessageError", "MessageType", "Plain", "given_value
 _SEQ: Final = struct.Struct("<I")
 
 
-class MessageType(DefinedType):
+class MessageType:
     """One message type.
 
     Args:
@@ -73,7 +72,7 @@ class MessageType(DefinedType):
 
     @classmethod
     def learn(cls, name: str, definition: str, md5: str = "") -> MessageType:
-        """Make a type from its publisher's header; the last ``_RECEIVED_TYPES_MAX`` types are cached.
+        """Make a type from its publisher's header; the last ``_LEARNT_TYPES_MAX`` types are cached.
 
         Args:
             name: ``package/Name``.
@@ -84,7 +83,7 @@ class MessageType(DefinedType):
             DefinitionError: The text is malformed, or has another md5 sum.
             LimitExceeded: The text is too long.
         """
-        learnt = _learn(name, definition)
+        learnt = learnt_type(name, definition)
         if md5 and learnt.md5sum != md5:
             raise DefinitionError(name, f"its definition has the md5 sum {learnt.md5sum}, its publisher says {md5}")
         return learnt
@@ -201,9 +200,10 @@ def _known_store() -> Typestore:
     return Ros1Store(Stores.ROS1_NOETIC)
 
 
-@functools.lru_cache(maxsize=_RECEIVED_TYPES_MAX)
-def _learn(name: str, definition: str) -> MessageType:
-    return MessageType(name, parse_definition(name, definition))
+@functools.lru_cache(maxsize=_LEARNT_TYPES_MAX)
+def learnt_type(name: str, definition: str, source: str = "") -> MessageType:
+    """A type from its full text, cached with its serialization code, which takes some 10 ms to generate."""
+    return MessageType(name, parse_definition(name, definition), source)
 
 
 def _learnt_store(name: str, specifications: Mapping[str, Specification]) -> Typestore:

@@ -40,56 +40,6 @@ _TEXTS: Final = re.compile(rb"<value>\s*(?:<string>)?([^<]{1,256})(?:</string>)?
 _BEGIN: Final = 4 * KIB
 
 
-class CallBody:
-    """Collects one body after the other; a call that is too large is answered with an XML-RPC fault.
-
-    A fault is the only error that ROS's clients show: ``rospy.set_param`` ignores a status of -1 and xmlrpc.client
-    hides the text of an HTTP error, while ``rosparam`` and ``roslaunch`` print a fault's text. A client reads no
-    answer before it has sent its whole call, so a refused call is read to its end, but only its beginning is kept.
-
-    Args:
-        reserve: ``(bytes) -> whether there is room``: called once for each large call.
-
-    Attributes:
-        size: Bytes received.
-        reserved: Bytes reserved for the present call, until its owner sets 0.
-        why: Makes the text of the fault from the beginning and size of a call that is too large; it is dropped.
-    """
-
-    def __init__(self, reserve: Callable[[int], bool]) -> None:
-        self._reserve = reserve
-        self._data = bytearray()
-        self.size = 0
-        self.reserved = 0
-        self.why: Callable[[Buffer, int], str] | None = None
-
-    def expect(self, size: int) -> None:
-        """Announce the size of a body that has a Content-length."""
-        if size > limits.HTTP_BODY_MAX:
-            self.why = too_large
-        elif size > limits.HTTP_BODY_INLINE and not self.reserved:
-            if self._reserve(size):
-                self.reserved = size
-            else:
-                self.why = too_many
-
-    def add(self, data: bytes) -> None:
-        """Add a part."""
-        self.size += len(data)
-        if self.why is None and self.size > limits.HTTP_BODY_INLINE:
-            # A body in chunks has no announced size.
-            self.expect(max(self.size, limits.HTTP_BODY_MAX))
-        self._data += data
-        if self.why is not None:
-            del self._data[_BEGIN:]
-
-    def end(self) -> tuple[memoryview, str]:
-        """Return the whole body and an empty text; for a refused one its beginning and the text of the fault."""
-        data, size, why = self._data, self.size, self.why
-        self._data, self.size, self.why = bytearray(), 0, None
-        return memoryview(data), why(data, size) if why is not None else ""
-
-
 def call_name(begin: Buffer) -> str:
     """A call's method, with the key if it is about a parameter: ``setParam /map``; ``a call`` if it is unknown.
 
@@ -124,60 +74,61 @@ def too_many(begin: Buffer, size: int) -> str:
 
 
 class HttpRequest(NamedTuple):
-    """One XML-RPC call.
+    """One XML-RPC call, or a request that is refused.
 
     Args:
         body: The XML; for a call that is too large only its beginning.
-        refusal: The text of the fault for a call that is too large; empty for all others.
+        refusal: The text of the fault for a call that is too large, or of the answer with an error of HTTP; empty for
+            all others.
         close: Whether the connection ends with the answer.
+        status: The status code of the answer. After a request with an error of HTTP nothing is parsed.
+        counter: The counter of the refusal, such as ``http.malformed``.
     """
 
     body: memoryview
     refusal: str
     close: bool
-
-
-class HttpRefusal(NamedTuple):
-    """A request that is answered with an HTTP error; nothing after it is parsed.
-
-    Args:
-        status: The status code of the answer.
-        text: The body of the answer.
-        counter: The counter of the refusal, such as ``http.malformed``.
-    """
-
-    status: int
-    text: str
-    counter: str
+    status: int = 200
+    counter: str = "http.too_large"
 
 
 class RequestParser:
     """Parses the requests of one client.
+
+    A call that is too large is answered with an XML-RPC fault, the only error that ROS's clients show:
+    ``rospy.set_param`` ignores a status of -1 and xmlrpc.client hides the text of an HTTP error, while ``rosparam``
+    and ``roslaunch`` print a fault's text. A client reads no answer before it has sent its whole call, so a refused
+    call is read to its end, but only its beginning is kept.
 
     Args:
         reserve: ``(bytes) -> whether there is room``: called once for each large call.
         on_begin: Called with the first byte of each request.
 
     Attributes:
-        body: The body of the request that is being received.
+        size: Bytes received of the body of the present request.
+        reserved: Bytes reserved for the present call, until the owner sets 0.
         receiving: Whether a request has begun and is not complete.
         expects_continue: Whether the client waits for ``CONTINUE`` before it sends a body; the owner resets it.
     """
 
+    # More than 12 fields: the body, the headers and their bounds.
     def __init__(self, reserve: Callable[[int], bool], on_begin: Callable[[], None]) -> None:
-        self.body = CallBody(reserve)
-        self.receiving = False
-        self.expects_continue = False
+        self.size = self.reserved = 0
+        self.receiving = self.expects_continue = False
+        self._reserve = reserve
         self._on_begin = on_begin
         self._parser: HttpRequestParser | None = HttpRequestParser(self)
-        self._found: list[HttpRequest | HttpRefusal] = []
+        self._found: list[HttpRequest] = []
         self._refused = False
         self._headers: dict[bytes, bytes] = {}
+        self._body = bytearray()
+        # Makes the text of the fault from the beginning and size of a call that is too large; it is dropped.
+        self._why: Callable[[Buffer, int], str] | None = None
         # Bytes since the last body data or end of a request: of headers, trailers and the lines between chunks.
         self._without_body = 0
         self._progress = False
 
-    def feed(self, data: Buffer) -> list[HttpRequest | HttpRefusal]:
+    def feed(self, data: Buffer) -> list[HttpRequest]:
         """Take the next bytes; return the requests that are complete now, a refusal last.
 
         The size of headers is bounded with the granularity of ``data``: give no more than some KiB at a time.
@@ -197,7 +148,7 @@ class RequestParser:
         found, self._found = self._found, []
         return found
 
-    def feed_eof(self) -> list[HttpRequest | HttpRefusal]:
+    def feed_eof(self) -> list[HttpRequest]:
         """Note the end of the client's stream; return a refusal if a request is incomplete."""
         if self.receiving:
             self._refuse(400, "the connection ended within a request", "http.malformed")
@@ -211,7 +162,7 @@ class RequestParser:
     def _refuse(self, status: int, text: str, counter: str) -> None:
         if not self._refused:
             self._refused = True
-            self._found.append(HttpRefusal(status, text, counter))
+            self._found.append(HttpRequest(memoryview(b""), text, True, status, counter))
 
     def on_message_begin(self) -> None:
         """Begin a request at its first byte."""
@@ -241,17 +192,34 @@ class RequestParser:
         elif headers.get(b"content-encoding", b"identity").lower() != b"identity":
             self._refuse(415, "an encoded body; send it as it is", "http.encoding")
         else:
-            self.body.expect(size)
+            self._expect(size)
             if is_1_1 and headers.get(b"expect", b"").lower() == b"100-continue":
-                if self.body.why is not None:
+                if self._why is not None:
                     self._refuse(413, f"a body of more than {limits.HTTP_BODY_MAX} bytes", "http.too_large")
                 self.expects_continue = not self._refused
+
+    def _expect(self, size: int) -> None:
+        """Judge the size of a body."""
+        if size > limits.HTTP_BODY_MAX:
+            self._why = too_large
+        elif size > limits.HTTP_BODY_INLINE and not self.reserved:
+            if self._reserve(size):
+                self.reserved = size
+            else:
+                self._why = too_many
 
     def on_body(self, data: bytes) -> None:
         """Add a part of the body."""
         self._progress = True
-        if not self._refused:
-            self.body.add(data)
+        if self._refused:
+            return
+        self.size += len(data)
+        if self._why is None and self.size > limits.HTTP_BODY_INLINE:
+            # A body in chunks has no announced size.
+            self._expect(max(self.size, limits.HTTP_BODY_MAX))
+        self._body += data
+        if self._why is not None:
+            del self._body[_BEGIN:]
 
     def on_message_complete(self) -> None:
         """Complete a request at its last byte."""
@@ -259,7 +227,9 @@ class RequestParser:
         self.receiving = self.expects_continue = False
         if not self._refused and self._parser is not None:
             close = self._parser.get_http_version() != "1.1" or not self._parser.should_keep_alive()
-            self._found.append(HttpRequest(*self.body.end(), close))
+            text = self._why(self._body, self.size) if self._why is not None else ""
+            self._found.append(HttpRequest(memoryview(self._body), text, close))
+            self._body, self.size, self._why = bytearray(), 0, None
 
 
 class ResponseParser:

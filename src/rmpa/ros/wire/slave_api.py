@@ -21,19 +21,22 @@ if TYPE_CHECKING:
 TCPROS: Final = "TCPROS"
 INBOUND: Final = "i"
 OUTBOUND: Final = "o"
+_PORT_MAX: Final = 65535
+# In the text about a connection; the socket is not always named.
+_INFO: Final = re.compile(r"on port ([0-9]{1,5}) to \[([^\s\[\]]+):([0-9]{1,5})(?: on socket \w+)?\]")
 
 
 @dataclass(frozen=True, slots=True)
 class BusConnection:
-    """One topic connection of a node, for ``getBusInfo``, ``getBusStats`` and RMPA's own tools.
+    """One topic connection of a node, as ``getBusInfo`` and ``getBusStats`` have it.
 
     Args:
         number: The connection's number within the node.
         other: The other side: a subscriber's caller id, or a publisher's slave API URI.
         direction: ``"o"`` to a subscriber, ``"i"`` from a publisher.
         topic: The topic.
-        connected: Whether messages can flow.
-        info: The addresses, for people.
+        connected: Whether messages can flow, as far as the node knows.
+        info: The addresses, for people: ``TCPROS connection on port 46087 to [10.0.0.1:45225 on socket 12]``.
         bytes: Bytes sent or received.
         messages: Messages sent or received.
         dropped: Messages dropped because the other side is slow; 0 inbound.
@@ -45,11 +48,33 @@ class BusConnection:
     direction: str
     topic: str
     connected: bool
-    info: str
-    bytes: int
-    messages: int
+    info: str = ""
+    bytes: int = 0
+    messages: int = 0
     dropped: int = 0
     waiting: int = 0
+
+    @property
+    def inbound(self) -> bool:
+        """Whether it is from a publisher."""
+        return self.direction == INBOUND
+
+    @property
+    def local_port(self) -> int | None:
+        """The port of the node's end of a TCP connection; ``None`` if the node does not say it."""
+        found = _INFO.search(self.info)
+        return _port(found[1]) if found is not None else None
+
+    @property
+    def remote(self) -> tuple[str, int] | None:
+        """Host and port of the other end, likewise; the host is an address, or a name that the publisher goes by."""
+        found = _INFO.search(self.info)
+        port = _port(found[3]) if found is not None else None
+        return (found[2], port) if found is not None and port is not None else None
+
+
+def _port(text: str) -> int | None:
+    return int(text) if 0 < int(text) <= _PORT_MAX else None
 
 
 # By method: the number of parameters after the caller id, and the value in an error's reply.
@@ -128,38 +153,11 @@ def bus_info(connections: Iterable[BusConnection]) -> list[XmlRpcValue]:
 # out, and so is what is unknown in one that can: a node may be of any library.
 
 
-# ``TCPROS connection on port 46087 to [10.0.0.1:45225 on socket 12]``; the socket is not always named.
-_INFO: Final = re.compile(r"on port ([0-9]{1,5}) to \[([^\s\[\]]+):([0-9]{1,5})(?: on socket \w+)?\]")
 # How rospy's text begins for a connection that has ended; the row says that it is connected all the same.
 _CLOSED: Final = "Closed "
-_PORT_MAX: Final = 65535
 
 
-@dataclass(frozen=True, slots=True)
-class BusLink:
-    """One connection of a node, as ``getBusInfo`` has it.
-
-    Args:
-        number: Its number within the node.
-        other: The other side: a subscriber's caller id, or a publisher's slave API URI.
-        inbound: Whether it is from a publisher; else it is to a subscriber.
-        topic: The topic.
-        connected: Whether messages can flow, as far as the node knows.
-        local_port: The port of the node's end of a TCP connection; ``None`` if the node does not say it.
-        remote: Host and port of the other end of a TCP connection, likewise. The host is an address, or the name that
-            the publisher goes by.
-    """
-
-    number: int
-    other: str
-    inbound: bool
-    topic: str
-    connected: bool
-    local_port: int | None
-    remote: tuple[str, int] | None
-
-
-def read_bus_info(answer: XmlRpcValue) -> list[BusLink]:
+def read_bus_info(answer: XmlRpcValue) -> list[BusConnection]:
     """The connections of a node.
 
     Args:
@@ -222,25 +220,15 @@ def sent_between(before: Sent, after: Sent) -> tuple[int, int] | None:
     return messages, max(0, size - LENGTH.size * messages)
 
 
-def _link(row: Sequence[XmlRpcValue]) -> BusLink | None:
+def _link(row: Sequence[XmlRpcValue]) -> BusConnection | None:
     number, other, direction, transport, topic, connected, info = [*row, *(None,) * 7][:7]
     if not isinstance(number, int) or isinstance(number, bool) or direction not in (INBOUND, OUTBOUND):
         return None
     if not isinstance(other, str) or not isinstance(topic, str):
         return None
     text = info if isinstance(info, str) else ""
-    local, remote = _addresses(text) if transport == TCPROS else (None, None)
     standing = connected in (True, 1) and not text.startswith(_CLOSED)
-    return BusLink(number, other, direction == INBOUND, topic, standing, local, remote)
-
-
-def _addresses(info: str) -> tuple[int | None, tuple[str, int] | None]:
-    """The local port, and the remote host and port, in the text about a connection."""
-    found = _INFO.search(info)
-    if found is None:
-        return None, None
-    local, host, port = int(found[1]), found[2], int(found[3])
-    return (local if 0 < local <= _PORT_MAX else None, (host, port) if 0 < port <= _PORT_MAX else None)
+    return BusConnection(number, other, str(direction), topic, standing, text if transport == TCPROS else "")
 
 
 def _list(value: XmlRpcValue) -> Sequence[XmlRpcValue]:

@@ -76,10 +76,20 @@ class TopicDescription:
         return f"{printable(self.type)}/{printable(self.md5sum)}"
 
 
+# What a subscriber that accepts any type asks for.
+ANYTHING: Final = TopicDescription(ANY, ANY, "")
+
+
 def printable(text: str) -> str:
     """Make received text safe for logs and terminals: replace control characters and surrogates, cut long text."""
     shown = text if len(text) <= _SHOWN else text[:_SHOWN] + "…"
     return "".join(c if c.isprintable() else "�" for c in shown)
+
+
+def pack_text(text: str) -> bytes:
+    """A string of a message."""
+    data = text.encode(errors="replace")
+    return LENGTH.pack(len(data)) + data
 
 
 def encode_header(fields: Mapping[str, str]) -> bytes:
@@ -188,19 +198,17 @@ def split_messages(data: memoryview) -> tuple[list[memoryview], int, int]:
 
 
 def subscriber_header(
-    topic: str, caller_id: str, *, type_name: str = ANY, md5sum: str = ANY, definition: str = "", nodelay: bool = True
+    topic: str, caller_id: str, wanted: TopicDescription = ANYTHING, *, nodelay: bool = True
 ) -> Header:
     """The header of a subscriber; an unknown definition is left out, as roscpp does."""
     fields = {
         "callerid": caller_id,
-        "md5sum": md5sum,
+        "md5sum": wanted.md5sum,
         "tcp_nodelay": "1" if nodelay else "0",
         "topic": topic,
-        "type": type_name,
+        "type": wanted.type,
     }
-    if definition:
-        fields["message_definition"] = definition
-    return fields
+    return fields | ({"message_definition": wanted.definition} if wanted.definition else {})
 
 
 def publisher_header(topic: str, caller_id: str, description: TopicDescription) -> Header:
@@ -220,11 +228,6 @@ def publisher_header(topic: str, caller_id: str, description: TopicDescription) 
         "topic": topic,
         "type": description.type,
     }
-
-
-def error_header(text: str) -> Header:
-    """The reply to a header that does not match; the connection is closed after it."""
-    return {"error": text}
 
 
 def check_request(fields: Mapping[str, str]) -> str | None:
@@ -299,7 +302,6 @@ def check_publisher(fields: Mapping[str, str], type_name: str = ANY, md5sum: str
 # The head of a reply: the ``ok`` byte and the length of the body.
 REPLY: Final = struct.Struct("<BI")
 _SCHEME: Final = "rosrpc://"
-_TRUE: Final = ("1", "true")
 
 
 @dataclass(frozen=True, slots=True)
@@ -363,14 +365,12 @@ def server_header(caller_id: str, description: ServiceDescription) -> Header:
     }
 
 
-def is_persistent(fields: Mapping[str, str]) -> bool:
-    """Whether a client calls several times over one connection: ``1`` or ``true`` in any case."""
-    return fields.get("persistent", "").lower() in _TRUE
+def is_set(fields: Mapping[str, str], name: str) -> bool:
+    """Whether a client's header has a mark: ``1`` or ``true`` in any case.
 
-
-def is_probe(fields: Mapping[str, str]) -> bool:
-    """Whether a client asks only for the description, and will send no request."""
-    return fields.get("probe", "").lower() in _TRUE
+    ``persistent``: it calls several times over one connection; ``probe``: it asks only for the description.
+    """
+    return fields.get(name, "").lower() in ("1", "true")
 
 
 def check_client(
@@ -394,19 +394,6 @@ def check_server(fields: Mapping[str, str], service: str, md5sum: str = ANY) -> 
     if md5sum not in (ANY, fields["md5sum"]):
         return f"the server of {service} has md5sum [{printable(fields['md5sum'])}], not [{printable(md5sum)}]"
     return None
-
-
-def frame_reply(ok: bool, body: Buffer) -> tuple[bytes, Buffer]:
-    """A reply's head and its body; for ``ok=False`` the body is the text of the error."""
-    return REPLY.pack(ok, len(body)), body
-
-
-def parse_request_length(data: Buffer) -> int | None:
-    """The length of the request that begins here, or ``None`` without enough bytes."""
-    if len(data) < LENGTH.size:
-        return None
-    size: int = LENGTH.unpack_from(data)[0]
-    return size
 
 
 def parse_reply_head(data: Buffer) -> tuple[bool, int] | None:

@@ -34,15 +34,10 @@ if TYPE_CHECKING:
 
 # XML 1.0, section 2.2: characters that a document cannot hold, not even escaped.
 _ILLEGAL: Final = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-# Scalars in one piece: some 50 microseconds.
+# Parts of text in one piece: some 50 microseconds.
 _PIECE: Final = 128
 # Characters of a long string, or bytes of binary data, in one piece; base64 has 57 bytes in a line.
 _SLICE: Final = 57 * 128
-
-
-def legal_text(text: str) -> str:
-    """Replace characters that XML cannot hold by ``?``."""
-    return _ILLEGAL.sub("?", text)
 
 
 def pieces(what: str, value: object) -> Iterator[bytes]:
@@ -55,72 +50,55 @@ def pieces(what: str, value: object) -> Iterator[bytes]:
     Raises:
         LocalProtocolError: A value cannot be written: ``None``, an integer beyond 32 bits, a control character.
     """
+    out: list[str] = []
     try:
-        yield from _pieces(value)
+        for text in _texts(value, 0):
+            out.append(text)
+            if len(out) >= _PIECE or len(text) >= _SLICE:
+                yield "".join(out).encode()
+                out.clear()
     except LocalProtocolError as error:
         raise LocalProtocolError(f"{what} {error}") from None
+    yield "".join(out).encode()
 
 
-def _pieces(value: object) -> Iterator[bytes]:
-    out: list[str] = []
-    rest: Iterator[object] = iter((value,))
-    members, end = False, ""
-    above: list[tuple[Iterator[object], bool, str]] = []
-    while True:
-        for item in rest:
-            if members:
-                key, item = cast("tuple[object, object]", item)  # noqa: PLW2901 - of the pair, the value
-                out.append(f"<member>\n<name>{_name(key)}</name>\n")
-            write = _SCALARS.get(type(item))
-            if write is None:
-                if len(above) > limits.XMLRPC_DEPTH_MAX:
-                    raise LocalProtocolError(f"is nested deeper than {limits.XMLRPC_DEPTH_MAX} levels")
-                above.append((rest, members, end))
-                rest, begin, end = _open(item, end="</member>\n" if members else "")
-                members = type(item) is dict
-                out.append(begin)
-                break
-            for text in write(item):
-                out.append(text)
-                if len(text) >= _SLICE:
-                    yield _flush(out)
-            if members:
-                out.append("</member>\n")
-            if len(out) >= _PIECE:
-                yield _flush(out)
-        else:
-            out.append(end)
-            if not above:
-                break
-            rest, members, end = above.pop()
-    yield _flush(out)
-
-
-def _flush(out: list[str]) -> bytes:
-    piece = "".join(out).encode()
-    out.clear()
-    return piece
-
-
-def _open(item: object, end: str) -> tuple[Iterator[object], str, str]:
-    """Return the elements of a list or dict, the text before them and the text after them, which ends in ``end``."""
-    if type(item) is dict:
-        return iter(item.items()), "<value><struct>\n", f"</struct></value>\n{end}"
-    if type(item) in {list, tuple}:
-        return iter(cast("list[object]", item)), "<value><array><data>\n", f"</data></array></value>\n{end}"
+def _texts(item: object, depth: int) -> Iterable[str]:
+    """The text of a value, in parts."""
+    write = _SCALARS.get(type(item))
+    if write is not None:
+        return write(item)
+    if depth > limits.XMLRPC_DEPTH_MAX:
+        raise LocalProtocolError(f"is nested deeper than {limits.XMLRPC_DEPTH_MAX} levels")
+    if isinstance(item, dict):
+        return _struct(item, depth + 1)
+    if isinstance(item, list | tuple):
+        return _array(item, depth + 1)
     raise LocalProtocolError(f"cannot be said in XML-RPC: it holds a {type(item).__name__}")
+
+
+def _struct(members: Mapping[object, object], depth: int) -> Iterator[str]:
+    yield "<value><struct>\n"
+    for key, item in members.items():
+        if not isinstance(key, str):
+            raise LocalProtocolError("cannot be said in XML-RPC: it has a dictionary key that is not a string")
+        yield f"<member>\n<name>{_escaped(key)}</name>\n"
+        yield from _texts(item, depth)
+        yield "</member>\n"
+    yield "</struct></value>\n"
+
+
+def _array(items: Iterable[object], depth: int) -> Iterator[str]:
+    yield "<value><array><data>\n"
+    for item in items:
+        write = _SCALARS.get(type(item))  # here too: arrays are long
+        yield from _texts(item, depth) if write is None else write(item)
+    yield "</data></array></value>\n"
 
 
 def _escaped(text: str) -> str:
     if not text.isprintable() and (illegal := _ILLEGAL.search(text)) is not None:
         raise LocalProtocolError(f"holds the character {illegal[0]!a}, which XML cannot hold; remove it")
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-
-
-def _name(key: object) -> str:
-    if type(key) is not str:
-        raise LocalProtocolError("cannot be said in XML-RPC: it has a dictionary key that is not a string")
-    return _escaped(key)
 
 
 def _string(value: str) -> Iterable[str]:
@@ -363,13 +341,6 @@ _MALFORMED: Final[Sequence[tuple[type[Exception] | tuple[type[Exception], ...], 
 )
 
 
-def parse_call(data: bytes) -> tuple[str, tuple[XmlRpcValue, ...]]:
-    """Read a whole ``methodCall`` document; returns and raises as ``DocumentReader.call``."""
-    reader = DocumentReader()
-    reader.feed(data)
-    return reader.call()
-
-
 def parse_response(data: bytes) -> XmlRpcValue:
     """Read a whole ``methodResponse`` document; returns and raises as ``DocumentReader.response``."""
     reader = DocumentReader()
@@ -398,11 +369,6 @@ def response_pieces(value: XmlRpcValue) -> Iterator[bytes]:
     yield b"</param>\n</params>\n</methodResponse>\n"
 
 
-def serialize_call(method: str, params: Sequence[XmlRpcValue]) -> bytes:
-    """Write a ``methodCall`` document; the errors are those of ``call_pieces``."""
-    return b"".join(call_pieces(method, params))
-
-
 def serialize_response(value: XmlRpcValue) -> bytes:
     """Write a ``methodResponse`` document; the errors are those of ``call_pieces``."""
     return b"".join(response_pieces(value))
@@ -410,5 +376,5 @@ def serialize_response(value: XmlRpcValue) -> bytes:
 
 def serialize_fault(code: int, text: str) -> bytes:
     """Write a fault as a ``methodResponse``; characters that XML cannot hold become ``?``."""
-    body = b"".join(pieces("the fault", {"faultCode": code, "faultString": legal_text(text)}))
+    body = b"".join(pieces("the fault", {"faultCode": code, "faultString": _ILLEGAL.sub("?", text)}))
     return b"%s<methodResponse>\n<fault>\n%s</fault>\n</methodResponse>\n" % (_DECLARATION.encode(), body)

@@ -311,7 +311,7 @@ class TypeLibrary:
                 fetched = await fetch_type(node.master_uri, node.name, name) if error.fetchable else None
                 if fetched is None:
                     raise
-                kind = fetched.kind
+                kind = fetched[0]
             return self._messages.get(name) or self._keep(name, kind)
 
     def _keep(self, name: str, kind: MessageType) -> MessageType:
