@@ -11,12 +11,11 @@ import asyncio
 import contextlib
 import json
 import logging
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import StartError, missing_extra
 from rmpa.gateway import limits
-from rmpa.gateway.zenoh.config import SocketTuning, session_config
+from rmpa.gateway.zenoh.config import bound_unsent, session_config
 from rmpa.gateway.zenoh.queries import ArrivedQuery, PendingGet, SerialWorker, content
 from rmpa.gateway.zenoh.threads import (
     ArrivalQueue,
@@ -28,9 +27,11 @@ from rmpa.gateway.zenoh.threads import (
     keep_thread_state,
 )
 from rmpa.runtime.accept import in_thread
+from rmpa.trust.store import CERTIFICATE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from rmpa.bridge.policy import Needs
     from rmpa.config.settings import Settings
@@ -127,7 +128,8 @@ class OpenSession:
         self._closing = False
         self._closed = False
         self._flushed = asyncio.Event()
-        self._tuning = SocketTuning()
+        # The endpoints whose sockets are bounded.
+        self._bounded: frozenset[str] = frozenset()
         self._looking: asyncio.TimerHandle | None = None
         self._look_at_links()
 
@@ -137,7 +139,10 @@ class OpenSession:
         return () if self._closed else tuple(str(link.dst) for link in self._session.info.links())
 
     def _look_at_links(self) -> None:
-        self._tuning.look(self.endpoints)
+        there = frozenset(self.endpoints)
+        if new := there - self._bounded:
+            bound_unsent(new)
+        self._bounded = there
         self._looking = self._loop.call_later(_LOOK_AT_LINKS, self._look_at_links)
 
     @property
@@ -443,8 +448,7 @@ async def open_session(config: ZenohConfig, changed: Callable[[], bool] = lambda
         session = await in_thread(lambda: zenoh.open(settings), "zenoh open")
     except zenoh.ZError as error:
         raise _start_error(config, _reason(error)) from None
-    files = config.certificates if config.listen else None
-    certificate = Path(files.certificate) if files is not None else None
+    certificate = config.certificates / CERTIFICATE if config.certificates is not None and config.listen else None
     stamp = _stamp(certificate)
 
     def stale() -> bool:
