@@ -181,7 +181,8 @@ class OfferedAction(JoinedAction, GoalsToRos1):
         """Publish a message for ROS 2."""
         publisher, gid = self._publishers[topic]
         self._sequence += 1
-        publisher.put(message, Ros2Attachment(self._sequence, self._clock.wall_ns(), gid).serialize())
+        attachment = Ros2Attachment(self._sequence, self._clock.wall_ns(), gid).serialize()
+        publisher.put_all([(message, attachment)])
 
     def answer(self, query: Query, response: bytes) -> None:
         """Answer a request; its attachment is repeated, as rmw_zenoh does."""

@@ -20,7 +20,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from msgspec import UNSET
 
@@ -155,8 +155,7 @@ class Ros2Qos:
 
     def serialize(self) -> str:
         """The text in a liveliness token."""
-        usual = Ros2Qos()
-        kinds = (str(int(at)) if (at := getattr(self, name)) != getattr(usual, name) else "" for name, _ in _WORDS)
+        kinds = (str(int(at)) if (at := getattr(self, name)) != getattr(_USUAL, name) else "" for name, _ in _KINDS)
         reliability, durability, history, liveliness = kinds
         deadline, lifespan, lease = (_duration(getattr(self, name)) for name in _TIMES)
         return f"{reliability}:{durability}:{history},{self.depth}:{deadline}:{lifespan}:{liveliness},{lease}"
@@ -171,45 +170,41 @@ class Ros2Qos:
         parts = text.split(":")
         if len(parts) < _PARTS:
             raise RemoteProtocolError(f"the QoS {text[:80]!r} has {len(parts)} parts instead of {_PARTS}")
-        default = cls()
         history, _, depth = parts[2].partition(",")
         liveliness, _, lease = parts[5].partition(",")
         return cls(
-            _kind(Ros2Reliability, parts[0], default.reliability),
-            _kind(Ros2Durability, parts[1], default.durability),
-            _kind(Ros2History, history, default.history),
+            _kind(Ros2Reliability, parts[0], _USUAL.reliability),
+            _kind(Ros2Durability, parts[1], _USUAL.durability),
+            _kind(Ros2History, history, _USUAL.history),
             _number(depth, DEFAULT_DEPTH),
             _duration_nanoseconds(parts[3]),
             _duration_nanoseconds(parts[4]),
-            _kind(Ros2Liveliness, liveliness, default.liveliness),
+            _kind(Ros2Liveliness, liveliness, _USUAL.liveliness),
             _duration_nanoseconds(lease),
         )
 
 
-# The fields of a QoS that are words, and those that are times, as rclpy names them (the lease is shorter here).
-_WORDS: Final[tuple[tuple[str, type[IntEnum]], ...]] = (
+# The fields of a QoS that are kinds, and those that are times, as rclpy names them (the lease is shorter here).
+_KINDS: Final[tuple[tuple[str, type[IntEnum]], ...]] = (
     ("reliability", Ros2Reliability),
     ("durability", Ros2Durability),
     ("history", Ros2History),
     ("liveliness", Ros2Liveliness),
 )
 _TIMES: Final = ("deadline", "lifespan", "lease")
+_USUAL: Final = Ros2Qos()
 
 
-def qos_fields(qos: Ros2Qos) -> dict[str, str | int]:
-    """The fields of a QoS that are not rmw's defaults, and its depth: what the process of rclpy reads."""
-    usual = Ros2Qos()
-    words = {name: getattr(qos, name).name for name, _ in _WORDS if getattr(qos, name) != getattr(usual, name)}
-    times = {name: getattr(qos, name) for name in _TIMES if getattr(qos, name) != INFINITE}
-    return {"depth": qos.depth, **words, **times}
+def qos_fields(qos: Ros2Qos) -> dict[str, int]:
+    """The numbers of a QoS that are not rmw's defaults, and its depth: what the process of rclpy reads."""
+    numbers = {name: int(getattr(qos, name)) for name in (*dict(_KINDS), *_TIMES)}
+    return {"depth": qos.depth, **{name: each for name, each in numbers.items() if each != getattr(_USUAL, name)}}
 
 
-def qos_of_fields(fields: Mapping[str, Any]) -> Ros2Qos:
-    """A QoS as the process of rclpy tells it; words that this version does not know count as the default."""
-    usual = Ros2Qos()
-    words = {name: kind.__members__.get(str(fields.get(name)), getattr(usual, name)) for name, kind in _WORDS}
-    numbers = {name: fields[name] for name in ("depth", *_TIMES) if isinstance(fields.get(name), int)}
-    return Ros2Qos(**words, **numbers)
+def qos_of_fields(fields: Mapping[str, int]) -> Ros2Qos:
+    """A QoS as the process of rclpy tells it."""
+    kinds = {name: _known(kind, fields.get(name, 0), getattr(_USUAL, name)) for name, kind in _KINDS}
+    return Ros2Qos(**kinds, **{name: fields[name] for name in ("depth", *_TIMES) if name in fields})
 
 
 def _duration(nanoseconds: int) -> str:
@@ -233,7 +228,10 @@ def _number(text: str, default: int) -> int:
 
 
 def _kind(kind: type[_Kind], text: str, default: _Kind) -> _Kind:
-    number = _number(text, int(default))
+    return _known(kind, _number(text, int(default)), default)
+
+
+def _known(kind: type[_Kind], number: int, default: _Kind) -> _Kind:
     try:
         return kind(number)
     except ValueError:

@@ -39,9 +39,6 @@ class Publishing(Declared, Protocol):
     def waiting(self) -> int:
         """Messages in its queue."""
 
-    def put(self, payload: Buffer, attachment: bytes = b"") -> int:
-        """Queue one message; return how many older ones were dropped."""
-
     def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
         """Queue messages, each with its attachment; return how many older ones were dropped."""
 

@@ -21,8 +21,7 @@ To the gateway:
 
 ``H``  JSON: ``protocol``, ``distribution``, ``rmw``, ``python``, ``gids`` (whether messages tell their publisher),
        ``prefix`` (of the GIDs of this process)
-``+``  an endpoint was created: JSON ``{"gid"}``
-``!``  it was not, or its QoS fits no other one: JSON ``{"text"}``
+``!``  an endpoint was not created, or its QoS fits no other one: JSON ``{"text"}``
 ``G``  the graph: JSON ``{"nodes": [...], "added": [...], "removed": [...]}``
 ``M``  a message: length of the GID (1 byte), the GID, source stamp (8), sequence number (8), then CDR
 ``Q``  a request: the number of the call, 8 bytes, and CDR
@@ -43,10 +42,9 @@ import time
 from functools import partial
 from typing import Any
 
-from .branches import distribution, event_callbacks, handle_of, look_at_events
+from .branches import GraphGuard, Waits, distribution, event_callbacks, handle_of, look_at_events
 from .graph import Watcher, read_qos
 from .taker import Taker, ignore
-from .waits import GraphGuard, Waits
 
 PROTOCOL = 1
 _HEAD = struct.Struct("<IBI")
@@ -257,7 +255,6 @@ class Half:
         handle = handle_of(self._native, entity)
         self._endpoints[number] = Made(number, kind, asked["name"], node, entity, handle, kind_of)
         self._waits = None
-        self._link.say("+", number)
 
     def _events(self, number: int, publishes: bool) -> Any:
         """Callbacks that tell of a QoS that fits no other endpoint."""

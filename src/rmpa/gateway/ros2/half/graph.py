@@ -23,12 +23,14 @@ _NAMING_PERIOD = 6.0
 # Hexadecimal digits of a GID that the participant of DDS has.
 _PARTICIPANT = 24
 _INFINITE = 2**63 - 1
+# What a QoS is made of, beside its depth, by the names of the gateway: the enumerations and times of rclpy.
 _POLICIES = {
-    "reliability": {1: "RELIABLE", 2: "BEST_EFFORT"},
-    "durability": {1: "TRANSIENT_LOCAL", 2: "VOLATILE"},
-    "history": {1: "KEEP_LAST", 2: "KEEP_ALL"},
-    "liveliness": {1: "AUTOMATIC", 2: "AUTOMATIC", 3: "MANUAL_BY_TOPIC"},
+    "reliability": "ReliabilityPolicy",
+    "durability": "DurabilityPolicy",
+    "history": "HistoryPolicy",
+    "liveliness": "LivelinessPolicy",
 }
+_TIMES = {"deadline": "deadline", "lifespan": "lifespan", "lease": "liveliness_lease_duration"}
 
 
 class Watcher:
@@ -114,15 +116,12 @@ def _told(gid: str, kind: str, node: str, name: str, kind_of: str, type_hash: st
     return {"gid": gid, "kind": kind, "node": node, "name": name, "type": kind_of, "hash": type_hash, "qos": qos}
 
 
-def _told_qos(profile: Any) -> dict[str, Any]:
-    told: dict[str, Any] = {}
-    for name, words in _POLICIES.items():
-        word = words.get(int(getattr(profile, name)))
-        if word is not None:
-            told[name] = word
+def _told_qos(profile: Any) -> dict[str, int]:
+    """A QoS for the gateway: the numbers of rmw/types.h, times in nanoseconds."""
+    told = {name: int(getattr(profile, name)) for name in _POLICIES}
     if profile.depth:
         told["depth"] = profile.depth
-    for name, field in (("deadline", "deadline"), ("lifespan", "lifespan"), ("lease", "liveliness_lease_duration")):
+    for name, field in _TIMES.items():
         value = getattr(profile, field).nanoseconds
         if 0 < value < _INFINITE:
             told[name] = value
@@ -153,22 +152,12 @@ def _service_hash(name: str) -> str:
     return _HASHES[name]
 
 
-def read_qos(given: dict[str, Any]) -> Any:
-    """The QoS as the gateway writes it: the fields of rmw that differ from its defaults; times in nanoseconds."""
+def read_qos(given: dict[str, int]) -> Any:
+    """The QoS as the gateway writes it: what differs from rmw's defaults, in the form of ``_told_qos``."""
     from rclpy import qos
     from rclpy.duration import Duration
 
     fields: dict[str, Any] = {"depth": given.get("depth", 10)}
-    kinds = (
-        ("reliability", qos.ReliabilityPolicy),
-        ("durability", qos.DurabilityPolicy),
-        ("history", qos.HistoryPolicy),
-        ("liveliness", qos.LivelinessPolicy),
-    )
-    for name, policy in kinds:
-        if name in given:
-            fields[name] = getattr(policy, given[name])
-    for name, field in (("deadline", "deadline"), ("lifespan", "lifespan"), ("lease", "liveliness_lease_duration")):
-        if name in given:
-            fields[field] = Duration(nanoseconds=given[name])
+    fields.update((name, getattr(qos, kind)(given[name])) for name, kind in _POLICIES.items() if name in given)
+    fields.update((field, Duration(nanoseconds=given[name])) for name, field in _TIMES.items() if name in given)
     return qos.QoSProfile(**fields)
