@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from rmpa.gateway.own_graph import AgentGraph, TopicTap
-    from rmpa.gateway.ros2.link import Publishing, Ros2Link
+    from rmpa.gateway.ros2.graph import Publishing, Ros2Link
     from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.zenoh.threads import ZenohQos
     from rmpa.ros.wire.tcpros import TopicDescription

@@ -155,7 +155,9 @@ class Ros2Qos:
 
     def serialize(self) -> str:
         """The text in a liveliness token."""
-        kinds = (str(int(at)) if (at := getattr(self, name)) != getattr(_USUAL, name) else "" for name, _ in _KINDS)
+        kinds = (
+            str(int(at)) if (at := getattr(self, name)) != getattr(USUAL_QOS, name) else "" for name, _ in _KINDS
+        )
         reliability, durability, history, liveliness = kinds
         deadline, lifespan, lease = (_duration(getattr(self, name)) for name in _TIMES)
         return f"{reliability}:{durability}:{history},{self.depth}:{deadline}:{lifespan}:{liveliness},{lease}"
@@ -173,13 +175,13 @@ class Ros2Qos:
         history, _, depth = parts[2].partition(",")
         liveliness, _, lease = parts[5].partition(",")
         return cls(
-            _kind(Ros2Reliability, parts[0], _USUAL.reliability),
-            _kind(Ros2Durability, parts[1], _USUAL.durability),
-            _kind(Ros2History, history, _USUAL.history),
+            _kind(Ros2Reliability, parts[0], USUAL_QOS.reliability),
+            _kind(Ros2Durability, parts[1], USUAL_QOS.durability),
+            _kind(Ros2History, history, USUAL_QOS.history),
             _number(depth, DEFAULT_DEPTH),
             _duration_nanoseconds(parts[3]),
             _duration_nanoseconds(parts[4]),
-            _kind(Ros2Liveliness, liveliness, _USUAL.liveliness),
+            _kind(Ros2Liveliness, liveliness, USUAL_QOS.liveliness),
             _duration_nanoseconds(lease),
         )
 
@@ -192,18 +194,19 @@ _KINDS: Final[tuple[tuple[str, type[IntEnum]], ...]] = (
     ("liveliness", Ros2Liveliness),
 )
 _TIMES: Final = ("deadline", "lifespan", "lease")
-_USUAL: Final = Ros2Qos()
+# The QoS that rmw gives topics and services.
+USUAL_QOS: Final = Ros2Qos()
 
 
 def qos_fields(qos: Ros2Qos) -> dict[str, int]:
     """The numbers of a QoS that are not rmw's defaults, and its depth: what the process of rclpy reads."""
     numbers = {name: int(getattr(qos, name)) for name in (*dict(_KINDS), *_TIMES)}
-    return {"depth": qos.depth, **{name: each for name, each in numbers.items() if each != getattr(_USUAL, name)}}
+    return {"depth": qos.depth, **{name: each for name, each in numbers.items() if each != getattr(USUAL_QOS, name)}}
 
 
 def qos_of_fields(fields: Mapping[str, int]) -> Ros2Qos:
     """A QoS as the process of rclpy tells it."""
-    kinds = {name: _known(kind, fields.get(name, 0), getattr(_USUAL, name)) for name, kind in _KINDS}
+    kinds = {name: _known(kind, fields.get(name, 0), getattr(USUAL_QOS, name)) for name, kind in _KINDS}
     return Ros2Qos(**kinds, **{name: fields[name] for name in ("depth", *_TIMES) if name in fields})
 
 

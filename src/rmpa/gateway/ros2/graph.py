@@ -1,34 +1,122 @@
-"""ROS 2's graph: what its tokens tell, what the gateway declares there, and types that its nodes are asked for."""
+"""ROS 2's graph: the way to it, what its tokens tell, and what the gateway declares there.
+
+The way is a Zenoh session, or a process with rclpy (``rclpy_session``).
+"""
 
 from __future__ import annotations
 
-import asyncio
 import itertools
 import re
 import time
 from collections import Counter
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
+from rmpa.bridge.policy import Needs
 from rmpa.config.rules import ROS2
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
-from rmpa.gateway.ros2.conversion import NoConversion
-from rmpa.gateway.ros2.format import NO_HASH, EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, parse_token
-from rmpa.gateway.ros2.pairs import described_types
-from rmpa.gateway.ros2.types import SERVICE, parse_type_response, type_request
+from rmpa.gateway.ros2.format import (
+    NO_HASH,
+    USUAL_QOS,
+    EntityKind,
+    Ros2Attachment,
+    Ros2Endpoint,
+    Ros2Node,
+    parse_token,
+)
 from rmpa.gateway.zenoh.threads import first_answer
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from rmpa.gateway.ros2.format import Ros2Qos
-    from rmpa.gateway.ros2.link import Declared, Ros2Link
-    from rmpa.gateway.ros2.types import Ros2Types
-    from rmpa.gateway.zenoh.threads import ZenohReply
+    from rmpa.gateway.zenoh.threads import ZenohQos, ZenohReply, ZenohSample
     from rmpa.ros.wire.tcpros import Buffer
 
 # The name of ROS 2 among the sites, in rules and in the names of proxies; it is ``{module}`` too.
 SITE: Final = ROS2
+_NEEDS: Final = Needs(
+    (),
+    "`[[gateway.rule]]` for `ros2` alone: ROS 2 has no permissions",
+    key="services and actions of ROS 2",
+)
+
+
+class Declared(Protocol):
+    """Something that was declared."""
+
+    def close(self) -> None:
+        """Take it back."""
+
+
+class Publishing(Declared, Protocol):
+    """A publisher with a bounded queue."""
+
+    dropped: int
+
+    @property
+    def waiting(self) -> int:
+        """Messages in its queue."""
+
+    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
+        """Queue messages, each with its attachment; return how many older ones were dropped."""
+
+
+class Query(Protocol):
+    """A call that has come."""
+
+    key: str
+    payload: bytes
+    attachment: bytes
+
+    def reply(self, key: str, payload: Buffer, attachment: bytes = b"") -> None:
+        """Answer it."""
+
+    def reply_error(self, text: str) -> None:
+        """Answer that it has failed, and finish."""
+
+    def finish(self) -> None:
+        """Say that no more answers come."""
+
+
+class Ros2Link(Protocol):
+    """Endpoints, messages and calls by rmw_zenoh's tokens and keys.
+
+    Attributes:
+        zid: Identifies this gateway among others.
+    """
+
+    zid: str
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """What it is connected to."""
+
+    def token(self, key: str) -> Declared:
+        """Declare a node or an endpoint."""
+
+    def watch_tokens(self, key: str, on_token: Callable[[str, bool], None]) -> Declared:
+        """Call ``on_token(token, alive)`` for each node and endpoint that is there, and at each change."""
+
+    def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> Publishing:
+        """Make a publisher; ``on_matching(there)`` tells whether there is a subscriber."""
+
+    def subscribe(self, key: str, on_sample: Callable[[ZenohSample], None], *, history: bool = False) -> Declared:
+        """Give what is published by a key to a function; ``history``: also what publishers keep."""
+
+    def queryable(self, key: str, on_query: Callable[[Any], object], _needs: Needs | None = None) -> Declared:
+        """Give calls of a service to a function, each as a ``Query``."""
+
+    async def get(
+        self,
+        selector: str,
+        payload: Buffer = b"",
+        attachment: bytes = b"",
+        *,
+        timeout: float = 5.0,  # noqa: ASYNC109 - a Zenoh query ends by itself
+        all_complete: bool = False,
+    ) -> list[ZenohReply]:
+        """Call a service; an empty list: no answer came within ``timeout`` seconds."""
 
 
 # Two endpoints of one name that do not hear each other, as their keys differ. ROS 2 itself says nothing.
@@ -220,25 +308,31 @@ _NOT_IN_NAMES: Final = re.compile(r"[^A-Za-z0-9_]")
 
 
 class OwnEndpoint:
-    """One endpoint with its token in ROS 2's graph.
+    """One endpoint with its token in ROS 2's graph, and with what takes what comes for it.
 
     Args:
         nodes: The node's owner.
         endpoint: The endpoint.
         gid: What its messages, requests or replies have in their attachment.
+        taking: What takes messages or calls; ``None``: none come.
     """
 
-    def __init__(self, nodes: OwnRos2Nodes, endpoint: Ros2Endpoint, gid: bytes) -> None:
+    def __init__(self, nodes: OwnRos2Nodes, endpoint: Ros2Endpoint, gid: bytes, taking: Declared | None) -> None:
         self.endpoint = endpoint
         self.gid = gid
         self._nodes = nodes
-        self._token: Declared | None = nodes.session.token(endpoint.token())
+        self._declared = [nodes.session.token(endpoint.token()), *([] if taking is None else [taking])]
+
+    async def call(self, request: Buffer, within: float) -> ZenohReply | None:
+        """Call its service as this client; ``None``: it gave no answer in ``within`` seconds."""
+        return await self._nodes.call(self.endpoint.key(), self.gid, request, within)
 
     def close(self) -> None:
-        """Take its token back, and its node's if it was the last of it."""
-        if self._token is not None:
-            self._token.close()
-            self._token = None
+        """Take it back, and its node's token if it was the last of it."""
+        declared, self._declared = self._declared, []
+        for each in declared:
+            each.close()
+        if declared:
             self._nodes.release(self.endpoint.node)
 
 
@@ -268,7 +362,15 @@ class OwnRos2Nodes:
         self._uses: Counter[str] = Counter()
 
     def declare(
-        self, node: str, kind: EntityKind, name: str, type_name: str, type_hash: str, qos: Ros2Qos
+        self,
+        node: str,
+        kind: EntityKind,
+        name: str,
+        types: tuple[str, str],
+        qos: Ros2Qos = USUAL_QOS,
+        *,
+        take: Callable[[Any], object] | None = None,
+        history: bool = False,
     ) -> OwnEndpoint:
         """Declare an endpoint, and its node if it is the first of it.
 
@@ -276,19 +378,25 @@ class OwnRos2Nodes:
             node: The node's full name, ``/rmpa/<module>/<node>`` or ``own_name``.
             kind: What it is.
             name: The topic or service, ``/like/this``.
-            type_name: ``package/msg/Name`` or ``package/srv/Name``.
-            type_hash: The hash of the type.
+            types: ``package/msg/Name`` or ``package/srv/Name``, and the hash of that type.
             qos: Its QoS.
+            take: Called with each message of a subscription (``ZenohSample``), or each call of a service (``Query``).
+            history: Whether a subscription gets what publishers keep.
         """
         if node not in self._nodes:
             made = Ros2Node(self._domain, self.session.zid, next(self._numbers), node)
             self._nodes[node] = (made, self.session.token(made.token()))
         self._uses[node] += 1
         owner = self._nodes[node][0]
-        endpoint = Ros2Endpoint(owner, next(self._numbers), kind, name, type_name, type_hash, qos)
+        endpoint = Ros2Endpoint(owner, next(self._numbers), kind, name, *types, qos)
         gid = gid_of(endpoint.token(), self._gid_bytes)
         self.gids.add(gid)
-        return OwnEndpoint(self, endpoint, gid)
+        taking: Declared | None = None
+        if take is not None and kind is EntityKind.SERVICE:
+            taking = self.session.queryable(endpoint.key(), take, _NEEDS)  # a client may call once it sees the token
+        elif take is not None:
+            taking = self.session.subscribe(endpoint.key(), take, history=history)
+        return OwnEndpoint(self, endpoint, gid, taking)
 
     async def call(self, key: str, gid: bytes, request: Buffer, within: float) -> ZenohReply | None:
         """Call a service of ROS 2 as the client with a GID; ``None``: it gave no answer in ``within`` seconds."""
@@ -308,99 +416,3 @@ def gid_of(token: str, size: int = 16) -> bytes:
     import xxhash  # noqa: PLC0415 - of the extra "zenoh"
 
     return int(xxhash.xxh3_128_intdigest(token.encode())).to_bytes(16, "little").ljust(size, b"\0")
-
-
-# Asks nodes of ROS 2 for the fields of types that are not known here, by their service ``get_type_description``.
-
-
-class Ros2TypeAsker:
-    """Asks for types; at most ``limits.ROS2_ASKS_MAX`` nodes at one time.
-
-    Args:
-        nodes: Our nodes in ROS 2's graph.
-        ros2: ROS 2's graph.
-        types: The types of ROS 2's distribution.
-    """
-
-    def __init__(self, nodes: OwnRos2Nodes, ros2: Ros2Graph, types: Ros2Types) -> None:
-        self._nodes = nodes
-        self._ros2 = ros2
-        self._types = types
-        self._appeared = asyncio.Event()
-        self._asking = 0
-
-    def appeared(self) -> None:
-        """An endpoint is new in ROS 2's graph."""
-        if self._asking:
-            self._appeared.set()
-            self._appeared = asyncio.Event()
-
-    async def learn(self, *endpoints: tuple[str, EntityKind], of: Ros2Endpoint) -> dict[str, Any]:
-        """The fields of the types of some endpoints of one node, which waits for those that have not appeared yet.
-
-        Args:
-            endpoints: The names and kinds of the endpoints; none: the type of ``of`` itself is meant.
-            of: An endpoint of the node, which has appeared.
-
-        Returns:
-            The fields of the types and of all that they embed, in rosbags' form; each type has the hash of its key.
-
-        Raises:
-            NoConversion: The node does not describe them, or describes others.
-            RemoteProtocolError: Its answer is malformed.
-        """
-        found: dict[str, Any] = {}
-        if self._asking >= limits.ROS2_ASKS_MAX:
-            raise NoConversion(f"{self._asking} ROS 2 nodes are asked for types already; this one is not")
-        self._asking += 1
-        try:
-            for name, kind in endpoints or ((of.name, of.kind),):
-                endpoint = of if (name, kind) == (of.name, of.kind) else await self._wait(name, kind, of.node)
-                if endpoint is None:
-                    raise NoConversion(f"node {of.node.name} has no {name}")
-                fields = await self._ask(endpoint)
-                described_types(self._types, endpoint.type, endpoint.type_hash, fields)
-                found |= fields
-        finally:
-            self._asking -= 1
-        return found
-
-    async def _ask(self, endpoint: Ros2Endpoint) -> dict[str, Any]:
-        server = await self._wait(f"{endpoint.node.name}/{SERVICE}", EntityKind.SERVICE, endpoint.node)
-        if server is None:
-            raise NoConversion(self._unknown(endpoint))
-        answer = await self.call(server, type_request(endpoint.type, endpoint.type_hash))
-        if answer is None or not answer.ok:
-            raise NoConversion(f"{server.name} does not answer; {self._unknown(endpoint)}")
-        return parse_type_response(answer.payload)
-
-    async def call(self, server: Ros2Endpoint, request: bytes) -> ZenohReply | None:
-        """Call one of the services that each node has; ``None``: it has not answered in time."""
-        gid = gid_of(f"{self._nodes.own_name}/{SERVICE}")
-        return await self._nodes.call(server.key(), gid, request, limits.ROS2_SERVICE_WAIT)
-
-    async def _wait(self, name: str, kind: EntityKind, node: Ros2Node) -> Ros2Endpoint | None:
-        """An endpoint of a node, once it is there; ``None`` if it does not appear."""
-        try:
-            async with asyncio.timeout(limits.ROS2_SERVICE_WAIT):
-                while True:
-                    for found in self._ros2.at(name, kind):
-                        if found.node.name == node.name:
-                            return found
-                    await self._appeared.wait()
-        except TimeoutError:
-            return None
-
-    def _unknown(self, endpoint: Ros2Endpoint) -> str:
-        distribution = self._types.distribution
-        if endpoint.type in self._types:
-            return (
-                f"its type hash {endpoint.type_hash} is not that of {distribution}'s {endpoint.type}, and node "
-                f"{endpoint.node.name} offers no get_type_description: set gateway.ros2.distribution to the one of "
-                "that node, or start it with the parameter start_type_description_service"
-            )
-        return (
-            f"the fields of {endpoint.type} are not known, and node {endpoint.node.name} offers no "
-            "get_type_description: start the node with the parameter start_type_description_service, or source a "
-            "ROS 1 workspace that has the type, with the same fields, where the gateway runs"
-        )

@@ -19,9 +19,9 @@ from rmpa.core.errors import StartError, UnreachableError
 from rmpa.core.identity import is_own
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.actions import Ros2Actions
+from rmpa.gateway.ros2.asking import Ros2Parameters
 from rmpa.gateway.ros2.format import Ros2Endpoint, graph_key
 from rmpa.gateway.ros2.graph import SITE
-from rmpa.gateway.ros2.parameters import Ros2Parameters
 from rmpa.gateway.ros2.rclpy_session import RclpySession, shown_in_ros2
 from rmpa.gateway.ros2.services import Ros2Context, Ros2Services
 from rmpa.gateway.ros2.topics import Ros2Topics
@@ -31,6 +31,7 @@ from rmpa.gateway.topics import flow
 from rmpa.observe.check import FAIL, OK, WARN, Check
 from rmpa.observe.sites import PARAM, REPORT, SITE_INFO, SITE_WHY, SiteInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.why.diagnosis import Diagnosis, until_failure
+from rmpa.ros.types.find import find_message_type
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     from rmpa.config.rules import GatewaySettings
     from rmpa.config.settings import Settings
     from rmpa.gateway.own_graph import AgentGraph
-    from rmpa.gateway.ros2.link import Declared, Ros2Link
+    from rmpa.gateway.ros2.graph import Declared, Ros2Link
     from rmpa.gateway.ros2.topics import Ros2Dialect, Ros2Import, Ros2Publisher
     from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.topics import ExportedTopic
@@ -79,10 +80,10 @@ class Ros2Neighbour:
         session: Ros2Link,
         settings: GatewaySettings,
         contracts: Contracts | None = None,
-        find: Callable[[str], MessageType] | None = None,
+        find: Callable[[str], MessageType] = find_message_type,
     ) -> None:
-        context = self.context = Ros2Context(graph, session, settings, contracts or Contracts())
-        self.topics = Ros2Topics(context) if find is None else Ros2Topics(context, find)
+        context = self.context = Ros2Context(graph, session, settings, contracts or Contracts(), find)
+        self.topics = Ros2Topics(context)
         self.services = Ros2Services(context)
         self.parameters = Ros2Parameters(context)
         # Actions take all topics and services of actions, so that no other part carries them.

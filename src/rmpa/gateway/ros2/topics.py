@@ -23,21 +23,17 @@ from rmpa.gateway.ros2.format import (
     zenoh_qos,
 )
 from rmpa.gateway.ros2.graph import SITE, gid_of, mismatch, valid_name
-from rmpa.gateway.ros2.pairs import Ros2Pairs
 from rmpa.gateway.ros2.types import Ros2Sequences
 from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.gateway.topics import ExportedTopic, TopicLimits
 from rmpa.gateway.zenoh.threads import BoundedQueue
-from rmpa.ros.types.find import find_message_type, type_of_header
+from rmpa.ros.types.find import type_of_header
 from rmpa.ros.wire.tcpros import TopicDescription
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from rmpa.gateway.foreign import ProxiedTopic
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint
-    from rmpa.gateway.ros2.link import Declared
     from rmpa.gateway.ros2.services import Ros2Context
     from rmpa.gateway.rules import CrossingDecision, MeshSource
     from rmpa.gateway.zenoh.threads import ZenohQos, ZenohSample
@@ -115,7 +111,7 @@ class Ros2Dialect:
         del large
         context, source = self._part.context, self.source
         try:
-            found = self._part.pairs.ros2_type(source.type) if about is None else self._learn(about)
+            found = context.pairs.ros2_type(source.type) if about is None else self._learn(about)
         except RmpaError:
             self._conversion = None
             self.close()
@@ -127,7 +123,7 @@ class Ros2Dialect:
         qos = ros2_qos(context.contracts, source.name, source.type, latching=self._latching, depth=depth)
         old = self.endpoint
         if old is None or (old.endpoint.type, old.endpoint.type_hash, old.endpoint.qos) != (*found, qos):
-            self.endpoint = context.nodes.declare(source.proxy, EntityKind.PUBLISHER, source.here, *found, qos)
+            self.endpoint = context.nodes.declare(source.proxy, EntityKind.PUBLISHER, source.here, found, qos)
             if old is not None:
                 old.close()
             self._part.declared(self)
@@ -167,8 +163,9 @@ class Ros2Dialect:
     def _learn(self, about: TopicDescription) -> tuple[str, str]:
         fields = {"type": about.type, "md5sum": about.md5sum, "message_definition": about.definition}
         kind = type_of_header(fields)
-        found = self._part.pairs.learn(kind)
-        self._conversion = self._part.pairs.outgoing(kind)
+        pairs = self._part.context.pairs
+        found = pairs.learn(kind)
+        self._conversion = pairs.outgoing(kind)
         return found
 
 
@@ -228,7 +225,8 @@ class Ros2Import:
         self._by_gid: dict[bytes, Ros2Publisher] = {}
         self._adopted: dict[bytes, Ros2Publisher] = {}
         self._has_seq = False
-        self._subscribed: tuple[Declared, OwnEndpoint] | None = None
+        # The gateway's subscription in ROS 2.
+        self._subscription: OwnEndpoint | None = None
         self._history = False
         self._qos = Ros2Qos()
         self.sequences = Ros2Sequences()
@@ -240,7 +238,7 @@ class Ros2Import:
     @property
     def declared(self) -> Ros2Endpoint | None:
         """The gateway's subscription in ROS 2; ``None``: there is none."""
-        return self._subscribed[1].endpoint if self._subscribed is not None else None
+        return self._subscription.endpoint if self._subscription is not None else None
 
     @property
     def idle(self) -> bool:
@@ -317,7 +315,7 @@ class Ros2Import:
 
     def _linger(self) -> None:
         """Stay subscribed for a moment, and hold what comes: nodes subscribe to a new source some time after it."""
-        if self._subscribed is None:
+        if self._subscription is None:
             return
         if self._lingering is not None:
             self._lingering.cancel()
@@ -333,15 +331,12 @@ class Ros2Import:
         wanted = self.conversion is not None and any(each.wanted for each in self.publishers.values())
         if not wanted and self._lingering is None:
             self._unsubscribe()
-        elif wanted and self._subscribed is None:
-            context, first = self.part.context, self.first
+        elif wanted and self._subscription is None:
+            nodes, first = self.part.context.nodes, self.first
             self._history = any(each.latched for each in self.publishers.values())
-            qos, kind = self._terms(), EntityKind.SUBSCRIPTION
-            self._qos = qos
-            self._subscribed = (
-                context.session.subscribe(first.key(), self._sample, history=self._history),
-                context.nodes.declare(context.nodes.own_name, kind, first.name, first.type, first.type_hash, qos),
-            )
+            self._qos = self._terms()
+            terms = EntityKind.SUBSCRIPTION, first.name, (first.type, first.type_hash), self._qos
+            self._subscription = nodes.declare(nodes.own_name, *terms, take=self._sample, history=self._history)
 
     def _terms(self) -> Ros2Qos:
         """The QoS that fits all publishers: DDS connects no subscription that asks for more than one offers."""
@@ -355,9 +350,9 @@ class Ros2Import:
         )
 
     def _unsubscribe(self) -> None:
-        for each in self._subscribed or ():
-            each.close()
-        self._subscribed = None
+        if self._subscription is not None:
+            self._subscription.close()
+            self._subscription = None
         self.sequences.forget()
         self._adopted.clear()
         for publisher in self.publishers.values():
@@ -430,16 +425,14 @@ class Ros2Topics:
 
     Args:
         context: What the parts share.
-        find: Finds a ROS 1 type on this machine by its name; raises ``RmpaError`` if there is none.
 
     Attributes:
         refused: Why topics do not cross, by ``<topic> of <node>``.
         imports: ROS 2's topics in the gateway's graph, by key.
     """
 
-    def __init__(self, context: Ros2Context, find: Callable[[str], MessageType] = find_message_type) -> None:
+    def __init__(self, context: Ros2Context) -> None:
         self.context: Final = context
-        self.pairs: Final = Ros2Pairs(context.types, context.mapping, find)
         self.refused: dict[str, str] = {}
         # By name here, then by proxy.
         self._exports: dict[str, dict[str, tuple[ExportedTopic, Ros2Dialect]]] = {}
@@ -504,7 +497,7 @@ class Ros2Topics:
         for imported in self.imports.values():  # a type was learnt: topics whose fields were not known may have it
             if imported.conversion is None:
                 with contextlib.suppress(NoConversion):
-                    found = self.pairs.incoming(imported.first.type, imported.first.type_hash)
+                    found = self.context.pairs.incoming(imported.first.type, imported.first.type_hash)
                     if found is not None:
                         imported.converted(found)
 
@@ -543,7 +536,7 @@ class Ros2Topics:
 
     def _add(self, endpoint: Ros2Endpoint, imported: Ros2Import | None, what: str) -> None:
         if imported is None:
-            kind = self.pairs.ros1_name(endpoint.type)
+            kind = self.context.pairs.ros1_name(endpoint.type)
             source = ForeignSource(SourceKind.TOPIC, SITE, "", endpoint.node.name, endpoint.name, kind)
             decision = self.context.rules.incoming(source)
             if not decision.allowed:
@@ -556,7 +549,7 @@ class Ros2Topics:
             if not imported.problem:
                 return  # else this node may be able to describe the type
         try:
-            conversion = self.pairs.incoming(endpoint.type, endpoint.type_hash)
+            conversion = self.context.pairs.incoming(endpoint.type, endpoint.type_hash)
         except NoConversion as error:
             imported.converted(None, str(error))
             return
@@ -569,8 +562,8 @@ class Ros2Topics:
         """Ask the publisher's node for the fields of its type."""
         name, type_hash = endpoint.type, endpoint.type_hash
         try:
-            self.pairs.described(name, type_hash, await self.context.asker.learn(of=endpoint))
-            imported.converted(self.pairs.incoming(name, type_hash))
+            self.context.pairs.described(name, type_hash, await self.context.asker.learn(of=endpoint))
+            imported.converted(self.context.pairs.incoming(name, type_hash))
         except (NoConversion, RemoteProtocolError) as error:
             if imported.conversion is None:
                 imported.converted(None, str(error))
