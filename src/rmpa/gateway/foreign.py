@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from rmpa.agent.agent import Agent
     from rmpa.gateway.rules import SourceKey
-    from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.zenoh.session import ArrivedQuery
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.tcpros import Buffer, ServiceDescription

@@ -12,8 +12,8 @@ from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.gateway import limits
 from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.gateway.sites.keys import MessageSource, SiteModule, SiteSource, token_keys
-from rmpa.gateway.sites.plans import SiteImport
-from rmpa.gateway.sites.topics import SiteTopics
+from rmpa.gateway.sites.site import SiteImport
+from rmpa.gateway.sites.topics import ImportedTopic, SiteTopics
 from rmpa.gateway.zenoh.threads import ZenohQos
 from tests.gateway.memory_graph import MemoryGraph
 from tests.gateway.memory_zenoh import MemoryPublisher, MemoryZenoh, eventually
@@ -213,14 +213,12 @@ class Hall:
             self.yard.put(b"x", write(number, 0))
 
     async def subscribe(self) -> None:
-        self.topics.show(ENTRY)
+        self.topic = ImportedTopic(ENTRY, self.topics)
         self.graph.topics["/scan", "/talker"].on_demand(True)
         await self.wanted.wait()
 
     async def counts(self, messages: int, lost: int) -> None:
-        topic = self.topics.imported(ENTRY)
-        assert topic is not None
-        await eventually(lambda: (topic.messages, topic.lost) == (messages, lost))
+        await eventually(lambda: (self.topic.messages, self.topic.lost) == (messages, lost))
 
 
 @pytest.mark.parametrize(
@@ -237,9 +235,9 @@ async def test_what_is_lost_while_a_site_is_away_is_counted_once_it_is_back(
     await hall.subscribe()
     hall.send(1, 2, 3)
     await hall.counts(3, 0)
-    hall.topics.hide(ENTRY)
+    hall.topic.close()
     await hall.subscribe()  # the site is back
     hall.send(104, 105)
     await hall.counts(messages, lost)
-    hall.topics.hide(ENTRY)
+    hall.topic.close()
     await hall.topics.close()

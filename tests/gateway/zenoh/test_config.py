@@ -17,7 +17,7 @@ from rmpa.config.rules import GatewaySettings
 from rmpa.config.settings import Settings
 from rmpa.core.errors import StartError
 from rmpa.gateway.zenoh.config import bound_unsent, gateway_config, session_config, zenohd_config
-from rmpa.gateway.zenoh.queries import ArrivedQuery
+from rmpa.gateway.zenoh.session import ArrivedQuery
 from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.trust.certificates import DenyList
 from rmpa.trust.store import CA

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 
 from rmpa.gateway import limits
-from rmpa.gateway.zenoh.queries import ArrivedQuery
-from rmpa.gateway.zenoh.session import OpenSession
+from rmpa.gateway.zenoh.session import ArrivedQuery, OpenSession
 from rmpa.gateway.zenoh.threads import ArrivalQueue, Arrivals, QueuedPublisher, SendingLane, ZenohQos
 from tests.gateway.memory_zenoh import eventually
 from tests.gateway.zenoh_bed import ZenohBed

@@ -6,8 +6,7 @@ import pytest
 
 from rmpa.core.errors import StartError
 from rmpa.gateway.zenoh.config import ZenohConfig
-from rmpa.gateway.zenoh.queries import ArrivedQuery
-from rmpa.gateway.zenoh.session import OpenSession, open_session
+from rmpa.gateway.zenoh.session import ArrivedQuery, OpenSession, open_session
 from rmpa.gateway.zenoh.threads import QueuedPublisher, ZenohPriority, ZenohQos, ZenohSample
 from tests.gateway.memory_zenoh import eventually
 from tests.gateway.zenoh_bed import ZenohBed, free_port

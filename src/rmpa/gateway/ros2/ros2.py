@@ -41,9 +41,8 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.ros2.graph import Declared, Ros2Link
-    from rmpa.gateway.ros2.topics import Ros2Dialect, Ros2Import, Ros2Publisher
+    from rmpa.gateway.ros2.topics import Ros2Export, Ros2Import, Ros2Publisher
     from rmpa.gateway.rules import MeshSource
-    from rmpa.gateway.topics import ExportedTopic
     from rmpa.observe.sites import SiteAnswerer
     from rmpa.ros.types.messages import MessageType
 
@@ -180,10 +179,10 @@ class Ros2Neighbour:
                 for each in imported.publishers.values():
                     stages = until_failure(_in_stages(imported, each))
                     ways.append(_way(stages, imported.decision.name, each.node, SITE, gateway))
-        for export, dialect in self.topics.exports() if not site else ():
+        for export in self.topics.exports() if not site else ():
             source = export.source
             if source.here == name:
-                stages = until_failure(_out_stages(export, dialect, self.context.problems))
+                stages = until_failure(_out_stages(export, self.context.problems))
                 ways.append(_way(stages, name, source.node, source.module, SITE))
         for what, why in self.topics.refused.items():
             topic, _, node = what.partition(" of ")
@@ -262,18 +261,18 @@ def _way(stages: tuple[Check, ...], name: str, node: str, peer: str, to: str) ->
     return Diagnosis.of(stages, name=name, peer=peer, to=to, node=node)
 
 
-def _out_stages(export: ExportedTopic, dialect: Ros2Dialect, problems: Mapping[str, str]) -> Iterator[Check]:
-    yield Check("rule", OK, dialect.why)
+def _out_stages(export: Ros2Export, problems: Mapping[str, str]) -> Iterator[Check]:
+    yield Check("rule", OK, export.why)
     if problem := export.problem or (
-        problems.get(shown_in_ros2(dialect.endpoint.endpoint)) if dialect.endpoint is not None else ""
+        problems.get(shown_in_ros2(export.endpoint.endpoint)) if export.endpoint is not None else ""
     ):
         yield Check("type", FAIL, problem)
-    if dialect.endpoint is None:
+    if export.endpoint is None:
         text = f"ROS 2 has no {export.source.type}; its publisher is being asked for the definition"
         yield Check("type", WARN, text)
         return
-    kept = ", transient local" if dialect.latched else ""
-    yield Check("type", OK, f"it is {dialect.endpoint.endpoint.type} in ROS 2{kept}")
+    kept = ", transient local" if export.latched else ""
+    yield Check("type", OK, f"it is {export.endpoint.endpoint.type} in ROS 2{kept}")
     ends = ((what.partition(" of "), text) for what, text in problems.items())
     deaf = [
         f"{node}: {text}"
@@ -290,7 +289,7 @@ def _out_stages(export: ExportedTopic, dialect: Ros2Dialect, problems: Mapping[s
     losses = (
         (export.dropped, _DROPPED),
         (export.limited, _LIMITED),
-        (dialect.unconverted, _UNCONVERTED),
+        (export.unconverted, _UNCONVERTED),
     )
     yield flow("sent", f"{export.messages} messages were sent{waiting}", export.messages, losses)
 

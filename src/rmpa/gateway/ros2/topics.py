@@ -74,15 +74,15 @@ _TOPIC_ENDS: Final = (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION)
 _SEQ: Final = struct.Struct("<I")
 
 
-class Ros2Dialect:
-    """The dialect of an ``ExportedTopic`` to ROS 2: messages are converted, and a token has the type's hash.
+class Ros2Export(ExportedTopic):
+    """A topic in ROS 2: messages are converted, and a token has the type's hash.
 
     A type that ROS 2's distribution does not have is learnt first from the publisher's header: its hash is part of
     the key. A latched topic becomes transient local, and stays connected once it was wanted, so that what is kept for
     late subscribers is the last message.
 
     Args:
-        part: Tells it the types, and compares it with what ROS 2 has.
+        part: Compares it with what ROS 2 has.
         source: The topic.
         decision: The rule that lets it cross.
 
@@ -91,7 +91,9 @@ class Ros2Dialect:
     """
 
     def __init__(self, part: Ros2Topics, source: MeshSource, decision: CrossingDecision) -> None:
-        self.source: Final = source
+        context = part.context
+        super().__init__(source, context.graph, context.session, decision.rate, decision.size)
+        self.payload, self.attachment = self._converted, self._attached
         self.why: Final = decision.why
         self.endpoint: OwnEndpoint | None = None
         self.unconverted = 0
@@ -107,14 +109,14 @@ class Ros2Dialect:
         return self.endpoint is not None and self.endpoint.endpoint.qos.latched
 
     def announce(self, about: TopicDescription | None, *, latched: bool, large: bool) -> tuple[str, ZenohQos] | None:
-        """Of ``ExportDialect``: once latched it stays so, and no message yields for its size."""
+        """Of ``ExportedTopic``: once latched it stays so, and no message yields for its size."""
         del large
         context, source = self._part.context, self.source
         try:
             found = context.pairs.ros2_type(source.type) if about is None else self._learn(about)
         except RmpaError:
             self._conversion = None
-            self.close()
+            self._undeclare()
             raise
         if found is None:
             return None
@@ -130,8 +132,24 @@ class Ros2Dialect:
         assert self.endpoint is not None  # noqa: S101 - it is declared here, or was before
         return self.endpoint.endpoint.key(), zenoh_qos(context.contracts.of(source.name, source.type), qos)
 
-    def payload(self, body: memoryview) -> bytes | None:
-        """Of ``ExportDialect``."""
+    def linger(self, *, keeps: bool) -> float | None:
+        """Of ``ExportedTopic``."""
+        return None if keeps else 0.0
+
+    def say(self, problem: str) -> None:
+        """Of ``ExportedTopic``; the log tells it too."""
+        super().say(problem)
+        self._log(problem)
+
+    def close(self) -> None:
+        """Take everything back."""
+        super().close()
+        self._undeclare()
+
+    def _log(self, problem: str) -> None:
+        self._part.context.say(f"{self.source.here} of {self.source.proxy}", problem)
+
+    def _converted(self, body: memoryview) -> bytes | None:
         if self._conversion is None:
             return None
         try:
@@ -139,31 +157,20 @@ class Ros2Dialect:
         except ConversionError as error:
             self.unconverted += 1
             if self.unconverted == 1:
-                self.say(str(error))
+                self._log(str(error))
             return None
 
-    def attachment(self, sequence: int, stamp: int) -> bytes:
-        """Of ``ExportDialect``."""
+    def _attached(self, sequence: int, stamp: int) -> bytes:
         return Ros2Attachment(sequence, stamp, self.endpoint.gid if self.endpoint is not None else b"").serialize()
 
-    def linger(self, *, keeps: bool) -> float | None:
-        """Of ``ExportDialect``."""
-        return None if keeps else 0.0
-
-    def say(self, problem: str) -> None:
-        """Of ``ExportDialect``."""
-        self._part.context.say(f"{self.source.here} of {self.source.proxy}", problem)
-
-    def close(self) -> None:
-        """Of ``ExportDialect``."""
+    def _undeclare(self) -> None:
         if self.endpoint is not None:
             self.endpoint.close()
             self.endpoint = None
 
     def _learn(self, about: TopicDescription) -> tuple[str, str]:
         fields = {"type": about.type, "md5sum": about.md5sum, "message_definition": about.definition}
-        kind = type_of_header(fields)
-        pairs = self._part.context.pairs
+        kind, pairs = type_of_header(fields), self._part.context.pairs
         found = pairs.learn(kind)
         self._conversion = pairs.outgoing(kind)
         return found
@@ -435,19 +442,19 @@ class Ros2Topics:
         self.context: Final = context
         self.refused: dict[str, str] = {}
         # By name here, then by proxy.
-        self._exports: dict[str, dict[str, tuple[ExportedTopic, Ros2Dialect]]] = {}
+        self._exports: dict[str, dict[str, Ros2Export]] = {}
         self.imports: dict[str, Ros2Import] = {}
         self._looks = asyncio.Semaphore(_LATCH_LOOKS_AT_ONCE)
 
     def close(self) -> None:
         """Take back all topics of both sides."""
-        for export, _ in self.exports():
+        for export in self.exports():
             export.close()
         for imported in self.imports.values():
             imported.close()
 
-    def exports(self) -> list[tuple[ExportedTopic, Ros2Dialect]]:
-        """The topics of modules in ROS 2's graph, each with its dialect."""
+    def exports(self) -> list[Ros2Export]:
+        """The topics of modules in ROS 2's graph."""
         return [each for exports in self._exports.values() for each in exports.values()]
 
     def _refuse(self, what: str, why: str) -> None:
@@ -461,7 +468,7 @@ class Ros2Topics:
             return False
         exports = self._exports.setdefault(source.here, {})
         if (old := exports.pop(source.proxy, None)) is not None:
-            old[0].close()
+            old.close()
         what = f"{source.here} of {source.proxy}"
         self.refused.pop(what, None)
         decision = self.context.rules.outgoing_to(SITE, source.module, source.name)
@@ -470,19 +477,15 @@ class Ros2Topics:
         elif there and not decision.allowed:
             self._refuse(what, decision.why)
         elif there:
-            dialect = Ros2Dialect(self, source, decision)
-            export = ExportedTopic(
-                source, self.context.graph, self.context.session, dialect, decision.rate, decision.size
-            )
-            exports[source.proxy] = export, dialect
+            export = exports[source.proxy] = Ros2Export(self, source, decision)
             export.start()
-            if export.announced and not dialect.latched and source.type not in _STREAMS:
+            if export.announced and not export.latched and source.type not in _STREAMS:
                 self.context.start(self._look(export), f"look at {source.here}")
         if not exports:
             del self._exports[source.here]
         return True
 
-    async def _look(self, export: ExportedTopic) -> None:
+    async def _look(self, export: Ros2Export) -> None:
         """Ask the publisher once for its header, which tells whether it latches, unless it was asked before."""
         await asyncio.sleep(limits.LATCH_LOOK_AFTER)
         async with self._looks:
@@ -490,10 +493,10 @@ class Ros2Topics:
                 with contextlib.suppress(RmpaError):
                     await export.header(_LATCH_LOOK_TIMEOUT)
 
-    def declared(self, dialect: Ros2Dialect) -> None:
+    def declared(self, export: Ros2Export) -> None:
         """A topic has another type or hash now: compare it with what ROS 2 has under its name."""
-        for other in list(self.context.ros2.at(dialect.source.here, *_TOPIC_ENDS)):
-            self._compare(dialect, other)
+        for other in list(self.context.ros2.at(export.source.here, *_TOPIC_ENDS)):
+            self._compare(export, other)
         for imported in self.imports.values():  # a type was learnt: topics whose fields were not known may have it
             if imported.conversion is None:
                 with contextlib.suppress(NoConversion):
@@ -501,9 +504,9 @@ class Ros2Topics:
                     if found is not None:
                         imported.converted(found)
 
-    def _compare(self, dialect: Ros2Dialect, other: Ros2Endpoint) -> None:
-        if dialect.endpoint is not None:
-            text = mismatch(dialect.endpoint.endpoint, other, self.context.types.distribution)
+    def _compare(self, export: Ros2Export, other: Ros2Endpoint) -> None:
+        if export.endpoint is not None:
+            text = mismatch(export.endpoint.endpoint, other, self.context.types.distribution)
             if text:
                 self.context.say(f"{other.name} of {other.node.name}", text)
 
@@ -513,8 +516,8 @@ class Ros2Topics:
             return False
         what = f"{endpoint.name} of {endpoint.node.name}"
         if there:
-            for _, dialect in self._exports.get(endpoint.name, {}).values():
-                self._compare(dialect, endpoint)
+            for export in self._exports.get(endpoint.name, {}).values():
+                self._compare(export, endpoint)
         else:
             self.context.say(what, "")
         if endpoint.kind is not EntityKind.PUBLISHER or "/_" in endpoint.name:
@@ -568,5 +571,5 @@ class Ros2Topics:
             if imported.conversion is None:
                 imported.converted(None, str(error))
             return
-        for export, _ in self.exports():
+        for export in self.exports():
             export.start()

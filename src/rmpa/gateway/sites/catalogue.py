@@ -23,7 +23,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource, parse_token
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable
 
 # Seconds from the end of a token to the end of what it stands for. The tokens of a gateway that was killed go one by
 # one, within some milliseconds: its own may be the last, and then the others are lost and not withdrawn.
@@ -107,13 +107,6 @@ class SiteCatalogue:
     def refused(self, site: str) -> int:
         """Tokens of a site that were left out because there are too many."""
         return self._sites.get(site, _NO_SITE).refused
-
-    def all(self) -> Iterator[SiteModule | SiteSource]:
-        """Everything that is there, modules before their sources."""
-        for site in self.sites:
-            for module in self.modules(site):
-                yield module
-                yield from self.sources(module)
 
     def token(self, key: str, now: float, *, alive: bool) -> SiteModule | SiteSource | SiteGateway | None:
         """A liveliness token came or went. What is none is counted and ignored.
@@ -348,12 +341,13 @@ class SiteHistory:
         sources = (source for site in self.away for source in self._had.get(site, ()))
         return tuple(sorted({(each.site, each.module.name) for each in sources if each.name == name}))
 
-    def seen(self, sites: Iterable[str]) -> None:
-        """These sites are there now, and no others."""
+    def seen(self, sites: Iterable[str]) -> tuple[list[str], list[str]]:
+        """These sites are there now, and no others; return which have come, and which have left."""
         there = frozenset(sites)
-        for site in there ^ self._there:
+        came, left = sorted(there - self._there), sorted(self._there - there)
+        for site in (*came, *left):
             self._since[site] = self._now()
-        for site in self._there - there:
+        for site in left:
             self._had[site] = dict.fromkeys(self._recent(site), 0.0)
         self._there = there
         oldest_first = sorted(self.away, key=self._since.__getitem__)
@@ -364,6 +358,7 @@ class SiteHistory:
         for site in oldest_first:
             if total > limits.SITES_SOURCES_MAX:
                 total -= len(self._had.pop(site, ()))
+        return came, left
 
     def _recent(self, site: str) -> dict[SiteSource, float]:
         """What a site has, or has withdrawn just now."""

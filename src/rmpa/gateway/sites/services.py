@@ -37,10 +37,9 @@ from rmpa.runtime.tasks import OwnedTasks
 if TYPE_CHECKING:
     from rmpa.gateway.own_graph import AgentGraph, TopicTap
     from rmpa.gateway.rules import ForeignSource, MeshSource
-    from rmpa.gateway.sites.keys import SiteSource
-    from rmpa.gateway.sites.plans import SiteExport, SiteImport
+    from rmpa.gateway.sites.site import SiteExport, SiteImport
     from rmpa.gateway.sites.topics import SiteContext
-    from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.zenoh.session import ArrivedQuery
     from rmpa.ros.wire.tcpros import Buffer
 
 # Bytes of the description of another site's service: four names.
@@ -196,10 +195,10 @@ class ImportedService:
         self.calls = self.failed = 0
         self._shown = context.graph.show_service(entry.source, self._serve, self._describe)
 
-    def renew(self, source: SiteSource) -> None:
-        """It is of another run of its module: calls under way end with an error, and its type is unknown."""
+    def renew(self, entry: SiteImport) -> None:
+        """It is of another run of its module, or its way was interrupted: calls under way end with an error."""
         self._asking.cancel()
-        self._source, self._description = source, None
+        self._source, self._description = entry.announced, None
 
     def close(self) -> None:
         """Take it back; calls under way end with an error at once."""
@@ -278,7 +277,6 @@ class SiteServices:
         self.waiting = 0
         # By module, service and the site that it is for.
         self._exported: dict[tuple[str, str, str], ExportedService] = {}
-        self.imported: dict[ForeignSource, ImportedService] = {}
         self._ending: list[Answering] = []
 
     def is_full(self, size: int) -> bool:
@@ -294,18 +292,6 @@ class SiteServices:
         gone = self._exported.pop(_key(entry))
         gone.queryable.close()
         self._ending = [*(each for each in self._ending if each), gone.answering]
-
-    def show(self, entry: SiteImport) -> None:
-        """Show a service of another site."""
-        self.imported[entry.source] = ImportedService(entry, self.context)
-
-    def renew(self, entry: SiteImport) -> None:
-        """It is of another run of its module, or its way was interrupted."""
-        self.imported[entry.source].renew(entry.announced)
-
-    def hide(self, entry: SiteImport) -> None:
-        """Take a service back."""
-        self.imported.pop(entry.source).close()
 
     async def close(self) -> None:
         """End calls under way with an error."""

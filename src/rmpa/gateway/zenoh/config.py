@@ -112,6 +112,35 @@ class ZenohConfig:
             entries["access_control"] = self.access_control
         return entries
 
+    def stamp(self) -> tuple[int, int] | None:
+        """What changes when the certificate of what listens is replaced; ``None``: none, or not seen."""
+        if self.certificates is None or not self.listen:
+            return None
+        try:
+            info = (self.certificates / CERTIFICATE).stat()
+        except OSError:
+            return None
+        return info.st_ino, info.st_mtime_ns
+
+    def start_error(self, reason: str) -> StartError:
+        """The error of a session that could not be opened, for what Zenoh says."""
+        where = ", ".join((*self.connect, *self.listen)) or "its default endpoints"
+        if "listener" in reason or "in use" in reason:
+            remedy = "choose another --listen, or stop the program that listens there"
+        elif "certificate" in reason.lower() or "tls" in reason.lower():
+            remedy = "both sides need certificates of the same mesh: see rmpa trust status"
+        else:
+            remedy = "start the router there, or correct --connect"
+        return StartError(f"zenoh {where}", reason, remedy)
+
+
+def reason_of(error: Exception) -> str:
+    """The text of an error of Zenoh without the places in Zenoh's source."""
+    text = str(error).strip()
+    while (at := text.rfind(" at /")) > 0:
+        text = text[:at].rstrip(" .;[")
+    return text
+
 
 def _tls_entries(folder: Path) -> dict[str, object]:
     """Zenoh's configuration of TLS: both sides show a certificate of the mesh, whose authority has signed it.

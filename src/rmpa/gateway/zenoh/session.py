@@ -11,32 +11,33 @@ import asyncio
 import contextlib
 import json
 import logging
+import threading
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import StartError, missing_extra
 from rmpa.gateway import limits
-from rmpa.gateway.zenoh.config import bound_unsent, session_config
-from rmpa.gateway.zenoh.queries import ArrivedQuery, PendingGet, SerialWorker, content
+from rmpa.gateway.zenoh.config import bound_unsent, reason_of, session_config
 from rmpa.gateway.zenoh.threads import (
     ArrivalQueue,
     Arrivals,
     QueuedPublisher,
     SendingLane,
+    SerialWorker,
     ZenohPriority,
+    ZenohReply,
     ZenohSample,
+    call_loop,
     keep_thread_state,
 )
 from rmpa.runtime.accept import in_thread
-from rmpa.trust.store import CERTIFICATE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from rmpa.bridge.policy import Needs
     from rmpa.config.settings import Settings
     from rmpa.gateway.zenoh.config import ZenohConfig
-    from rmpa.gateway.zenoh.threads import ZenohQos, ZenohReply
+    from rmpa.gateway.zenoh.threads import ZenohQos
     from rmpa.ros.wire.tcpros import Buffer
 
 _log = logging.getLogger(__name__)
@@ -49,6 +50,121 @@ _CLOSE_MAX: Final = 3.0
 _GET_GRACE: Final = 1.0
 
 _WILD: Final = frozenset("*$")
+_BUSY: Final = "too many answers wait at this gateway; ask again later"
+
+
+def content(data: Any) -> bytes:
+    """The bytes of a payload or an attachment of Zenoh; empty for none."""
+    return b"" if data is None else bytes(data.to_bytes())
+
+
+class ArrivedQuery:
+    """A query that has come, and whose answers go out by a thread.
+
+    Args:
+        query: Zenoh's query.
+        worker: The thread that answers.
+        arrivals: Has room for the answers that wait.
+    """
+
+    def __init__(self, query: Any, worker: SerialWorker, arrivals: Arrivals) -> None:
+        self._query: Any = query
+        self._worker = worker
+        self._arrivals = arrivals
+        self.key = str(query.key_expr)
+        self.parameters = str(query.parameters)
+        self.payload = content(query.payload)
+        self.attachment = content(query.attachment)
+
+    def reply(self, key: str, payload: Buffer, attachment: bytes = b"") -> None:
+        """Give one answer; more may follow until ``finish``."""
+        query = self._query
+        if query is None:
+            return
+        if not self._arrivals.take_room(len(payload)):
+            self.reply_error(_BUSY)
+            return
+        body = payload if isinstance(payload, bytes) else bytes(payload)
+        self._worker.submit(lambda: self._give(query, key, body, attachment))
+
+    def _give(self, query: Any, key: str, body: bytes, attachment: bytes) -> None:
+        try:
+            query.reply(key, body, attachment=attachment or None)
+        finally:
+            self._arrivals.free_room(len(body))
+
+    def reply_error(self, text: str) -> None:
+        """Answer with an error, and finish."""
+        query = self._query
+        if query is not None:
+            self._worker.submit(lambda: query.reply_err(text))
+            self.finish()
+
+    def finish(self) -> None:
+        """Say that no more answers come."""
+        query, self._query = self._query, None
+        if query is not None:
+            self._worker.submit(query.drop)
+
+
+class PendingGet:
+    """A query that was asked; collects its answers in Zenoh's threads, within ``limits.REPLIES_MAX``.
+
+    Args:
+        done: Resolved in the event loop with all answers, as soon as there are too many.
+        arrivals: Counts answers that are dropped, and calls functions in the event loop.
+
+    Attributes:
+        unfinished: Whether it was resolved because there were too many answers, and more may come.
+    """
+
+    def __init__(self, done: asyncio.Future[list[ZenohReply]], arrivals: Arrivals) -> None:
+        self._done = done
+        self._arrivals = arrivals
+        self._lock = threading.Lock()
+        self._replies: list[ZenohReply] = []
+        self._bytes = 0
+        self.unfinished = False
+
+    def add(self, reply: Any) -> None:
+        """Take one answer. Zenoh's own for a time-out, here or in a router on the way, is left out."""
+        if self.unfinished:
+            self._arrivals.refuse("zenoh.reply.limit")
+            return
+        sample = reply.ok
+        if sample is not None:
+            if sample.attachment is not None and len(sample.attachment) > limits.ATTACHMENT_MAX:
+                self._arrivals.refuse("zenoh.attachment.long")
+                return
+            answer = ZenohReply(str(sample.key_expr), content(sample.payload), content(sample.attachment), ok=True)
+        elif reply.replier_id is None or not reply.replier_id.eid:
+            return  # no queryable has the entity id 0
+        else:
+            answer = ZenohReply("", content(reply.err.payload), b"", ok=False)
+        size = len(answer.payload) + len(answer.attachment) + len(answer.key)
+        with self._lock:
+            self.unfinished = bool(self._replies) and (
+                len(self._replies) >= limits.REPLIES_MAX or self._bytes + size > limits.REPLY_BYTES_MAX
+            )
+            if not self.unfinished:
+                self._bytes += size
+                self._replies.append(answer)
+                return
+        self._arrivals.refuse("zenoh.reply.limit")
+        self.finish()
+
+    def finish(self) -> None:
+        """Resolve with what has come; called from any thread, and again without effect."""
+        call_loop(self._arrivals.loop, self._settle)
+
+    def collected(self) -> list[ZenohReply]:
+        """The answers up to now."""
+        with self._lock:
+            return list(self._replies)
+
+    def _settle(self) -> None:
+        if not self._done.done():
+            self._done.set_result(self.collected())
 
 
 class Declaration:
@@ -152,7 +268,6 @@ class OpenSession:
 
     def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> QueuedPublisher:
         """Declare a publisher; ``on_matching(there)`` tells whether there is a subscriber, also at the beginning."""
-        self._check(key)
         last: list[bool] = []
 
         def matched(there: bool) -> None:
@@ -180,7 +295,7 @@ class OpenSession:
             return objects
 
         publisher = QueuedPublisher(self._lane(qos.priority), key, qos, undeclare)
-        declaration = Declaration(self._declarations, self._kept, declare, queue)
+        declaration = self._declare(key, declare, queue)
         self._publishers.add(publisher)
         return publisher
 
@@ -192,7 +307,6 @@ class OpenSession:
         history: bool = False,
     ) -> Declaration:
         """Subscribe to a key expression; ``history``: ask publishers with a cache for what they keep."""
-        self._check(key)
         fixed = None if _WILD.intersection(key) else key
         queue = ArrivalQueue(self._arrivals, on_sample, limits.ARRIVED_MESSAGES, limits.ARRIVED_BYTES)
         put = self._zenoh.SampleKind.PUT
@@ -213,16 +327,14 @@ class OpenSession:
             asked = ext.HistoryConfig(detect_late_publishers=True)
             return [ext.declare_advanced_subscriber(self._session, key, self._direct(arrived), history=asked)]
 
-        return Declaration(self._declarations, self._kept, declare, queue)
+        return self._declare(key, declare, queue)
 
     def token(self, key: str) -> Declaration:
         """Declare a liveliness token."""
-        self._check(key)
-        return Declaration(self._declarations, self._kept, lambda: [self._session.liveliness().declare_token(key)])
+        return self._declare(key, lambda: [self._session.liveliness().declare_token(key)])
 
     def watch_tokens(self, key: str, on_token: Callable[[str, bool], None]) -> Declaration:
         """Call ``on_token(key, alive)`` for each token that is there, and at each change."""
-        self._check(key)
         put = self._zenoh.SampleKind.PUT
         queue: ArrivalQueue[tuple[str, bool]] = ArrivalQueue(
             self._arrivals, lambda change: on_token(*change), limits.ARRIVED_TOKENS, limits.ARRIVED_TOKEN_BYTES
@@ -236,7 +348,7 @@ class OpenSession:
         def declare() -> list[Any]:
             return [self._session.liveliness().declare_subscriber(key, self._direct(arrived), history=True)]
 
-        return Declaration(self._declarations, self._kept, declare, queue)
+        return self._declare(key, declare, queue)
 
     def queryable(
         self,
@@ -245,7 +357,6 @@ class OpenSession:
         _needs: Needs | None = None,
     ) -> Declaration:
         """Answer queries."""
-        self._check(key)
         queue: ArrivalQueue[ArrivedQuery] = ArrivalQueue(
             self._arrivals,
             on_query,
@@ -268,7 +379,7 @@ class OpenSession:
         def declare() -> list[Any]:
             return [self._session.declare_queryable(key, self._direct(arrived), complete=True)]
 
-        return Declaration(self._declarations, self._kept, declare, queue)
+        return self._declare(key, declare, queue)
 
     async def get(
         self,
@@ -337,7 +448,7 @@ class OpenSession:
     def _end(self) -> None:
         lanes = [lane.thread for lane in self._lanes.values()]
         for lane in self._lanes.values():
-            lane.stop()
+            lane.stop(discard=True)
         self._declarations.stop(discard=True)
         self._queries.stop(discard=True)
         closing = SerialWorker("zenoh session close")
@@ -381,12 +492,18 @@ class OpenSession:
         self._arrivals.refuse("zenoh.key.long")
         return False
 
+    def _declare(
+        self, key: str, declare: Callable[[], list[Any]], queue: ArrivalQueue[Any] | None = None
+    ) -> Declaration:
+        self._check(key)
+        return Declaration(self._declarations, self._kept, declare, queue)
+
     def _check(self, key: str) -> None:
         """Refuse a key that Zenoh would refuse later, in another thread."""
         try:
             self._zenoh.KeyExpr(key)
         except self._zenoh.ZError as error:
-            raise ValueError(f"{key!r} is not a key expression of Zenoh: {_reason(error)}") from None
+            raise ValueError(f"{key!r} is not a key expression of Zenoh: {reason_of(error)}") from None
 
     def _lane(self, priority: ZenohPriority) -> SendingLane:
         lane = self._lanes.get(priority)
@@ -447,42 +564,13 @@ async def open_session(config: ZenohConfig, changed: Callable[[], bool] = lambda
             settings.insert_json5(key, json.dumps(value))
         session = await in_thread(lambda: zenoh.open(settings), "zenoh open")
     except zenoh.ZError as error:
-        raise _start_error(config, _reason(error)) from None
-    certificate = config.certificates / CERTIFICATE if config.certificates is not None and config.listen else None
-    stamp = _stamp(certificate)
+        raise config.start_error(reason_of(error)) from None
+    stamp = config.stamp()
 
     def stale() -> bool:
-        return _stamp(certificate) != stamp or changed()
+        return config.stamp() != stamp or changed()
 
     return OpenSession(zenoh, session, asyncio.get_running_loop(), stale)
-
-
-def _stamp(file: Path | None) -> tuple[int, int] | None:
-    """What changes when a file is replaced; ``None`` for none, and for one that cannot be seen."""
-    try:
-        info = file.stat() if file is not None else None
-    except OSError:
-        return None
-    return (info.st_ino, info.st_mtime_ns) if info is not None else None
-
-
-def _reason(error: Exception) -> str:
-    """The text of an error of Zenoh without the places in Zenoh's source."""
-    text = str(error).strip()
-    while (at := text.rfind(" at /")) > 0:
-        text = text[:at].rstrip(" .;[")
-    return text
-
-
-def _start_error(config: ZenohConfig, reason: str) -> StartError:
-    where = ", ".join((*config.connect, *config.listen)) or "its default endpoints"
-    if "listener" in reason or "in use" in reason:
-        remedy = "choose another --listen, or stop the program that listens there"
-    elif "certificate" in reason.lower() or "tls" in reason.lower():
-        remedy = "both sides need certificates of the same mesh: see rmpa trust status"
-    else:
-        remedy = "start the router there, or correct --connect"
-    return StartError(f"zenoh {where}", reason, remedy)
 
 
 async def open_trusted_session(settings: Settings) -> OpenSession:
