@@ -65,7 +65,7 @@ class Gateway:
     ) -> None:
         self._settings = _own(settings)
         self._open_session = open_session
-        self._make_neighbours = make_neighbours or _make_neighbours
+        self._make_neighbours = make_neighbours or self._make
         self.agent = Agent(self._settings, realtime, load)
         self.graph = AgentGraph(self.agent, self._settings)
         self.agent.bridge.add(self.graph)
@@ -223,15 +223,28 @@ class Gateway:
         self.session = session
         self._problem = ""
         self.neighbours = dict(self._make_neighbours(self.graph, session, self._settings))
-        if self._settings.gateway.ros2.enabled and "ros2" not in self.neighbours:
-            from rmpa.gateway.ros2.ros2 import make_ros2_neighbour  # noqa: PLC0415 - it reads all types of ROS
-
-            self.neighbours["ros2"] = make_ros2_neighbour(self.graph, self.ros2 or session, self._settings)
         for neighbour in self.neighbours.values():
             neighbour.start()
         self._join_others(session)
         way = "rclpy" if session is self.ros2 else "zenoh"
         _log.info("= joined: %s; %s session %s", ", ".join(self.neighbours) or "none", way, session.zid)
+
+    def _make(self, graph: AgentGraph, session: Any, settings: Settings) -> dict[str, Neighbour]:
+        """Make the neighbours that the settings ask for, by their names; they are not started.
+
+        Raises:
+            ConfigError: A setting of one is wrong.
+        """
+        neighbours: dict[str, Neighbour] = {}
+        if settings.gateway.site:
+            from rmpa.gateway.sites.answers import make_site_neighbour  # noqa: PLC0415 - not every gateway needs it
+
+            neighbours["sites"] = make_site_neighbour(graph, session, settings)
+        if settings.gateway.ros2.enabled:
+            from rmpa.gateway.ros2.ros2 import make_ros2_neighbour  # noqa: PLC0415 - it reads all types of ROS
+
+            neighbours["ros2"] = make_ros2_neighbour(graph, self.ros2 or session, settings)
+        return neighbours
 
     def _join_others(self, session: OpenSession | RclpySession) -> None:
         """Make and start the neighbours of other packages; one that fails is logged, and left out."""
@@ -276,21 +289,6 @@ async def _discard(opening: asyncio.Future[OpenSession | RclpySession]) -> None:
     """Closes a session that is not needed any more, once it is open."""
     with contextlib.suppress(StartError):
         await (await opening).close()
-
-
-def _make_neighbours(graph: AgentGraph, session: Any, settings: Settings) -> dict[str, Neighbour]:
-    """Make the neighbours that the settings ask for, by their names; they are not started.
-
-    Raises:
-        ConfigError: A setting of one is wrong.
-    """
-    neighbours: dict[str, Neighbour] = {}
-    gateway = settings.gateway
-    if gateway.site:
-        from rmpa.gateway.sites.answers import make_site_neighbour  # noqa: PLC0415 - not every gateway needs it
-
-        neighbours["sites"] = make_site_neighbour(graph, session, settings)
-    return neighbours
 
 
 async def _main(

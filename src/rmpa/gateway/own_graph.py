@@ -56,21 +56,22 @@ class MeshSources:
     Args:
         agent: The gateway's agent.
         name: Its name among its peers.
-
-    Attributes:
-        known: The sources that were reported.
     """
 
     def __init__(self, agent: Agent, name: str) -> None:
         self._agent = agent
         self._name = name
         self._relay = agent.bridge.relay
-        self.known: dict[SourceKey, MeshSource] = {}
         self.watchers: list[Callable[[MeshSource, bool], None]] = []
         self._by_name: dict[tuple[SourceKind, str], dict[SourceKey, MeshSource]] = {}
         self._changed: dict[tuple[SourceKind, str], None] = {}
         self._soon: asyncio.Handle | None = None
         self._begun = False
+
+    @property
+    def reported(self) -> list[MeshSource]:
+        """The sources that there are, as they were reported."""
+        return [source for found in self._by_name.values() for source in found.values()]
 
     def begin(self) -> None:
         """Begin to report; the agent's place in the network is known."""
@@ -114,11 +115,9 @@ class MeshSources:
                 self._by_name[kind, name] = found
             for key, source in before.items():
                 if found.get(key) != source:
-                    del self.known[key]
                     self._tell(source, there=False)
             for key, source in found.items():
                 if before.get(key) != source:
-                    self.known[key] = source
                     self._tell(source, there=True)
 
     def _tell(self, source: MeshSource, *, there: bool) -> None:
@@ -173,8 +172,6 @@ class AgentGraph(Part):
         name: The gateway's name among its peers.
         reloaded: Called with other rules, after the graph has taken them.
         node: The node that taps topics.
-        sources: The local sources by kind, name here and node here. What came from a neighbour is not among
-            them.
     """
 
     def __init__(self, agent: Agent, settings: Settings) -> None:
@@ -184,7 +181,6 @@ class AgentGraph(Part):
         self._core = agent.core
         self._sources = MeshSources(agent, settings.name)
         self._sources.watchers.append(self._source_changed)
-        self.sources: Final = self._sources.known
         agent.services.make_room = self._make_room
         self._taps: dict[str, set[TopicTap]] = {}
         self._pools: dict[str, ServicePool] = {}
@@ -201,7 +197,7 @@ class AgentGraph(Part):
     def watch(self, on_change: Callable[[MeshSource, bool], None]) -> None:
         """Call ``on_change(source, there)`` for each source that is there now, and at each change."""
         self._sources.watchers.append(on_change)
-        for source in list(self.sources.values()):
+        for source in self._sources.reported:
             on_change(source, True)
 
     def tap(

@@ -12,6 +12,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.core.timers import TokenBucket
 from rmpa.gateway import limits
 from rmpa.observe.check import OK, WARN, Check
+from rmpa.runtime.loop import Delay
 from rmpa.runtime.stream import after_read
 
 if TYPE_CHECKING:
@@ -126,14 +127,14 @@ class ExportedTopic(ABC):
         self._publisher: Publishing | None = None
         self._tap: TopicTap | None = None
         self._opening = self._closed = False
-        self._linger: asyncio.TimerHandle | None = None
+        self._linger = Delay()
         self._asking: list[asyncio.Future[TopicDescription]] = []
         # The messages of the present read.
         self._collected: list[bytes] = []
         # The last message of a latched topic.
         self._last: bytes | None = None
         # When that is sent, which a limit holds back.
-        self._held: asyncio.TimerHandle | None = None
+        self._held = Delay()
 
     @abstractmethod
     def announce(self, about: TopicDescription | None, *, latched: bool, large: bool) -> tuple[str, ZenohQos] | None:
@@ -212,8 +213,8 @@ class ExportedTopic(ABC):
     def close(self) -> None:
         """Take everything back; what waits for Zenoh is still sent for a moment."""
         self._closed = True
-        self._stop_lingering()
-        self._drop_held()
+        self._linger.cancel()
+        self._held.cancel()
         for answer in self._asking:
             if not answer.done():
                 gone = f"{self.source.name} of {self.source.module} is not offered any more"
@@ -259,24 +260,18 @@ class ExportedTopic(ABC):
         if self._closed:
             return
         if self.wanted or self._asking or (self._terms is None and not self._failed):
-            self._stop_lingering()
+            self._linger.cancel()
             if self._tap is None and not self._opening:
                 self._opening = True
                 self._tap = self._graph.tap(self.source, self._message, self._described, self._lost)
                 self._opening = False
                 self._judge()
-        elif self._tap is not None and self._linger is None:
+        elif self._tap is not None and not self._linger:
             delay = self.linger(keeps=self._latched and self._was_wanted)
             if delay is not None:
-                self._linger = asyncio.get_running_loop().call_later(delay, self._end_demand)
-
-    def _stop_lingering(self) -> None:
-        if self._linger is not None:
-            self._linger.cancel()
-            self._linger = None
+                self._linger.set(delay, self._end_demand)
 
     def _end_demand(self) -> None:
-        self._linger = None
         self._disconnect()
         # What it keeps would be told to the next subscriber, although the publisher may have a newer message.
         self._last, self._latched, self._was_wanted = None, False, False
@@ -321,24 +316,16 @@ class ExportedTopic(ABC):
             if not self._limits.admit(now, len(payload)):
                 self.limited += 1
                 if self._latched:  # the last one is sent as soon as the limits let it
-                    self._drop_held()
-                    loop = asyncio.get_running_loop()
                     delay = self._limits.next(now, len(payload)) - now
-                    self._held = loop.call_later(delay, self._send_last, payload)
+                    self._held.set(delay, partial(self._send_last, payload))
                 return
-            self._drop_held()
+            self._held.cancel()
         self._send(payload)
 
     def _send_last(self, payload: bytes) -> None:
-        self._held = None
         if self._limits is not None and self._limits.admit(time.monotonic() + _BOUNDARY, len(payload)):
             self.limited -= 1
             self._send(payload)
-
-    def _drop_held(self) -> None:
-        if self._held is not None:
-            self._held.cancel()
-            self._held = None
 
     def _send(self, payload: bytes) -> None:
         if len(payload) >= limits.LARGE_MESSAGE and not self._large:

@@ -20,7 +20,7 @@ from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.ros.types.definitions import Specification, known_specifications
 from rmpa.ros.types.find import find_message_type
 from rmpa.ros.types.messages import MessageType
-from rmpa.runtime.loop import MachineTimer, SystemClock
+from rmpa.runtime.loop import Delay, MachineTimer, SystemClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -286,7 +286,7 @@ class ShownAction(JoinedAction):
         # What the gateway declares for its clients, by part.
         self._callers: dict[str, OwnEndpoint] = {}
         self._types: dict[str, tuple[str, str]] = {}
-        self._leaving: asyncio.TimerHandle | None = None
+        self._leaving = Delay()
 
     def follow(self, clients: set[MeshSource]) -> None:
         """The topics *goal* and *cancel* of its clients are these now."""
@@ -304,12 +304,11 @@ class ShownAction(JoinedAction):
         """The server is gone: goals under way end as aborted, then the topics go."""
         super().close()
         # The last results have to leave before their publishers.
-        self._leaving = asyncio.get_running_loop().call_later(_ROS2_LAST_RESULTS, self.finish)
+        self._leaving.set(_ROS2_LAST_RESULTS, self.finish)
 
     def finish(self) -> None:
         """Take its topics out of the graph, once it is closed."""
-        if self._leaving is not None:
-            self._leaving.cancel()
+        self._leaving.cancel()
         super().finish()
 
     def ask(self, service: str, uuid: bytes, request: bytes) -> None:

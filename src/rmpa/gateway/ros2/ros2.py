@@ -233,28 +233,21 @@ class Ros2Neighbour:
 
     def _rows(self, asker: str) -> Iterator[SiteSourceInfo]:
         """What ROS 2 has, with what is wrong with it; then problems of what the modules have."""
-        topic, service = SourceKind.TOPIC, SourceKind.SERVICE
-        rows: list[tuple[SourceKind, str, str, str, str, str]] = []
-        for each in self.topics.imports.values():
-            for one in each.publishers.values():
-                problem = each.problem or one.topic.problem
-                rows.append((topic, each.first.name, one.node, each.ros1_type, each.decision.name, problem))
-        for name, shown in self.services.shown.items():
-            rows.append((service, name, "", shown.server.type, name, ""))
+        rows: list[tuple[SourceKind, str, str, str, str, str]] = [
+            (SourceKind.TOPIC, each.first.name, one.node, each.ros1_type, each.decision.name, each.problem_of(one))
+            for each in self.topics.imports.values()
+            for one in each.publishers.values()
+        ]
+        rows += [
+            (SourceKind.SERVICE, name, "", one.server.type, name, "") for name, one in self.services.shown.items()
+        ]
         for what, problem in self.context.problems.items():
             name, _, node = what.partition(" of ")
-            rows.append((topic, name, node, "*", "", problem))
+            rows.append((SourceKind.TOPIC, name, node, "*", "", problem))
         for kind, name, node, type_name, here, problem in rows:
             if self.permissions.tells(asker, kind, here or name):
-                yield SiteSourceInfo(
-                    kind=kind.name.lower(),
-                    module="",
-                    node=node,
-                    name=name,
-                    type=type_name,
-                    here=here,
-                    problem=problem,
-                )
+                row = {"node": node, "name": name, "type": type_name, "here": here, "problem": problem}
+                yield SiteSourceInfo(kind=kind.name.lower(), module="", **row)
 
 
 def _way(stages: tuple[Check, ...], name: str, node: str, peer: str, to: str) -> Diagnosis:
@@ -299,7 +292,7 @@ def _in_stages(imported: Ros2Import, publisher: Ros2Publisher) -> Iterator[Check
     yield Check("rule", OK, imported.decision.why)
     own = imported.declared
     in_ros2 = imported.part.context.problems.get(shown_in_ros2(own), "") if own is not None else ""
-    if problem := imported.problem or publisher.topic.problem or in_ros2:
+    if problem := imported.problem_of(publisher) or in_ros2:
         yield Check("type", FAIL, problem)
     kept = ", transient local" if publisher.latched else ""
     yield Check("type", OK, f"{there.type} of ROS 2 is {imported.ros1_type} here{kept}")

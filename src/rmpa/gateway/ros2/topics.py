@@ -29,6 +29,7 @@ from rmpa.gateway.topics import ExportedTopic, TopicLimits
 from rmpa.gateway.zenoh.threads import BoundedQueue
 from rmpa.ros.types.find import type_of_header
 from rmpa.ros.wire.tcpros import TopicDescription
+from rmpa.runtime.loop import Delay
 
 if TYPE_CHECKING:
     from rmpa.gateway.foreign import ProxiedTopic
@@ -240,7 +241,7 @@ class Ros2Import:
         self.early: BoundedQueue[tuple[bytes, int, bytes]] = BoundedQueue(_ROS2_EARLY_MESSAGES, _ROS2_EARLY_BYTES)
         self.unconverted = self.limited = 0
         self._limits = TopicLimits.of(decision.rate, decision.size)
-        self._lingering: asyncio.TimerHandle | None = None
+        self._lingering = Delay()
 
     @property
     def declared(self) -> Ros2Endpoint | None:
@@ -250,7 +251,11 @@ class Ros2Import:
     @property
     def idle(self) -> bool:
         """Whether it has no publishers, and none came or went a moment ago: its publisher does not restart."""
-        return not self.publishers and self._lingering is None
+        return not self.publishers and not self._lingering
+
+    def problem_of(self, publisher: Ros2Publisher) -> str:
+        """Why messages of one of its publishers do not come, or are not understood; empty for nothing."""
+        return self.problem or publisher.topic.problem
 
     def add(self, endpoint: Ros2Endpoint) -> None:
         """A publisher appeared."""
@@ -289,8 +294,7 @@ class Ros2Import:
 
     def close(self) -> None:
         """Take it out of the gateway's graph."""
-        if self._lingering is not None:
-            self._lingering.cancel()
+        self._lingering.cancel()
         for publisher in self.publishers.values():
             publisher.topic.close()
         self._unsubscribe()
@@ -322,21 +326,17 @@ class Ros2Import:
 
     def _linger(self) -> None:
         """Stay subscribed for a moment, and hold what comes: nodes subscribe to a new source some time after it."""
-        if self._subscription is None:
-            return
-        if self._lingering is not None:
-            self._lingering.cancel()
-        self._lingering = asyncio.get_running_loop().call_later(_ROS2_LINGER, self._end_lingering)
+        if self._subscription is not None:
+            self._lingering.set(_ROS2_LINGER, self._end_lingering)
 
     def _end_lingering(self) -> None:
-        self._lingering = None
         self.early.clear()
         self._follow_demand()
         self.part.drop_idle(self)
 
     def _follow_demand(self) -> None:
         wanted = self.conversion is not None and any(each.wanted for each in self.publishers.values())
-        if not wanted and self._lingering is None:
+        if not wanted and not self._lingering:
             self._unsubscribe()
         elif wanted and self._subscription is None:
             nodes, first = self.part.context.nodes, self.first
@@ -382,7 +382,7 @@ class Ros2Import:
             self._deliver(publisher, sample.payload, sequence)
         elif publisher is not None and publisher.latched:
             publisher.kept = sample.payload
-        elif self._lingering is not None:
+        elif self._lingering:
             self.early.push((gid, sequence, sample.payload), len(sample.payload))
 
     def _publisher_of(self, gid: bytes) -> Ros2Publisher | None:

@@ -20,6 +20,7 @@ from rmpa.gateway.sites.keys import ROOT, AttachmentReader, MessageSource, Seque
 from rmpa.gateway.topics import ExportedTopic
 from rmpa.gateway.zenoh.threads import PRIORITIES, BoundedQueue, ZenohPriority, ZenohQos, first_answer
 from rmpa.ros.wire.tcpros import printable
+from rmpa.runtime.loop import Delay
 from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
@@ -191,8 +192,7 @@ class ImportedTopic:
         self._last_latched: bytes | None = None
         self.mismatched = self.dropped = 0
         self._task: asyncio.Task[None] | None = None
-        self._linger: asyncio.TimerHandle | None = None
-        self._checking: asyncio.TimerHandle | None = None
+        self._linger, self._checking = Delay(), Delay()
         self._topic = part.context.graph.show_topic(entry.source, self._demand)
 
     def take(self, payload: bytes, sequence: int, source: MessageSource) -> None:
@@ -246,7 +246,7 @@ class ImportedTopic:
 
     def close(self) -> None:
         """Take it out of the graph; its counts are kept for the same topic once it is back."""
-        if self.wanted and self._linger is None:
+        if self.wanted and not self._linger:
             kept = self._part.interrupted
             kept[self.entry.source] = self._sequence, self.messages
             if len(kept) > limits.INTERRUPTED_TOPICS_MAX:
@@ -258,10 +258,10 @@ class ImportedTopic:
         self._topic.close()
 
     def _demand(self, wanted: bool) -> None:
-        self._stop_lingering()
+        self._linger.cancel()
         if not wanted:
             if self.wanted:
-                self._linger = asyncio.get_running_loop().call_later(_DEMAND_LINGER, self._detach)
+                self._linger.set(_DEMAND_LINGER, self._detach)
         elif not self.wanted:
             self.wanted = True
             if time.monotonic() > self._resumes_until:
@@ -271,18 +271,12 @@ class ImportedTopic:
             self._check_in(_IDLE_CHECK)
             self._ask()
 
-    def _stop_lingering(self) -> None:
-        if self._linger is not None:
-            self._linger.cancel()
-            self._linger = None
-
     def _detach(self) -> None:
-        self._stop_lingering()
+        self._linger.cancel()
         if not self.wanted:
             return
         self.wanted = False
-        if self._checking is not None:
-            self._checking.cancel()
+        self._checking.cancel()
         self._part.unsubscribe(self)
         # The next subscriber gets the last message from over there.
         self._sequence.restart()
@@ -291,9 +285,7 @@ class ImportedTopic:
         self._held.clear()
 
     def _check_in(self, pause: float) -> None:
-        if self._checking is not None:
-            self._checking.cancel()
-        self._checking = asyncio.get_running_loop().call_later(pause, self._check, pause)
+        self._checking.set(pause, partial(self._check, pause))
 
     def _check(self, pause: float) -> None:
         if self._fresh:

@@ -30,6 +30,7 @@ from rmpa.gateway.zenoh.threads import (
     keep_thread_state,
 )
 from rmpa.runtime.accept import in_thread
+from rmpa.runtime.loop import Delay
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -246,7 +247,7 @@ class OpenSession:
         self._flushed = asyncio.Event()
         # The endpoints whose sockets are bounded.
         self._bounded: frozenset[str] = frozenset()
-        self._looking: asyncio.TimerHandle | None = None
+        self._looking = Delay()
         self._look_at_links()
 
     @property
@@ -259,7 +260,7 @@ class OpenSession:
         if new := there - self._bounded:
             bound_unsent(new)
         self._bounded = there
-        self._looking = self._loop.call_later(_LOOK_AT_LINKS, self._look_at_links)
+        self._looking.set(_LOOK_AT_LINKS, self._look_at_links)
 
     @property
     def stale(self) -> bool:
@@ -432,8 +433,7 @@ class OpenSession:
         if self._closing:
             return
         self._closing = True
-        if self._looking is not None:
-            self._looking.cancel()
+        self._looking.cancel()
         if not self._publishers:
             self._flushed.set()
         for publisher in tuple(self._publishers):

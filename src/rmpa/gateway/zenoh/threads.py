@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from rmpa.core.contract import Priority
 from rmpa.gateway import limits
+from rmpa.runtime.loop import Delay
 from rmpa.runtime.stream import CollectedSends
 
 if TYPE_CHECKING:
@@ -476,7 +477,7 @@ class QueuedPublisher(BoundedQueue[tuple[bytes, bytes]]):
         self.handle: Any = None
         self._taken = 0
         self._scheduled = False
-        self._flush_timer: asyncio.TimerHandle | None = None
+        self._flushing = Delay()
         self._closed = False
         self.sent = 0
 
@@ -517,7 +518,7 @@ class QueuedPublisher(BoundedQueue[tuple[bytes, bytes]]):
         if empty:
             self._undeclare()
         else:
-            self._flush_timer = self._lane.loop.call_later(limits.FLUSH_MAX, self._give_up)
+            self._flushing.set(limits.FLUSH_MAX, self._give_up)
 
     def _schedule(self) -> None:
         """Take a turn soon, if something waits. The caller has the lock."""
@@ -547,12 +548,11 @@ class QueuedPublisher(BoundedQueue[tuple[bytes, bytes]]):
         self._lane.rest(len(turn))
 
     def _flushed(self) -> None:
-        if self._flush_timer is not None:
-            self._flush_timer.cancel()
-            self._flush_timer = None
+        if self._flushing:
+            self._flushing.cancel()
             self._undeclare()
 
     def _give_up(self) -> None:
         with self._lock:
             self.dropped += len(self.clear())
-        self._flushed()
+        self._undeclare()
