@@ -351,7 +351,7 @@ class Ros2Node:
 
     def token(self) -> str:
         """The node's liveliness token."""
-        return f"{self._head(self.number, EntityKind.NODE)}"
+        return self._head(self.number, EntityKind.NODE)
 
     def _head(self, number: int, kind: EntityKind) -> str:
         namespace, _, name = self.name.rpartition("/")
@@ -414,28 +414,25 @@ def parse_token(key: str) -> Ros2Node | Ros2Endpoint:
     Raises:
         RemoteProtocolError: It has another form. The parts behind those that are known are ignored.
     """
-    if len(key) > limits.KEY_MAX:
-        raise RemoteProtocolError(f"a liveliness token has {len(key)} characters; at most {limits.KEY_MAX} are read")
     parts = key.split("/")
-    if len(parts) < _NODE_PARTS or parts[0] != ADMIN_SPACE or not all(parts):
-        raise RemoteProtocolError(f"{_short(key)} is not a liveliness token of ROS 2")
-    if not _WILD.isdisjoint(key):
-        raise RemoteProtocolError(f"{_short(key)} is an expression, not a liveliness token")
+    whole = len(key) <= limits.KEY_MAX and len(parts) >= _NODE_PARTS and parts[0] == ADMIN_SPACE and all(parts)
+    if not whole or not _WILD.isdisjoint(key):
+        raise RemoteProtocolError(f"{key[:120]!r} is not a liveliness token of ROS 2")
     try:
         kind = EntityKind(parts[5])
-    except ValueError:
-        raise RemoteProtocolError(f"{_short(key)}: {parts[5][:20]!r} is no kind of entity") from None
-    domain = _token_number(parts[1], _DOMAIN_MAX, key)
+        domain = _token_number(parts[1], _DOMAIN_MAX)
+        session_number, number = (_token_number(part, _ENTITY_ID_MAX) for part in parts[3:5])
+    except ValueError as error:
+        raise RemoteProtocolError(f"{key[:120]!r} is not a liveliness token of ROS 2: {error}") from None
     enclave, namespace, name = (_demangle(part) for part in parts[6:9])
     if not name or "/" in name:
-        raise RemoteProtocolError(f"{_short(key)} has no name of a node")
+        raise RemoteProtocolError(f"{key[:120]!r} has no name of a node")
     full = f"{_absolute(namespace)}/{name}" if namespace else f"/{name}"
-    node = Ros2Node(domain, parts[2], _token_number(parts[3], _ENTITY_ID_MAX, key), full, enclave)
+    node = Ros2Node(domain, parts[2], session_number, full, enclave)
     if kind is EntityKind.NODE:
         return node
     if len(parts) < _ENDPOINT_PARTS:
-        raise RemoteProtocolError(f"{_short(key)} has {len(parts)} parts; an endpoint's has {_ENDPOINT_PARTS}")
-    number = _token_number(parts[4], _ENTITY_ID_MAX, key)
+        raise RemoteProtocolError(f"{key[:120]!r} has {len(parts)} parts; an endpoint's has {_ENDPOINT_PARTS}")
     name = _absolute(_demangle(parts[9]))
     return Ros2Endpoint(node, number, kind, name, ros_type(parts[10]), parts[11], Ros2Qos.parse(parts[12]))
 
@@ -474,11 +471,7 @@ def _absolute(name: str) -> str:
     return name if name.startswith("/") else f"/{name}"
 
 
-def _token_number(text: str, largest: int, key: str) -> int:
+def _token_number(text: str, largest: int) -> int:
     if text.isascii() and text.isdigit() and len(text) <= len(str(largest)) and int(text) <= largest:
         return int(text)
-    raise RemoteProtocolError(f"{_short(key)}: {text[:20]!r} is not a number up to {largest}")
-
-
-def _short(key: str) -> str:
-    return repr(key[:120])
+    raise ValueError(f"{text[:20]!r} is not a number up to {largest}")

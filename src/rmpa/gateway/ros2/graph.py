@@ -1,6 +1,7 @@
 """ROS 2's graph: the way to it, what its tokens tell, and what the gateway declares there.
 
-The way is a Zenoh session, or a process with rclpy (``rclpy_session``).
+The way is a Zenoh session, or a process with rclpy (``rclpy_session``): both have endpoints, messages and calls by
+rmw_zenoh's tokens and keys.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ import itertools
 import re
 import time
 from collections import Counter
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.policy import Needs
 from rmpa.config.rules import ROS2
@@ -27,11 +28,20 @@ from rmpa.gateway.ros2.format import (
 from rmpa.gateway.zenoh.threads import first_answer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator
+    from contextlib import ExitStack
+    from typing import TypeAlias
 
     from rmpa.gateway.ros2.format import Ros2Qos
-    from rmpa.gateway.zenoh.threads import ZenohQos, ZenohReply, ZenohSample
+    from rmpa.gateway.ros2.rclpy_session import RclpyPublisher, RclpyQuery, RclpySession
+    from rmpa.gateway.zenoh.session import ArrivedQuery, Declaration, OpenSession
+    from rmpa.gateway.zenoh.threads import QueuedPublisher, ZenohReply
     from rmpa.ros.wire.tcpros import Buffer
+
+    Ros2Link: TypeAlias = OpenSession | RclpySession
+    Declared: TypeAlias = Declaration | ExitStack
+    Publishing: TypeAlias = QueuedPublisher | RclpyPublisher
+    Query: TypeAlias = ArrivedQuery | RclpyQuery
 
 # The name of ROS 2 among the sites, in rules and in the names of proxies; it is ``{module}`` too.
 SITE: Final = ROS2
@@ -40,83 +50,6 @@ _NEEDS: Final = Needs(
     "`[[gateway.rule]]` for `ros2` alone: ROS 2 has no permissions",
     key="services and actions of ROS 2",
 )
-
-
-class Declared(Protocol):
-    """Something that was declared."""
-
-    def close(self) -> None:
-        """Take it back."""
-
-
-class Publishing(Declared, Protocol):
-    """A publisher with a bounded queue."""
-
-    dropped: int
-
-    @property
-    def waiting(self) -> int:
-        """Messages in its queue."""
-
-    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
-        """Queue messages, each with its attachment; return how many older ones were dropped."""
-
-
-class Query(Protocol):
-    """A call that has come."""
-
-    key: str
-    payload: bytes
-    attachment: bytes
-
-    def reply(self, key: str, payload: Buffer, attachment: bytes = b"") -> None:
-        """Answer it."""
-
-    def reply_error(self, text: str) -> None:
-        """Answer that it has failed, and finish."""
-
-    def finish(self) -> None:
-        """Say that no more answers come."""
-
-
-class Ros2Link(Protocol):
-    """Endpoints, messages and calls by rmw_zenoh's tokens and keys.
-
-    Attributes:
-        zid: Identifies this gateway among others.
-    """
-
-    zid: str
-
-    @property
-    def endpoints(self) -> tuple[str, ...]:
-        """What it is connected to."""
-
-    def token(self, key: str) -> Declared:
-        """Declare a node or an endpoint."""
-
-    def watch_tokens(self, key: str, on_token: Callable[[str, bool], None]) -> Declared:
-        """Call ``on_token(token, alive)`` for each node and endpoint that is there, and at each change."""
-
-    def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> Publishing:
-        """Make a publisher; ``on_matching(there)`` tells whether there is a subscriber."""
-
-    def subscribe(self, key: str, on_sample: Callable[[ZenohSample], None], *, history: bool = False) -> Declared:
-        """Give what is published by a key to a function; ``history``: also what publishers keep."""
-
-    def queryable(self, key: str, on_query: Callable[[Any], object], _needs: Needs | None = None) -> Declared:
-        """Give calls of a service to a function, each as a ``Query``."""
-
-    async def get(
-        self,
-        selector: str,
-        payload: Buffer = b"",
-        attachment: bytes = b"",
-        *,
-        timeout: float = 5.0,  # noqa: ASYNC109 - a Zenoh query ends by itself
-        all_complete: bool = False,
-    ) -> list[ZenohReply]:
-        """Call a service; an empty list: no answer came within ``timeout`` seconds."""
 
 
 # Two endpoints of one name that do not hear each other, as their keys differ. ROS 2 itself says nothing.

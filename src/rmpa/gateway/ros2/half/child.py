@@ -39,6 +39,7 @@ import struct
 import sys
 import threading
 import time
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -121,19 +122,22 @@ def load_type(name: str) -> Any:
         raise LookupError("the package %s of ROS 2 has no %s here: it is older or newer" % (package, name))
 
 
+@dataclass(eq=False)
 class Made:
-    """One publisher, subscription, server or client that was made for the gateway."""
+    """One publisher, subscription, server or client that was made for the gateway.
 
-    def __init__(self, number: int, kind: str, name: str, node: Any, entity: Any, handle: Any, kind_of: Any) -> None:
-        self.number = number
-        self.kind = kind
-        self.name = name
-        self.node = node
-        self.entity = entity
-        self.handle = handle
-        self.type = kind_of
-        # Of a server: the header of each call that waits; of a client: the calls by rcl's numbers.
-        self.calls: dict[int, Any] = {}
+    Attributes:
+        calls: Of a server the header of each call that waits; of a client the calls by rcl's numbers.
+    """
+
+    number: int
+    kind: str
+    name: str
+    node: Any
+    entity: Any
+    handle: Any
+    type: Any
+    calls: dict[int, Any] = field(default_factory=dict)
 
 
 class Half:
