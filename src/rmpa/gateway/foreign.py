@@ -274,6 +274,7 @@ class ProxiedTopic(ProxiedSource, PublicationEvents):
         self._on_demand = on_demand
         self._wanted = False
         self._publication = Publication(source.name, self._offered.node, events=self)
+        site.show(self)
 
     def describe(self, description: TopicDescription) -> None:
         """Set type, md5 sum, definition and latching; subscribers of another definition are disconnected."""
@@ -359,6 +360,7 @@ class ProxiedService(ProxiedSource):
             timeout=timeout,
             on_mismatch=self._mismatched,
         )
+        site.show(self)
 
     def make_room(self) -> None:
         """Leave the name to a module's service, until that one has gone."""

@@ -275,10 +275,7 @@ class AgentGraph(Part):
             source: The topic.
             on_demand: ``(wanted)``: a first node or module has subscribed, or the last one has left.
         """
-        site = self._site(source)
-        shown = ProxiedTopic(source, site, on_demand)
-        site.show(shown)
-        return shown
+        return ProxiedTopic(source, self._site(source), on_demand)
 
     def show_service(
         self,
@@ -293,10 +290,7 @@ class AgentGraph(Part):
             serve: Awaited with each request for its response; an ``RmpaError`` is the client's error.
             describe: Awaited once a client or a module asks for its type; an ``RmpaError`` is the client's error.
         """
-        site = self._site(source)
-        shown = ProxiedService(source, site, serve, describe)
-        site.show(shown)
-        return shown
+        return ProxiedService(source, self._site(source), serve, describe)
 
     async def begin(self) -> None:
         """Begin to follow the graph, once the agent has started and its place in the network is known."""

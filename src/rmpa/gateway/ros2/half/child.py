@@ -43,9 +43,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from .branches import GraphGuard, Waits, distribution, event_callbacks, handle_of, look_at_events
+from .branches import GraphGuard, Taker, Waits, distribution, event_callbacks, handle_of, ignore, look_at_events
 from .graph import Watcher, read_qos
-from .taker import Taker, ignore
 
 PROTOCOL = 1
 _HEAD = struct.Struct("<IBI")
@@ -133,7 +132,7 @@ class Made:
     number: int
     kind: str
     name: str
-    node: Any
+    node: str
     entity: Any
     handle: Any
     type: Any
@@ -166,6 +165,13 @@ class Half:
         self._graph = Watcher(self._own, link.say)
         self._guard = GraphGuard(self._own)
         self._requests = 0
+        self._operations = {
+            "+": self._create,
+            "-": self._destroy,
+            "M": self._publish,
+            "Q": self._call,
+            "A": self._answer,
+        }
         # Messages of our own that have not come back yet, by topic and hash.
         self._echoes: collections.Counter[tuple[str, int]] = collections.Counter()
 
@@ -211,16 +217,7 @@ class Half:
                 raise
 
     def _do(self, operation: str, number: int, body: bytes) -> None:
-        if operation == "M":
-            self._publish(number, body)
-        elif operation == "+":
-            self._create(number, json.loads(body))
-        elif operation == "-":
-            self._destroy(number)
-        elif operation == "Q":
-            self._call(number, body)
-        elif operation == "A":
-            self._answer(number, body)
+        self._operations[operation](number, body)
         with self._lock:
             self._waiting[number] -= 1
             if not self._waiting[number]:
@@ -231,7 +228,8 @@ class Half:
         options = {"start_parameter_services": False, "enable_rosout": False}
         return self._rclpy.create_node(base, context=self._context, namespace=namespace or "/", **options)
 
-    def _create(self, number: int, asked: dict[str, Any]) -> None:
+    def _create(self, number: int, body: bytes) -> None:
+        asked = json.loads(body)
         name, kind = asked["node"], asked["kind"]
         try:
             kind_of = load_type(asked["type"])
@@ -257,7 +255,7 @@ class Half:
             return
         users.append(number)
         handle = handle_of(self._native, entity)
-        self._endpoints[number] = Made(number, kind, asked["name"], node, entity, handle, kind_of)
+        self._endpoints[number] = Made(number, kind, asked["name"], name, entity, handle, kind_of)
         self._waits = None
 
     def _events(self, number: int, publishes: bool) -> Any:
@@ -270,12 +268,12 @@ class Half:
 
         return event_callbacks(publishes, incompatible)
 
-    def _destroy(self, number: int) -> None:
+    def _destroy(self, number: int, _body: bytes) -> None:
         endpoint = self._endpoints.pop(number, None)
         if endpoint is None:
             return
         self._waits = None
-        node = endpoint.node
+        node, users = self._nodes[endpoint.node]
         destroy = {
             "MP": node.destroy_publisher,
             "MS": node.destroy_subscription,
@@ -283,12 +281,10 @@ class Half:
             "SC": node.destroy_client,
         }
         destroy[endpoint.kind](endpoint.entity)
-        for name, (each, users) in list(self._nodes.items()):
-            if each is node:
-                users.remove(number)
-                if not users:
-                    del self._nodes[name]
-                    node.destroy_node()
+        users.remove(number)
+        if not users:
+            del self._nodes[endpoint.node]
+            node.destroy_node()
 
     def _call(self, number: int, body: bytes) -> None:
         from rclpy.serialization import deserialize_message
