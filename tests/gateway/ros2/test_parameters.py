@@ -9,10 +9,9 @@ from typing import Any, cast
 import pytest
 
 from rmpa.core.errors import RmpaError
+from rmpa.gateway.ros2.asking import Ros2Parameters, _kind, service_types
 from rmpa.gateway.ros2.conversion import Ros2Codec
 from rmpa.gateway.ros2.format import EntityKind
-from rmpa.gateway.ros2.parameters import Ros2Parameters, _kind
-from rmpa.gateway.ros2.types import service_types
 from rmpa.gateway.rules import CrossingRules
 from rmpa.gateway.zenoh.threads import ZenohReply
 

@@ -52,13 +52,11 @@ class Ros2Sequences:
 
     Attributes:
         lost: Messages that publishers sent and that did not come.
-        repeated: Messages that came again.
     """
 
     def __init__(self) -> None:
         self._last: dict[bytes, int] = {}
         self.lost = 0
-        self.repeated = 0
 
     def accept(self, attachment: Ros2Attachment, *, history: bool) -> bool:
         """Take in a message.
@@ -75,7 +73,6 @@ class Ros2Sequences:
             del self._last[next(iter(self._last))]
         if last is not None and history and 0 < attachment.sequence <= last:
             self._last[attachment.gid] = last
-            self.repeated += 1
             return False
         self._last[attachment.gid] = attachment.sequence
         if last is not None and attachment.sequence > last + 1:
