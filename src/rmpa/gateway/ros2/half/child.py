@@ -206,8 +206,8 @@ def _told_qos(profile: Any) -> dict[str, int]:
     told = {name: int(getattr(profile, name)) for name in _POLICIES}
     if profile.depth:
         told["depth"] = profile.depth
-    for name, field in _TIMES.items():
-        value = getattr(profile, field).nanoseconds
+    for name, attribute in _TIMES.items():
+        value = getattr(profile, attribute).nanoseconds
         if 0 < value < _INFINITE:
             told[name] = value
     return told
@@ -244,7 +244,7 @@ def read_qos(given: dict[str, int]) -> Any:
 
     fields: dict[str, Any] = {"depth": given.get("depth", 10)}
     fields.update((name, getattr(qos, kind)(given[name])) for name, kind in _POLICIES.items() if name in given)
-    fields.update((field, Duration(nanoseconds=given[name])) for name, field in _TIMES.items() if name in given)
+    fields.update((key, Duration(nanoseconds=given[name])) for name, key in _TIMES.items() if name in given)
     return qos.QoSProfile(**fields)
 
 
