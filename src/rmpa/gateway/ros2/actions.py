@@ -14,18 +14,15 @@ from rmpa.gateway import limits
 from rmpa.gateway.ros2.format import USUAL_QOS, EntityKind, Ros2Attachment, Ros2Durability, Ros2Qos
 from rmpa.gateway.ros2.goals import GoalsToRos1, GoalsToRos2
 from rmpa.gateway.ros2.graph import SITE, valid_name
-from rmpa.gateway.ros2.pairs import PART, ActionPair, derive_ros1
+from rmpa.gateway.ros2.pairs import PART, ActionPair, find_types
 from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.ros.types.definitions import Specification, known_specifications
-from rmpa.ros.types.find import find_message_type
 from rmpa.ros.types.messages import MessageType
 from rmpa.runtime.loop import Delay, MachineTimer, SystemClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-
-    from rosbags.typesys.store import Typestore
 
     from rmpa.gateway.foreign import ProxiedTopic
     from rmpa.gateway.own_graph import TopicTap
@@ -40,8 +37,6 @@ if TYPE_CHECKING:
 _ROS2_GOAL_TIMEOUT: Final = 86_400.0
 # Seconds for which an action's topics stay in ROS 1's graph once its server is gone: its last results leave.
 _ROS2_LAST_RESULTS: Final = 1.0
-# What the definition of an action is made of.
-KINDS: Final = ("Goal", "Result", "Feedback")
 # Seconds for an action server of ROS 1 to connect to the gateway's topics; then a goal is refused.
 _ROS2_ACTION_READY: Final = 5.0
 
@@ -153,16 +148,6 @@ class JoinedAction(ABC):
             self._timer.arm()
 
 
-async def find_types(*names: str) -> list[MessageType]:
-    """Find types of ROS 1; raises ``RmpaError`` if a definition is missing."""
-    return [await asyncio.to_thread(find_message_type, name) for name in names]
-
-
-async def _parts_of(ros1: str) -> list[MessageType]:
-    """Goal, result and feedback of an action of ROS 1; errors as for ``find_types``."""
-    return await find_types(*(f"{ros1}{kind}" for kind in KINDS))
-
-
 class OfferedAction(JoinedAction):
     """Offers one actionlib server to ROS 2.
 
@@ -210,7 +195,7 @@ class OfferedAction(JoinedAction):
             return
         try:
             rule = context.pairs.mapping.counterpart(self.ros1, "action")
-            pair = ActionPair(await _parts_of(self.ros1), rule, context.types)
+            pair = ActionPair(await ActionPair.find(self.ros1), rule, context.types)
             topics = await find_types(f"{self.ros1}ActionGoal", "actionlib_msgs/GoalID")
         except RmpaError as error:
             context.say(self.here, f"ROS 2 does not see this action: {error}")
@@ -319,11 +304,6 @@ class ShownAction(JoinedAction):
     async def _join(self) -> None:
         context, server = self._context, self.server
         ros2 = server.type.removesuffix("_SendGoal")
-
-        def derive(store: Typestore, ros1: str) -> list[MessageType]:
-            own = {f"{ros2}_{kind}": f"{ros1}{kind}" for kind in KINDS}
-            return [derive_ros1(store, each, lambda it: own.get(it) or context.pairs.ros1_name(it)) for each in own]
-
         asked = (
             ("send_goal", EntityKind.SERVICE),
             ("get_result", EntityKind.SERVICE),
@@ -331,7 +311,7 @@ class ShownAction(JoinedAction):
         )
         endpoints = [(f"{self._name}{PART}{part}", kind) for part, kind in asked]
         try:
-            pair = await context.find_pair(server, ros2, _parts_of, ActionPair, derive, *endpoints)
+            pair = await context.find_pair(server, ros2, ActionPair, *endpoints)
             headers = [kind.describe() for kind in await find_types("actionlib_msgs/GoalStatusArray")]
             headers += await self._outcome_headers(pair)
         except RmpaError as error:

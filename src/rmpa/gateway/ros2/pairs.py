@@ -12,6 +12,7 @@ their keys are made as its others are.
 
 from __future__ import annotations
 
+import asyncio
 import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
@@ -27,6 +28,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.ros2.conversion import Conversion, NoConversion
 from rmpa.gateway.ros2.types import EMPTY_MEMBER, TIMES, FieldPaths, TypePair, check_size, ros2_fields, ros2_name
 from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, Specification, known_text, known_types
+from rmpa.ros.types.find import find_message_type, find_service_type
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 
@@ -61,6 +63,8 @@ _USUAL: Final = {
 }
 # Stands between an action's name and those of its services and topics in ROS 2.
 PART: Final = "/_action/"
+# What the definition of an action is made of.
+_GOAL_PARTS: Final = ("Goal", "Result", "Feedback")
 CANCEL_TYPE: Final = "action_msgs/srv/CancelGoal"
 STATUS_TYPE: Final = "action_msgs/msg/GoalStatusArray"
 _UUID: Final = ("goal_id", (Nodetype.NAME, "unique_identifier_msgs/msg/UUID"))
@@ -438,6 +442,11 @@ def described_types(types: Ros2Types, name: str, type_hash: str, fields: Mapping
     return variant
 
 
+async def find_types(*names: str) -> list[MessageType]:
+    """Find types of ROS 1; raises ``RmpaError`` if a definition is missing."""
+    return [await asyncio.to_thread(find_message_type, name) for name in names]
+
+
 class ServicePair:
     """Converts the calls of one service type.
 
@@ -454,6 +463,13 @@ class ServicePair:
     Raises:
         NoConversion: The types are no pair.
     """
+
+    derive = staticmethod(derive_service)
+
+    @staticmethod
+    async def find(name: str) -> ServiceType:
+        """The type of ROS 1 on this machine; raises ``RmpaError`` if there is none."""
+        return await asyncio.to_thread(find_service_type, name)
 
     def __init__(self, ros1: ServiceType, pair: TypePair, types: Ros2Types) -> None:
         if pair.paths and pair.name not in types:
@@ -490,6 +506,17 @@ class ActionPair:
         NoConversion: The types are no pair.
     """
 
+    @staticmethod
+    async def find(name: str) -> list[MessageType]:
+        """Goal, result and feedback of an action of ROS 1 on this machine; errors as for ``find_types``."""
+        return await find_types(*(f"{name}{part}" for part in _GOAL_PARTS))
+
+    @staticmethod
+    def derive(store: Typestore, name: str, own: str, name1: Callable[[str], str]) -> list[MessageType]:
+        """Make these of an action of ROS 2; arguments and errors as for ``derive_service``."""
+        ros1 = {f"{name}_{part}": f"{own}{part}" for part in _GOAL_PARTS}
+        return [derive_ros1(store, each, lambda it: ros1.get(it) or name1(it)) for each in ros1]
+
     def __init__(self, kinds: Sequence[MessageType], rule: TypePair, types: Ros2Types) -> None:
         goal, result, feedback = kinds
         self.name: Final = rule.name
@@ -498,7 +525,7 @@ class ActionPair:
             raise NoConversion(
                 f"the rule of {self.ros1} maps fields to {rule.name}, whose definition is not known here"
             )
-        for part, kind in zip(("Goal", "Result", "Feedback"), kinds, strict=True):
+        for part, kind in zip(_GOAL_PARTS, kinds, strict=True):
             types.learn({name: each for name, each in kind.specifications.items() if name != kind.name})
             types.define_as(f"{rule.name}_{part}", kind.specifications[kind.name])
         self.types: Final = _define(rule.name, types)
@@ -535,7 +562,7 @@ class ActionPair:
 
 def _define(name: str, types: Ros2Types) -> dict[str, tuple[str, str]]:
     """Define the types of one action of ROS 2, as rosidl_parser does."""
-    own: dict[str, Any] = {part: (Nodetype.NAME, f"{name}_{part}") for part in ("Goal", "Result", "Feedback")}
+    own: dict[str, Any] = {part: (Nodetype.NAME, f"{name}_{part}") for part in _GOAL_PARTS}
     number = (Nodetype.BASE, ("int8", 0))
     sent = [("accepted", (Nodetype.BASE, ("bool", 0))), _TIME]
     types.define_service(f"{name}_SendGoal", [_UUID, ("goal", own["Goal"])], sent)

@@ -21,16 +21,14 @@ from rmpa.gateway.ros2.asking import Ros2TypeAsker
 from rmpa.gateway.ros2.conversion import NoConversion
 from rmpa.gateway.ros2.format import GID_BYTES, EntityKind, Ros2Attachment
 from rmpa.gateway.ros2.graph import SITE, OwnRos2Nodes, Ros2Graph, valid_name
-from rmpa.gateway.ros2.pairs import ActionPair, Ros2Pairs, ServicePair, TypeMapping, derive_service
+from rmpa.gateway.ros2.pairs import ActionPair, Ros2Pairs, ServicePair, TypeMapping
 from rmpa.gateway.ros2.types import WITHOUT_HASH, Ros2Types, TypePair
 from rmpa.gateway.rules import CrossingRules, ForeignSource, SourceKind
 from rmpa.ros.types.find import find_service_type
 from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
-
-    from rosbags.typesys.store import Typestore
+    from collections.abc import Callable
 
     from rmpa.config.rules import GatewaySettings
     from rmpa.core.contract import Contracts
@@ -39,7 +37,6 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint, Query, Ros2Link
     from rmpa.gateway.rules import MeshSource
-    from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import ServiceDescription
 
@@ -73,7 +70,6 @@ def without_use(type_name: str) -> str:
     return _WITHOUT_USE.get(type_name) or _WITHOUT_USE.get(package, "")
 
 
-_Kinds = TypeVar("_Kinds")
 _Pair = TypeVar("_Pair", ServicePair, ActionPair)
 
 
@@ -129,9 +125,7 @@ class Ros2Context(OwnedTasks):
         self,
         server: Ros2Endpoint,
         ros2: str,
-        find: Callable[[str], Awaitable[_Kinds]],
-        make: Callable[[_Kinds, TypePair, Ros2Types], _Pair],
-        derive: Callable[[Typestore, str], _Kinds],
+        kind: type[_Pair],
         *endpoints: tuple[str, EntityKind],
     ) -> _Pair:
         """Pair the type of a server of ROS 2; what is not known here its node is asked for.
@@ -139,9 +133,7 @@ class Ros2Context(OwnedTasks):
         Args:
             server: The endpoint whose hash tells whether the types are those that are known here.
             ros2: ``package/srv/Name`` or ``package/action/Name``.
-            find: Finds ROS 1's types by the name of the pair in ROS 1.
-            make: Makes the pair.
-            derive: Makes ROS 1's types of that name from those of ROS 2.
+            kind: The class of the pair, which finds ROS 1's types by their name, or makes them from those of ROS 2.
             endpoints: The names and kinds of those whose types the node is asked for; none: that of ``server``.
 
         Raises:
@@ -153,8 +145,8 @@ class Ros2Context(OwnedTasks):
             rule = TypePair(ros2)
         kinds = None
         try:
-            kinds = await find(ros1)
-            pair = make(kinds, rule, self.types)
+            kinds = await kind.find(ros1)
+            pair = kind(kinds, rule, self.types)
             if pair.type_hash == server.type_hash:
                 return pair
             problem = (
@@ -165,7 +157,7 @@ class Ros2Context(OwnedTasks):
             problem = str(error)
         try:
             types = self.types.variant(await self.asker.learn(*endpoints, of=server))
-            return make(kinds or derive(types.store, ros1), rule, types)
+            return kind(kinds or kind.derive(types.store, ros2, ros1, self.pairs.ros1_name), rule, types)
         except RmpaError as error:
             raise NoConversion(f"{problem}; {error}") from error
         except KeyError as error:
@@ -302,15 +294,8 @@ class ShownRos2Service:
     async def _show(self) -> None:
         """Find the types, and show it if they are a pair."""
         context, server = self._context, self.server
-
-        async def find(name: str) -> ServiceType:
-            return await asyncio.to_thread(find_service_type, name)
-
-        def derive(store: Typestore, name: str) -> ServiceType:
-            return derive_service(store, server.type, name, context.pairs.ros1_name)
-
         try:
-            pair = await context.find_pair(server, server.type, find, ServicePair, derive)
+            pair = await context.find_pair(server, server.type, ServicePair)
         except RmpaError as error:
             context.say(self.here, f"the service of ROS 2's node {server.node.name} is not shown: {error}")
             return
