@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
 from rmpa.core.errors import RmpaError
-from rmpa.gateway.ros2.asking import Ros2Parameters, _kind, service_types
+from rmpa.gateway.ros2.asking import Ros2Asker, _kind, service_types
 from rmpa.gateway.ros2.conversion import Ros2Codec
 from rmpa.gateway.ros2.format import EntityKind
 from rmpa.gateway.rules import CrossingRules
@@ -49,12 +48,20 @@ VALUES = {
 ALL = ("list_parameters", "get_parameters", "set_parameters_atomically")
 
 
-def parameters(node: Node) -> Ros2Parameters:
-    return Ros2Parameters(cast("Any", SimpleNamespace(rules=CrossingRules(), ros2=node, asker=node)))
+class Asker(Ros2Asker):
+    """Asks the stand-in."""
+
+    def __init__(self, node: Node) -> None:
+        given: Any = node
+        super().__init__(given, given, given, CrossingRules())
+        self._node = node
+
+    async def call(self, server: Any, request: bytes) -> ZenohReply:
+        return await self._node.call(server, request)
 
 
 async def ask(node: Node, why: str = "", **args: str) -> Any:
-    text = await parameters(node).answer({"node": "/arm", **args}, lambda _: why)
+    text = await Asker(node).parameters({"node": "/arm", **args}, lambda _: why)
     return json.loads(text) if text else None
 
 

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
     from rmpa.gateway.ros2.format import Ros2Endpoint, Ros2Node
     from rmpa.gateway.ros2.graph import OwnRos2Nodes, Ros2Graph
-    from rmpa.gateway.ros2.services import Ros2Context
     from rmpa.gateway.ros2.types import Fields
+    from rmpa.gateway.rules import CrossingRules
     from rmpa.gateway.zenoh.threads import ZenohReply
     from rmpa.ros.wire.tcpros import Buffer
 
@@ -156,16 +156,18 @@ def _inner(kind: Any, number: int) -> Any:
     return (Nodetype.BASE, (_BASES[number], int(kind.string_capacity) if number == _BOUNDED_STRING else 0))
 
 
-class Ros2TypeAsker:
-    """Asks for types; at most ``limits.ROS2_ASKS_MAX`` nodes at one time.
+class Ros2Asker:
+    """Asks for types, at most ``limits.ROS2_ASKS_MAX`` nodes at one time; reads and sets parameters.
 
     Args:
         nodes: Our nodes in ROS 2's graph.
         ros2: ROS 2's graph.
         types: The types of ROS 2's distribution.
+        rules: Decide which services of parameters may be called.
     """
 
-    def __init__(self, nodes: OwnRos2Nodes, ros2: Ros2Graph, types: Ros2Types) -> None:
+    def __init__(self, nodes: OwnRos2Nodes, ros2: Ros2Graph, types: Ros2Types, rules: CrossingRules) -> None:
+        self._rules = rules
         self._nodes = nodes
         self._ros2 = ros2
         self._types = types
@@ -248,19 +250,10 @@ class Ros2TypeAsker:
             "ROS 1 workspace that has the type, with the same fields, where the gateway runs"
         )
 
-
-class Ros2Parameters:
-    """Reads and sets parameters of nodes of ROS 2. Each is a call of a service of the node, under its rules.
-
-    Args:
-        context: What the parts share.
-    """
-
-    def __init__(self, context: Ros2Context) -> None:
-        self._context = context
-
-    async def answer(self, args: dict[str, Any], denial: Callable[[str], str]) -> str:
+    async def parameters(self, args: dict[str, Any], denial: Callable[[str], str]) -> str:
         """The names of all parameters of a ``node``, the value of a ``key``, or nothing once it is set; as JSON.
+
+        Each is a call of a service of the node, under its rules.
 
         Args:
             args: ``node``; with ``key`` one parameter, or the first part of the names of some, or all; with ``text``
@@ -275,7 +268,7 @@ class Ros2Parameters:
             if text is not None:
                 await self._set(node, dict(_leaves(str(key or ""), json.loads(str(text)))), denial)
                 return ""
-            names = sorted((await self._call(node, "list_parameters", denial))["result"]["names"])
+            names = sorted((await self._of_parameters(node, "list_parameters", denial))["result"]["names"])
             return json.dumps(names if key is None else await self._get(node, str(key), names, denial))
         except (*MALFORMED, RecursionError) as error:
             if isinstance(error, PeerRefused | UnreachableError):
@@ -286,34 +279,37 @@ class Ros2Parameters:
         within = [name for name in names if not key or name == key or name.startswith(f"{key}.")]
         if not within and key:
             raise PeerRefused(node, f"it has no parameter {key}", "`rmpa param list` has them all")
-        answer = await self._call(node, "get_parameters", denial, names=within)
+        answer = await self._of_parameters(node, "get_parameters", denial, names=within)
         values = [_read(each) for each in answer["values"]]
         begin = len(key) + 1 if key else 0
         return values[0] if within == [key] else {n[begin:]: v for n, v in zip(within, values, strict=True)}
 
     async def _set(self, node: str, wanted: dict[str, Any], denial: Callable[[str], str]) -> None:
         """Set all or none."""
-        present = (await self._call(node, "get_parameters", denial, names=list(wanted)))["values"]
+        present = (await self._of_parameters(node, "get_parameters", denial, names=list(wanted)))["values"]
         # A node answers with nothing at all if one of them is not declared.
         numbers = [each["type"] for each in present] or [0] * len(wanted)
         made = [{"name": name, "value": _write(wanted[name], at)} for name, at in zip(wanted, numbers, strict=True)]
-        result = (await self._call(node, "set_parameters_atomically", denial, parameters=made))["result"]
+        result = (await self._of_parameters(node, "set_parameters_atomically", denial, parameters=made))["result"]
         if not result["successful"]:
             raise PeerRefused(node, result["reason"] or "it gives no reason")
 
-    async def _call(self, node: str, service: str, denial: Callable[[str], str], **fields: Any) -> dict[str, Any]:
-        name, context = f"{node}/{service}", self._context
-        decision = context.rules.incoming(ForeignSource(SourceKind.SERVICE, SITE, "", node, name, "*"))
+    async def _of_parameters(
+        self, node: str, service: str, denial: Callable[[str], str], **fields: Any
+    ) -> dict[str, Any]:
+        """Call one of the services for parameters."""
+        name = f"{node}/{service}"
+        decision = self._rules.incoming(ForeignSource(SourceKind.SERVICE, SITE, "", node, name, "*"))
         if why := denial(decision.name) if decision.allowed else decision.why:
             raise PeerRefused(SITE, why)
-        server = next(context.ros2.at(name, EntityKind.SERVICE), None)
-        if server is None and node in context.ros2.nodes:
+        server = next(self._ros2.at(name, EntityKind.SERVICE), None)
+        if server is None and node in self._ros2.nodes:
             raise UnreachableError("service", name, "the node was started without services of parameters")
         if server is None:
             raise UnreachableError("node of ROS 2", node, "`rmpa site info ros2` lists what is there")
         kind = f"rcl_interfaces/srv/{re.sub('(?:^|_)(.)', lambda found: found[1].upper(), service)}"
         request = Ros2Codec(service_types(), f"{kind}_Request").write(fields)
-        reply = await context.asker.call(server, request)
+        reply = await self.call(server, request)
         if reply is None or not reply.ok:
             raise UnreachableError("node of ROS 2", node, reply.text if reply is not None else "it gave no answer")
         if len(reply.payload) > limits.ROS2_DESCRIPTION_MAX:

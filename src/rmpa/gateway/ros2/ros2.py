@@ -19,7 +19,6 @@ from rmpa.core.errors import StartError, UnreachableError
 from rmpa.core.identity import is_own
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.actions import Ros2Actions
-from rmpa.gateway.ros2.asking import Ros2Parameters
 from rmpa.gateway.ros2.format import Ros2Endpoint, graph_key
 from rmpa.gateway.ros2.graph import SITE
 from rmpa.gateway.ros2.rclpy_session import RclpySession, shown_in_ros2
@@ -84,7 +83,6 @@ class Ros2Neighbour:
         context = self.context = Ros2Context(graph, session, settings, contracts or Contracts(), find)
         self.topics = Ros2Topics(context)
         self.services = Ros2Services(context)
-        self.parameters = Ros2Parameters(context)
         # Actions take all topics and services of actions, so that no other part carries them.
         self._parts: tuple[_Part, ...] = (Ros2Actions(context), self.services, self.topics)
         # By proxy.
@@ -201,7 +199,7 @@ class Ros2Neighbour:
             return [*ways, *(await self.sites.answer(what, args, asker) if self.sites is not None else ())]
         if what == PARAM and site == SITE:
             denial = partial(self.permissions.denial, asker, access=Access.CALL)
-            return await self.parameters.answer(args, denial if asker else lambda _: "")
+            return await self.context.asker.parameters(args, denial if asker else lambda _: "")
         if what == REPORT or (what == SITE_INFO and site == SITE):
             report = await self._report(asker)
             if what == SITE_INFO:

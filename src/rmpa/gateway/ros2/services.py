@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.foreign import Answering
-from rmpa.gateway.ros2.asking import Ros2TypeAsker
+from rmpa.gateway.ros2.asking import Ros2Asker
 from rmpa.gateway.ros2.conversion import NoConversion
 from rmpa.gateway.ros2.format import GID_BYTES, EntityKind, Ros2Attachment
 from rmpa.gateway.ros2.graph import SITE, OwnRos2Nodes, Ros2Graph, valid_name
@@ -118,7 +118,7 @@ class Ros2Context(OwnedTasks):
         size = _GID_BYTES_BEFORE if ros2.distribution in WITHOUT_HASH else GID_BYTES
         self.nodes: Final = OwnRos2Nodes(session, ros2.domain, graph.name, size)
         self.ros2: Final = Ros2Graph(ros2.domain, session.zid)
-        self.asker: Final = Ros2TypeAsker(self.nodes, self.ros2, self.types)
+        self.asker: Final = Ros2Asker(self.nodes, self.ros2, self.types, self.rules)
         self.problems: dict[str, str] = {}
 
     async def find_pair(
