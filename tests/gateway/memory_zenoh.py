@@ -92,13 +92,13 @@ class MemoryQuery:
     done: asyncio.Event = field(default_factory=asyncio.Event)
     replies: list[ZenohReply] = field(default_factory=list)
 
-    def reply(self, key: str, payload: Buffer, attachment: bytes = b"") -> None:
-        self.replies.append(ZenohReply(key, bytes(payload), attachment, True))
+    def reply(self, payload: Buffer, attachment: bytes = b"") -> None:
+        self.replies.append(ZenohReply(self.key, bytes(payload), attachment, True))
+        self.finish()
 
     def answer(self, payload: Buffer) -> None:
-        """Give the only answer, with the attachment of the query."""
-        self.reply(self.key, payload, self.attachment)
-        self.finish()
+        """Answer with the attachment of the query."""
+        self.reply(payload, self.attachment)
 
     def reply_error(self, text: str) -> None:
         self.replies.append(ZenohReply("", text.encode(), b"", False))

@@ -66,8 +66,7 @@ class Answering(OwnedTasks):
 
     async def _answer(self, query: ArrivedQuery, respond: Respond) -> None:
         try:
-            query.reply(query.key, *(await respond(query)))
-            query.finish()
+            query.reply(*(await respond(query)))
         except PeerRefused as error:
             query.reply_error(error.reason)
         except RmpaError as error:

@@ -173,8 +173,7 @@ async def test_a_member_may_use_the_keys_of_sites_whatever_the_rules_of_names_sa
     assert bool(heard["valve"]) == fleet_router, "with deny, other programs' keys do not pass"
 
     def stop(query: ArrivedQuery) -> None:
-        query.reply(query.key, b"stopped")
-        query.finish()
+        query.reply(b"stopped")
 
     a.queryable("rmpa/1/home/arm/s/*/stop", stop)
     async with asyncio.timeout(20):

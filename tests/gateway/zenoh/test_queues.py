@@ -253,17 +253,19 @@ async def test_a_client_that_asks_and_does_not_read_fills_no_memory(
     victim: OpenSession, eve: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Answers wait in order for Zenoh; what is beyond the bound ends its query."""
-    monkeypatch.setattr(limits, "ANSWERS_WAITING_MAX", 3)
-    taken: list[int] = []
+    monkeypatch.setattr(limits, "ANSWERS_WAITING_MAX", 1)
+    taken: list[ArrivedQuery] = []
+    held: list[Any] = []
 
     def answer(query: ArrivedQuery) -> None:
-        for number in range(200):
-            query.reply("q/q", bytes(200_000))
-            taken.append(number)
-        query.finish()
+        query.reply(bytes(200_000))
+        taken.append(query)
+
+    def ask() -> None:
+        held.extend(eve.get("q/q", timeout=5.0) for _ in range(200))
 
     victim.queryable("q/q", answer)
-    await repeated(lambda: asyncio.to_thread(lambda: list(eve.get("q/q", timeout=2.0))), lambda _: taken)
+    await repeated(lambda: asyncio.to_thread(ask), lambda _: len(taken) > 100)
     assert await counted(victim, "zenoh.answer.limit")
     publisher = victim.publisher(KEY, ZenohQos(), lambda _: None)
     publisher.put(b"it lives")

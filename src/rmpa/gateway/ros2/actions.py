@@ -185,8 +185,7 @@ class OfferedAction(JoinedAction):
         except RmpaError as error:
             query.reply_error(str(error))
             return
-        query.reply(query.key, response, Ros2Attachment(asked.sequence, time.time_ns(), asked.gid).serialize())
-        query.finish()
+        query.reply(response, Ros2Attachment(asked.sequence, time.time_ns(), asked.gid).serialize())
 
     async def _join(self) -> None:
         context = self._context

@@ -126,7 +126,7 @@ class RclpyQuery:
         self.payload = request
         self.attachment = Ros2Attachment(_CALL.unpack(call)[0], 0, bytes(16)).serialize()
 
-    def reply(self, _key: str, payload: Buffer, _attachment: bytes = b"") -> None:
+    def reply(self, payload: Buffer, _attachment: bytes = b"") -> None:
         """Give the answer."""
         self._finish(b"\1", bytes(payload))
 

@@ -442,8 +442,7 @@ class SiteAnswers:
             # Whether or not it is there: that is not told.
             stages = [_refused_stage("there", denial, self._site)]
             ways.append(self._diagnosis(question.name, question.module, "", kinds[0], stages))
-        query.reply(query.key, msgspec.json.encode(ways))
-        query.finish()
+        query.reply(msgspec.json.encode(ways))
 
 
 def _why_key(site: str) -> str:

@@ -476,7 +476,6 @@ class SiteTopics:
         of_module = (nodes for (name, _), nodes in self._exported.items() if name == module)
         for about in (export.about for nodes in of_module for export in nodes.values()):
             if about is not None and about.md5sum == md5:
-                query.reply(query.key, about.definition.encode(errors="surrogateescape"))
-                query.finish()
+                query.reply(about.definition.encode(errors="surrogateescape"))
                 return
         query.reply_error(f"no publisher with the md5 sum {md5[:40]} was connected yet")

@@ -77,8 +77,8 @@ class ArrivedQuery:
         self.payload = content(query.payload)
         self.attachment = content(query.attachment)
 
-    def reply(self, key: str, payload: Buffer, attachment: bytes = b"") -> None:
-        """Give one answer; more may follow until ``finish``."""
+    def reply(self, payload: Buffer, attachment: bytes = b"") -> None:
+        """Give the answer, and finish."""
         query = self._query
         if query is None:
             return
@@ -86,11 +86,12 @@ class ArrivedQuery:
             self.reply_error(_BUSY)
             return
         body = payload if isinstance(payload, bytes) else bytes(payload)
-        self._worker.submit(lambda: self._give(query, key, body, attachment))
+        self._worker.submit(lambda: self._give(query, body, attachment))
+        self.finish()
 
-    def _give(self, query: Any, key: str, body: bytes, attachment: bytes) -> None:
+    def _give(self, query: Any, body: bytes, attachment: bytes) -> None:
         try:
-            query.reply(key, body, attachment=attachment or None)
+            query.reply(self.key, body, attachment=attachment or None)
         finally:
             self._arrivals.free_room(len(body))
 
@@ -102,7 +103,7 @@ class ArrivedQuery:
             self.finish()
 
     def finish(self) -> None:
-        """Say that no more answers come."""
+        """Say that no answer comes."""
         query, self._query = self._query, None
         if query is not None:
             self._worker.submit(query.drop)
