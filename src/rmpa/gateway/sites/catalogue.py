@@ -34,7 +34,7 @@ _ENDING: Final = 2.0
 
 
 class CatalogueChange(Enum):
-    """What has happened to a module or a source.
+    """What has happened to a source.
 
     Attributes:
         RENEWED: Its token had gone and came back in time: another gateway may have it now.
@@ -66,15 +66,14 @@ class SiteCatalogue:
 
     Args:
         own: This site's name, whose tokens are ignored.
-        changed: Called with each change of a module or a source. A module is found before its sources, and goes after
-            them.
+        changed: Called with each change of a source.
         counters: ``site.token.malformed``, ``site.token.later_version``, ``site.limit``.
     """
 
     def __init__(
         self,
         own: str,
-        changed: Callable[[CatalogueChange, SiteModule | SiteSource], None],
+        changed: Callable[[CatalogueChange, SiteSource], None],
         counters: Counters | None = None,
     ) -> None:
         self._own = own
@@ -182,7 +181,8 @@ class SiteCatalogue:
     def _came(self, site: _Site, item: SiteModule | SiteSource, key: str) -> None:
         if self._by_token.pop(key, None) is not None:
             self._ending.set(key, None)
-            self._tell(CatalogueChange.RENEWED, item)
+            if isinstance(item, SiteSource):
+                self._tell(CatalogueChange.RENEWED, item)
             return
         if isinstance(item, SiteModule):
             if item in site.modules:
@@ -191,7 +191,6 @@ class SiteCatalogue:
                 self._refuse(site)
                 return
             sources = site.modules[item] = site.orphans.pop(item, set())
-            self._tell(CatalogueChange.FOUND, item)
             for source in sorted(sources, key=SiteSource.token):
                 self._tell(CatalogueChange.FOUND, source)
             return
@@ -231,7 +230,6 @@ class SiteCatalogue:
             else:
                 self._count(site, -1)
             self._tell(CatalogueChange.GONE, source)
-        self._tell(CatalogueChange.GONE, module)
 
     def _count(self, site: _Site, more: int) -> None:
         site.sources += more

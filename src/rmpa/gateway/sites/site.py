@@ -497,9 +497,7 @@ class SiteNeighbour:
             self.exports.sites_seen(self.catalogue.sites)
         self._timer.arm()
 
-    def _site_changed(self, change: CatalogueChange, item: SiteModule | SiteSource) -> None:
-        if isinstance(item, SiteModule):
-            return
+    def _site_changed(self, change: CatalogueChange, item: SiteSource) -> None:
         if change is CatalogueChange.RENEWED:
             self.imports.renewed(item)
             return
