@@ -12,7 +12,7 @@ from rmpa.gateway.ros2.asking import Ros2Asker, _kind, service_types
 from rmpa.gateway.ros2.conversion import Ros2Codec
 from rmpa.gateway.ros2.format import EntityKind
 from rmpa.gateway.rules import CrossingRules
-from rmpa.gateway.zenoh.threads import ZenohReply
+from rmpa.gateway.zenoh.threads import ZenohSample
 
 
 class Node:
@@ -27,7 +27,7 @@ class Node:
     def at(self, name: str, kind: EntityKind) -> Any:
         return iter([name] if name.rpartition("/")[2] in self.services and kind is EntityKind.SERVICE else [])
 
-    async def call(self, server: str, request: bytes) -> ZenohReply:
+    async def call(self, server: str, request: bytes) -> ZenohSample:
         kind = "rcl_interfaces/srv/" + server.rpartition("/")[2].title().replace("_", "")
         asked = Ros2Codec(service_types(), f"{kind}_Request").read(request)
         self.asked.append(asked)
@@ -37,7 +37,7 @@ class Node:
         elif "Get" in kind:
             answer = {"values": [VALUES.get(name, {}) for name in asked["names"]]}
         made = Ros2Codec(service_types(), f"{kind}_Response").write(answer)
-        return ZenohReply("", made + b"garbage", b"", ok=True)
+        return ZenohSample(made + b"garbage")
 
 
 VALUES = {
@@ -56,7 +56,7 @@ class Asker(Ros2Asker):
         super().__init__(given, given, given, CrossingRules())
         self._node = node
 
-    async def call(self, server: Any, request: bytes) -> ZenohReply:
+    async def call(self, server: Any, request: bytes) -> ZenohSample:
         return await self._node.call(server, request)
 
 

@@ -22,6 +22,7 @@ from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.trust.certificates import DenyList
 from rmpa.trust.store import CA
 from tests.gateway.memory_zenoh import eventually
+from tests.gateway.zenoh_bed import put
 from tests.gateway.zenoh_fleet import Fleet
 from tests.trust.io.member_files import SecuredMesh
 
@@ -163,9 +164,9 @@ async def test_a_member_may_use_the_keys_of_sites_whatever_the_rules_of_names_sa
     scan = a.publisher(key, ZenohQos(cache=1), heard["matching"].append)
     valve = a.publisher("plant/valve", ZenohQos(), lambda _: None)
     await eventually(lambda: True in heard["matching"])
-    valve.put(b"open")
+    put(valve, b"open")
     await eventually(lambda: valve.sent)
-    scan.put(b"scan")
+    put(scan, b"scan")
     await eventually(lambda: heard["scan"])
     b.subscribe(key, lambda sample: heard["late"].append(sample.payload), history=True)
     await eventually(lambda: heard["late"])
@@ -234,7 +235,7 @@ async def test_a_listener_that_is_no_authority_refuses_what_was_revoked_and_lets
     scan = a.publisher("rmpa/1/home/arm/t/a%B/scan", ZenohQos(cache=1), matching.append)
     a.token("rmpa/1/home/arm/up/00")
     await eventually(lambda: True in matching)
-    scan.put(b"scan")
+    put(scan, b"scan")
     await eventually(lambda: {b"scan", "rmpa/1/home/arm/up/00"} <= {*heard["later"]})
     assert heard["b"] == []
     # What it sends goes nowhere either.
@@ -242,11 +243,11 @@ async def test_a_listener_that_is_no_authority_refuses_what_was_revoked_and_lets
     a.subscribe("rmpa/1/home/arm/t/a%B/forged", lambda sample: forged.append(sample.payload))
     sent = b.publisher("rmpa/1/home/arm/t/a%B/forged", ZenohQos(), lambda _: None)
     proof = later.publisher("rmpa/1/home/arm/t/a%B/forged", ZenohQos(), lambda _: None)
-    sent.put(b"forged")
+    put(sent, b"forged")
     await eventually(lambda: sent.sent)
 
     def arrived() -> bool:
-        proof.put(b"proof")
+        put(proof, b"proof")
         return b"proof" in forged
 
     await eventually(arrived)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.graph import OwnRos2Nodes, Ros2Graph
     from rmpa.gateway.ros2.types import Fields
     from rmpa.gateway.rules import CrossingRules
-    from rmpa.gateway.zenoh.threads import ZenohReply
+    from rmpa.gateway.zenoh.threads import ZenohSample
     from rmpa.ros.wire.tcpros import Buffer
 
 # The last part of the name of the service that describes types; the others are its node's.
@@ -219,7 +219,7 @@ class Ros2Asker:
             raise NoConversion(f"{server.name} does not answer; {self._unknown(endpoint)}")
         return parse_type_response(answer.payload)
 
-    async def call(self, server: Ros2Endpoint, request: bytes) -> ZenohReply | None:
+    async def call(self, server: Ros2Endpoint, request: bytes) -> ZenohSample | None:
         """Call one of the services that each node has; ``None``: it has not answered in time."""
         gid = gid_of(f"{self._nodes.own_name}/{SERVICE}")
         return await self._nodes.call(server.key(), gid, request, limits.ROS2_SERVICE_WAIT)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.format import Ros2Qos
     from rmpa.gateway.ros2.rclpy_session import RclpyPublisher, RclpyQuery, RclpySession
     from rmpa.gateway.zenoh.session import ArrivedQuery, Declaration, OpenSession
-    from rmpa.gateway.zenoh.threads import QueuedPublisher, ZenohReply
+    from rmpa.gateway.zenoh.threads import QueuedPublisher, ZenohSample
     from rmpa.ros.wire.tcpros import Buffer
 
     Ros2Link: TypeAlias = OpenSession | RclpySession
@@ -256,7 +256,7 @@ class OwnEndpoint:
         self._nodes = nodes
         self._declared = [nodes.session.token(endpoint.token()), *([] if taking is None else [taking])]
 
-    async def call(self, request: Buffer, within: float) -> ZenohReply | None:
+    async def call(self, request: Buffer, within: float) -> ZenohSample | None:
         """Call its service as this client; ``None``: it gave no answer in ``within`` seconds."""
         return await self._nodes.call(self.endpoint.key(), self.gid, request, within)
 
@@ -331,7 +331,7 @@ class OwnRos2Nodes:
             taking = self.session.subscribe(endpoint.key(), take, history=history)
         return OwnEndpoint(self, endpoint, gid, taking)
 
-    async def call(self, key: str, gid: bytes, request: Buffer, within: float) -> ZenohReply | None:
+    async def call(self, key: str, gid: bytes, request: Buffer, within: float) -> ZenohSample | None:
         """Call a service of ROS 2 as the client with a GID; ``None``: it gave no answer in ``within`` seconds."""
         attachment = Ros2Attachment(next(self._calls), time.time_ns(), gid).serialize()
         return first_answer(await self.session.get(key, request, attachment, timeout=within, all_complete=True))

@@ -39,7 +39,7 @@ from rmpa.gateway.ros2.format import (
     ros_type,
 )
 from rmpa.gateway.ros2.graph import OWN_NAMESPACE, gid_of
-from rmpa.gateway.zenoh.threads import ZenohReply, ZenohSample
+from rmpa.gateway.zenoh.threads import ZenohSample
 from rmpa.runtime.stream import Stream
 from rmpa.runtime.tasks import OwnedTasks
 
@@ -165,9 +165,8 @@ class RclpyPublisher:
         own, waiting = self._session.own.items(), self._session.outbox.waiting
         return sum(waiting(number) for number, each in own if each.publisher is self)
 
-    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
-        """Queue messages; return how many older ones were dropped."""
-        dropped = 0
+    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> None:
+        """Queue messages."""
         for payload, attachment in messages:
             number = self._session.by_gid.get(Ros2Attachment.parse(attachment).gid)
             if number is not None:
@@ -175,11 +174,9 @@ class RclpyPublisher:
                 if own.publisher is not self:
                     own.publisher = self
                     self._session.outbox.set_terms(number, self._qos.messages)
-                dropped += self._session.write("M", number, payload)
+                self.dropped += self._session.write("M", number, payload)
                 if self._qos.cache:
                     own.kept = payload
-        self.dropped += dropped
-        return dropped
 
     def judge(self) -> None:
         """Tell whether a node of ROS 2 subscribes, if that has changed."""
@@ -246,7 +243,7 @@ class RclpySession:
         self._gids: dict[bytes, tuple[bytes, str]] = {}
         self._nodes: dict[str, Ros2Node] = {}
         self._own_prefixes: set[str] = set()
-        self._calls: dict[bytes, tuple[str, asyncio.Future[list[ZenohReply]]]] = {}
+        self._calls: dict[bytes, asyncio.Future[list[ZenohSample]]] = {}
         self._call_numbers = itertools.count(1)
 
     async def start(self) -> None:
@@ -333,9 +330,9 @@ class RclpySession:
             self._remove(gid)
         for name in list(self._nodes):
             self._tell(self._nodes.pop(name), alive=False)
-        for key, answer in self._calls.values():
+        for answer in self._calls.values():
             if not answer.done():
-                answer.set_result([ZenohReply(key, b"ROS 2's half has ended", b"", ok=False)])
+                answer.set_result([ZenohSample(b"ROS 2's half has ended", ok=False)])
         self._calls.clear()
         self._ended.set()
 
@@ -472,15 +469,14 @@ class RclpySession:
         *,
         timeout: float = 5.0,  # noqa: ASYNC109 - as a Zenoh session
         all_complete: bool = False,  # noqa: ARG002 - likewise
-    ) -> list[ZenohReply]:
+    ) -> list[ZenohSample]:
         """Call a service; no answer within ``timeout`` seconds is an empty list."""
         number = self.by_gid.get(Ros2Attachment.parse(attachment).gid) or self._client(selector)
         call = _CALL.pack(next(self._call_numbers))
-        answer: asyncio.Future[list[ZenohReply]] = asyncio.get_running_loop().create_future()
-        self._calls[call] = selector, answer
+        answer = self._calls[call] = asyncio.get_running_loop().create_future()
         try:
             if self._stream is None:
-                return [ZenohReply(selector, self.problem.encode(), b"", ok=False)]
+                return [ZenohSample(self.problem.encode(), ok=False)]
             self.write("Q", number, call + bytes(payload))
             async with asyncio.timeout(timeout):
                 return await answer
@@ -509,7 +505,7 @@ class RclpySession:
         gid, of = self._gids.get(real, (real[:GID_BYTES].ljust(GID_BYTES, b"\0"), key))
         if of != key:
             return  # of a publisher with another definition of the type, which has a subscription of its own
-        sample = ZenohSample(key, bytes(body[at + _STAMPS.size :]), Ros2Attachment(sequence, stamp, gid).serialize())
+        sample = ZenohSample(bytes(body[at + _STAMPS.size :]), Ros2Attachment(sequence, stamp, gid).serialize())
         if (take := self._subscribers.get(key)) is not None:
             take(sample)
 
@@ -522,10 +518,10 @@ class RclpySession:
             query.finish()
 
     def _answered(self, body: bytes) -> None:
-        key, answer = self._calls.get(body[: _CALL.size], ("", None))
+        answer = self._calls.get(body[: _CALL.size])
         if answer is not None and not answer.done():
             ok, payload = bool(body[_CALL.size]), body[_CALL.size + 1 :]
-            answer.set_result([ZenohReply(key, payload, b"", ok=ok)])
+            answer.set_result([ZenohSample(payload, ok=ok)])
 
     def watch_tokens(self, key: str, on_token: Callable[[str, bool], None]) -> ExitStack:
         """Call ``on_token(token, alive)`` for what ROS 2 has, and at each change."""

@@ -24,7 +24,6 @@ from rmpa.gateway.zenoh.threads import (
     SendingLane,
     SerialWorker,
     ZenohPriority,
-    ZenohReply,
     ZenohSample,
     call_loop,
     keep_thread_state,
@@ -50,7 +49,6 @@ _CLOSE_MAX: Final = 3.0
 # Seconds beyond a query's own time-out after which its answers are no longer waited for.
 _GET_GRACE: Final = 1.0
 
-_WILD: Final = frozenset("*$")
 _BUSY: Final = "too many answers wait at this gateway; ask again later"
 
 
@@ -120,11 +118,11 @@ class PendingGet:
         unfinished: Whether it was resolved because there were too many answers, and more may come.
     """
 
-    def __init__(self, done: asyncio.Future[list[ZenohReply]], arrivals: Arrivals) -> None:
+    def __init__(self, done: asyncio.Future[list[ZenohSample]], arrivals: Arrivals) -> None:
         self._done = done
         self._arrivals = arrivals
         self._lock = threading.Lock()
-        self._replies: list[ZenohReply] = []
+        self._replies: list[ZenohSample] = []
         self._bytes = 0
         self.unfinished = False
 
@@ -138,12 +136,12 @@ class PendingGet:
             if sample.attachment is not None and len(sample.attachment) > limits.ATTACHMENT_MAX:
                 self._arrivals.refuse("zenoh.attachment.long")
                 return
-            answer = ZenohReply(str(sample.key_expr), content(sample.payload), content(sample.attachment), ok=True)
+            answer = ZenohSample(content(sample.payload), content(sample.attachment))
         elif reply.replier_id is None or not reply.replier_id.eid:
             return  # no queryable has the entity id 0
         else:
-            answer = ZenohReply("", content(reply.err.payload), b"", ok=False)
-        size = len(answer.payload) + len(answer.attachment) + len(answer.key)
+            answer = ZenohSample(content(reply.err.payload), ok=False)
+        size = len(answer.payload) + len(answer.attachment)
         with self._lock:
             self.unfinished = bool(self._replies) and (
                 len(self._replies) >= limits.REPLIES_MAX or self._bytes + size > limits.REPLY_BYTES_MAX
@@ -159,7 +157,7 @@ class PendingGet:
         """Resolve with what has come; called from any thread, and again without effect."""
         call_loop(self._arrivals.loop, self._settle)
 
-    def collected(self) -> list[ZenohReply]:
+    def collected(self) -> list[ZenohSample]:
         """The answers up to now."""
         with self._lock:
             return list(self._replies)
@@ -308,18 +306,14 @@ class OpenSession:
         *,
         history: bool = False,
     ) -> Declaration:
-        """Subscribe to a key expression; ``history``: ask publishers with a cache for what they keep."""
-        fixed = None if _WILD.intersection(key) else key
+        """Subscribe to a key; ``history``: ask publishers with a cache for what they keep."""
         queue = ArrivalQueue(self._arrivals, on_sample, limits.ARRIVED_MESSAGES, limits.ARRIVED_BYTES)
         put = self._zenoh.SampleKind.PUT
 
         def arrived(sample: Any) -> None:
-            if sample.kind != put or not self._readable(sample.attachment):
-                return
-            name = fixed or str(sample.key_expr)
-            if fixed or self._short(name):
+            if sample.kind == put and self._readable(sample.attachment):
                 payload, attachment = content(sample.payload), content(sample.attachment)
-                queue.add(ZenohSample(name, payload, attachment), len(payload) + len(attachment))
+                queue.add(ZenohSample(payload, attachment), len(payload) + len(attachment))
 
         def declare() -> list[Any]:
             if not history:
@@ -392,11 +386,11 @@ class OpenSession:
         timeout: float = 5.0,  # noqa: ASYNC109 - Zenoh ends the query by itself
         all_complete: bool = False,
         priority: ZenohPriority = ZenohPriority.DATA,
-    ) -> list[ZenohReply]:
+    ) -> list[ZenohSample]:
         """Ask; wait for all answers, or for ``timeout`` seconds. ``all_complete``: ask every complete queryable."""
         zenoh = self._zenoh
         self._check(selector.partition("?")[0])
-        done: asyncio.Future[list[ZenohReply]] = self._loop.create_future()
+        done: asyncio.Future[list[ZenohSample]] = self._loop.create_future()
         pending = PendingGet(done, self._arrivals)
         cancellation = zenoh.CancellationToken()
         body = payload if isinstance(payload, bytes) else bytes(payload)

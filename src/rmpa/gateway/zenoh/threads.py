@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Sequence
 
-    from rmpa.ros.wire.tcpros import Buffer
 
 _log = logging.getLogger(__name__)
 
@@ -87,34 +86,17 @@ class ZenohQos:
 
 @dataclass(frozen=True, slots=True)
 class ZenohSample:
-    """One message that was received.
+    """One message that was received, or one answer to ``get``.
 
     Args:
-        key: Its key.
-        payload: Its bytes.
+        payload: Its bytes; of an error its text in UTF-8.
         attachment: Its attachment; empty if it has none.
+        ok: Whether it is no error.
     """
 
-    key: str
     payload: bytes
-    attachment: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class ZenohReply:
-    """One answer to ``get``.
-
-    Args:
-        key: The key that was answered; empty for an error.
-        payload: The answer, or the error's text in UTF-8.
-        attachment: Its attachment; empty if it has none.
-        ok: Whether it is an answer and no error.
-    """
-
-    key: str
-    payload: bytes
-    attachment: bytes
-    ok: bool
+    attachment: bytes = b""
+    ok: bool = True
 
     @property
     def text(self) -> str:
@@ -122,7 +104,7 @@ class ZenohReply:
         return self.payload.decode(errors="replace")
 
 
-def first_answer(replies: Sequence[ZenohReply]) -> ZenohReply | None:
+def first_answer(replies: Sequence[ZenohSample]) -> ZenohSample | None:
     """The first answer, or the first error if there is none; ``None``: nothing answered."""
     return min(replies, key=lambda each: not each.ok, default=None)
 
@@ -486,21 +468,15 @@ class QueuedPublisher(BoundedQueue[tuple[bytes, bytes]]):
         """Messages in the queue, with those whose turn it is."""
         return len(self._items) + self._taken
 
-    def put(self, payload: Buffer, attachment: bytes = b"") -> int:
-        """Queue one message; the payload is copied if it is not ``bytes``. Returns the messages dropped for it."""
-        return self.put_all(((payload if isinstance(payload, bytes) else bytes(payload), attachment),))
-
-    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
-        """Queue messages, each with its attachment, in order; returns the messages dropped for them."""
+    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> None:
+        """Queue messages, each with its attachment, in order."""
         with self._lock:
             if self._closed:
                 self.dropped += len(messages)
-                return len(messages)
-            before = self.dropped
+                return
             for message in messages:
                 self.push(message, len(message[0]), self._taken)
             self._schedule()
-            return self.dropped - before
 
     def declared(self, handle: Any) -> None:
         """Begin to send: Zenoh's publisher is there. Called from the thread that declares."""
