@@ -254,7 +254,10 @@ class OwnEndpoint:
         self.endpoint = endpoint
         self.gid = gid
         self._nodes = nodes
-        self._declared = [nodes.session.token(endpoint.token()), *([] if taking is None else [taking])]
+        self._declared: list[Declared] = [
+            nodes.session.token(endpoint.token()),
+            *([] if taking is None else [taking]),
+        ]
 
     async def call(self, request: Buffer, within: float) -> ZenohSample | None:
         """Call its service as this client; ``None``: it gave no answer in ``within`` seconds."""

@@ -473,7 +473,8 @@ class RclpySession:
         """Call a service; no answer within ``timeout`` seconds is an empty list."""
         number = self.by_gid.get(Ros2Attachment.parse(attachment).gid) or self._client(selector)
         call = _CALL.pack(next(self._call_numbers))
-        answer = self._calls[call] = asyncio.get_running_loop().create_future()
+        answer: asyncio.Future[list[ZenohSample]] = asyncio.get_running_loop().create_future()
+        self._calls[call] = answer
         try:
             if self._stream is None:
                 return [ZenohSample(self.problem.encode(), ok=False)]
