@@ -28,7 +28,7 @@ class Followed(SiteCatalogue):
 
     def __init__(self, own: str = "home") -> None:
         self.told: list[tuple[CatalogueChange, SiteSource]] = []
-        super().__init__(own, lambda change, item: self.told.append((change, item)))
+        super().__init__(own, lambda change, item: self.told.append((change, item)), lambda *_: None)
 
     def all_tokens(self, now: float, *, alive: bool) -> None:
         for item in EVERYTHING:

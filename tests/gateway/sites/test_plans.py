@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 from dataclasses import replace
 
@@ -16,7 +15,7 @@ from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.config.settings import TrustSettings
 from rmpa.gateway import limits
 from rmpa.gateway.rules import CrossingRules, ForeignSource, MeshSource, SourceKind
-from rmpa.gateway.sites.catalogue import SiteCatalogue, SiteHistory
+from rmpa.gateway.sites.catalogue import SiteCatalogue
 from rmpa.gateway.sites.keys import (
     AttachmentReader,
     MessageSource,
@@ -219,7 +218,7 @@ def source(
 
 def test_all_sites_together_announce_a_bounded_number_of_sources(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "SITES_SOURCES_MAX", 100)
-    catalogue = SiteCatalogue("home", lambda *_: None)
+    catalogue = SiteCatalogue("home", lambda *_: None, lambda *_: None)
     for site in ("a", "b", "c"):
         catalogue.token(SiteModule(site, "arm", RUN).token(), 0.0, alive=True)
         for number in range(60):
@@ -274,15 +273,17 @@ def test_a_crowd_that_waits_for_one_name_is_not_judged_anew_each_time(kind: Sour
 
 def test_what_sites_had_that_are_away_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "SITES_SOURCES_MAX", 100)
-    now = itertools.count(0.0)
-    history = SiteHistory(lambda: next(now))
-    for site in (f"s{number}" for number in range(20)):
-        history.seen([site])
-        for number in range(30):
-            history.source(source(number, "/x", "a/B", site=site), there=True)
-    history.seen([])
-    assert len(history.away) == 20
-    assert [site for site, _ in history.had("/x")] == ["s17", "s18", "s19"]
+    catalogue = SiteCatalogue("home", lambda *_: None, lambda *_: None)
+    for when, site in enumerate(f"s{number}" for number in range(20)):
+        tokens = [SiteModule(site, "arm", RUN).token()]
+        tokens += [source(number, "/x", "a/B", site=site).token() for number in range(30)]
+        for alive in (True, False):
+            for token in tokens:
+                catalogue.token(token, 10.0 * when, alive=alive)
+        catalogue.handle_timer(10.0 * when + 1)
+    assert len(catalogue.away) == 20
+    assert [site for site, _ in catalogue.had("/x")] == ["s17", "s18", "s19"]
+    assert catalogue.since_ago("s19", 200.0) == 9.0
 
 
 def test_attachments_of_invented_sources_fill_no_memory() -> None:

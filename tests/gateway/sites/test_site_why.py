@@ -152,7 +152,7 @@ async def test_a_site_that_left_is_unreachable_since_then_and_one_that_never_was
     (module,) = report.sites[1].modules
     assert (module.name, module.topics, module.services, module.shown) == ("arm", 1, 0, 1)
     await yard.site.neighbour.close()
-    await until(lambda: hall.site.neighbour.history.away == ("yard",))
+    await until(lambda: hall.site.neighbour.catalogue.away == ("yard",))
     report = await hall.report()
     assert report.sites[1].state == "unreachable"
     assert report.sites[1].since_ago is not None

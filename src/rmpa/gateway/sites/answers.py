@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+import time
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -200,7 +201,7 @@ class SiteAnswers:
     async def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Any:
         """The reply to one question of ``observe.operations``; raises as that says."""
         name, site, module = (str(args.get(key) or "") for key in ("name", "site", "module"))
-        others = {*self._sites.catalogue.sites, *self._sites.history.away} - {self._site}
+        others = {*self._sites.catalogue.sites, *self._sites.catalogue.away} - {self._site}
         known = [self._site, *sorted(others)]
         if what == REPORT:
             return self._report(known, asker, sources=False)
@@ -252,7 +253,7 @@ class SiteAnswers:
     def _other(self, name: str, asker: str, sources: bool) -> SiteInfo:
         catalogue = self._sites.catalogue
         if name not in catalogue.sites:
-            return SiteInfo(name=name, state="unreachable", since_ago=self._sites.history.since_ago(name))
+            return SiteInfo(name=name, state="unreachable", since_ago=catalogue.since_ago(name, time.monotonic()))
         rows: list[SiteSourceInfo] = []
         modules = []
         for module in catalogue.modules(name):
@@ -263,7 +264,7 @@ class SiteAnswers:
         return SiteInfo(
             name=name,
             state="joined" if gateways else "no gateway",
-            since_ago=self._sites.history.since_ago(name),
+            since_ago=catalogue.since_ago(name, time.monotonic()),
             gateways=len(gateways),
             modules=tuple(modules),
             sources=tuple(rows[: limits.SITE_REPORT_SOURCES_MAX]) if sources else (),
@@ -290,7 +291,7 @@ class SiteAnswers:
             asker: The module that asks, whose own sources are told of too; empty for this machine's user.
             service: Whether a service is meant.
         """
-        known = site in self._sites.catalogue.sites or site in self._sites.history.away
+        known = site in self._sites.catalogue.sites or site in self._sites.catalogue.away
         if not self._sites.leads or (site and not known and not module):
             return []  # a name that is no site's is a peer's
         kinds = (SourceKind.SERVICE,) if service else tuple(ACCESS)
@@ -312,7 +313,7 @@ class SiteAnswers:
             ways.append(self._diagnosis(name, f"{site}/{module}" if module else site, "", kinds[0], [denied]))
         if site:
             return ways
-        for away, had in self._sites.history.had(name) if permitted else ():
+        for away, had in self._sites.catalogue.had(name) if permitted else ():
             ways.append(await self._no_way(name, away, had, permitted))
 
         def own(source: MeshSource) -> bool:
@@ -354,10 +355,11 @@ class SiteAnswers:
         return self._diagnosis(name, f"{site}/{module}" if module else site, node, kind, stages)
 
     def _site_stage(self, site: str) -> Check:
-        gateways, history = len(self._sites.catalogue.gateways(site)), self._sites.history
-        if site not in self._sites.catalogue.sites:
-            if site in history.away:
-                text = f"site {site} is unreachable since {history.since_ago(site) or 0:.0f} s"
+        catalogue = self._sites.catalogue
+        gateways = len(catalogue.gateways(site))
+        if site not in catalogue.sites:
+            if site in catalogue.away:
+                text = f"site {site} is unreachable since {catalogue.since_ago(site, time.monotonic()) or 0:.0f} s"
                 remedy = "is its gateway on, and its way to the router? `rmpa site list` there"
                 return Check("site", FAIL, text, remedy)
             text = f"no gateway of a site {site} is at the routers that this site's gateway reaches"

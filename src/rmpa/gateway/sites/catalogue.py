@@ -1,4 +1,4 @@
-"""What other sites have, which gateway of a site leads, and since when a site is away. Without I/O.
+"""What other sites have or had, since when they are there or away, and which gateway of a site leads. Without I/O.
 
 Tokens come and go one by one, in any order. A source is there while its own token and that of its module are. What a
 gateway withdraws goes at once (after ``_SITE_SETTLE``); what is lost together with the leading gateway of its
@@ -23,7 +23,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource, parse_token
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable
 
 # Seconds from the end of a token to the end of what it stands for. The tokens of a gateway that was killed go one by
 # one, within some milliseconds: its own may be the last, and then the others are lost and not withdrawn.
@@ -54,6 +54,10 @@ class _Site:
     orphans: dict[SiteModule, set[SiteSource]] = field(default_factory=dict)
     # With the orphans.
     sources: int = 0
+    # Sources that have ended lately, and when.
+    ended: dict[SiteSource, float] = field(default_factory=dict)
+    # Since when it is told of.
+    since: float | None = None
     interrupted_until: float = 0.0
     refused: int = 0
 
@@ -62,11 +66,12 @@ _NO_SITE: Final = _Site()
 
 
 class SiteCatalogue:
-    """Keeps what other sites have.
+    """Keeps what other sites have, and what those had that are away.
 
     Args:
         own: This site's name, whose tokens are ignored.
         changed: Called with each change of a source.
+        seen: ``(site, there)``: a site has come, before its sources are looked at, or has left.
         counters: ``site.token.malformed``, ``site.token.later_version``, ``site.limit``.
     """
 
@@ -74,10 +79,14 @@ class SiteCatalogue:
         self,
         own: str,
         changed: Callable[[CatalogueChange, SiteSource], None],
+        seen: Callable[[str, bool], None],
         counters: Counters | None = None,
     ) -> None:
         self._own = own
         self._tell = changed
+        self._seen = seen
+        # When each site left that is away, and what it had; the oldest first.
+        self._away: dict[str, tuple[float, list[SiteSource]]] = {}
         self._sites: dict[str, _Site] = {}
         # Of all sites together.
         self._sources = 0
@@ -89,6 +98,21 @@ class SiteCatalogue:
     def sites(self) -> tuple[str, ...]:
         """The names of the other sites, in order."""
         return tuple(sorted(self._sites))
+
+    @property
+    def away(self) -> tuple[str, ...]:
+        """The sites that were there and are not, by name."""
+        return tuple(sorted(self._away))
+
+    def since_ago(self, site: str, now: float) -> float | None:
+        """Seconds since a site came or left; ``None``: it was never seen."""
+        since = self._away[site][0] if site in self._away else self._sites.get(site, _NO_SITE).since
+        return None if since is None else now - since
+
+    def had(self, name: str) -> tuple[tuple[str, str], ...]:
+        """The sites that are away and had a topic or service of this name, each with its module."""
+        sources = (source for _, had in self._away.values() for source in had)
+        return tuple(sorted({(each.site, each.module.name) for each in sources if each.name == name}))
 
     def gateways(self, site: str) -> list[SiteGateway]:
         """The gateways of another site, the leading one first."""
@@ -145,7 +169,7 @@ class SiteCatalogue:
             self._came(site, item, key)
         else:
             self._went(site, item, key, now)
-        self._forget_if_empty(name)
+        self._judge(name, now)
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is to be called; ``None``: nothing waits."""
@@ -157,12 +181,12 @@ class SiteCatalogue:
             item = self._by_token.pop(key)
             site = self._sites[item.site]
             if isinstance(item, SiteModule):
-                self._end_module(site, item)
+                self._end_module(site, item, now)
             else:
                 site.modules[item.module].discard(item)
                 self._count(site, -1)
-                self._tell(CatalogueChange.GONE, item)
-            self._forget_if_empty(item.site)
+                self._end(site, item, now)
+            self._judge(item.site, now)
 
     def _gateway(self, site: _Site, gateway: SiteGateway, now: float, *, alive: bool) -> None:
         if alive:
@@ -220,7 +244,16 @@ class SiteCatalogue:
             self._by_token[key] = item
             self._ending.set(key, max(now + _SITE_SETTLE, site.interrupted_until))
 
-    def _end_module(self, site: _Site, module: SiteModule) -> None:
+    def _end(self, site: _Site, source: SiteSource, now: float) -> None:
+        """A source is gone; what ended before its site could end with it is forgotten."""
+        ended = site.ended
+        ended.pop(source, None)
+        ended[source] = now
+        while ended[oldest := next(iter(ended))] < now - _ENDING:
+            del ended[oldest]
+        self._tell(CatalogueChange.GONE, source)
+
+    def _end_module(self, site: _Site, module: SiteModule, now: float) -> None:
         for source in sorted(site.modules.pop(module), key=SiteSource.token):
             key = source.token()
             self._ending.set(key, None)
@@ -229,7 +262,7 @@ class SiteCatalogue:
                 site.orphans.setdefault(module, set()).add(source)
             else:
                 self._count(site, -1)
-            self._tell(CatalogueChange.GONE, source)
+            self._end(site, source, now)
 
     def _count(self, site: _Site, more: int) -> None:
         site.sources += more
@@ -239,10 +272,27 @@ class SiteCatalogue:
         site.refused += 1
         self.counters.add("site.limit")
 
-    def _forget_if_empty(self, name: str) -> None:
+    def _judge(self, name: str, now: float) -> None:
+        """Tell of a site that has come, or left; of those that are away, the oldest are forgotten."""
         site = self._sites[name]
-        if not (site.gateways or site.modules or site.orphans):
-            del self._sites[name]
+        if site.gateways or site.modules or site.orphans:
+            if site.since is None:
+                site.since = now
+                self._away.pop(name, None)
+                self._seen(name, True)
+            return
+        del self._sites[name]
+        if site.since is None:
+            return
+        self._away[name] = now, [source for source, at in site.ended.items() if at >= now - _ENDING]
+        while self._away and len(self._away) + len(self._sites) > limits.SITES_REMEMBERED_MAX:
+            del self._away[next(iter(self._away))]
+        total = sum(len(had) for _, had in self._away.values())
+        for _, had in self._away.values():
+            if total > limits.SITES_SOURCES_MAX:
+                total -= len(had)
+                had.clear()
+        self._seen(name, False)
 
 
 # Which gateway of a site leads, where there are several. The others stand by, so that no message crosses twice.
@@ -299,66 +349,3 @@ class Leader:
             self.leads, self._best_since = False, None
         elif self._best_since is None:
             self._best_since = now
-
-
-# Which sites were there and are not, and what they had. For "unreachable since".
-
-
-class SiteHistory:
-    """Remembers since when other sites are there or away.
-
-    Args:
-        now: Monotonic seconds.
-    """
-
-    def __init__(self, now: Callable[[], float]) -> None:
-        self._now = now
-        self._there: frozenset[str] = frozenset()
-        self._since: dict[str, float] = {}
-        # When each source was withdrawn: infinite while it is there, and 0 if it went with its site.
-        self._had: dict[str, dict[SiteSource, float]] = {}
-
-    @property
-    def away(self) -> tuple[str, ...]:
-        """The sites that were there and are not, by name."""
-        return tuple(sorted(self._since.keys() - self._there))
-
-    def since_ago(self, site: str) -> float | None:
-        """Seconds since a site came or left; ``None``: it was never seen."""
-        return self._now() - self._since[site] if site in self._since else None
-
-    def source(self, source: SiteSource, *, there: bool) -> None:
-        """A site announces a source, or withdraws it; not called for those that go together with their site."""
-        had = self._had.setdefault(source.site, {})
-        had[source] = float("inf") if there else self._now()
-        if len(had) > 2 * limits.SITE_SOURCES_MAX:
-            self._had[source.site] = self._recent(source.site)
-
-    def had(self, name: str) -> tuple[tuple[str, str], ...]:
-        """The sites that are away and had a topic or service of this name, each with its module."""
-        sources = (source for site in self.away for source in self._had.get(site, ()))
-        return tuple(sorted({(each.site, each.module.name) for each in sources if each.name == name}))
-
-    def seen(self, sites: Iterable[str]) -> tuple[list[str], list[str]]:
-        """These sites are there now, and no others; return which have come, and which have left."""
-        there = frozenset(sites)
-        came, left = sorted(there - self._there), sorted(self._there - there)
-        for site in (*came, *left):
-            self._since[site] = self._now()
-        for site in left:
-            self._had[site] = dict.fromkeys(self._recent(site), 0.0)
-        self._there = there
-        oldest_first = sorted(self.away, key=self._since.__getitem__)
-        for site in oldest_first[: max(0, len(self._since) - limits.SITES_REMEMBERED_MAX)]:
-            del self._since[site]
-            self._had.pop(site, None)
-        total = sum(len(self._had.get(site, ())) for site in oldest_first)
-        for site in oldest_first:
-            if total > limits.SITES_SOURCES_MAX:
-                total -= len(self._had.pop(site, ()))
-        return came, left
-
-    def _recent(self, site: str) -> dict[SiteSource, float]:
-        """What a site has, or has withdrawn just now."""
-        least = self._now() - _ENDING
-        return {source: at for source, at in self._had.get(site, {}).items() if at and at >= least}

@@ -13,7 +13,7 @@ from rmpa.core.log import RefusalLog, logged_failure
 from rmpa.core.timers import earliest
 from rmpa.gateway import limits
 from rmpa.gateway.rules import ForeignSource, SourceKind
-from rmpa.gateway.sites.catalogue import CatalogueChange, Leader, SiteCatalogue, SiteHistory
+from rmpa.gateway.sites.catalogue import CatalogueChange, Leader, SiteCatalogue
 from rmpa.gateway.sites.keys import (
     ANY_GATEWAY,
     ROOT,
@@ -394,7 +394,6 @@ class SiteNeighbour:
 
     Attributes:
         catalogue: What the other sites have.
-        history: Since when they are there or away.
         exports: What this site offers.
         imports: What is shown of the other sites.
         imported: What runs for it, by what is shown.
@@ -407,8 +406,7 @@ class SiteNeighbour:
     def __init__(self, context: SiteContext, own: SiteGateway) -> None:
         self.context = context
         self.own = own
-        self.catalogue = SiteCatalogue(own.site, self._site_changed, context.counters)
-        self.history = SiteHistory(time.monotonic)
+        self.catalogue = SiteCatalogue(own.site, self._source_changed, self._site_seen, context.counters)
         self.exports = SiteExports(own.site, context.rules, self._own_changed)
         self.imports = SiteImports(context.rules, self._import_changed)
         self.topics = SiteTopics(context)
@@ -482,29 +480,28 @@ class SiteNeighbour:
         self._follow()
 
     def _follow(self) -> None:
-        """Lead or rest, and tell which sites have come and gone."""
+        """Lead or rest."""
         if self._leader.leads and not self.leads:
             self._lead()
         elif self.leads and not self._leader.leads:
             _log.info("= another gateway of site %s leads now", self.own.site)
             self._rest()
-        came, left = self.history.seen(self.catalogue.sites)
-        for site in came:
-            _log.info("= site %s is joined", site)
-        for site in left:
-            _log.warning("! site %s is unreachable; `rmpa site list` shows all [site-unreachable]", site)
-        if came:
-            self.exports.sites_seen(self.catalogue.sites)
         self._timer.arm()
 
-    def _site_changed(self, change: CatalogueChange, item: SiteSource) -> None:
-        if change is CatalogueChange.RENEWED:
-            self.imports.renewed(item)
-            return
-        there = change is CatalogueChange.FOUND
-        (self.imports.found if there else self.imports.gone)(item)
-        if there or self.catalogue.gateways(item.site):
-            self.history.source(item, there=there)
+    def _site_seen(self, site: str, there: bool) -> None:
+        if there:
+            _log.info("= site %s is joined", site)
+            self.exports.sites_seen(self.catalogue.sites)
+        else:
+            _log.warning("! site %s is unreachable; `rmpa site list` shows all [site-unreachable]", site)
+
+    def _source_changed(self, change: CatalogueChange, source: SiteSource) -> None:
+        follow = {
+            CatalogueChange.FOUND: self.imports.found,
+            CatalogueChange.RENEWED: self.imports.renewed,
+            CatalogueChange.GONE: self.imports.gone,
+        }
+        follow[change](source)
 
     def _lead(self) -> None:
         _log.info("= this gateway leads site %s", self.own.site)
