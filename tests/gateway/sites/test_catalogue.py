@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import random
+from functools import partial
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from hypothesis import given
@@ -10,10 +13,10 @@ from hypothesis import strategies as st
 
 from rmpa.gateway import limits
 from rmpa.gateway.rules import SourceKind
-from rmpa.gateway.sites.catalogue import CatalogueChange, Leader, SiteCatalogue
+from rmpa.gateway.sites.catalogue import Leader, SiteCatalogue
 from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource
 
-FOUND, RENEWED, GONE = CatalogueChange.FOUND, CatalogueChange.RENEWED, CatalogueChange.GONE
+FOUND, RENEWED, GONE = "found", "renewed", "gone"
 FIRST = SiteGateway("cloud", 1, "1" * 32)
 SECOND = SiteGateway("cloud", 2, "2" * 32)
 ARM = SiteModule("cloud", "arm", "a" * 32)
@@ -27,15 +30,19 @@ class Followed(SiteCatalogue):
     """A catalogue of the site ``home``, and what it has told."""
 
     def __init__(self, own: str = "home") -> None:
-        self.told: list[tuple[CatalogueChange, SiteSource]] = []
-        super().__init__(own, lambda change, item: self.told.append((change, item)), lambda *_: None)
+        self.told: list[tuple[str, SiteSource]] = []
+        tell = {word: partial(self._told, word) for word in (FOUND, RENEWED, GONE)}
+        super().__init__(own, cast("Any", SimpleNamespace(**tell)), lambda *_: None)
+
+    def _told(self, word: str, source: SiteSource) -> None:
+        self.told.append((word, source))
 
     def all_tokens(self, now: float, *, alive: bool) -> None:
         for item in EVERYTHING:
             self.token(item.token(), now, alive=alive)
 
 
-def told(catalogue: Followed) -> list[tuple[CatalogueChange, SiteSource]]:
+def told(catalogue: Followed) -> list[tuple[str, SiteSource]]:
     events, catalogue.told[:] = list(catalogue.told), []
     return events
 
@@ -110,11 +117,11 @@ def test_events_say_what_the_tokens_say_in_any_order(changes: list[tuple[SiteSou
     shown: set[object] = set()
     now = 0.0
 
-    def follow(change: CatalogueChange, item: SiteSource) -> None:
-        if change is FOUND:
+    def follow(change: str, item: SiteSource) -> None:
+        if change == FOUND:
             assert item not in shown
             shown.add(item)
-        elif change is RENEWED:
+        elif change == RENEWED:
             assert item in shown
         else:
             shown.remove(item)

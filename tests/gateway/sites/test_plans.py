@@ -218,7 +218,7 @@ def source(
 
 def test_all_sites_together_announce_a_bounded_number_of_sources(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "SITES_SOURCES_MAX", 100)
-    catalogue = SiteCatalogue("home", lambda *_: None, lambda *_: None)
+    catalogue = SiteCatalogue("home", Imports(), lambda *_: None)
     for site in ("a", "b", "c"):
         catalogue.token(SiteModule(site, "arm", RUN).token(), 0.0, alive=True)
         for number in range(60):
@@ -273,7 +273,7 @@ def test_a_crowd_that_waits_for_one_name_is_not_judged_anew_each_time(kind: Sour
 
 def test_what_sites_had_that_are_away_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "SITES_SOURCES_MAX", 100)
-    catalogue = SiteCatalogue("home", lambda *_: None, lambda *_: None)
+    catalogue = SiteCatalogue("home", Imports(), lambda *_: None)
     for when, site in enumerate(f"s{number}" for number in range(20)):
         tokens = [SiteModule(site, "arm", RUN).token()]
         tokens += [source(number, "/x", "a/B", site=site).token() for number in range(30)]

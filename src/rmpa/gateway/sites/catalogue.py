@@ -13,7 +13,6 @@ the leading gateway takes everything down and up::
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError
@@ -25,24 +24,14 @@ from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource, parse_t
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from rmpa.gateway.sites.site import SiteImports
+
 # Seconds from the end of a token to the end of what it stands for. The tokens of a gateway that was killed go one by
 # one, within some milliseconds: its own may be the last, and then the others are lost and not withdrawn.
 _SITE_SETTLE: Final = 0.05
 
 # Seconds within which a gateway that ends withdraws what it announced: that too is what its site had.
 _ENDING: Final = 2.0
-
-
-class CatalogueChange(Enum):
-    """What has happened to a source.
-
-    Attributes:
-        RENEWED: Its token had gone and came back in time: another gateway may have it now.
-    """
-
-    FOUND = "found"
-    RENEWED = "renewed"
-    GONE = "gone"
 
 
 @dataclass(slots=True)
@@ -70,7 +59,8 @@ class SiteCatalogue:
 
     Args:
         own: This site's name, whose tokens are ignored.
-        changed: Called with each change of a source.
+        imports: Is told of each source that is found, renewed (its token had gone and came back in time: another
+            gateway may have it now), or gone.
         seen: ``(site, there)``: a site has come, before its sources are looked at, or has left.
         counters: ``site.token.malformed``, ``site.token.later_version``, ``site.limit``.
     """
@@ -78,12 +68,12 @@ class SiteCatalogue:
     def __init__(
         self,
         own: str,
-        changed: Callable[[CatalogueChange, SiteSource], None],
+        imports: SiteImports,
         seen: Callable[[str, bool], None],
         counters: Counters | None = None,
     ) -> None:
         self._own = own
-        self._tell = changed
+        self._imports = imports
         self._seen = seen
         # When each site left that is away, and what it had; the oldest first.
         self._away: dict[str, tuple[float, list[SiteSource]]] = {}
@@ -206,7 +196,7 @@ class SiteCatalogue:
         if self._by_token.pop(key, None) is not None:
             self._ending.set(key, None)
             if isinstance(item, SiteSource):
-                self._tell(CatalogueChange.RENEWED, item)
+                self._imports.renewed(item)
             return
         if isinstance(item, SiteModule):
             if item in site.modules:
@@ -216,7 +206,7 @@ class SiteCatalogue:
                 return
             sources = site.modules[item] = site.orphans.pop(item, set())
             for source in sorted(sources, key=SiteSource.token):
-                self._tell(CatalogueChange.FOUND, source)
+                self._imports.found(source)
             return
         known = site.modules.get(item.module)
         into = known if known is not None else site.orphans.setdefault(item.module, set())
@@ -230,7 +220,7 @@ class SiteCatalogue:
         into.add(item)
         self._count(site, 1)
         if known is not None:
-            self._tell(CatalogueChange.FOUND, item)
+            self._imports.found(item)
 
     def _went(self, site: _Site, item: SiteModule | SiteSource, key: str, now: float) -> None:
         if isinstance(item, SiteSource) and item in site.orphans.get(item.module, ()):
@@ -251,7 +241,7 @@ class SiteCatalogue:
         ended[source] = now
         while ended[oldest := next(iter(ended))] < now - _ENDING:
             del ended[oldest]
-        self._tell(CatalogueChange.GONE, source)
+        self._imports.gone(source)
 
     def _end_module(self, site: _Site, module: SiteModule, now: float) -> None:
         for source in sorted(site.modules.pop(module), key=SiteSource.token):

@@ -13,7 +13,7 @@ from rmpa.core.log import RefusalLog, logged_failure
 from rmpa.core.timers import earliest
 from rmpa.gateway import limits
 from rmpa.gateway.rules import ForeignSource, SourceKind
-from rmpa.gateway.sites.catalogue import CatalogueChange, Leader, SiteCatalogue
+from rmpa.gateway.sites.catalogue import Leader, SiteCatalogue
 from rmpa.gateway.sites.keys import (
     ANY_GATEWAY,
     ROOT,
@@ -406,9 +406,9 @@ class SiteNeighbour:
     def __init__(self, context: SiteContext, own: SiteGateway) -> None:
         self.context = context
         self.own = own
-        self.catalogue = SiteCatalogue(own.site, self._source_changed, self._site_seen, context.counters)
         self.exports = SiteExports(own.site, context.rules, self._own_changed)
         self.imports = SiteImports(context.rules, self._import_changed)
+        self.catalogue = SiteCatalogue(own.site, self.imports, self._site_seen, context.counters)
         self.topics = SiteTopics(context)
         self.services = SiteServices(context)
         self.imported: dict[ForeignSource, ImportedTopic | ImportedService] = {}
@@ -494,14 +494,6 @@ class SiteNeighbour:
             self.exports.sites_seen(self.catalogue.sites)
         else:
             _log.warning("! site %s is unreachable; `rmpa site list` shows all [site-unreachable]", site)
-
-    def _source_changed(self, change: CatalogueChange, source: SiteSource) -> None:
-        follow = {
-            CatalogueChange.FOUND: self.imports.found,
-            CatalogueChange.RENEWED: self.imports.renewed,
-            CatalogueChange.GONE: self.imports.gone,
-        }
-        follow[change](source)
 
     def _lead(self) -> None:
         _log.info("= this gateway leads site %s", self.own.site)
