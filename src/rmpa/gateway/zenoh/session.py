@@ -218,21 +218,18 @@ class OpenSession:
     Args:
         library: The module ``zenoh``.
         session: Zenoh's session.
-        loop: The event loop in which all callbacks are called.
-        stale: Whether it has to be opened anew for others to connect: its certificate or table of access is another.
-            Zenoh reads the table and the certificate of a listener once, and that of a connection each time.
+        config: What it was opened with.
+        settings: What that was made of, and is made of again; ``None``: it stays as it is.
     """
 
-    def __init__(
-        self,
-        library: Any,
-        session: Any,
-        loop: asyncio.AbstractEventLoop,
-        stale: Callable[[], bool] = lambda: False,
-    ) -> None:
+    def __init__(self, library: Any, session: Any, config: ZenohConfig, settings: Settings | None) -> None:
         self._zenoh = library
         self._session = session
-        self._loop = loop
+        self._config = config
+        self._stamp = config.stamp()
+        self._settings = settings
+        # The event loop in which all callbacks are called.
+        self._loop = loop = asyncio.get_running_loop()
         self.zid = str(session.zid())
         self._arrivals = Arrivals(loop)
         self._declarations = SerialWorker("zenoh declarations")
@@ -240,7 +237,6 @@ class OpenSession:
         self._lanes: dict[ZenohPriority, SendingLane] = {}
         self._publishers: set[QueuedPublisher] = set()
         self._kept: set[Declaration] = set()
-        self._stale = stale
         self._closing = False
         self._closed = False
         self._flushed = asyncio.Event()
@@ -263,8 +259,18 @@ class OpenSession:
 
     @property
     def stale(self) -> bool:
-        """Whether it has to be opened anew for others to connect."""
-        return self._stale()
+        """Whether it has to be opened anew for others to connect: its certificate or table of access is another.
+
+        Zenoh reads the table and the certificate of a listener once, and that of a connection each time. The table is
+        another where a module was revoked, or has joined since.
+        """
+        renewed = self._config.stamp() != self._stamp
+        if renewed or self._settings is None:
+            return renewed
+        try:
+            return session_config(self._settings).access_control != self._config.access_control
+        except StartError:
+            return False  # files are being written
 
     def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> QueuedPublisher:
         """Declare a publisher; ``on_matching(there)`` tells whether there is a subscriber, also at the beginning."""
@@ -537,12 +543,12 @@ class OpenSession:
         )
 
 
-async def open_session(config: ZenohConfig, changed: Callable[[], bool] = lambda: False) -> OpenSession:
+async def open_session(config: ZenohConfig, settings: Settings | None = None) -> OpenSession:
     """Open a session, in a thread.
 
     Args:
         config: Its mode, endpoints and certificates.
-        changed: Whether it would be another one now (``OpenSession.stale``).
+        settings: What that was made of (``OpenSession.stale``).
 
     Raises:
         StartError: The library is missing, an address is taken, or the endpoints do not answer.
@@ -553,19 +559,14 @@ async def open_session(config: ZenohConfig, changed: Callable[[], bool] = lambda
         raise StartError(
             "zenoh", "eclipse-zenoh is not installed", missing_extra("zenoh"), code="extra-missing"
         ) from None
-    settings = zenoh.Config()
+    terms = zenoh.Config()
     try:
         for key, value in config.entries().items():
-            settings.insert_json5(key, json.dumps(value))
-        session = await in_thread(lambda: zenoh.open(settings), "zenoh open")
+            terms.insert_json5(key, json.dumps(value))
+        session = await in_thread(lambda: zenoh.open(terms), "zenoh open")
     except zenoh.ZError as error:
         raise config.start_error(reason_of(error)) from None
-    stamp = config.stamp()
-
-    def stale() -> bool:
-        return config.stamp() != stamp or changed()
-
-    return OpenSession(zenoh, session, asyncio.get_running_loop(), stale)
+    return OpenSession(zenoh, session, config, settings)
 
 
 async def open_trusted_session(settings: Settings) -> OpenSession:
@@ -574,13 +575,4 @@ async def open_trusted_session(settings: Settings) -> OpenSession:
     Raises:
         StartError: It may not be opened without certificates, an address is taken, or no router answers.
     """
-    config = session_config(settings)
-
-    def changed() -> bool:
-        """Whether the table of access would be another one now: a module was revoked, or has joined since."""
-        try:
-            return session_config(settings).access_control != config.access_control
-        except StartError:
-            return False  # files are being written
-
-    return await open_session(config, changed)
+    return await open_session(session_config(settings), settings)
