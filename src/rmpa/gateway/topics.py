@@ -128,7 +128,9 @@ class ExportedTopic(ABC):
         self._tap: TopicTap | None = None
         self._opening = self._closed = False
         self._linger = Delay()
-        self._asking: list[asyncio.Future[TopicDescription]] = []
+        # Questions for the header that wait, and whether it has come by the present connection.
+        self._asking = 0
+        self._header_came = asyncio.Event()
         # The messages of the present read.
         self._collected: list[bytes] = []
         # The last message of a latched topic.
@@ -192,20 +194,21 @@ class ExportedTopic(ABC):
             RmpaError: It does not answer in that time, or cannot cross.
         """
         if self._tap is None or self._tap.description is None:
-            if self._closed or len(self._asking) >= _HEADER_QUERIES_MAX:
+            if self._closed or self._asking >= _HEADER_QUERIES_MAX:
                 raise RmpaError("too many questions for this publisher's header wait already, or it has gone")
-            answer: asyncio.Future[TopicDescription] = asyncio.get_running_loop().create_future()
-            self._asking.append(answer)
+            self._asking += 1
             self._judge()
             try:
                 async with asyncio.timeout(within):
-                    await answer
+                    await self._header_came.wait()
             except TimeoutError:
                 why = self.problem or "no connection to it yet"
                 raise RmpaError(f"{self.source.node} of {self.source.module} does not answer: {why}") from None
             finally:
-                self._asking.remove(answer)
+                self._asking -= 1
                 self._judge()
+            if self._closed:
+                raise RmpaError(f"{self.source.name} of {self.source.module} is not offered any more")
         if self.about is None or self._failed:
             raise RmpaError(self.problem or "the publisher's header is not known")
         return self.about
@@ -215,10 +218,7 @@ class ExportedTopic(ABC):
         self._closed = True
         self._linger.cancel()
         self._held.cancel()
-        for answer in self._asking:
-            if not answer.done():
-                gone = f"{self.source.name} of {self.source.module} is not offered any more"
-                answer.set_exception(RmpaError(gone))
+        self._header_came.set()
         self._flush()
         self._disconnect()
         if self._publisher is not None:
@@ -279,6 +279,7 @@ class ExportedTopic(ABC):
 
     def _disconnect(self) -> None:
         tap, self._tap = self._tap, None
+        self._header_came.clear()
         if tap is not None:
             tap.close()
 
@@ -290,13 +291,12 @@ class ExportedTopic(ABC):
         self._latched = about.latching
         self._repeated = about.latching and self._last is not None
         self._announce()
-        for answer in self._asking:
-            if not answer.done():
-                answer.set_result(about)
+        self._header_came.set()
         self._judge()
 
     def _lost(self, reason: str) -> None:
         self.problem = reason
+        self._header_came.clear()
 
     def _message(self, body: memoryview) -> None:
         if self._failed or (payload := self.payload(body)) is None:

@@ -130,7 +130,7 @@ class ExportedService:
                 why = f"service {source.name} is of the type {has}, not {asked}"
         except RemoteProtocolError as error:
             md5, why = NO_MD5, str(error)
-        if not why and self._part.is_full(size):
+        if not why and (size > ros_limits.SERVICE_MESSAGE_MAX or self._part.waiting + size > _SITE_CALL_BYTES):
             why = f"{len(self.answering)} calls of service {source.name} wait already; try again later"
         if why:
             query.reply_error(why)
@@ -275,21 +275,16 @@ class SiteServices:
     def __init__(self, context: SiteContext) -> None:
         self.context = context
         self.waiting = 0
-        # By module, service and the site that it is for.
-        self._exported: dict[tuple[str, str, str], ExportedService] = {}
+        self._exported: dict[SiteExport, ExportedService] = {}
         self._ending: list[Answering] = []
-
-    def is_full(self, size: int) -> bool:
-        """Whether a request of this size finds no room."""
-        return size > ros_limits.SERVICE_MESSAGE_MAX or self.waiting + size > _SITE_CALL_BYTES
 
     def export(self, entry: SiteExport) -> None:
         """Let other sites call a service."""
-        self._exported[_key(entry)] = ExportedService(entry, self)
+        self._exported[entry] = ExportedService(entry, self)
 
     def withdraw(self, entry: SiteExport) -> None:
         """Take it back; calls under way end as the server lets them."""
-        gone = self._exported.pop(_key(entry))
+        gone = self._exported.pop(entry)
         gone.queryable.close()
         self._ending = [*(each for each in self._ending if each), gone.answering]
 
@@ -297,10 +292,6 @@ class SiteServices:
         """End calls under way with an error."""
         for each in (*self._ending, *(exported.answering for exported in self._exported.values())):
             await each.close()
-
-
-def _key(entry: SiteExport) -> tuple[str, str, str]:
-    return entry.source.module, entry.source.name, entry.announced.to
 
 
 class SiteActions:
