@@ -376,7 +376,7 @@ def _ignore(_value: object) -> None:
 
 
 class Ros2Actions:
-    """Joins actions both ways. It takes all topics and services of actions, so that no other part carries them."""
+    """Joins actions both ways."""
 
     def __init__(self, context: Ros2Context) -> None:
         self._context = context
@@ -387,11 +387,15 @@ class Ros2Actions:
         # Actions whose server is gone, the last of each name: their topics stay for a moment.
         self._leaving: dict[str, ShownAction] = {}
 
-    def mesh_source(self, source: MeshSource, *, there: bool) -> bool:
+    @staticmethod
+    def takes(source: MeshSource) -> bool:
+        """Whether a source of a module is a topic of an action."""
+        name, _, part = source.here.rpartition("/")
+        return bool(name) and source.kind is SourceKind.TOPIC and source.type.endswith(_TYPES.get(part, "\0"))
+
+    def mesh_source(self, source: MeshSource, *, there: bool) -> None:
         """Take a topic of an action."""
         name, _, part = source.here.rpartition("/")
-        if source.kind is not SourceKind.TOPIC or not name or not source.type.endswith(_TYPES.get(part, "\0")):
-            return False
         topics = self._topics.setdefault(name, {})
         if there:
             topics[source] = part
@@ -404,12 +408,9 @@ class Ros2Actions:
                 shown.follow(self._clients(name))
         if not topics:
             del self._topics[name]
-        return True
 
-    def endpoint(self, endpoint: Ros2Endpoint, *, there: bool) -> bool:
+    def endpoint(self, endpoint: Ros2Endpoint, *, there: bool) -> None:
         """Take a service or topic of an action; its *send_goal* stands for the server."""
-        if PART not in endpoint.name:
-            return False
         if endpoint.kind is EntityKind.SERVICE and endpoint.name.endswith(_SEND):
             name = endpoint.name.removesuffix(_SEND)
             shown = self._shown.get(name)
@@ -421,7 +422,6 @@ class Ros2Actions:
                 # The next server of this name takes its place.
                 if (other := next(self._context.ros2.at(endpoint.name, EntityKind.SERVICE), None)) is not None:
                     self._show(name, other)
-        return True
 
     def close(self) -> None:
         """Take back all actions of both sides."""

@@ -19,8 +19,9 @@ from rmpa.core.errors import StartError, UnreachableError
 from rmpa.core.identity import is_own
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.actions import Ros2Actions
-from rmpa.gateway.ros2.format import Ros2Endpoint, graph_key
+from rmpa.gateway.ros2.format import EntityKind, Ros2Endpoint, graph_key
 from rmpa.gateway.ros2.graph import SITE
+from rmpa.gateway.ros2.pairs import PART
 from rmpa.gateway.ros2.rclpy_session import RclpySession, shown_in_ros2
 from rmpa.gateway.ros2.services import Ros2Context, Ros2Services
 from rmpa.gateway.ros2.topics import Ros2Topics
@@ -34,7 +35,6 @@ from rmpa.ros.types.find import find_message_type
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
-    from typing import TypeAlias
 
     from rmpa.config.rules import GatewaySettings
     from rmpa.config.settings import Settings
@@ -44,8 +44,6 @@ if TYPE_CHECKING:
     from rmpa.gateway.rules import MeshSource
     from rmpa.observe.sites import SiteAnswerer
     from rmpa.ros.types.messages import MessageType
-
-    _Part: TypeAlias = Ros2Actions | Ros2Services | Ros2Topics
 
 _log: Final = logging.getLogger(__name__)
 _RULES: Final = "change [[gateway.rule]] in the rmpa.toml of the gateway, and reload it"
@@ -83,8 +81,8 @@ class Ros2Neighbour:
         context = self.context = Ros2Context(graph, session, settings, contracts or Contracts(), find)
         self.topics = Ros2Topics(context)
         self.services = Ros2Services(context)
-        # Actions take all topics and services of actions, so that no other part carries them.
-        self._parts: tuple[_Part, ...] = (Ros2Actions(context), self.services, self.topics)
+        # It takes all topics and services of actions, so that no other part carries them.
+        self._actions = Ros2Actions(context)
         # By proxy.
         self._sources: dict[str, set[MeshSource]] = {}
         # The proxies that another gateway shows in ROS 2, with its session.
@@ -104,7 +102,7 @@ class Ros2Neighbour:
         self._closed = True
         if self._watch is not None:
             self._watch.close()
-        for part in self._parts:
+        for part in (self._actions, self.services, self.topics):
             part.close()
         await self.context.close()
 
@@ -125,7 +123,12 @@ class Ros2Neighbour:
         entity = self.context.ros2.change(key, alive=alive)
         if isinstance(entity, Ros2Endpoint):
             _log.debug("%s %s", "+" if alive else "-", entity.token())
-            any(part.endpoint(entity, there=alive) for part in self._parts)
+            if PART in entity.name:
+                self._actions.endpoint(entity, there=alive)
+            elif entity.kind is EntityKind.SERVICE:
+                self.services.endpoint(entity, there=alive)
+            elif entity.kind is not EntityKind.CLIENT:
+                self.topics.endpoint(entity, there=alive)
             if alive:
                 self.context.asker.appeared()
 
@@ -154,7 +157,9 @@ class Ros2Neighbour:
                 self._offer(source, there=stands_by)
 
     def _offer(self, source: MeshSource, *, there: bool) -> None:
-        any(part.mesh_source(source, there=there) for part in self._parts)
+        others = self.services if source.kind is SourceKind.SERVICE else self.topics
+        part = self._actions if self._actions.takes(source) else others
+        part.mesh_source(source, there=there)
 
     def ways(self, name: str, site: str = "", module: str = "") -> list[Diagnosis]:
         """The ways of a topic between ROS 2 and the modules.

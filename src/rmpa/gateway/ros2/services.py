@@ -338,10 +338,8 @@ class Ros2Services:
         self._offered: dict[str, list[OfferedService]] = {}
         self.shown: dict[str, ShownRos2Service] = {}
 
-    def mesh_source(self, source: MeshSource, *, there: bool) -> bool:
+    def mesh_source(self, source: MeshSource, *, there: bool) -> None:
         """Offer a service of a module to ROS 2, or take it back."""
-        if source.kind is not SourceKind.SERVICE:
-            return False
         services = self._offered.setdefault(source.here, [])
         known = next((each for each in services if each.source == source), None)
         if known is not None:
@@ -353,17 +351,14 @@ class Ros2Services:
             services[0].start()
         else:
             del self._offered[source.here]
-        return True
 
-    def endpoint(self, endpoint: Ros2Endpoint, *, there: bool) -> bool:
+    def endpoint(self, endpoint: Ros2Endpoint, *, there: bool) -> None:
         """Show a service of ROS 2 in the gateway's graph, or take it out."""
-        if endpoint.kind is not EntityKind.SERVICE:
-            return False
         shown = self.shown.get(endpoint.name)
         if shown is not None and shown.server == endpoint and not there:
             self.shown.pop(endpoint.name).close()
         if there and shown is not None:
-            return True
+            return
         others = self._context.ros2.at(endpoint.name, EntityKind.SERVICE)
         first = next((each for each in others if not without_use(each.type)), None)
         if first is not None and endpoint.name not in self.shown:
@@ -371,7 +366,6 @@ class Ros2Services:
             decision = self._context.rules.incoming(source)
             if decision.allowed:
                 self.shown[endpoint.name] = ShownRos2Service(self._context, first, decision.name)
-        return True
 
     def close(self) -> None:
         """Take back all services of both sides."""

@@ -462,10 +462,8 @@ class Ros2Topics:
             del self.refused[next(iter(self.refused))]
         self.refused[what] = why
 
-    def mesh_source(self, source: MeshSource, *, there: bool) -> bool:
+    def mesh_source(self, source: MeshSource, *, there: bool) -> None:
         """Put a topic of a module into ROS 2's graph, or take it out."""
-        if source.kind is not SourceKind.TOPIC:
-            return False
         exports = self._exports.setdefault(source.here, {})
         if (old := exports.pop(source.proxy, None)) is not None:
             old.close()
@@ -483,7 +481,6 @@ class Ros2Topics:
                 self.context.start(self._look(export), f"look at {source.here}")
         if not exports:
             del self._exports[source.here]
-        return True
 
     async def _look(self, export: Ros2Export) -> None:
         """Ask the publisher once for its header, which tells whether it latches, unless it was asked before."""
@@ -510,10 +507,8 @@ class Ros2Topics:
             if text:
                 self.context.say(f"{other.name} of {other.node.name}", text)
 
-    def endpoint(self, endpoint: Ros2Endpoint, *, there: bool) -> bool:
+    def endpoint(self, endpoint: Ros2Endpoint, *, there: bool) -> None:
         """Show a publisher of ROS 2 in the gateway's graph, or take it out; compare it with what is here."""
-        if endpoint.kind not in _TOPIC_ENDS:
-            return False
         what = f"{endpoint.name} of {endpoint.node.name}"
         if there:
             for export in self._exports.get(endpoint.name, {}).values():
@@ -521,7 +516,7 @@ class Ros2Topics:
         else:
             self.context.say(what, "")
         if endpoint.kind is not EntityKind.PUBLISHER or "/_" in endpoint.name:
-            return True  # ROS 2's tools hide what has such a name, as the topics of actions
+            return  # ROS 2's tools hide what has such a name, as the topics of actions
         imported = self.imports.get(endpoint.key())
         if there:
             self._add(endpoint, imported, what)
@@ -530,7 +525,6 @@ class Ros2Topics:
             if imported is not None:
                 imported.remove(endpoint)
                 self.drop_idle(imported)
-        return True
 
     def drop_idle(self, imported: Ros2Import) -> None:
         """A topic without publishers goes; one that was wanted stays for a while, as its publisher may restart."""
