@@ -102,8 +102,9 @@ class Ros2Neighbour:
         self._closed = True
         if self._watch is not None:
             self._watch.close()
-        for part in (self._actions, self.services, self.topics):
-            part.close()
+        self._actions.close()
+        self.services.close()
+        self.topics.close()
         await self.context.close()
 
     def report(self) -> dict[str, object]:
@@ -157,9 +158,12 @@ class Ros2Neighbour:
                 self._offer(source, there=stands_by)
 
     def _offer(self, source: MeshSource, *, there: bool) -> None:
-        others = self.services if source.kind is SourceKind.SERVICE else self.topics
-        part = self._actions if self._actions.takes(source) else others
-        part.mesh_source(source, there=there)
+        if self._actions.takes(source):
+            self._actions.mesh_source(source, there=there)
+        elif source.kind is SourceKind.SERVICE:
+            self.services.mesh_source(source, there=there)
+        else:
+            self.topics.mesh_source(source, there=there)
 
     def ways(self, name: str, site: str = "", module: str = "") -> list[Diagnosis]:
         """The ways of a topic between ROS 2 and the modules.
