@@ -94,6 +94,7 @@ def mismatch(own: Ros2Endpoint, other: Ros2Endpoint, distribution: str) -> str:
 # 2 node may use it: one that does is taken for a gateway's, and ignored. So two gateways in one domain make no
 # loop.
 OWN_NAMESPACE: Final = "/rmpa/"
+_OTHER_GATEWAY: Final = "other gateway"
 _NAME: Final = re.compile(r"(/[A-Za-z0-9_]+)+")
 _TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/(msg|srv|action)/[A-Za-z][A-Za-z0-9_]*")
 
@@ -115,9 +116,8 @@ class Ros2Graph:
         self._nodes: dict[str, Ros2Node] = {}
         self._endpoints: dict[str, Ros2Endpoint] = {}
         self._by_name: dict[str, dict[str, Ros2Endpoint]] = {}
-        # By the name of a node the tokens and sessions of other gateways that show it.
-        self._rivals: dict[str, dict[str, str]] = {}
-        self._rival_tokens = 0
+        # The nodes that other gateways show.
+        self._rivals: dict[str, Ros2Node] = {}
         self.ignored: Counter[str] = Counter()
 
     @property
@@ -133,55 +133,30 @@ class Ros2Graph:
         """The endpoints of a topic or service, of the given kinds, in the order in which they appeared."""
         return (each for each in self._by_name.get(name, {}).values() if each.kind in kinds)
 
-    def rival(self, key: str, *, alive: bool) -> str:
-        """Take in that another gateway's node appeared or disappeared.
-
-        Returns:
-            The node's name; empty if the token is no such one.
-        """
-        try:
-            node = parse_token(key)
-        except RemoteProtocolError:
-            return ""
-        if not isinstance(node, Ros2Node) or node.zid == self._own_zid or node.domain != self._domain:
-            return ""
-        shown = self._rivals.get(node.name, {})
-        if not node.name.startswith(OWN_NAMESPACE) or alive == (key in shown):
-            return ""
-        if alive and self._rival_tokens >= limits.ROS2_NODES_MAX:
-            return ""
-        self._rival_tokens += 1 if alive else -1
-        if alive:
-            self._rivals.setdefault(node.name, {})[key] = node.zid
-        else:
-            del shown[key]
-            if not shown:
-                del self._rivals[node.name]
-        return node.name
-
     def led_by(self, node: str) -> str:
         """The Zenoh session of another gateway that shows a module's node; empty if this gateway is to show it.
 
         Two gateways of one mesh would show each node twice, and each message would come twice. Of those that show a
         node the one with the least session id goes on.
         """
-        shown = self._rivals.get(node, {}).values()
+        shown = (each.zid for each in self._rivals.values() if each.name == node)
         return min((zid for zid in shown if _order(zid) < _order(self._own_zid)), key=_order, default="")
 
     def change(self, key: str, *, alive: bool) -> Ros2Node | Ros2Endpoint | None:
         """Take in that a token appeared or disappeared.
 
         Returns:
-            The node or endpoint that is new or gone; ``None`` if nothing has changed.
+            The node or endpoint that is new or gone, also a node that another gateway shows; ``None`` if nothing has
+            changed.
         """
         if not alive:
-            gone = self._nodes.pop(key, None) or self._endpoints.pop(key, None)
+            gone = self._nodes.pop(key, None) or self._endpoints.pop(key, None) or self._rivals.pop(key, None)
             if isinstance(gone, Ros2Endpoint):
                 del self._by_name[gone.name][key]
                 if not self._by_name[gone.name]:
                     del self._by_name[gone.name]
             return gone
-        if key in self._nodes or key in self._endpoints:
+        if key in self._nodes or key in self._endpoints or key in self._rivals:
             return None
         try:
             entity = parse_token(key)
@@ -193,7 +168,10 @@ class Ros2Graph:
             return None
         if reason := self._problem(node, entity):
             self.ignored[reason] += 1
-            return None
+            if reason != _OTHER_GATEWAY or node is not entity or len(self._rivals) >= limits.ROS2_NODES_MAX:
+                return None
+            self._rivals[key] = node
+            return node
         if isinstance(entity, Ros2Node):
             self._nodes[key] = entity
         else:
@@ -208,7 +186,7 @@ class Ros2Graph:
         if not _valid(node.name):
             return "impossible name"
         if f"{node.name}/".startswith(OWN_NAMESPACE):
-            return "other gateway"
+            return _OTHER_GATEWAY
         if isinstance(entity, Ros2Node):
             return "too many nodes" if len(self._nodes) >= limits.ROS2_NODES_MAX else ""
         if not _valid(entity.name) or _TYPE.fullmatch(entity.type) is None:

@@ -19,7 +19,7 @@ from rmpa.core.errors import StartError, UnreachableError
 from rmpa.core.identity import is_own
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.actions import Ros2Actions
-from rmpa.gateway.ros2.format import EntityKind, Ros2Endpoint, graph_key
+from rmpa.gateway.ros2.format import EntityKind, Ros2Node, graph_key
 from rmpa.gateway.ros2.graph import SITE
 from rmpa.gateway.ros2.pairs import PART
 from rmpa.gateway.ros2.rclpy_session import RclpySession, shown_in_ros2
@@ -119,10 +119,10 @@ class Ros2Neighbour:
     def _token(self, key: str, alive: bool) -> None:
         if self._closed:
             return
-        if rival := self.context.ros2.rival(key, alive=alive):
-            self._judge(rival)
         entity = self.context.ros2.change(key, alive=alive)
-        if isinstance(entity, Ros2Endpoint):
+        if isinstance(entity, Ros2Node):
+            self._judge(entity.name)  # of another gateway, if it is of a module
+        elif entity is not None:
             _log.debug("%s %s", "+" if alive else "-", entity.token())
             if PART in entity.name:
                 self._actions.endpoint(entity, there=alive)
