@@ -248,7 +248,7 @@ def test_thousands_of_publishers_of_one_name_are_judged_in_linear_time() -> None
 @pytest.mark.parametrize("kind", list(SourceKind))
 def test_a_crowd_that_waits_for_one_name_is_not_judged_anew_each_time(kind: SourceKind) -> None:
     """One program that shows and hides a source must not keep the gateway busy with all others of its name."""
-    imports = SiteImports(CrossingRules(), lambda *_: None)
+    imports = Imports()
     holder = source(0, "/x", "a/First", kind)
     imports.found(holder)
     for number in range(1, MANY):

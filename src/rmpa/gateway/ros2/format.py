@@ -20,7 +20,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from msgspec import UNSET
 
@@ -204,7 +204,7 @@ def qos_fields(qos: Ros2Qos) -> dict[str, int]:
     return {"depth": qos.depth, **{name: each for name, each in numbers.items() if each != getattr(USUAL_QOS, name)}}
 
 
-def qos_of_fields(fields: Mapping[str, int]) -> Ros2Qos:
+def qos_of_fields(fields: Mapping[str, Any]) -> Ros2Qos:
     """A QoS as the process of rclpy tells it."""
     kinds = {name: _known(kind, fields.get(name, 0), getattr(USUAL_QOS, name)) for name, kind in _KINDS}
     return Ros2Qos(**kinds, **{name: fields[name] for name in ("depth", *_TIMES) if name in fields})

@@ -235,7 +235,7 @@ class RclpySession:
         # Of services that are called without a declared client, by their keys.
         self._clients: dict[str, int] = {}
         self.publishers: set[RclpyPublisher] = set()
-        self._subscribers: dict[str, Callable[[ZenohSample], None]] = {}
+        self._subscribers: dict[str, Callable[[ZenohSample], object]] = {}
         self._servers: dict[str, Callable[[RclpyQuery], object]] = {}
         self._watchers: dict[str, Callable[[str, bool], None]] = {}
         # ROS 2's endpoints by their GID, and its nodes by name.
@@ -450,7 +450,7 @@ class RclpySession:
         asyncio.get_running_loop().call_soon(made.judge)
         return made
 
-    def subscribe(self, key: str, on_sample: Callable[[ZenohSample], None], *, history: bool = False) -> ExitStack:
+    def subscribe(self, key: str, on_sample: Callable[[ZenohSample], object], *, history: bool = False) -> ExitStack:
         """Give what arrives for a key to a function; the subscription is declared by its token."""
         del history  # the token has its durability
         self._subscribers[key] = on_sample
@@ -527,7 +527,8 @@ class RclpySession:
     def watch_tokens(self, key: str, on_token: Callable[[str, bool], None]) -> ExitStack:
         """Call ``on_token(token, alive)`` for what ROS 2 has, and at each change."""
         self._watchers[key] = on_token
-        for entity in (*self._nodes.values(), *self._foreign.values()):
+        entities: list[Ros2Node | Ros2Endpoint] = [*self._nodes.values(), *self._foreign.values()]
+        for entity in entities:
             on_token(entity.token(), True)
         return _closing(lambda: self._watchers.pop(key, None))
 

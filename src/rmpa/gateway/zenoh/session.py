@@ -308,7 +308,7 @@ class OpenSession:
     def subscribe(
         self,
         key: str,
-        on_sample: Callable[[ZenohSample], None],
+        on_sample: Callable[[ZenohSample], object],
         *,
         history: bool = False,
     ) -> Declaration:
